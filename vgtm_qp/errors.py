@@ -1,0 +1,66 @@
+"""The one exception tree of the package; every message names the choices there were."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+
+class VgtmError(Exception):
+    """Root of every error that this package raises on purpose."""
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One mistake in a problem file: where it stands, what was found and what was expected."""
+
+    key: str
+    value: str
+    expected: str
+
+    def __str__(self) -> str:
+        found = f": found {self.value}" if self.value else ""
+        return f"{self.key}{found}; expected {self.expected}"
+
+
+class ProblemError(VgtmError):
+    """A problem, or the file it was read from, is wrong; one :class:`Mistake` per mistake."""
+
+    def __init__(self, source: str, mistakes: Sequence[Mistake]) -> None:
+        self.source = source
+        self.mistakes = tuple(mistakes)
+        super().__init__("\n".join(f"{source}: {mistake}" for mistake in self.mistakes))
+
+
+class TrussError(VgtmError):
+    """A truss is not statically determinate, or its description contradicts itself."""
+
+
+class CurveError(VgtmError):
+    """A reference curve cannot be built or evaluated as asked."""
+
+
+class GoalError(VgtmError):
+    """A goal is not a number, has the wrong shape, or asks for what the arm cannot do at all."""
+
+
+class SolverError(VgtmError):
+    """A QP solver is unknown or not installed, or its answer failed the residual check."""
+
+
+class ResultError(VgtmError):
+    """A result file is cut, altered, or of another version."""
+
+
+class MissingExtraError(VgtmError):
+    """An optional dependency is absent; the message holds the pip line that brings it."""
+
+    def __init__(self, extra: str, package: str) -> None:
+        super().__init__(f"{package} is not installed: pip install 'vgtm-qp[{extra}]'")
+
+
+def nearest(name: str, choices: Iterable[str]) -> str:
+    """Return ``; did you mean "..."?`` for the closest of `choices`, or an empty string."""
+    close = difflib.get_close_matches(name, list(choices), n=1)
+    return f'; did you mean "{close[0]}"?' if close else ""
