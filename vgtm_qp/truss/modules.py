@@ -8,15 +8,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.truss import Array, Truss
+from vgtm_qp.truss.joints import axial_joints
+from vgtm_qp.truss.truss import Array, Index, Mask, Truss
 
-Limits = Sequence[float]
-"""Least and greatest length of an actuated member, m."""
+
+class Limits(TypedDict, total=False):
+    """What every builder takes by keyword besides its dimensions."""
+
+    stroke: Sequence[float] | None
+    """Least and greatest length of an actuated member, m; the module's factors times home if not given."""
+    rate: float | None
+    """Greatest |dl/dt| of an actuated member, m/s; none if not given."""
+    acceleration: float | None
+    """Greatest |d2l/dt2| of an actuated member, m/s^2; none if not given."""
+    member_radius: float
+    """Radius of every member, m; 0.03 if not given."""
+    joint_offset: float
+    """Distance from node to member end, along the member at home, m; 0 (pin joints) if not given."""
 
 
 class _Member(NamedTuple):
@@ -25,27 +38,8 @@ class _Member(NamedTuple):
     actuated: bool
 
 
-class _Actuators(NamedTuple):
-    """What is the same for every actuated member, and the radius of all members."""
-
-    stroke: Limits | None
-    default_stroke: tuple[float, float]
-    rate: float | None
-    acceleration: float | None
-    member_radius: float
-
-
-def octahedral(
-    bays: int,
-    *,
-    longeron: float = 1.0,
-    batten: float = 1.0,
-    stroke: Limits | None = None,
-    rate: float | None = None,
-    acceleration: float | None = None,
-    member_radius: float = 0.03,
-) -> Truss:
-    """Octahedral bays: six fixed longerons to the face below, three actuated battens, three free motions a bay.
+def octahedral(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:
+    """Octahedral bays: six fixed longerons to the face below and three actuated battens, three free motions.
 
     The height of a bay between equal faces is sqrt(L^2 - b^2 / 3) for longeron L and batten b.
 
@@ -55,32 +49,174 @@ def octahedral(
         Number of bays, at least 1.
     longeron, batten : float
         Home lengths, m; batten < sqrt(3) longeron.
-    stroke : pair of float, optional
-        Least and greatest length of a batten, m; 0.6 and 1.5 times the home length if not given.
-    rate, acceleration : float, optional
-        Limits of an actuated member, m/s and m/s^2; none if not given.
-    member_radius : float
-        Radius of every member, m.
+    **limits
+        See :class:`Limits`; the stroke of a batten is 0.6 to 1.5 times its home length where not given.
 
     Raises
     ------
     TrussError
-        A dimension is not positive, the bay would be flat, or the home length is outside the stroke.
+        A dimension is not positive, the bay would be flat, or a home length is outside its stroke.
     """
-    actuators = _Actuators(stroke, (0.6, 1.5), rate, acceleration, member_radius)
     _check_dimensions(bays, longeron=longeron, batten=batten)
-    home = _antiprism_nodes(bays, longeron, batten)
+    members: list[_Member] = []
+    for layer in range(1, bays + 1):
+        members += [*_zigzag(layer, actuated=False), *_battens(layer, actuated=True)]
+    home = _antiprism(bays, longeron, batten)
+    return _assemble("octahedral", home, members, limits, (0.6, 1.5), trackable=("position",))
+
+
+def double_octahedral(
+    bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]
+) -> Truss:
+    """Double octahedral bays: two octahedral layers, the middle face actuated, the end face rigid.
+
+    Three free motions a double bay; the arm's faces are the rigid ones. Layers 2k - 1 and 2k belong to bay k.
+    Each layer is a stage of its own: six longerons and three battens place its three nodes.
+
+    Parameters
+    ----------
+    bays : int
+        Number of double bays, at least 1.
+    longeron, batten : float
+        Home lengths, m; batten < sqrt(3) longeron.
+    **limits
+        See :class:`Limits`; the stroke of a middle batten is 0.6 to 1.5 times its home length if not given.
+
+    Raises
+    ------
+    TrussError
+        As :func:`octahedral`.
+    """
+    _check_dimensions(bays, longeron=longeron, batten=batten)
+    members: list[_Member] = []
+    for layer in range(1, 2 * bays + 1):
+        members += [*_zigzag(layer, actuated=False), *_battens(layer, actuated=layer % 2 == 1)]
+    home = _antiprism(2 * bays, longeron, batten)
+    return _assemble(
+        "double-octahedral", home, members, limits, (0.6, 1.5), trackable=("position",), layers_per_bay=2
+    )
+
+
+def hexapod(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:
+    """Hexapod bays: rigid faces joined by six actuated legs, six free motions each.
+
+    Parameters
+    ----------
+    bays : int
+        Number of bays, at least 1.
+    longeron, batten : float
+        Home length of a leg and length of a side of a face, m; batten < sqrt(3) longeron.
+    **limits
+        See :class:`Limits`; the stroke of a leg is 0.7 to 1.4 times its home length where not given.
+
+    Raises
+    ------
+    TrussError
+        As :func:`octahedral`.
+    """
+    _check_dimensions(bays, longeron=longeron, batten=batten)
+    members: list[_Member] = []
+    for layer in range(1, bays + 1):
+        members += [*_zigzag(layer, actuated=True), *_battens(layer, actuated=False)]
+    home = _antiprism(bays, longeron, batten)
+    trackable = ("position", "pointing", "orientation")
+    return _assemble("hexapod", home, members, limits, (0.7, 1.4), trackable=trackable)
+
+
+def longeron(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:
+    """Prismatic bays: three actuated longerons, three fixed diagonals and a rigid face, three free motions.
+
+    The hand of the diagonals alternates from bay to bay: with one hand alone, extension would twist the arm
+    by 3.5 rad per unit of height, and two bays could not meet all six coordinates of a face.
+
+    Parameters
+    ----------
+    bays : int
+        Number of bays, at least 1.
+    longeron, batten : float
+        Home length of a longeron and length of a side of a face, m.
+    **limits
+        See :class:`Limits`; the stroke of a longeron is 0.6 to 1.4 times its home length where not given.
+
+    Raises
+    ------
+    TrussError
+        A dimension is not positive or a home length is outside its stroke.
+    """
+    _check_dimensions(bays, longeron=longeron, batten=batten)
+    members: list[_Member] = []
+    for layer in range(1, bays + 1):
+        below, above = 3 * (layer - 1), 3 * layer
+        hand = 1 if layer % 2 else 2
+        members += [_Member(f"L{layer}-{i + 1}", (below + i, above + i), True) for i in range(3)]
+        members += [
+            _Member(f"D{layer}-{i + 1}", (below + i, above + (i + hand) % 3), False) for i in range(3)
+        ]
+        members += _battens(layer, actuated=False)
+    home = np.vstack([_triangle(batten, 0.0, layer * longeron) for layer in range(bays + 1)])
+    trackable = ("position", "pointing", "orientation")
+    return _assemble("longeron", home, members, limits, (0.6, 1.4), trackable=trackable, face_stride=2)
+
+
+def tetrahedral(
+    bays: int,
+    *,
+    longeron: float = 1.0,
+    batten: float = 1.0,
+    actuated: Sequence[int] = (1, 2, 3),
+    **limits: Unpack[Limits],
+) -> Truss:
+    """Tetrahedra face on face (Boerdijk-Coxeter helix): each node hangs by three members on the three before.
+
+    A bay is three nodes, and every node is a stage of its own. Members (i, i-1) and (i, i-2) are the battens
+    ``B`` and ``D``, members (i, i-3) the longerons ``L``. The home pose is a helix about z, theta its turn
+    node, cos theta = -1/2 - L^2 / (6 b^2). Three successive nodes with the weights w, 1 - 2 w, w, where
+    w = 1 / (2 (1 - cos theta)), have their mean on its axis (w = 0.3 where L = b). No face is normal to the
+    axis, the base neither: its axis point is the origin.
+
+    Parameters
+    ----------
+    bays : int
+        Number of bays of three nodes, at least 1.
+    longeron, batten : float
+        Home length of members (i, i-3), and of members (i, i-1) and (i, i-2), m;
+        longeron < sqrt(3) batten.
+    actuated : sequence of int
+        Which k of the members (i, i-k) are actuated: three, six or nine free motions a bay.
+    **limits
+        See :class:`Limits`; the stroke is 0.75 to 1.3 times the home length where not given.
+
+    Raises
+    ------
+    TrussError
+        A dimension is not positive, the longeron is too long for a helix, `actuated` is not one to three of
+        the numbers 1, 2, 3, or a home length is outside its stroke.
+    """
+    _check_dimensions(bays, longeron=longeron, batten=batten)
+    if not actuated or len(set(actuated)) < len(actuated) or not set(actuated) <= {1, 2, 3}:
+        raise TrussError(f"actuated is {list(actuated)}; expected one to three different numbers of 1, 2, 3")
+    home, cosine = _helix(3 * (bays + 1), longeron, batten)
     members = [
-        member
-        for layer in range(1, bays + 1)
-        for member in (*_zigzag(layer, "L", False), *_battens(layer, actuated=True))
+        _Member(f"{kind}{i // 3}-{i % 3 + 1}", (i - k, i), k in actuated)
+        for i in range(3, len(home))
+        for k, kind in ((1, "B"), (2, "D"), (3, "L"))
     ]
-    return _layered("octahedral", home, members, actuators, bays=bays, trackable=("position",))
+    weight = 1.0 / (2.0 * (1.0 - cosine))
+    return _assemble(
+        "tetrahedral",
+        home,
+        members,
+        limits,
+        (0.75, 1.3),
+        trackable=("position", "pointing", "orientation") if len(actuated) > 1 else ("position",),
+        weights=(weight, 1.0 - 2.0 * weight, weight),
+        stage=np.maximum(np.arange(len(home)) - 3, -1),
+    )
 
 
 def _check_dimensions(bays: int, **lengths: float) -> None:
     if bays < 1:
-        raise TrussError(f"a truss has at least one bay, not {bays}")
+        raise TrussError(f"bays is {bays}; expected at least 1")
     for name, length in lengths.items():
         if not (math.isfinite(length) and length > 0.0):
             raise TrussError(f"{name} is {length:g} m; expected a finite length greater than 0")
@@ -93,25 +229,45 @@ def _triangle(batten: float, angle: float, z: float) -> Array:
     return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.full(3, z)])
 
 
-def _antiprism_nodes(layers: int, side: float, batten: float) -> Array:
+def _antiprism(layers: int, side: float, batten: float) -> Array:
     """Triangles turned by 60 degrees at every second layer, each node at `side` from two nodes below."""
     height_squared = side**2 - batten**2 / 3.0
     if height_squared <= 1e-9 * side**2:
         raise TrussError(
-            f"batten {batten:g} m and side member {side:g} m make a flat bay; "
-            f"expected batten < sqrt(3) times the side member = {math.sqrt(3.0) * side:g} m"
+            f"batten is {batten:g} m: the bay folds flat; expected less than sqrt(3) times the longeron, "
+            f"{math.sqrt(3.0) * side:g} m"
         )
     height = math.sqrt(height_squared)
     return np.vstack([_triangle(batten, (k % 2) * math.pi / 3.0, k * height) for k in range(layers + 1)])
 
 
-def _zigzag(layer: int, kind: str, actuated: bool) -> Iterator[_Member]:
+def _helix(count: int, longeron: float, batten: float) -> tuple[Array, float]:
+    """Return `count` nodes of the helix about z, the second one at z = 0, and the cosine of its turn a node.
+
+    A helix of radius r and rise d has 2 r^2 (1 - cos k theta) + (k d)^2 between nodes i and i - k: `batten`
+    squared for k = 1 and 2, `longeron` squared for k = 3.
+    """
+    cosine = -0.5 - longeron**2 / (6.0 * batten**2)
+    if cosine <= -1.0 + 1e-9:
+        raise TrussError(
+            f"longeron is {longeron:g} m: the helix folds flat; expected less than sqrt(3) times the batten, "
+            f"{math.sqrt(3.0) * batten:g} m"
+        )
+    chord_squared = 1.5 * batten**2 / (1.0 - cosine)
+    radius = math.sqrt(chord_squared / (2.0 * (1.0 - cosine)))
+    rise = math.sqrt(batten**2 - chord_squared)
+    steps = np.arange(count)
+    angles = steps * math.acos(cosine)
+    return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), (steps - 1) * rise]), cosine
+
+
+def _zigzag(layer: int, *, actuated: bool) -> Iterator[_Member]:
     """Yield the six members of an antiprism between `layer` and the layer below it."""
     # Odd layers are turned by 60 degrees: node i stands between nodes i and i+1 below. Even layers turn back.
     other = 1 if layer % 2 else 2
     pairs = [(i, (i + shift) % 3) for i in range(3) for shift in (0, other)]
     for place, (i, below) in enumerate(pairs, start=1):
-        yield _Member(f"{kind}{layer}-{place}", (3 * (layer - 1) + below, 3 * layer + i), actuated)
+        yield _Member(f"L{layer}-{place}", (3 * (layer - 1) + below, 3 * layer + i), actuated)
 
 
 def _battens(layer: int, *, actuated: bool) -> Iterator[_Member]:
@@ -119,76 +275,95 @@ def _battens(layer: int, *, actuated: bool) -> Iterator[_Member]:
         yield _Member(f"B{layer}-{i + 1}", (3 * layer + i, 3 * layer + (i + 1) % 3), actuated)
 
 
-def _layered(
+def _assemble(
     module: str,
     home: Array,
     members: Sequence[_Member],
-    actuators: _Actuators,
+    limits: Limits,
+    stroke_factors: tuple[float, float],
     *,
-    bays: int,
     trackable: tuple[str, ...],
     layers_per_bay: int = 1,
+    face_stride: int = 1,
     weights: Sequence[float] = (1 / 3, 1 / 3, 1 / 3),
-    stage: Array | None = None,
+    stage: Index | None = None,
 ) -> Truss:
-    """Assemble a truss whose nodes come in layers of three; a face ends each bay, parallel to the base."""
+    """Assemble a truss of layers of three nodes; a face ends each bay, and all face frames are the base's."""
     nodes = np.arange(len(home))
     layer = nodes // 3
-    faces = nodes.reshape(-1, 3)[::layers_per_bay]
+    stage = layer - 1 if stage is None else stage
+    node_names = tuple(f"n{i // 3}-{i % 3 + 1}" for i in range(len(home)))
+    member_names = tuple(member.name for member in members)
     pairs = np.array([member.nodes for member in members], dtype=np.int64)
     actuated = np.array([member.actuated for member in members])
     lengths = np.linalg.norm(home[pairs[:, 0]] - home[pairs[:, 1]], axis=1)
+    faces = nodes.reshape(-1, 3)[::layers_per_bay]
+    offset = limits.get("joint_offset", 0.0)
+    if not 0.0 <= 2.0 * offset < lengths.min():
+        raise TrussError(
+            f"joint_offset is {offset:g} m; expected at least 0 and less than half the shortest member, "
+            f"{lengths.min() / 2:g} m"
+        )
+    offsets = np.full((len(members), 2), offset)
     return Truss(
         module=module,
-        node_names=tuple(f"n{k}-{i + 1}" for k, i in zip(layer, nodes % 3, strict=True)),
-        member_names=tuple(member.name for member in members),
+        node_names=node_names,
+        member_names=member_names,
         home=home,
         base=layer == 0,
         members=pairs,
         actuated=actuated,
-        stroke=_strokes([member.name for member in members], lengths, actuated, actuators),
-        rate=_limit(actuated, actuators.rate, "rate"),
-        acceleration=_limit(actuated, actuators.acceleration, "acceleration"),
-        radius=_radii(len(members), actuators.member_radius),
+        stroke=_strokes(member_names, lengths - 2.0 * offset, actuated, limits.get("stroke"), stroke_factors),
+        rate=_greatest(actuated, limits.get("rate"), "rate"),
+        acceleration=_greatest(actuated, limits.get("acceleration"), "acceleration"),
+        radius=np.full(len(members), _radius(limits.get("member_radius", 0.03))),
         faces=faces,
         face_weights=np.tile(np.asarray(weights, dtype=np.float64), (len(faces), 1)),
         face_frames=np.tile(np.eye(3), (len(faces), 1, 1)),
         tip=faces[-1],
         tip_weights=np.asarray(weights, dtype=np.float64),
         tip_frame=np.eye(3),
-        stage=layer - 1 if stage is None else stage,
-        bays=bays,
+        stage=stage,
+        bays=len(faces) - 1,
         trackable=trackable,
+        face_stride=face_stride,
+        joints=axial_joints(node_names, home, pairs, stage, offsets) if offset > 0.0 else None,
     )
 
 
-def _strokes(names: Sequence[str], lengths: Array, actuated: Array, actuators: _Actuators) -> Array:
+def _strokes(
+    names: Sequence[str],
+    lengths: Array,
+    actuated: Mask,
+    stroke: Sequence[float] | None,
+    factors: tuple[float, float],
+) -> Array:
     """(M, 2) least and greatest lengths, m; the home length twice where a member is fixed."""
     strokes = np.column_stack([lengths, lengths])
-    if actuators.stroke is None:
-        strokes[actuated] *= actuators.default_stroke
-    else:
-        least, greatest = actuators.stroke
-        if not 0.0 < least <= greatest:
-            raise TrussError(f"stroke is [{least:g}, {greatest:g}] m; expected 0 < least <= greatest")
-        strokes[actuated] = least, greatest
+    if stroke is None:
+        strokes[actuated] *= factors
+        return strokes
+    least, greatest = stroke
+    if not 0.0 < least <= greatest:
+        raise TrussError(f"stroke is [{least:g}, {greatest:g}] m; expected 0 < least <= greatest")
+    strokes[actuated] = least, greatest
     outside = (lengths < strokes[:, 0] - 1e-9) | (lengths > strokes[:, 1] + 1e-9)
     if outside.any():
         k = int(np.argmax(outside))
         raise TrussError(
-            f"home length {lengths[k]:g} m of member {names[k]} is outside its stroke "
-            f"[{strokes[k, 0]:g}, {strokes[k, 1]:g}] m"
+            f"the home length of member {names[k]}, {lengths[k]:g} m, is outside its stroke "
+            f"[{least:g}, {greatest:g}] m"
         )
     return strokes
 
 
-def _limit(actuated: Array, limit: float | None, name: str) -> Array:
+def _greatest(actuated: Mask, limit: float | None, name: str) -> Array:
     if limit is not None and not limit > 0.0:
         raise TrussError(f"{name} is {limit:g}; expected a number greater than 0")
     return np.where(actuated, np.inf if limit is None else limit, np.inf)
 
 
-def _radii(count: int, radius: float) -> Array:
+def _radius(radius: float) -> float:
     if not (math.isfinite(radius) and radius >= 0.0):
         raise TrussError(f"member_radius is {radius:g} m; expected a finite radius of at least 0")
-    return np.full(count, radius)
+    return radius

@@ -75,7 +75,11 @@ class Truss:
     bays : int
         Number of bays.
     trackable : tuple of str
-        What the faces of this truss can track at first order: ``"position"``, ``"pointing"``, ``"orientation"``.
+        What every `face_stride`-th face of this truss can track at once, to first order: ``"position"``,
+        ``"pointing"``, ``"orientation"``, each with those before it.
+    face_stride : int
+        1, or 2 where only every second face has the motions that `trackable` needs (the longeron module); the faces
+        between can track a position as long as no orientation is asked for.
     joints : Joints or None
         Offset joints; None for ideal pin joints.
     """
@@ -100,6 +104,7 @@ class Truss:
     stage: Index
     bays: int
     trackable: tuple[str, ...] = ("position",)
+    face_stride: int = 1
     joints: Joints | None = field(default=None)
 
     @property
@@ -152,6 +157,4 @@ class Truss:
         except ValueError:
             from vgtm_qp.errors import nearest
 
-            raise TrussError(
-                f'no member is called "{name}"{nearest(name, self.member_names)}'
-            ) from None
+            raise TrussError(f'no member is called "{name}"{nearest(name, self.member_names)}') from None

@@ -1,0 +1,83 @@
+"""Offset joints, eqs. (12)-(13): which triangle orients the joint at each node, where members end in it."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from vgtm_qp.errors import TrussError
+from vgtm_qp.truss.truss import Array, Index, Joints
+
+_LEAST_SINE = 0.1
+"""A triangle with a smaller sine at the node does not orient a joint: its normal would turn too fast."""
+
+
+def axial_joints(
+    node_names: tuple[str, ...], home: Array, members: Index, stage: Index, offset: Array
+) -> Joints:
+    """Return joints whose members end `offset` (M, 2), m, away from their nodes, on the members' axes."""
+    triangle = joint_triangles(node_names, home, members, stage)
+    direction = home[members[:, 1]] - home[members[:, 0]]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    outward = np.stack([direction, -direction], axis=1) * offset[:, :, None]
+    frames = joint_frames(home, triangle)
+    return Joints(triangle, np.einsum("mexy,mex->mey", frames[members], outward))
+
+
+def joint_frames(X: Array, triangle: Index) -> Array:
+    """Return (N, 3, 3) joint rotations: z the triangle's normal, x its outward bisector at the node."""
+    corner = X[triangle]
+    first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    first = first / np.linalg.norm(first, axis=1, keepdims=True)
+    second = second / np.linalg.norm(second, axis=1, keepdims=True)
+    z = np.cross(first, second)
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    x = -(first + second)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def joint_triangles(node_names: tuple[str, ...], home: Array, members: Index, stage: Index) -> Index:
+    """Return (N, 3) the nodes whose triangle orients each node's joint, eq. (13), the node itself first.
+
+    The two others are neighbours of the same or an earlier stage, so that no member's length depends on a
+    later stage. Neighbours of the node's own stage come first, then the triangle with the largest sine.
+
+    Raises
+    ------
+    TrussError
+        A node has no two such neighbours off one line.
+    """
+    neighbours: list[set[int]] = [set() for _ in node_names]
+    for i, j in members.tolist():
+        neighbours[i].add(j)
+        neighbours[j].add(i)
+    base = np.flatnonzero(stage < 0).tolist()
+    for i in base:
+        neighbours[i].update(base)
+    triangle = np.empty((len(node_names), 3), dtype=np.int64)
+    for i, around in enumerate(neighbours):
+        earlier = sorted(j for j in around if j != i and stage[j] <= stage[i])
+        best: tuple[int, float, int] | None = None
+        for a, b in combinations(earlier, 2):
+            normal, sine = _normal(home, i, a, b)
+            rank = (int(stage[a] + stage[b]), round(sine, 9), -min(a, b))
+            if sine < _LEAST_SINE or (best is not None and rank <= best):
+                continue
+            best = rank
+            upward = normal @ (home[i] - home[stage < 0].mean(axis=0)) if stage[i] >= 0 else normal[2]
+            triangle[i] = (i, a, b) if upward >= -1e-9 else (i, b, a)
+        if best is None:
+            raise TrussError(
+                f"the joint at node {node_names[i]} has no orientation: none of its earlier neighbours "
+                f"{', '.join(node_names[j] for j in earlier)} make a triangle with it"
+            )
+    return triangle
+
+
+def _normal(home: Array, i: int, a: int, b: int) -> tuple[Array, float]:
+    """Return the normal of the triangle (i, a, b) at node i, of length |sine|, and that sine."""
+    first, second = home[a] - home[i], home[b] - home[i]
+    normal = np.cross(first, second) / (np.linalg.norm(first) * np.linalg.norm(second))
+    return normal, float(np.linalg.norm(normal))
