@@ -1,0 +1,340 @@
+"""A reference curve, sections 4.3-4.4: positions, frames, arc length and the Jacobian J_s of eq. (36)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vgtm_qp.curve.bernstein import Array, basis, increasing_roots
+from vgtm_qp.curve.families import CurveFamily
+from vgtm_qp.errors import CurveError
+
+_FRAME_STEPS_PER_CELL = 4
+_NO_STEP = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A curve r(s) = sum w_i(s) p_i with a frame F(s) along it.
+
+    Every method takes s of any shape, written (...), and gives arrays that begin with it. The columns of all
+    Jacobians are the 3 V coordinates of p = col[p_i], eq. (33), then the T torsion coordinates: D = 3 V + T.
+
+    Attributes
+    ----------
+    family : CurveFamily
+        The weights w_i(s).
+    control_vertices : (V, 3)
+        p_i, m.
+    torsion : (T,)
+        tau_j, rad: the frame is turned about the tangent by tau(s) = sum b_j(s) tau_j, j = 1..T, with b_j the
+        Bernstein polynomials of degree T. So tau(0) = 0, and tau(1) is the last coordinate.
+    base_frame : (3, 3)
+        Rotation whose third column is the base normal. F(0) is this frame, turned by the least rotation that
+        brings its third column on the tangent; no rotation at all where the curve leaves along the normal.
+
+    Raises
+    ------
+    CurveError
+        Arrays of the wrong shape, or entries that are not numbers.
+    """
+
+    family: CurveFamily
+    control_vertices: Array
+    torsion: Array = field(default_factory=lambda: np.empty(0))
+    base_frame: Array = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        for name in ("control_vertices", "torsion", "base_frame"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        expected = {
+            "control_vertices": (self.family.control_vertices, 3),
+            "torsion": (self.torsion.size,),
+            "base_frame": (3, 3),
+        }
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise CurveError(
+                    f"{name} of this {self.family.name} must have the shape {shape}, not {array.shape}"
+                )
+            if not np.all(np.isfinite(array)):
+                raise CurveError(f"{name} must be finite numbers")
+
+    @property
+    def coordinates(self) -> int:
+        """Number D = 3 V + T of configuration variables."""
+        return self.control_vertices.size + self.torsion.size
+
+    def position(self, s: ArrayLike) -> Array:
+        """r(s), m: (..., 3)."""
+        return self.derivative(s, 0)
+
+    def derivative(self, s: ArrayLike, order: int = 1) -> Array:
+        """Differentiate r by s, `order` times, m: (..., 3)."""
+        return np.asarray(self.family.weights(s, order) @ self.control_vertices)
+
+    def tangent(self, s: ArrayLike) -> Array:
+        """t(s), the unit tangent: (..., 3).
+
+        Raises
+        ------
+        CurveError
+            r' vanishes at some s.
+        """
+        return _unit(self.derivative(s, 1))
+
+    def curvature(self, s: ArrayLike) -> Array:
+        """Curvature |r' x r''| / |r'|^3, 1/m: (...)."""
+        return np.asarray(
+            np.linalg.norm(_curvature_binormal(self.derivative(s, 1), self.derivative(s, 2)), axis=-1)
+        )
+
+    def frame(self, s: ArrayLike) -> Array:
+        """F(s): (..., 3, 3), columns x, y and the tangent, eq. (32).
+
+        A rotation-minimising frame by double reflection (Wang et al., ACM Trans. Graphics 27, 2008; error of
+        fourth order in the step), turned by tau(s) about the tangent. Straight parts and inflections are no
+        singularities of it.
+
+        Raises
+        ------
+        CurveError
+            The family has kinks, r' vanishes, or the curve leaves against the base normal.
+        """
+        self._require_smooth()
+        s = np.asarray(s, dtype=float)
+        flat = np.clip(s.ravel(), 0.0, 1.0)
+        grid = self._frame_grid()
+        along = _running_products(self._double_reflections(grid[:-1], grid[1:]))
+        step = np.clip(np.searchsorted(grid, flat, side="right") - 1, 0, len(grid) - 2)
+        turn = self._double_reflections(grid[step], flat) @ along[step]
+        angle = self._torsion_weights(flat) @ self.torsion
+        swing = _least_rotation(self.base_frame[:, 2], self.tangent(0.0))
+        frames = turn @ (swing @ self.base_frame) @ _rotation_about_z(angle)
+        return np.asarray(frames.reshape(*s.shape, 3, 3))
+
+    def frame_rate(self, s: ArrayLike) -> Array:
+        """Angular velocity of F along the curve, dF/ds = [w]x F, rad per unit of s: (..., 3)."""
+        first, second = self.derivative(s, 1), self.derivative(s, 2)
+        speed = np.linalg.norm(first, axis=-1, keepdims=True)
+        twist = self._torsion_weights(s, 1) @ self.torsion
+        return np.asarray(_curvature_binormal(first, second) * speed + twist[..., None] * _unit(first))
+
+    def length(self, s: ArrayLike = 1.0) -> Array:
+        """Arc length from 0 to s, m: (...)."""
+        return self._integral(lambda w1, _: np.linalg.norm(w1 @ self.control_vertices, axis=-1), s)
+
+    def arc_parameter(self, fraction: ArrayLike) -> Array:
+        """Parameters s at which these fractions, 0 to 1, of the whole arc length are reached: (...).
+
+        Raises
+        ------
+        CurveError
+            A fraction is outside 0 to 1 or not a number.
+        """
+        fraction = np.asarray(fraction, dtype=float)
+        if not np.all((fraction >= 0.0) & (fraction <= 1.0)):
+            raise CurveError("fractions of the arc length must be within 0 to 1")
+        cells = self.family.cells
+        lengths = self.length(cells)
+        goal = fraction.ravel() * lengths[-1]
+        cell = np.clip(np.searchsorted(lengths, goal, side="right") - 1, 0, len(cells) - 2)
+
+        def excess(s: Array) -> tuple[Array, Array]:
+            return self.length(s) - goal, np.asarray(np.linalg.norm(self.derivative(s, 1), axis=-1))
+
+        s = increasing_roots(excess, cells[cell], cells[cell + 1])
+        s = np.where(fraction.ravel() == 0.0, 0.0, np.where(fraction.ravel() == 1.0, 1.0, s))
+        return np.asarray(s.reshape(fraction.shape))
+
+    def position_jacobian(self, s: ArrayLike) -> Array:
+        """dr/d(p, tau), the upper rows of eq. (36): (..., 3, D)."""
+        return self._pad(_spread(self.family.weights(s)))
+
+    def tangent_jacobian(self, s: ArrayLike) -> Array:
+        """dt/d(p, tau) = (I - t t^T) / |r'| sum w_i' dp_i, 1/m: (..., 3, D)."""
+        return self._pad(self._tangent_rows(self.family.weights(s, 1)))
+
+    def orientation_jacobian(self, s: ArrayLike) -> Array:
+        """Angular velocity of F(s) per rate of (p, tau), the lower rows of eq. (36): (..., 3, D).
+
+        Two of its three components turn the tangent. The third, about the tangent, is the torsion's rate less
+        the integral of w_i' kappa b over 0 to s, kappa b = r' x r'' / |r'|^3, plus what the least rotation at
+        the base contributes where the curve leaves it off the normal.
+
+        Raises
+        ------
+        CurveError
+            As `frame`.
+        """
+        self._require_smooth()
+        s = np.asarray(s, dtype=float)
+        tangent = self.tangent(s)
+        turn = np.cross(
+            tangent[..., None, :], np.swapaxes(self._tangent_rows(self.family.weights(s, 1)), -1, -2)
+        )
+
+        def roll_rate(w1: Array, w2: Array) -> Array:
+            binormal = _curvature_binormal(w1 @ self.control_vertices, w2 @ self.control_vertices)
+            return np.asarray(-w1[..., :, None] * binormal[..., None, :])
+
+        roll = self._integral(roll_rate, s).reshape(*s.shape, -1) + self._base_roll()
+        rows = np.swapaxes(turn, -1, -2) + tangent[..., :, None] * roll[..., None, :]
+        return np.concatenate([rows, tangent[..., :, None] * self._torsion_weights(s)[..., None, :]], axis=-1)
+
+    def arc_node_rates(self, s: ArrayLike) -> Array:
+        """ds/d(p, tau) of curve nodes that keep their fractions of the arc length, 1/m: (..., D).
+
+        A node's whole rate is then (J_s + x' ds/dp) p-dot, with x' = (`derivative`, `frame_rate`); the
+        paper's eq. (35) has the first term alone.
+        """
+        s = np.asarray(s, dtype=float)
+
+        def stretch(w1: Array, _: Array) -> Array:
+            return np.asarray(w1[..., :, None] * _unit(w1 @ self.control_vertices)[..., None, :])
+
+        ends = np.append(s.ravel(), 1.0)
+        gradient = self._integral(stretch, ends).reshape(ends.size, -1)
+        lengths = self.length(ends)
+        speed = np.linalg.norm(self.derivative(s.ravel(), 1), axis=-1)
+        rates = ((lengths[:-1] / lengths[-1])[:, None] * gradient[-1] - gradient[:-1]) / speed[:, None]
+        return self._pad(rates.reshape(*s.shape, -1))
+
+    def _require_smooth(self) -> None:
+        if not self.family.smooth:
+            raise CurveError(
+                f"this {self.family.name} of degree {self.family.degree} has kinks at knots of that "
+                "multiplicity, and so no frame; choose a higher degree or repeat knots less often"
+            )
+
+    def _pad(self, rows: Array) -> Array:
+        return np.concatenate([rows, np.zeros((*rows.shape[:-1], self.torsion.size))], axis=-1)
+
+    def _tangent_rows(self, w1: Array) -> Array:
+        """(..., 3, 3 V) rows of dt/dp from the table of w'."""
+        first = w1 @ self.control_vertices
+        tangent = _unit(first)
+        across = (np.eye(3) - tangent[..., :, None] * tangent[..., None, :]) / np.linalg.norm(first, axis=-1)[
+            ..., None, None
+        ]
+        return np.asarray(across @ _spread(w1))
+
+    def _torsion_weights(self, s: ArrayLike, order: int = 0) -> Array:
+        return basis(self.torsion.size, s, order)[..., 1:]
+
+    def _base_roll(self) -> Array:
+        """(3 V,) rate of roll at s = 0: the area swept by the arc from base normal to tangent."""
+        normal, tangent = self.base_frame[:, 2], self.tangent(0.0)
+        return np.asarray(
+            np.cross(tangent, normal)
+            / (1.0 + normal @ tangent)
+            @ self._tangent_rows(self.family.weights(0.0, 1))
+        )
+
+    def _frame_grid(self) -> Array:
+        cells = self.family.cells
+        inner = (
+            cells[:-1, None]
+            + np.diff(cells)[:, None] * np.arange(_FRAME_STEPS_PER_CELL) / _FRAME_STEPS_PER_CELL
+        )
+        return np.append(inner.ravel(), 1.0)
+
+    def _double_reflections(self, start: Array, end: Array) -> Array:
+        """(n, 3, 3) rotations that carry the frame from each parameter of `start` to that of `end`."""
+        tangent, goal = self.tangent(start), self.tangent(end)
+        # The direction of a chord of no length is that of the tangent.
+        nearby = (end - start < _NO_STEP)[:, None]
+        chord = _reflections(np.where(nearby, tangent, self.position(end) - self.position(start)))
+        return np.asarray(_reflections(goal - np.einsum("nij,nj->ni", chord, tangent)) @ chord)
+
+    def _integral(self, integrand: Callable[[Array, Array], Array], s: ArrayLike) -> Array:
+        """Integrate a function of the tables w', w'' over 0 to s; its values may have further axes."""
+        s = np.asarray(s, dtype=float)
+        flat = np.clip(s.ravel(), 0.0, 1.0)
+        cells = self.family.cells
+        nodes, weights = self.family.gauss
+        whole = np.moveaxis(integrand(*self.family.quadrature), 1, -1) @ weights
+        whole = (whole.T * np.diff(cells)).T
+        until = np.concatenate([np.zeros((1, *whole.shape[1:])), np.cumsum(whole, axis=0)])
+        cell = np.clip(np.searchsorted(cells, flat, side="right") - 1, 0, len(cells) - 2)
+        rest = flat - cells[cell]
+        points = cells[cell, None] + rest[:, None] * nodes
+        part = (
+            np.moveaxis(integrand(self.family.weights(points, 1), self.family.weights(points, 2)), 1, -1)
+            @ weights
+        )
+        total = until[cell] + (part.T * rest).T
+        return np.asarray(total.reshape(s.shape + total.shape[1:]))
+
+
+def straight_curve(family: CurveFamily, start: ArrayLike, end: ArrayLike) -> Curve:
+    """Lay a straight curve from `start` (3,) to `end` (3,), m: control vertices at the family's abscissae."""
+    start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    return Curve(family, start + family.abscissae[:, None] * (end - start))
+
+
+def _unit(vectors: Array) -> Array:
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if not np.all(norm > 0.0):
+        raise CurveError(
+            "the curve has no tangent where its derivative vanishes; part its control vertices there"
+        )
+    return np.asarray(vectors / norm)
+
+
+def _curvature_binormal(first: Array, second: Array) -> Array:
+    """Kappa b = r' x r'' / |r'|^3, 1/m: (..., 3)."""
+    norm = np.linalg.norm(first, axis=-1, keepdims=True)
+    if not np.all(norm > 0.0):
+        raise CurveError(
+            "the curve has no curvature where its derivative vanishes; part its control vertices there"
+        )
+    return np.asarray(np.cross(first, second) / norm**3)
+
+
+def _spread(weights: Array) -> Array:
+    """(..., V) weights as the rows (..., 3, 3 V) of d(sum w_i p_i)/dp."""
+    rows = weights[..., None, :, None] * np.eye(3)[:, None, :]
+    return np.asarray(rows.reshape(*weights.shape[:-1], 3, 3 * weights.shape[-1]))
+
+
+def _running_products(turns: Array) -> Array:
+    """(n + 1, 3, 3) products of the first 0..n of (n, 3, 3) rotations, later ones on the left."""
+    products = np.concatenate([np.eye(3)[None], turns])
+    # Doubling spans takes log2 n batched products in the place of n single ones.
+    span = 1
+    while span < len(products):
+        products[span:] = products[span:] @ products[:-span]
+        span *= 2
+    return products
+
+
+def _reflections(normals: Array) -> Array:
+    square = np.einsum("ni,ni->n", normals, normals)
+    if not np.all(square > 0.0):
+        raise CurveError("the curve turns back on itself within a step; part its control vertices there")
+    return np.asarray(np.eye(3) - 2.0 * normals[:, :, None] * normals[:, None, :] / square[:, None, None])
+
+
+def _least_rotation(start: Array, end: Array) -> Array:
+    """Rotation (3, 3) by the least angle from unit vector `start` to `end`."""
+    cosine = float(start @ end)
+    if cosine < -1.0 + 1e-12:
+        raise CurveError("the curve leaves its base against the base normal, where its frame is not defined")
+    x, y, z = np.cross(start, end)
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + cosine))
+
+
+def _rotation_about_z(angle: Array) -> Array:
+    """(n, 3, 3) rotations about z."""
+    turn = np.zeros((angle.size, 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
+    turn[:, 1, 0] = np.sin(angle)
+    turn[:, 0, 1] = -turn[:, 1, 0]
+    turn[:, 2, 2] = 1.0
+    return turn

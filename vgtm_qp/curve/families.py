@@ -1,0 +1,259 @@
+"""Curve families, section 4.2: each r(s) = sum w_i(s) p_i is a chain of Bezier segments, linear in p."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vgtm_qp.curve.bernstein import Array, basis
+from vgtm_qp.errors import CurveError, nearest
+
+FAMILIES = ("bezier", "b-spline", "beta-spline")
+
+_QUADRATURE_CELLS = 32
+_GAUSS_POINTS = 6
+_OUTSIDE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class CurveFamily:
+    """The weights w_i(s), 0 <= s <= 1, of eqs. (29)-(30): non-negative, with sum 1.
+
+    Attributes
+    ----------
+    name : str
+        One of `FAMILIES`.
+    degree : int
+        Degree d of the segments.
+    breaks : (S + 1,)
+        Parameters at which the segments begin and end, from 0 to 1.
+    extraction : (S, d + 1, V)
+        Bezier points of each segment as weighted averages of the V control vertices.
+    abscissae : (V,)
+        Control vertices at these fractions of a straight line give r(s) linear along it (Greville abscissae).
+        With bias != 1 or tension > 0 it is the same line, but the speed along it varies.
+    smooth : bool
+        True if the direction of the tangent is continuous wherever it exists.
+    knots : (V + d + 1,)
+        Knots of a B-spline; empty for the other families.
+    bias, tension : float
+        Shape parameters of a Beta-spline.
+    """
+
+    name: str
+    degree: int
+    breaks: Array
+    extraction: Array
+    abscissae: Array
+    smooth: bool
+    knots: Array
+    bias: float = 1.0
+    tension: float = 0.0
+
+    @property
+    def control_vertices(self) -> int:
+        """Number of control vertices V (the paper's N + 1)."""
+        return len(self.abscissae)
+
+    def weights(self, s: ArrayLike, order: int = 0) -> Array:
+        """Weights w_i, or their derivatives of `order` by s, at s of any shape: (..., V).
+
+        At a break where a derivative jumps it is the one of the segment that begins there.
+
+        Raises
+        ------
+        CurveError
+            Some s is outside 0 <= s <= 1 or is not a number.
+        """
+        given = np.asarray(s, dtype=float)
+        if not np.all((given >= -_OUTSIDE) & (given <= 1.0 + _OUTSIDE)):
+            raise CurveError("the curve parameter s must be within 0 <= s <= 1")
+        at = np.clip(given, 0.0, 1.0)
+        segment = np.searchsorted(self.breaks[1:-1], at, side="right")
+        width = np.diff(self.breaks)[segment]
+        table = basis(self.degree, (at - self.breaks[segment]) / width, order)
+        if len(self.breaks) == 2:
+            return np.asarray(table @ self.extraction[0])
+        table = table / width[..., None] ** order
+        return np.asarray(np.einsum("...j,...jv->...v", table, self.extraction[segment]))
+
+    @cached_property
+    def cells(self) -> Array:
+        """(C + 1,) a subdivision of the segments, fine enough for quadrature and for moving a frame along."""
+        pieces = max(2, -(-_QUADRATURE_CELLS // (len(self.breaks) - 1)))
+        inner = self.breaks[:-1, None] + np.diff(self.breaks)[:, None] * np.arange(pieces) / pieces
+        return np.append(inner.ravel(), 1.0)
+
+    @cached_property
+    def gauss(self) -> tuple[Array, Array]:
+        """(G,) nodes and (G,) weights of Gauss-Legendre quadrature on [0, 1]."""
+        nodes, weights = np.polynomial.legendre.leggauss(_GAUSS_POINTS)
+        return (nodes + 1.0) / 2.0, weights / 2.0
+
+    @cached_property
+    def quadrature(self) -> tuple[Array, Array]:
+        """(C, G, V) tables of w' and w'' at the Gauss points of the cells."""
+        points = self.cells[:-1, None] + np.diff(self.cells)[:, None] * self.gauss[0]
+        return self.weights(points, 1), self.weights(points, 2)
+
+
+def bezier(control_vertices: int) -> CurveFamily:
+    """Bezier curve of degree V - 1.
+
+    Raises
+    ------
+    CurveError
+        Fewer than two control vertices.
+    """
+    _require_vertices("bezier", control_vertices, 2)
+    return CurveFamily(
+        name="bezier",
+        degree=control_vertices - 1,
+        breaks=np.array([0.0, 1.0]),
+        extraction=np.eye(control_vertices)[None],
+        abscissae=np.linspace(0.0, 1.0, control_vertices),
+        smooth=True,
+        knots=np.empty(0),
+    )
+
+
+def b_spline(
+    control_vertices: int, degree: int = 3, interior_knots: Sequence[float] | Array | None = None
+) -> CurveFamily:
+    """B-spline of any degree whose ends are clamped at the first and last control vertex.
+
+    Parameters
+    ----------
+    interior_knots : (V - degree - 1,), optional
+        Not decreasing, each strictly between 0 and 1 and at most `degree` times; uniform where not given.
+
+    Raises
+    ------
+    CurveError
+        Degree below one, fewer than degree + 1 control vertices, or wrong knots.
+    """
+    if degree < 1:
+        raise CurveError(f"the degree of a b-spline must be 1 or more, not {degree}")
+    _require_vertices(f"b-spline of degree {degree}", control_vertices, degree + 1)
+    count = control_vertices - degree - 1
+    if interior_knots is None:
+        interior = np.linspace(0.0, 1.0, count + 2)[1:-1]
+    else:
+        interior = np.asarray(interior_knots, dtype=float)
+    inside = interior.shape == (count,) and np.all((interior > 0.0) & (interior < 1.0))
+    if not inside or np.any(np.diff(interior) < 0.0):
+        raise CurveError(
+            f"a b-spline of degree {degree} with {control_vertices} control vertices takes {count} interior "
+            "knots, not decreasing, each between 0 and 1"
+        )
+    breaks, multiplicity = np.unique(np.concatenate([[0.0], interior, [1.0]]), return_counts=True)
+    if np.any(multiplicity > degree):
+        raise CurveError(f"a knot may be repeated at most {degree} times in a b-spline of degree {degree}")
+    knots = np.concatenate([np.zeros(degree + 1), interior, np.ones(degree + 1)])
+    return CurveFamily(
+        name="b-spline",
+        degree=degree,
+        breaks=breaks,
+        extraction=_extraction(knots, degree, breaks),
+        abscissae=np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree).mean(axis=1),
+        smooth=bool(np.all(multiplicity[1:-1] < degree)),
+        knots=knots,
+    )
+
+
+def beta_spline(control_vertices: int, bias: float = 1.0, tension: float = 0.0) -> CurveFamily:
+    """Uniform cubic Beta-spline (Barsky) that passes through its first and last control vertex.
+
+    With b1 the bias and b2 the tension, segments join with r'+ = b1 r'- and r''+ = b1^2 r''- + b2 r'- (in the
+    segments' own parameters): direction of the tangent and curvature are continuous, r' itself is not unless
+    b1 = 1. Two phantom vertices, p_0 + (p_0 - p_1) / b1^3 and p_N + b1^3 (p_N - p_N-1), bring it to its end
+    vertices along the first and last leg of the control polygon.
+
+    Raises
+    ------
+    CurveError
+        Fewer than two control vertices, bias not positive, or tension negative.
+    """
+    _require_vertices("beta-spline", control_vertices, 2)
+    if not (np.isfinite(bias) and bias > 0.0):
+        raise CurveError(f"the bias of a beta-spline must be greater than 0, not {bias}")
+    if not (np.isfinite(tension) and tension >= 0.0):
+        raise CurveError(f"the tension of a beta-spline must be 0 or more, not {tension}")
+    b1, b2 = bias, tension
+    delta = 2 * b1**3 + 4 * b1**2 + 4 * b1 + b2 + 2
+    segment = np.array(
+        [
+            [2 * b1**3, 4 * b1**2 + 4 * b1 + b2, 2.0, 0.0],
+            [0.0, 2 * b1**3 + 4 * b1**2 + 2 * b1 + b2, 2 * b1 + 2, 0.0],
+            [0.0, 2 * b1**3 + 2 * b1**2, 2 * b1**2 + 4 * b1 + b2 + 2, 0.0],
+            [0.0, 2 * b1**3, 4 * b1**2 + 4 * b1 + b2, 2.0],
+        ]
+    )
+    segments = control_vertices - 1
+    extended = np.zeros((segments, 4, control_vertices + 2))
+    for k in range(segments):
+        extended[k, :, k : k + 4] = segment
+    extraction = extended[:, :, 1:-1] / delta
+    # The phantom vertices enter at the two ends alone, and bring those to the end vertices.
+    extraction[0, 0] = np.eye(control_vertices)[0]
+    extraction[-1, 3] = np.eye(control_vertices)[-1]
+    return CurveFamily(
+        name="beta-spline",
+        degree=3,
+        breaks=np.linspace(0.0, 1.0, segments + 1),
+        extraction=extraction,
+        abscissae=np.linspace(0.0, 1.0, control_vertices),
+        smooth=True,
+        knots=np.empty(0),
+        bias=bias,
+        tension=tension,
+    )
+
+
+def make_family(
+    name: str, control_vertices: int, *, degree: int = 3, bias: float = 1.0, tension: float = 0.0
+) -> CurveFamily:
+    """Make a family by its name in a problem file; `degree` is the B-spline's, the rest the Beta-spline's.
+
+    Raises
+    ------
+    CurveError
+        Unknown name, or parameters that the family cannot have.
+    """
+    if name == "bezier":
+        return bezier(control_vertices)
+    if name == "b-spline":
+        return b_spline(control_vertices, degree)
+    if name == "beta-spline":
+        return beta_spline(control_vertices, bias, tension)
+    raise CurveError(
+        f'unknown curve family "{name}"{nearest(name, FAMILIES)}; choose from {", ".join(FAMILIES)}'
+    )
+
+
+def _require_vertices(family: str, control_vertices: int, least: int) -> None:
+    if control_vertices < least:
+        raise CurveError(f"a {family} needs at least {least} control vertices, not {control_vertices}")
+
+
+def _extraction(knots: Array, degree: int, breaks: Array) -> Array:
+    """(S, d + 1, V) Bezier points of each knot span, by the blossom of start and end."""
+    vertices = len(knots) - degree - 1
+    matrices = np.zeros((len(breaks) - 1, degree + 1, vertices))
+    for k, (start, end) in enumerate(pairwise(breaks)):
+        span = int(np.searchsorted(knots, start, side="right")) - 1
+        for j in range(degree + 1):
+            arguments = [start] * (degree - j) + [end] * j
+            rows = np.eye(vertices)[span - degree : span + 1]
+            for r, u in enumerate(arguments):
+                lower = knots[span - degree + r + 1 : span + 1]
+                upper = knots[span + 1 : span + degree - r + 1]
+                alpha = ((u - lower) / (upper - lower))[:, None]
+                rows = (1.0 - alpha) * rows[:-1] + alpha * rows[1:]
+            matrices[k, j] = rows[0]
+    return matrices
