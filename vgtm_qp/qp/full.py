@@ -1,0 +1,324 @@
+"""The whole QP of one step, every column and row with a name, a kind and a unit.
+
+    minimise  1/2 z' diag-block(P) z + q' z   subject to   row_lower <= A z <= row_upper,  column_lower <= z <= column_upper
+
+z holds the displacements over the step of nodes, actuators, control vertices and path progress, and the gaps between
+faces and curve after it; because actuators and gaps are columns of their own, P is constant and only A's values change.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class Label(NamedTuple):
+    """Name, kind and unit of a row or column."""
+
+    name: str
+    kind: str
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class StepQP:
+    """A step's QP as data. Arrays are shared with the builder and valid until the next build.
+
+    Attributes
+    ----------
+    P : (n, n) sparse
+        Hessian, symmetric, constant over a maneuver.
+    q : (n,)
+    A : (m, n) sparse
+    row_lower, row_upper : (m,)
+    column_lower, column_upper : (n,)
+    columns, rows : tuple of Label
+    """
+
+    P: sparse.csc_matrix
+    q: Array
+    A: sparse.csc_matrix
+    row_lower: Array
+    row_upper: Array
+    column_lower: Array
+    column_upper: Array
+    columns: tuple[Label, ...]
+    rows: tuple[Label, ...]
+
+    def primal_residual(self, z: Array) -> float:
+        """Return the greatest violation of a row or bound at `z`, in that row's unit."""
+        value = self.A @ z
+        return float(
+            max(
+                np.max(self.row_lower - value, initial=0.0),
+                np.max(value - self.row_upper, initial=0.0),
+                np.max(self.column_lower - z, initial=0.0),
+                np.max(z - self.column_upper, initial=0.0),
+            )
+        )
+
+    def dual_residual(self, z: Array, row_multipliers: Array, column_multipliers: Array) -> float:
+        """Return max |P z + q + A'y + w|, multipliers positive at upper and negative at lower bounds."""
+        return float(np.max(np.abs(self.P @ z + self.q + self.A.T @ row_multipliers + column_multipliers)))
+
+    def violated(self, z: Array, tolerance: float = 1e-9) -> list[tuple[str, float]]:
+        """Return the names of rows and columns out of their bounds at `z` by more than `tolerance`, worst first."""
+        value = self.A @ z
+        row = np.maximum(self.row_lower - value, value - self.row_upper)
+        column = np.maximum(self.column_lower - z, z - self.column_upper)
+        found = [(self.rows[k].name, float(row[k])) for k in np.flatnonzero(row > tolerance)]
+        found += [(self.columns[k].name, float(column[k])) for k in np.flatnonzero(column > tolerance)]
+        return sorted(found, key=lambda item: -item[1])
+
+    def __str__(self) -> str:
+        columns = Counter((label.kind, label.unit) for label in self.columns)
+        rows = Counter((label.kind, label.unit) for label in self.rows)
+        lines = [f"QP of one step: {len(self.columns)} columns, {len(self.rows)} rows, {self.A.nnz} nonzeros", "columns"]
+        lines += [f"  {count:6d}  {kind} [{unit}]" for (kind, unit), count in columns.items()]
+        lines.append("rows")
+        for (kind, unit), count in rows.items():
+            lines.append(f"  {count:6d}  {kind} [{unit}]")
+        value = [label.name for label in self.rows if label.kind == "clearance"]
+        if value:
+            lines.append("near pairs: " + ", ".join(name.removeprefix("clearance: ") for name in value[:12]))
+        return "\n".join(lines)
+
+
+class FullBuilder:
+    """Fills the full QP from :class:`StepNumbers`; the sparsity is kept while the near pairs stay the same."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        truss, weights = layout.truss, layout.weights
+        tracked, vertices = len(layout.tracked), layout.vertices
+        sizes = {
+            "nodes": layout.node_columns,
+            "actuators": len(truss.actuators),
+            "vertices": 3 * vertices,
+            "position": 3 * tracked,
+            "tangent": 2 * tracked,
+            "progress": 1,
+        }
+        ends = np.cumsum(list(sizes.values()))
+        self.column = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        self.size = int(ends[-1])
+        second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
+        curve = weights.curve_rate * np.eye(vertices) + weights.smoothness * second.T @ second
+        diagonal = [
+            np.full(sizes["nodes"], weights.node_rate),
+            np.full(sizes["actuators"], weights.actuator_rate + weights.stroke_centring),
+        ]
+        self._hessian = sparse.block_diag(
+            [
+                sparse.diags(np.concatenate(diagonal)),
+                np.kron(curve, np.eye(3)),
+                sparse.diags(np.full(sizes["position"], 0.0 if layout.hard_tracking else weights.tracking)),
+                sparse.diags(np.full(sizes["tangent"], weights.tangent)),
+                np.ones((1, 1)),
+            ],
+            format="csc",
+        )
+        self._rows_i, self._rows_j, self._row_labels = self._fixed_pattern()
+        self._column_labels = self._columns()
+        self._pattern: tuple[bytes, ...] | None = None
+        self._matrix = sparse.csc_matrix((0, self.size))
+        self._order: Index = np.zeros(0, dtype=np.int64)
+        self._labels: tuple[Label, ...] = ()
+        self._keep: Index = np.zeros(0, dtype=np.int64)
+
+    @property
+    def structure(self) -> object:
+        """A token that changes when the sparsity of `A` does."""
+        return self._pattern
+
+    def build(self, numbers: StepNumbers) -> StepQP:
+        """Return the QP with the values of `numbers`."""
+        layout, clearance = self.layout, numbers.clearance
+        fixed_rows = len(self._row_labels)
+        columns = layout.node_column[clearance.nodes]
+        present = columns >= 0
+        pattern = (columns.tobytes(),)
+        if pattern != self._pattern:
+            k, slot = np.nonzero(present)
+            i = np.repeat(fixed_rows + k, 3)
+            j = (columns[k, slot][:, None] + np.arange(3)).reshape(-1)
+            rows = np.concatenate([self._rows_i, i])
+            cols = np.concatenate([self._rows_j, j])
+            total = fixed_rows + len(clearance)
+            keys = cols * total + rows
+            unique, position = np.unique(keys, return_inverse=True)
+            indptr = np.searchsorted(unique, np.arange(self.size + 1) * total)
+            self._matrix = sparse.csc_matrix(
+                (np.zeros(len(unique)), unique % total, indptr), shape=(total, self.size)
+            )
+            self._order, self._pattern = position, pattern
+        self._labels = self._row_labels + tuple(
+            Label(clearance.name(k), "clearance", "m") for k in range(len(clearance))
+        )
+        values = np.concatenate([self._fixed_values(numbers), clearance.coefficients[present].reshape(-1)])
+        self._matrix.data[:] = np.bincount(self._order, weights=values, minlength=len(self._matrix.data))
+
+        q = np.zeros(self.size)
+        q[self.column["actuators"]] = numbers.actuator_gradient
+        q[self.column["vertices"]] = numbers.vertex_gradient.reshape(-1)
+        q[self.column["progress"]] = numbers.progress_gradient
+        self._hessian.data[-1] = numbers.progress_curvature
+
+        column_lower, column_upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        column_lower[self.column["actuators"]], column_upper[self.column["actuators"]] = numbers.lower, numbers.upper
+        column_lower[-1], column_upper[-1] = numbers.progress_lower, numbers.progress_upper
+        if layout.hard_tracking:
+            column_lower[self.column["position"]] = column_upper[self.column["position"]] = 0.0
+        equal = np.concatenate(
+            [
+                numbers.length_rhs,
+                numbers.tip_rhs,
+                numbers.base_displacement if layout.vertices else np.zeros(0),
+                numbers.base_rhs if layout.vertices else np.zeros(0),
+                -numbers.position_rhs.reshape(-1),
+                -numbers.tangent_rhs.reshape(-1),
+            ]
+        )
+        return StepQP(
+            self._hessian,
+            q,
+            self._matrix,
+            np.concatenate([equal, clearance.lower]),
+            np.concatenate([equal, np.full(len(clearance), np.inf)]),
+            column_lower,
+            column_upper,
+            self._column_labels,
+            self._labels,
+        )
+
+    def solution(self, z: Array, row_multipliers: Array, column_multipliers: Array, iterations: int) -> StepSolution:
+        """Return `z` and the multipliers in the arm's terms."""
+        truss = self.layout.truss
+        nodes = np.zeros((truss.node_count, 3))
+        nodes[truss.free] = z[self.column["nodes"]].reshape(-1, 3)
+        return StepSolution(
+            nodes=nodes,
+            actuators=z[self.column["actuators"]].copy(),
+            vertices=z[self.column["vertices"]].reshape(-1, 3).copy(),
+            progress=float(z[-1]),
+            actuator_multipliers=column_multipliers[self.column["actuators"]].copy(),
+            clearance_multipliers=-row_multipliers[len(self._row_labels) :],
+            iterations=iterations,
+        )
+
+    def _columns(self) -> tuple[Label, ...]:
+        layout, truss = self.layout, self.layout.truss
+        axes = "xyz"
+        labels = [Label(f"node {truss.node_names[n]} {a}", "node displacement", "m") for n in truss.free for a in axes]
+        labels += [Label(f"stroke: {truss.member_names[m]}", "actuator displacement", "m") for m in truss.actuators]
+        labels += [
+            Label(f"control vertex p{i} {a}", "control vertex displacement", "m")
+            for i in range(layout.vertices)
+            for a in axes
+        ]
+        labels += [Label(f"gap: face {k} {a}", "tracking gap", "m") for k in layout.tracked for a in axes]
+        labels += [Label(f"tilt: face {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in "xy"]
+        return (*labels, Label("progress along the path", "progress", "1"))
+
+    def _fixed_pattern(self) -> tuple[Index, Index, tuple[Label, ...]]:
+        """Return row and column of every entry above the clearance rows, in the order of `_fixed_values`."""
+        layout, truss, column = self.layout, self.layout.truss, self.column
+        rows: list[Index] = []
+        cols: list[Index] = []
+        labels: list[Label] = []
+
+        def add(i: Index, j: Index) -> None:
+            rows.append(np.asarray(i, dtype=np.int64).reshape(-1) + len(labels))
+            cols.append(np.asarray(j, dtype=np.int64).reshape(-1))
+
+        member, _, node_column = layout.length_scatter
+        add(member, node_column)
+        add(truss.actuators, column["actuators"].start + np.arange(len(truss.actuators)))
+        labels += [
+            Label(
+                f"{'actuator' if on else 'member'}: {name}", "actuated member" if on else "fixed member", "m"
+            )
+            for name, on in zip(truss.member_names, truss.actuated, strict=True)
+        ]
+        tip = len(layout.tip_rows)
+        tip_columns = layout.node_column[truss.tip]
+        present = np.repeat(tip_columns >= 0, 3)
+        flat = (tip_columns[:, None] + np.arange(3)).reshape(-1)[present]
+        add(np.repeat(np.arange(tip), len(flat)), np.tile(flat, tip))
+        add(np.arange(tip), np.full(tip, column["progress"].start))
+        labels += [Label(name, "end effector", "m" if name[-1] in "xyz" and "rot" not in name else "rad") for name in layout.tip_rows]
+        if not layout.vertices:
+            return np.concatenate(rows), np.concatenate(cols), tuple(labels)
+
+        vertex = column["vertices"].start
+        add(np.arange(3), vertex + np.arange(3))
+        labels += [Label(f"curve base {a}", "curve base", "m") for a in "xyz"]
+        add(np.repeat(np.arange(2), 6), np.tile(vertex + np.arange(6), 2))
+        labels += [Label(f"curve base tangent {a}", "curve base", "m") for a in "xy"]
+
+        tracked = len(layout.tracked)
+        faces = layout.node_column[truss.faces[layout.tracked]]
+        k, slot = np.nonzero(faces >= 0)
+        axis = np.arange(3)
+        add(3 * k[:, None] + axis, faces[k, slot][:, None] + axis)
+        i, v = np.nonzero(layout.curve_weights)
+        add(3 * i[:, None] + axis, vertex + 3 * v[:, None] + axis)
+        add(np.arange(3 * tracked), column["position"].start + np.arange(3 * tracked))
+        labels += [Label(f"track: face {f} {a}", "tracking", "m") for f in layout.tracked for a in "xyz"]
+
+        shape = (len(k), 2, 3)
+        add(
+            np.broadcast_to((2 * k[:, None] + np.arange(2))[..., None], shape),
+            np.broadcast_to((faces[k, slot][:, None] + axis)[:, None, :], shape),
+        )
+        i, v = np.nonzero(layout.curve_slopes)
+        shape = (len(i), 2, 3)
+        add(
+            np.broadcast_to((2 * i[:, None] + np.arange(2))[..., None], shape),
+            np.broadcast_to((vertex + 3 * v[:, None] + axis)[:, None, :], shape),
+        )
+        add(np.arange(2 * tracked), column["tangent"].start + np.arange(2 * tracked))
+        labels += [Label(f"tilt: face {f} {a}", "tangent", "rad") for f in layout.tracked for a in "xy"]
+        return np.concatenate(rows), np.concatenate(cols), tuple(labels)
+
+    def _fixed_values(self, numbers: StepNumbers) -> Array:
+        layout, truss = self.layout, self.layout.truss
+        _, flat, _ = layout.length_scatter
+        present = np.repeat(layout.node_column[truss.tip] >= 0, 3)
+        values = [
+            numbers.gradient.reshape(-1)[flat],
+            np.full(len(truss.actuators), -1.0),
+            numbers.tip_jacobian[:, present].reshape(-1),
+            -numbers.tip_rate,
+        ]
+        if layout.vertices:
+            faces = truss.faces[layout.tracked]
+            k, slot = np.nonzero(layout.node_column[faces] >= 0)
+            weights = truss.face_weights[layout.tracked][k, slot]
+            i, v = np.nonzero(layout.curve_weights)
+            tangent = numbers.tangent_face.reshape(-1, 2, 3, 3)[k, :, slot]
+            ii, vv = np.nonzero(layout.curve_slopes)
+            slope = numbers.tangent_curve[ii] * layout.curve_slopes[ii, vv][:, None, None]
+            base = np.concatenate([-numbers.base_axes, numbers.base_axes], axis=1)
+            values += [
+                np.ones(3),
+                base.reshape(-1),
+                np.repeat(weights, 3),
+                np.repeat(-layout.curve_weights[i, v], 3),
+                np.full(3 * len(layout.tracked), -1.0),
+                tangent.reshape(-1),
+                slope.reshape(-1),
+                np.full(2 * len(layout.tracked), -1.0),
+            ]
+        return np.concatenate(values)

@@ -1,0 +1,129 @@
+"""The numbers of one step's QP, in the terms of the arm: what both the full and the condensed form are filled from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass
+class ClearanceRows:
+    """Linearised clearances: sum over slots of coefficients . d rho[nodes] >= lower, in m.
+
+    ``nodes`` (R, 4) are node indices: the two ends of the member, then those of the other member in a self pair
+    (repeated with zero coefficients otherwise). ``coefficients`` is (R, 4, 3). Base nodes may occur; their
+    displacement is already part of ``lower``.
+    """
+
+    nodes: Index = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))
+    coefficients: Array = field(default_factory=lambda: np.zeros((0, 4, 3)))
+    lower: Array = field(default_factory=lambda: np.zeros(0))
+    name: Callable[[int], str] = str
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    def joined(self, other: ClearanceRows) -> ClearanceRows:
+        """Return these rows followed by `other`'s."""
+        count, first, second = len(self), self.name, other.name
+        return ClearanceRows(
+            np.concatenate([self.nodes, other.nodes]),
+            np.concatenate([self.coefficients, other.coefficients]),
+            np.concatenate([self.lower, other.lower]),
+            lambda k: first(k) if k < count else second(k - count),
+        )
+
+
+@dataclass
+class StepNumbers:
+    """Numbers of one QP at one configuration; displacements d over the step are the unknowns.
+
+    With J the length Jacobian, E the selection of actuated members, W and W' the curve weights::
+
+        J d_rho - E d_a                    = length_rhs            m
+        lower <= d_a <= upper                                      m
+        tip_jacobian d_rho[tip] - tip_rate d_alpha = tip_rhs       m or rad
+        progress_lower <= d_alpha <= progress_upper                1
+        gap     = C d_rho - W d_p  + position_rhs                  m
+        tangent = tangent_face d_rho[face] + tangent_curve . (W' d_p) + tangent_rhs   rad
+        d_p[0]  = base_displacement, base_axes (d_p[1] - d_p[0]) = base_rhs            m
+        clearance rows
+
+    Attributes
+    ----------
+    gradient : (M, Q, 3)
+    length_rhs : (M,)
+    lower, upper, actuator_gradient : (n_a,)
+        Box on d_a and the objective's gradient there.
+    tip_jacobian : (n_e, 3 K_tip)
+    tip_rate, tip_rhs : (n_e,)
+    progress_lower, progress_upper, progress_gradient, progress_curvature : float
+    position_rhs : (K, 3)
+    tangent_face : (K, 2, 9)
+    tangent_curve : (K, 2, 3)
+    tangent_rhs : (K, 2)
+    vertex_gradient : (V, 3)
+    base_displacement : (3,)
+    base_axes : (2, 3)
+    base_rhs : (2,)
+    clearance : ClearanceRows
+    """
+
+    gradient: Array
+    length_rhs: Array
+    lower: Array
+    upper: Array
+    actuator_gradient: Array
+    tip_jacobian: Array
+    tip_rate: Array
+    tip_rhs: Array
+    progress_lower: float
+    progress_upper: float
+    progress_gradient: float
+    progress_curvature: float
+    position_rhs: Array
+    tangent_face: Array
+    tangent_curve: Array
+    tangent_rhs: Array
+    vertex_gradient: Array
+    base_displacement: Array
+    base_axes: Array
+    base_rhs: Array
+    clearance: ClearanceRows
+
+
+@dataclass(frozen=True)
+class StepSolution:
+    """The primal and dual answer of one QP, in the arm's terms.
+
+    Attributes
+    ----------
+    nodes : (N, 3)
+        Displacements of all nodes, base nodes included, m.
+    actuators : (n_a,)
+        Changes of the actuated lengths, m.
+    vertices : (V, 3)
+        Displacements of the control vertices, m.
+    progress : float
+        Change of the path variable alpha.
+    actuator_multipliers : (n_a,)
+        Positive at an upper, negative at a lower bound.
+    clearance_multipliers : (R,)
+        Nonnegative.
+    iterations : int
+        Iterations of the solver.
+    """
+
+    nodes: Array
+    actuators: Array
+    vertices: Array
+    progress: float
+    actuator_multipliers: Array
+    clearance_multipliers: Array
+    iterations: int = 0

@@ -1,0 +1,40 @@
+"""Stroke, rate and acceleration of each actuator as one box that never contradicts itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
+    """Return the greatest speed of a step of `dt` after which steps slowing by `acceleration` stop within `distance`.
+
+    Speeds v, v - a dt, v - 2 a dt, ... cover dt (N v - a dt N (N - 1) / 2) in the N steps before they reach zero;
+    this is the exact inverse, so a speed that was allowed once can always be braked within the limits. m/s.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gap = np.maximum(distance, 0.0)
+        steps = np.maximum(np.ceil((np.sqrt(1.0 + 8.0 * gap / (acceleration * dt * dt)) - 1.0) / 2.0), 1.0)
+        speed = gap / (steps * dt) + acceleration * dt * (steps - 1.0) / 2.0
+    return np.asarray(np.where(np.isfinite(acceleration), speed, np.inf))
+
+
+def length_box(
+    length: Array, speed: Array, stroke: Array, rate: Array, acceleration: Array, dt: float
+) -> tuple[Array, Array]:
+    """Return the least and greatest lengths (n_a,) after a step of `dt` from `length`, with `speed` before it, m.
+
+    Rate, acceleration and the speed from which the actuator still brakes before the end of its stroke are
+    intersected. Where they contradict one another (a start outside a limit) the acceleration gives way, then the
+    rate; an actuator outside its stroke may only come back.
+    """
+    low, high = np.minimum(stroke[:, 0], length), np.maximum(stroke[:, 1], length)
+    fastest = np.minimum(rate, braking_speed(high - length, acceleration, dt))
+    slowest = -np.minimum(rate, braking_speed(length - low, acceleration, dt))
+    with np.errstate(invalid="ignore"):
+        least, greatest = speed - acceleration * dt, speed + acceleration * dt
+    upper = np.clip(greatest, slowest, fastest)
+    lower = np.clip(least, slowest, fastest)
+    return np.maximum(low, length + lower * dt), np.minimum(high, length + upper * dt)

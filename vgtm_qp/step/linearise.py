@@ -1,0 +1,163 @@
+"""From a configuration to the numbers of its QP: every row of mathematics section 5, linearised there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.geometry.clearance import Clearance, NearPairs
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
+from vgtm_qp.step.path import Path
+from vgtm_qp.step.task import TipTask
+from vgtm_qp.truss.kinematics import Kinematics
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What one step is asked for: a piece of a path, the time it takes and where the base will be.
+
+    Attributes
+    ----------
+    path : Path
+    start, end : float
+        Values of the path variable between which the step moves; progress alpha runs from 0 to 1 over them.
+    lower, upper : (n_a,)
+        Actuator lengths allowed at the end of the step, m.
+    time : float
+        Time at the end of the step, s.
+    base : (N, 3) or None
+        Positions of the base nodes at the end of the step (other rows are ignored), m.
+    """
+
+    path: Path
+    start: float
+    end: float
+    lower: Array
+    upper: Array
+    time: float
+    base: Array | None = None
+
+
+class Linearisation:
+    """Fills :class:`StepNumbers` at a configuration."""
+
+    def __init__(self, layout: Layout, kinematics: Kinematics, task: TipTask, home_lengths: Array) -> None:
+        self.layout = layout
+        self.kinematics = kinematics
+        self.task = task
+        self.home_lengths = home_lengths
+        self._fixed_lengths = home_lengths[layout.fixed]
+        self._home_strokes = home_lengths[layout.truss.actuators]
+        second = np.diff(np.eye(layout.vertices), n=2, axis=0) if layout.vertices > 2 else np.zeros((0, layout.vertices))
+        self._polygon = layout.weights.smoothness * second.T @ second
+
+    def length_error(self) -> float:
+        """Return the largest error of a fixed member at the configuration evaluated last, m."""
+        return float(np.max(np.abs(self.kinematics.lengths[self.layout.fixed] - self._fixed_lengths), initial=0.0))
+
+    def numbers(
+        self, X: Array, vertices: Array, target: Target, progress: float, clearance: ClearanceRows, *, motion: bool
+    ) -> StepNumbers:
+        """Return the QP's numbers at node positions `X` (N, 3) and control vertices (V, 3).
+
+        Parameters
+        ----------
+        progress
+            Progress alpha reached so far; the step may go back to 0 and on to 1.
+        motion
+            True for the QP that moves the arm; False for a correction, which returns to the constraints on the
+            shortest way, without the gradients of the null-space objectives.
+        """
+        layout, kinematics, weights = self.layout, self.kinematics, self.layout.weights
+        kinematics.evaluate(X)
+        actuators, tracked = layout.truss.actuators, layout.tracked
+
+        length_rhs = np.zeros(layout.truss.member_count)
+        length_rhs[layout.fixed] = self._fixed_lengths - kinematics.lengths[layout.fixed]
+        shift = np.zeros(3)
+        if target.base is not None:
+            moved = np.where(layout.truss.base[:, None], target.base - X, 0.0)
+            length_rhs -= layout.base_length_rate(kinematics.gradient, moved)
+        length = kinematics.lengths[actuators]
+
+        span = target.end - target.start
+        goal = target.path.at(target.start + progress * span)
+        tip = self.task.rows(X, goal)
+        rate = tip.rate * span
+        curvature = weights.progress * max(float(rate @ rate), 1e-12)
+
+        position_rhs = np.zeros((len(tracked), 3))
+        tangent_face, tangent_curve = np.zeros((len(tracked), 2, 9)), np.zeros((len(tracked), 2, 3))
+        tangent_rhs = np.zeros((len(tracked), 2))
+        base_axes, base_rhs = np.zeros((2, 3)), np.zeros(2)
+        vertex_gradient = np.zeros_like(vertices)
+        if layout.vertices:
+            centres = kinematics.face_centres(X)
+            if motion or layout.hard_tracking:
+                position_rhs = centres[tracked] - layout.curve_weights @ vertices
+            slopes = layout.curve_slopes @ vertices
+            speed = np.linalg.norm(slopes, axis=1, keepdims=True)
+            tangents = slopes / speed
+            axes = kinematics.face_rotation[tracked][:, :, :2].transpose(0, 2, 1)
+            turn = np.cross(axes, tangents[:, None, :])
+            tangent_face = np.einsum("kac,kcf->kaf", turn, kinematics.face_spin[tracked])
+            along = np.einsum("kac,kc->ka", axes, tangents)
+            tangent_curve = (axes - along[..., None] * tangents[:, None, :]) / speed[:, None]
+            if motion:
+                tangent_rhs = along
+                vertex_gradient = self._polygon @ vertices
+            base_axes = kinematics.face_rotation[0][:, :2].T
+            shift = centres[0] - vertices[0]
+            if target.base is not None:
+                face = layout.truss.faces[0]
+                shift = layout.truss.face_weights[0] @ target.base[face] - vertices[0]
+            base_rhs = -base_axes @ (vertices[1] - vertices[0])
+        return StepNumbers(
+            gradient=kinematics.gradient,
+            length_rhs=length_rhs,
+            lower=target.lower - length,
+            upper=target.upper - length,
+            actuator_gradient=weights.stroke_centring * (length - self._home_strokes)
+            if motion
+            else np.zeros(len(actuators)),
+            tip_jacobian=tip.jacobian,
+            tip_rate=rate,
+            tip_rhs=tip.error,
+            progress_lower=-progress,
+            progress_upper=1.0 - progress,
+            progress_gradient=curvature * (progress - 2.0),
+            progress_curvature=curvature,
+            position_rhs=position_rhs,
+            tangent_face=tangent_face,
+            tangent_curve=tangent_curve,
+            tangent_rhs=tangent_rhs,
+            vertex_gradient=vertex_gradient,
+            base_displacement=shift,
+            base_axes=base_axes,
+            base_rhs=base_rhs,
+            clearance=clearance,
+        )
+
+
+def clearance_rows(monitor: Clearance, pairs: NearPairs, safe: float, fraction: float = 1.0) -> ClearanceRows:
+    """Return the rows n . d(witness) >= safe - distance for near `pairs`.
+
+    `fraction` is where on the straight way to the end of the step the pairs were found: a displacement of the end state
+    moves that point by so much of it. A pair that is already too near may not come nearer, but is not asked to jump.
+    """
+    count = len(pairs.distance)
+    nodes = np.empty((count, 4), dtype=np.int64)
+    coefficients = np.zeros((count, 4, 3))
+    nodes[:, :2] = monitor.members[pairs.member]
+    nodes[:, 2:] = np.where(pairs.is_self[:, None], monitor.members[np.where(pairs.is_self, pairs.other, 0)], nodes[:, :2])
+    coefficients[:, 0] = ((1.0 - pairs.t) * fraction)[:, None] * pairs.normal
+    coefficients[:, 1] = (pairs.t * fraction)[:, None] * pairs.normal
+    other = np.where(pairs.is_self, fraction, 0.0)
+    coefficients[:, 2] = -((1.0 - pairs.t_other) * other)[:, None] * pairs.normal
+    coefficients[:, 3] = -(pairs.t_other * other)[:, None] * pairs.normal
+    return ClearanceRows(nodes, coefficients, safe - pairs.distance, pairs.name)

@@ -1,0 +1,180 @@
+"""A resolver for a control loop: one call, one certified step, or a stop that says why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vgtm_qp.errors import GoalError
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.step.arm import Arm
+from vgtm_qp.step.attempt import Attempt, Outcome
+from vgtm_qp.step.limits import length_box
+from vgtm_qp.step.linearise import Linearisation, Target
+from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
+from vgtm_qp.step.state import State, frozen
+
+Array = NDArray[np.float64]
+
+
+class StepStatus(StrEnum):
+    """How a step ended."""
+
+    REACHED = "reached"
+    SLOWED = "slowed"
+    BLOCKED = "blocked"
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What one call of :meth:`Resolver.step` did.
+
+    Attributes
+    ----------
+    status : StepStatus
+        ``reached``: the goal was met; ``slowed``: the arm moved on along the way to it, as far as the rows allow;
+        ``blocked``: no safe motion was found and the state is unchanged.
+    progress : float
+        The part of the way that was covered, 0 to 1.
+    state : State
+        The state after the step.
+    active : tuple of str
+        Names of the rows that were active in the QP, most decisive first.
+    multipliers : dict
+        Multiplier of each active row.
+    reason : str
+        Why the step was cut, empty where it was not.
+    """
+
+    status: StepStatus
+    progress: float
+    state: State
+    active: tuple[str, ...]
+    multipliers: dict[str, float]
+    reason: str
+    qps: int
+    seconds: float = 0.0
+
+
+class Resolver:
+    """Moves one arm step by step. Not to be shared by threads: use one per thread."""
+
+    def __init__(self, arm: Arm) -> None:
+        self.arm = arm
+        self.layout: Layout = arm.layout
+        self._linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
+        self._attempt = Attempt(self._linearisation, arm.solver, arm.monitor, arm.safe, arm.influence)
+        self.state = arm.home_state()
+
+    @property
+    def phases(self) -> dict[str, float]:
+        """Seconds spent so far in each phase."""
+        return self._attempt.phases.seconds
+
+    def step(
+        self,
+        *,
+        position: ArrayLike | None = None,
+        pointing: ArrayLike | None = None,
+        rotation_vector: ArrayLike | None = None,
+        dt: float | None = None,
+    ) -> Step:
+        """Move towards a goal of the end effector in one step and return what was done.
+
+        Parameters
+        ----------
+        position
+            (3,) wanted position, m; where the tip is, by default.
+        pointing
+            (3,) wanted direction of the tip's z-axis.
+        rotation_vector
+            (3,) wanted orientation, rad.
+        dt
+            Duration of the step, s; the problem's by default.
+
+        Raises
+        ------
+        GoalError
+            The goal is not three finite numbers, or names a coordinate that is not tracked; the state is unchanged.
+        """
+        here, rotation = self.tip()
+        there = here if position is None else _vector(position, "position")
+        if pointing is not None:
+            wanted = _vector(pointing, "pointing")
+            norm = float(np.linalg.norm(wanted))
+            if norm < 1e-9:
+                raise GoalError("pointing must not be the zero vector; the state of the arm is unchanged")
+            turned = rotation_from_vector(turn_between(rotation[:, 2], wanted / norm)) @ rotation
+        elif rotation_vector is not None:
+            turned = rotation_from_vector(_vector(rotation_vector, "rotation_vector"))
+        else:
+            turned = rotation
+        path = Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation, turned]))
+        return self.follow(path, 0.0, 1.0, dt=dt)
+
+    def tip(self) -> tuple[Array, Array]:
+        """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
+        kinematics = self.arm.kinematics
+        kinematics.evaluate(self.state.nodes)
+        return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
+
+    def follow(self, path: Path, start: float, end: float, *, dt: float | None = None, smallest: float = 1 / 64) -> Step:
+        """Move along `path` from its value `start` towards `end` in one step; pieces are halved until one is safe."""
+        dt = self.arm.dt if dt is None else dt
+        state, actuators = self.state, self.arm.truss.actuators
+        truss = self.arm.truss
+        lower, upper = length_box(
+            state.lengths[actuators],
+            state.length_rates[actuators],
+            truss.stroke[actuators],
+            truss.rate[actuators],
+            truss.acceleration[actuators],
+            dt,
+        )
+        share, outcome = 1.0, None
+        while share >= smallest:
+            target = Target(path, start, start + share * (end - start), lower, upper, state.time + dt)
+            outcome = self._attempt.run(state, target)
+            if outcome.accepted:
+                break
+            share /= 2
+        assert outcome is not None
+        active, multipliers = self._active(outcome)
+        if not outcome.accepted:
+            return Step(StepStatus.BLOCKED, 0.0, state, active, multipliers, outcome.reason, outcome.iterations)
+        progress = share * outcome.progress
+        lengths = frozen(self.arm.kinematics.lengths)
+        self.state = replace(
+            state,
+            time=state.time + dt,
+            nodes=frozen(outcome.nodes),
+            control_vertices=frozen(outcome.control_vertices),
+            lengths=lengths,
+            length_rates=frozen((lengths - state.lengths) / dt),
+        )
+        status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
+        return Step(status, progress, self.state, active, multipliers, "", outcome.iterations)
+
+    def _active(self, outcome: Outcome) -> tuple[tuple[str, ...], dict[str, float]]:
+        solution, rows = outcome.solution, outcome.rows
+        if solution is None or rows is None:
+            return (), {}
+        found: dict[str, float] = {}
+        for k in np.flatnonzero(solution.clearance_multipliers > 1e-9):
+            name = rows.name(int(k))
+            found[name] = max(found.get(name, 0.0), float(solution.clearance_multipliers[k]))
+        names = self.arm.truss.member_names
+        for k in np.flatnonzero(np.abs(solution.actuator_multipliers) > 1e-9):
+            found[f"stroke: {names[self.arm.truss.actuators[k]]}"] = float(abs(solution.actuator_multipliers[k]))
+        ordered = dict(sorted(found.items(), key=lambda item: -item[1]))
+        return tuple(ordered), ordered
+
+
+def _vector(value: ArrayLike, name: str) -> Array:
+    vector = np.asarray(value, dtype=float)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+        raise GoalError(f"{name} must be three finite numbers, not {value!r}; the state of the arm is unchanged")
+    return vector

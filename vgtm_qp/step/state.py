@@ -1,0 +1,42 @@
+"""The state of an arm between two steps; immutable, so a refused step leaves nothing behind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def frozen(array: Array) -> Array:
+    """Return a read-only contiguous copy of `array`."""
+    copy = np.array(array, dtype=float, order="C")
+    copy.setflags(write=False)
+    return copy
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where the arm is.
+
+    Attributes
+    ----------
+    time : float
+        s.
+    nodes : (N, 3)
+        Node positions, m.
+    control_vertices : (V, 3)
+        Reference curve, m; V = 0 without a curve.
+    lengths : (M,)
+        Member lengths, m.
+    length_rates : (M,)
+        Rate of each length over the step that led here, m/s.
+    """
+
+    time: float
+    nodes: Array
+    control_vertices: Array
+    lengths: Array
+    length_rates: Array

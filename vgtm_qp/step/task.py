@@ -1,0 +1,79 @@
+"""The end effector's coordinates as rows of the QP, eqs. (11) and (16); orientation by rotation vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import GoalError, nearest
+from vgtm_qp.step.path import PathPoint, turn_between, vector_from_rotation
+from vgtm_qp.truss.kinematics import Kinematics
+
+Array = NDArray[np.float64]
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+_ROWS = {
+    "position": ("tip x", "tip y", "tip z"),
+    "pointing": ("tip direction 1", "tip direction 2"),
+    "orientation": ("tip rotation x", "tip rotation y", "tip rotation z"),
+    "x": ("tip x",),
+    "y": ("tip y",),
+    "z": ("tip z",),
+}
+
+
+@dataclass(frozen=True)
+class TipRows:
+    """Jacobian (n_e, 3 K_tip) w.r.t. the tip's nodes, rate (n_e,) along the path, and error (n_e,) goal minus value."""
+
+    jacobian: Array
+    rate: Array
+    error: Array
+
+
+class TipTask:
+    """One to six coordinates of the end effector.
+
+    Raises
+    ------
+    GoalError
+        A name is unknown, coordinates are given twice, or the tip has too few nodes to have a direction.
+    """
+
+    def __init__(self, track: Sequence[str], kinematics: Kinematics) -> None:
+        for name in track:
+            if name not in _ROWS:
+                raise GoalError(f'cannot track "{name}"{nearest(name, _ROWS)}; choices: {", ".join(_ROWS)}')
+        rows = [row for name in track for row in _ROWS[name]]
+        if len(set(rows)) < len(rows) or {"pointing", "orientation"} <= set(track):
+            raise GoalError(f"the end effector's coordinates {list(track)} name one coordinate twice")
+        self.turns = "pointing" if "pointing" in track else "orientation" if "orientation" in track else None
+        if self.turns and not kinematics.has_tip_frame:
+            raise GoalError(f'"{self.turns}" needs a tip of three or more nodes; this one has {len(kinematics.truss.tip)}')
+        self.track = tuple(track)
+        self.row_names = tuple(rows)
+        self.axes = np.array([_AXES[row[-1]] for row in rows if row in ("tip x", "tip y", "tip z")], dtype=np.int64)
+        self._kinematics = kinematics
+        weights = kinematics.truss.tip_weights
+        self._position_jacobian = np.kron(weights, np.eye(3))[self.axes]
+
+    def rows(self, X: Array, goal: PathPoint) -> TipRows:
+        """Return the rows at node positions `X`, at which the kinematics was evaluated, towards `goal`."""
+        kinematics = self._kinematics
+        error = goal.position - kinematics.tip_position(X)
+        jacobian, rate, residual = [self._position_jacobian], [goal.velocity[self.axes]], [error[self.axes]]
+        if self.turns:
+            rotation, spin = kinematics.tip_rotation, kinematics.tip_spin
+            if self.turns == "pointing":
+                across = rotation[:, :2].T
+                turn = turn_between(rotation[:, 2], goal.rotation[:, 2])
+            else:
+                across = np.eye(3)
+                turn = vector_from_rotation(goal.rotation @ rotation.T)
+            jacobian.append(across @ spin)
+            rate.append(across @ goal.spin)
+            residual.append(across @ turn)
+        return TipRows(np.concatenate(jacobian), np.concatenate(rate), np.concatenate(residual))
