@@ -1,0 +1,1 @@
+"""Distances between the members of an arm and obstacles, and between members."""

@@ -1,0 +1,243 @@
+"""Obstacles: sets of convex pieces that may move with constant velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vgtm_qp.errors import VgtmError
+from vgtm_qp.geometry.exact import WIDTH
+
+Array = NDArray[np.float64]
+
+_MESH_FORMATS = (".stl", ".obj", ".ply", ".off")
+
+
+class ObstacleError(VgtmError):
+    """An obstacle has no volume, is not a number, or its mesh cannot be read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """One named obstacle; make it by `box`, `sphere`, `cylinder` or `mesh`.
+
+    Attributes
+    ----------
+    name : str
+    shape : str
+        ``"box"``, ``"sphere"``, ``"cylinder"`` or ``"triangle"`` (a mesh).
+    pieces : (P, 15)
+        Parameters of each piece at time 0, see :func:`vgtm_qp.geometry.exact.parameters_of`.
+    velocity : (3,)
+        m/s.
+    solid : bool
+        Whether the triangles of a mesh bound a volume; the other shapes are solid.
+    """
+
+    name: str
+    shape: str
+    pieces: Array
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
+    solid: bool = True
+
+    def bounding_spheres(self) -> tuple[Array, Array]:
+        """Return centers (P, 3) at time 0 and radii (P,) of spheres that hold the pieces, m."""
+        pieces = self.pieces
+        if self.shape == "triangle":
+            corners = pieces[:, :9].reshape(-1, 3, 3)
+            centers = corners.mean(axis=1)
+            return centers, np.asarray(np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1))
+        if self.shape == "sphere":
+            return pieces[:, :3], pieces[:, 3]
+        sizes = pieces[:, 12:15] if self.shape == "box" else pieces[:, 12:14]
+        return pieces[:, :3], np.asarray(np.linalg.norm(sizes, axis=1))
+
+
+def box(
+    name: str,
+    center: ArrayLike,
+    size: float | ArrayLike,
+    rotation: ArrayLike | None = None,
+    velocity: ArrayLike = (0.0, 0.0, 0.0),
+) -> Obstacle:
+    """Return a box.
+
+    Parameters
+    ----------
+    center : (3,)
+        m.
+    size : float or (3,)
+        Edge of a cube, or the three full edges, m.
+    rotation : (3, 3) or None
+        Columns are the box's axes.
+
+    Raises
+    ------
+    ObstacleError
+        A number is not finite, a size is not positive, or `rotation` is not a rotation.
+    """
+    half = 0.5 * np.broadcast_to(np.asarray(size, dtype=float), 3)
+    return _placed(name, "box", center, rotation, half, velocity)
+
+
+def sphere(name: str, center: ArrayLike, radius: float, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> Obstacle:
+    """Return a sphere; `center` and `radius` in m. Raises as `box`."""
+    piece = np.zeros((1, WIDTH))
+    piece[0, :3] = _vector(name, "center", center)
+    piece[0, 3] = _positive(name, np.array([radius]))[0]
+    return Obstacle(name, "sphere", piece, _vector(name, "velocity", velocity))
+
+
+def cylinder(
+    name: str,
+    center: ArrayLike,
+    radius: float,
+    height: float,
+    rotation: ArrayLike | None = None,
+    velocity: ArrayLike = (0.0, 0.0, 0.0),
+) -> Obstacle:
+    """Return a solid cylinder with flat ends; its axis is the third column of `rotation`. Raises as `box`."""
+    return _placed(name, "cylinder", center, rotation, np.array([radius, 0.5 * height]), velocity)
+
+
+def mesh(
+    name: str,
+    source: str | PathLike[str] | tuple[ArrayLike, ArrayLike],
+    center: ArrayLike = (0.0, 0.0, 0.0),
+    rotation: ArrayLike | None = None,
+    scale: float = 1.0,
+    velocity: ArrayLike = (0.0, 0.0, 0.0),
+) -> Obstacle:
+    """Return a triangle mesh, convex or not.
+
+    A watertight mesh is solid: a member inside it has a negative clearance. An open one is a sheet.
+
+    Parameters
+    ----------
+    source : path or (vertices (K, 3), triangles (T, 3))
+        STL, OBJ, PLY or OFF file, or the arrays, m.
+    center, rotation, scale
+        Placement: ``center + rotation @ (scale * vertex)``.
+
+    Raises
+    ------
+    ObstacleError
+        The file is missing or cannot be read, it holds no triangle, or a number is wrong.
+    """
+    import trimesh
+
+    if isinstance(source, tuple):
+        vertices, triangles = np.asarray(source[0], dtype=float), np.asarray(source[1], dtype=np.int64)
+        surface = trimesh.Trimesh(vertices, triangles, process=True)
+    else:
+        surface = _read(name, Path(source))
+    if len(surface.faces) == 0:
+        raise ObstacleError(f'obstacle "{name}": the mesh holds no triangle')
+    solid = bool(surface.is_watertight)
+    if solid:
+        surface.fix_normals()
+    turn = _rotation(name, rotation)
+    corners = _positive(name, np.array([scale]))[0] * np.asarray(surface.triangles, dtype=float)
+    corners = corners @ turn.T + _vector(name, "center", center)
+    if not np.isfinite(corners).all():
+        raise ObstacleError(f'obstacle "{name}": the mesh holds a coordinate that is not finite')
+    pieces = np.zeros((len(corners), WIDTH))
+    pieces[:, :9] = corners.reshape(-1, 9)
+    return Obstacle(name, "triangle", pieces, _vector(name, "velocity", velocity), solid)
+
+
+def _read(name: str, path: Path) -> object:
+    import trimesh
+
+    if path.suffix.lower() not in _MESH_FORMATS:
+        raise ObstacleError(f'obstacle "{name}": {path.name} is not one of {", ".join(_MESH_FORMATS)}')
+    try:
+        return trimesh.load_mesh(path)
+    except Exception as error:  # a reader of foreign files raises anything
+        raise ObstacleError(f'obstacle "{name}": cannot read {path}: {error}') from None
+
+
+def _placed(
+    name: str, shape: str, center: ArrayLike, rotation: ArrayLike | None, sizes: Array, velocity: ArrayLike
+) -> Obstacle:
+    piece = np.zeros((1, WIDTH))
+    piece[0, :3] = _vector(name, "center", center)
+    piece[0, 3:12] = _rotation(name, rotation).ravel()
+    piece[0, 12 : 12 + len(sizes)] = _positive(name, sizes)
+    return Obstacle(name, shape, piece, _vector(name, "velocity", velocity))
+
+
+def _vector(name: str, what: str, values: ArrayLike) -> Array:
+    vector = np.array(values, dtype=float)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ObstacleError(f'obstacle "{name}": {what} must be three finite numbers, not {values!r}')
+    return vector
+
+
+def _positive(name: str, sizes: Array) -> Array:
+    if not (np.isfinite(sizes).all() and (sizes > 0.0).all()):
+        raise ObstacleError(f'obstacle "{name}": sizes must be positive, not {sizes.tolist()}')
+    return sizes
+
+
+def _rotation(name: str, rotation: ArrayLike | None) -> Array:
+    if rotation is None:
+        return np.eye(3)
+    turn = np.array(rotation, dtype=float)
+    if (
+        turn.shape != (3, 3)
+        or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+        or np.linalg.det(turn) < 0
+    ):
+        raise ObstacleError(f'obstacle "{name}": rotation must be a right-handed orthonormal 3 x 3 matrix')
+    return turn
+
+
+class Pieces:
+    """All pieces of a list of obstacles, side by side.
+
+    Attributes
+    ----------
+    parameters : (P, 15)
+        At time 0.
+    shape : (P,) str
+    obstacle : (P,) int
+        Index of the obstacle each belongs to.
+    velocity : (P, 3)
+    speed : (P,)
+    center, radius : (P, 3), (P,)
+        Bounding spheres at time 0.
+    """
+
+    def __init__(self, obstacles: Sequence[Obstacle]) -> None:
+        counts = [len(o.pieces) for o in obstacles]
+        self.parameters = np.vstack([np.zeros((0, WIDTH)), *(o.pieces for o in obstacles)])
+        self.shape = np.repeat([o.shape for o in obstacles] or [""], counts or [0])
+        self.obstacle = np.repeat(np.arange(len(obstacles)), counts)
+        self.velocity = np.repeat(np.reshape([o.velocity for o in obstacles], (-1, 3)), counts, axis=0)
+        self.speed = np.asarray(np.linalg.norm(self.velocity, axis=1))
+        spheres = [o.bounding_spheres() for o in obstacles]
+        self.center = np.vstack([np.zeros((0, 3)), *(s[0] for s in spheres)])
+        self.radius = np.concatenate([np.zeros(0), *(s[1] for s in spheres)])
+        self.moving = bool(self.speed.any())
+        self._shift = np.zeros_like(self.parameters)
+        self._shift[:, :3] = self.velocity
+        triangles = self.shape == "triangle"
+        self._shift[triangles, :9] = np.tile(self.velocity[triangles], 3)
+        self._now: tuple[float, Array] = (0.0, self.parameters)
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def at(self, time: float) -> Array:
+        """Return the parameters (P, 15) at `time`; do not write into them."""
+        if not self.moving:
+            return self.parameters
+        if self._now[0] != time:
+            self._now = (time, self.parameters + time * self._shift)
+        return self._now[1]

@@ -1,0 +1,137 @@
+"""Proof of clearance over a straight motion: swept bounds, then halves of the time for what is left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.geometry.candidates import Group
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_DEPTH = 12
+_SAMPLES = np.linspace(0.0, 1.0, 33)[1:-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What became of some pairs of a group over a motion.
+
+    Attributes
+    ----------
+    proven : float
+        Least lower bound of the pairs that were certified, m.
+    rows : (F,) int
+        Rows of the group that were not certified.
+    fraction : (F,)
+        Where on the motion each of those was found nearest, in (0, 1).
+    """
+
+    proven: float
+    rows: Index
+    fraction: Array
+
+    def placed(
+        self, group: Group, start: Array, end: Array, start_time: float, end_time: float
+    ) -> tuple[Array, Array]:
+        """Return segments and parameters of the failing pairs at their fractions, in the base frame."""
+        motion = _Motion(group, self.rows, start, end, start_time, end_time)
+        segments, others = motion.at(np.arange(len(self.rows)), self.fraction)
+        if group.is_self:
+            return segments, others
+        shift = group.displacement(end_time - start_time, self.rows) * self.fraction[:, None]
+        corners = _corners(group.shape)
+        others = others.copy()
+        others[:, : 3 * corners] += np.tile(shift, corners)
+        return segments + np.tile(shift, 2), others
+
+
+def _corners(shape: str) -> int:
+    return 3 if shape == "triangle" else 1
+
+
+class _Motion:
+    """The segments of some pairs over a motion, in the frame of the obstacle, which rests there."""
+
+    def __init__(
+        self, group: Group, rows: Index, start: Array, end: Array, start_time: float, end_time: float
+    ) -> None:
+        self._is_self = group.is_self
+        self.segments = group.segments(start, rows)
+        self.change = group.segments(end, rows) - self.segments
+        self.others = group.others(start, start_time, rows)
+        if group.is_self:
+            self.other_change = group.others(end, end_time, rows) - self.others
+        else:
+            self.change -= np.tile(group.displacement(end_time - start_time, rows), 2)
+
+    def at(self, k: Index, fraction: Array) -> tuple[Array, Array]:
+        """Return segments and parameters of the pairs `k` at their `fraction`."""
+        s = fraction[:, None]
+        others = self.others[k]
+        if self._is_self:
+            others = others + s * self.other_change[k]
+        return self.segments[k] + s * self.change[k], others
+
+
+def sweep_group(
+    group: Group, rows: Index, start: Array, end: Array, start_time: float, end_time: float, floor: float
+) -> Found:
+    """Return which of the pairs `rows` stay above `floor` over the motion, provably."""
+    motion = _Motion(group, rows, start, end, start_time, end_time)
+    k = np.arange(len(rows))
+    left, right = np.zeros(len(rows)), np.ones(len(rows))
+    failed = np.zeros(len(rows), dtype=bool)
+    worst = np.full(len(rows), np.inf)
+    fraction = np.full(len(rows), 0.5)
+    proven = np.full(len(rows), np.inf)
+    for depth in range(_DEPTH + 1):
+        a, other_a = motion.at(k, left)
+        b, other_b = motion.at(k, right)
+        answer = group.sweep(a, b, other_a, other_b, rows[k])
+        bound = answer[:, 0]
+        exact = answer[:, 1:]
+        nearest = exact.argmin(axis=1)
+        least = exact[np.arange(len(k)), nearest]
+        # The negation also catches what is not a number.
+        open_ = ~(bound >= floor)
+        below = ~(least >= floor)
+        if not open_.any():
+            np.minimum.at(proven, k, bound)
+            break
+        where = np.where(nearest == 0, left, np.where(nearest == 1, 0.5 * (left + right), right))
+        for i in np.flatnonzero(open_ & (least < worst[k])):
+            if least[i] < worst[k[i]]:
+                worst[k[i]], fraction[k[i]] = least[i], where[i]
+        failed[k[below]] = True
+        if depth == _DEPTH:
+            failed[k[open_]] = True
+        np.minimum.at(proven, k[~open_], bound[~open_])
+        split = open_ & ~failed[k]
+        if not split.any():
+            break
+        middle = 0.5 * (left[split] + right[split])
+        left, right = np.concatenate([left[split], middle]), np.concatenate([middle, right[split]])
+        k = np.concatenate([k[split], k[split]])
+    chosen = np.flatnonzero(failed)
+    kept = float(proven[~failed].min(initial=np.inf))
+    if not len(chosen):
+        return Found(kept, rows[chosen], fraction[chosen])
+    return Found(
+        kept, rows[chosen], _nearest_fraction(group, motion, rows, chosen, worst[chosen], fraction[chosen])
+    )
+
+
+def _nearest_fraction(
+    group: Group, motion: _Motion, rows: Index, chosen: Index, worst: Array, fraction: Array
+) -> Array:
+    """Return where the `chosen` pairs are nearest: the best of the point known and of even samples."""
+    k = np.repeat(chosen, len(_SAMPLES))
+    segments, others = motion.at(k, np.tile(_SAMPLES, len(chosen)))
+    distance = group.exact_of(segments, others, rows[k])[0].reshape(len(chosen), -1)
+    best = distance.argmin(axis=1)
+    better = distance[np.arange(len(chosen)), best] < worst
+    return np.clip(np.where(better, _SAMPLES[best], fraction), _SAMPLES[0], _SAMPLES[-1])
