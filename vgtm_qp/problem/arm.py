@@ -1,0 +1,91 @@
+"""``[arm]``: a serial arm in the place of a truss, from a URDF file or a list of joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from vgtm_qp.problem.fields import Choice, Direction, Distance, File, Limit, Name, Number, Vector, exactly
+from vgtm_qp.problem.table import Place, Table
+from vgtm_qp.problem.truss import BasePose, Lock, increasing, known_names, unique
+
+
+class Joint(Table):
+    """A joint of a serial arm, placed in the frame of the joint before it."""
+
+    called: ClassVar[str] = "a joint"
+    name: Name = Field(description="name of the joint")
+    kind: Annotated[Literal["revolute", "prismatic"], Choice()] = Field(
+        default="revolute", description="how it moves"
+    )
+    axis: Direction = Field(description="axis in its own frame; need not be a unit vector")
+    position: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="origin in the frame of the joint before, m"
+    )
+    rotation_vector: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="attitude in that frame at joint value 0, rad"
+    )
+    limits: Annotated[tuple[Number, Number], exactly(2, "two numbers [least, greatest]")] | None = Field(
+        default=None, description="least and greatest joint value, rad or m"
+    )
+    home: Number = Field(default=0.0, description="joint value of the home pose, rad or m")
+    rate: Limit | None = Field(default=None, description="greatest speed, rad/s or m/s")
+    acceleration: Limit | None = Field(default=None, description="greatest acceleration, rad/s^2 or m/s^2")
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        if self.limits is None:
+            return
+        if self.limits[0] >= self.limits[1]:
+            yield ("limits",), "[least, greatest] with the least value first and below the greatest"
+        elif not self.limits[0] <= self.home <= self.limits[1]:
+            yield ("home",), f"a value within the limits, {self.limits[0]:g} to {self.limits[1]:g}"
+
+
+class Arm(Table):
+    """A serial arm."""
+
+    called: ClassVar[str] = "an arm"
+    urdf: File | None = Field(default=None, description="URDF file, relative to the problem file")
+    base_link: Name | None = Field(
+        default=None, description="first link taken from the URDF; its root where absent"
+    )
+    tip_link: Name | None = Field(
+        default=None, description="last link taken from the URDF; its one leaf where absent"
+    )
+    home: tuple[Number, ...] | None = Field(
+        default=None,
+        description="joint values of the home pose of a URDF arm, base first, rad or m; zeros where absent",
+    )
+    joint: tuple[Joint, ...] = Field(
+        default=(), description="the joints, base first, in the place of a URDF file"
+    )
+    tip: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="position of the end effector in the last frame, m"
+    )
+    link_radius: Distance = Field(
+        default=0.03, description="radius of the capsules between successive joints, m"
+    )
+    locked: tuple[Lock, ...] = Field(
+        default=(), description="joints that are stuck: names, or tables of member and time"
+    )
+    base_motion: tuple[BasePose, ...] = Field(
+        default=(), description="poses of a moving base, in the order of time"
+    )
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        yield from increasing("base_motion", [pose.time for pose in self.base_motion])
+        yield from unique("locked", "member", [lock.member for lock in self.locked])
+        if self.urdf is not None and self.joint:
+            yield ("joint",), "a urdf file or a list of joints, not both"
+        if self.urdf is None:
+            if not self.joint:
+                yield ("joint",), "a list of joints [[arm.joint]], or a urdf file"
+            for key in ("base_link", "tip_link", "home"):
+                if getattr(self, key) is not None:
+                    yield (key,), f"no {key} without a urdf file"
+            yield from unique("joint", "name", [joint.name for joint in self.joint])
+            names = {joint.name: joint for joint in self.joint}
+            for i, lock in enumerate(self.locked):
+                yield from known_names(("locked", i), (lock.member,), names, key="member")

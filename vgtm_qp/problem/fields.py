@@ -1,0 +1,277 @@
+"""The kinds of values that a problem file holds, each with the words that say what was expected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WithJsonSchema,
+    WrapValidator,
+)
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from vgtm_qp.errors import nearest
+
+# Beyond these a square overflows the tolerances of the certificate; no arm is that long or that fine.
+LEAST_LENGTH = 1e-6
+GREATEST_LENGTH = 1e6
+
+
+def unexpected(phrase: str) -> PydanticCustomError:
+    """Return the error of a value that is not what `phrase` says."""
+    return PydanticCustomError("expected", phrase)
+
+
+def expect(phrase: str) -> WrapValidator:
+    """Return an annotation that answers every wrong value of a type by `phrase`."""
+
+    def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return handler(value)
+        except ValidationError:
+            raise unexpected(phrase) from None
+
+    return WrapValidator(validate)
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Return the names as ``"a", "b", "c"``."""
+    return ", ".join(f'"{name}"' for name in names)
+
+
+class Choice:
+    """Annotation of a ``Literal`` of strings: a wrong value is answered by the choices."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        choices = get_args(source)
+
+        def validate(value: Any, inner: ValidatorFunctionWrapHandler) -> Any:
+            try:
+                return inner(value)
+            except ValidationError:
+                hint = nearest(value, choices) if isinstance(value, str) else ""
+                only = quoted(choices) if len(choices) == 1 else f"one of {quoted(choices)}"
+                raise unexpected(f"{only}{hint}") from None
+
+        return core_schema.no_info_wrap_validator_function(validate, handler(source))
+
+
+class Count:
+    """Annotation of an integer from `least` to `greatest`."""
+
+    def __init__(self, least: int, greatest: int) -> None:
+        self.least, self.greatest = least, greatest
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        phrase = f"an integer from {self.least} to {self.greatest}"
+
+        def validate(value: Any, inner: ValidatorFunctionWrapHandler) -> Any:
+            try:
+                return inner(value)
+            except ValidationError:
+                raise unexpected(phrase) from None
+
+        bounds = core_schema.int_schema(ge=self.least, le=self.greatest, strict=True)
+        return core_schema.no_info_wrap_validator_function(validate, bounds)
+
+
+class ByKey:
+    """Annotation of a union of tables: the value of one key picks the table.
+
+    Parameters
+    ----------
+    key
+        The key.
+    tags
+        From every value of `key` to the ``Tag`` of its table; a tag is written ``"<...>"`` so that it can be
+        told from a key in the place of a mistake.
+    default
+        Value of `key` where a table has none.
+    pick
+        Returns the tag of a table in the place of the look-up in `tags`, or None.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        tags: Mapping[str, str],
+        *,
+        default: str | None = None,
+        pick: Callable[[Any], str | None] | None = None,
+    ) -> None:
+        self.key, self.tags, self.default, self.pick = key, tags, default, pick or self._tag
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        discriminator = Discriminator(
+            self.pick,
+            custom_error_type="choice",
+            custom_error_message="a table",
+            custom_error_context={"key": self.key, "choices": ",".join(self.tags)},
+        )
+        return discriminator.__get_pydantic_core_schema__(source, handler)
+
+    def _tag(self, value: Any) -> str | None:
+        chosen = entry(value, self.key)
+        chosen = self.default if chosen is None and isinstance(value, Mapping) else chosen
+        return self.tags.get(chosen) if isinstance(chosen, str) else None
+
+
+def entry(table: Any, key: str) -> Any:
+    """Return the value of a key of a table or of the mapping it is made from; None where it has none."""
+    if isinstance(table, Mapping):
+        return table.get(key)
+    return getattr(table, key, None) if isinstance(table, BaseModel) else None
+
+
+def exactly(count: int, phrase: str) -> WrapValidator:
+    """Return an annotation that answers an array of another length than `count` by `phrase`."""
+
+    def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+        entries = value.tolist() if hasattr(value, "tolist") else value
+        if not isinstance(entries, list | tuple) or len(entries) != count:
+            raise unexpected(phrase)
+        return handler(entries)
+
+    return WrapValidator(validate)
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] >= value[1]:
+        raise unexpected("[least, greatest] with the least length first and below the greatest")
+    return value
+
+
+def _edges(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+    entries = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(entries, list | tuple):
+        if len(entries) != 3:
+            raise unexpected("one edge length, or three [sx, sy, sz], in metres")
+        return handler(entries)
+    try:
+        return handler((entries, entries, entries))
+    except ValidationError:
+        raise unexpected("an edge length greater than 0, or three [sx, sy, sz], in metres") from None
+
+
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if math.hypot(*value) < 1e-9:
+        raise unexpected("a direction: three numbers [x, y, z] that are not all zero")
+    return value
+
+
+def _file(value: str, info: ValidationInfo) -> str:
+    context = info.context or {}
+    folder = Path(context.get("folder") or Path.cwd())
+    try:
+        path = folder.joinpath(Path(value).expanduser()).absolute()
+        found = path.is_file()
+    except (OSError, RuntimeError, ValueError):
+        raise unexpected("the path of a file") from None
+    if not found and context.get("check_files", True):
+        try:
+            names = [entry.name for entry in path.parent.iterdir() if entry.is_file()]
+        except OSError:
+            names = []
+        raise unexpected(f"a file that exists; there is none at {path}{nearest(path.name, names)}")
+    return str(path)
+
+
+def _array(item: dict[str, Any], count: int) -> WithJsonSchema:
+    # Plain `items` with equal bounds, not `prefixItems`: TOML editors know older drafts of JSON Schema only.
+    return WithJsonSchema({"type": "array", "items": item, "minItems": count, "maxItems": count})
+
+
+_LENGTH_SCHEMA = {"type": "number", "exclusiveMinimum": 0, "maximum": GREATEST_LENGTH}
+_COORDINATE_SCHEMA = {"type": "number", "minimum": -GREATEST_LENGTH, "maximum": GREATEST_LENGTH}
+
+Flag = Annotated[bool, Field(strict=True), expect("true or false")]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e6, le=1e6), expect("a finite number")]
+Coordinate = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False, ge=-GREATEST_LENGTH, le=GREATEST_LENGTH),
+    expect(f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"),
+]
+Length = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False, ge=LEAST_LENGTH, le=GREATEST_LENGTH),
+    WithJsonSchema(_LENGTH_SCHEMA),
+    expect(f"a length in metres greater than 0 (from {LEAST_LENGTH:g} to {GREATEST_LENGTH:g})"),
+]
+Distance = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False, ge=0, le=GREATEST_LENGTH),
+    expect("a distance in metres, 0 or more"),
+]
+Angle = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False, ge=0, lt=math.pi / 2),
+    expect("an angle in radians, 0 or more and less than a right angle (1.5708)"),
+]
+Limit = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False, gt=0, le=1e9),
+    expect("a limit greater than 0; leave the key out for no limit"),
+]
+Seconds = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False, ge=LEAST_LENGTH, le=1e9),
+    expect("a time in seconds, greater than 0"),
+]
+Onset = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e9), expect("a time in seconds, 0 or more")
+]
+Weight = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e12), expect("a weight, 0 or more")
+]
+Factor = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e6), expect("a number greater than 0")
+]
+NonNegative = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6), expect("a number, 0 or more")
+]
+Name = Annotated[
+    str,
+    Field(
+        strict=True,
+        min_length=1,
+        max_length=200,
+        pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*$",
+    ),
+    expect("a name: a string of 1 to 200 printable characters"),
+]
+File = Annotated[
+    str,
+    Field(strict=True, min_length=1, max_length=4096),
+    expect("the path of a file, relative to the problem file"),
+    AfterValidator(_file),
+]
+Vector = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate],
+    exactly(3, "three numbers [x, y, z]"),
+    _array(_COORDINATE_SCHEMA, 3),
+]
+Direction = Annotated[Vector, AfterValidator(_direction), _array(_COORDINATE_SCHEMA, 3)]
+Stroke = Annotated[
+    tuple[Length, Length],
+    exactly(2, "two lengths [least, greatest] in metres"),
+    AfterValidator(_ordered),
+    _array(_LENGTH_SCHEMA, 2),
+]
+Edges = Annotated[
+    tuple[Length, Length, Length],
+    WrapValidator(_edges),
+    WithJsonSchema(
+        {"anyOf": [_LENGTH_SCHEMA, {"type": "array", "items": _LENGTH_SCHEMA, "minItems": 3, "maxItems": 3}]}
+    ),
+]

@@ -1,0 +1,136 @@
+"""``[end_effector]`` and ``[maneuver]``: which coordinates of the tip are steered, and where to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, Tag
+
+from vgtm_qp.problem.fields import (
+    ByKey,
+    Choice,
+    Count,
+    Direction,
+    File,
+    Length,
+    NonNegative,
+    Seconds,
+    Vector,
+    entry,
+)
+from vgtm_qp.problem.table import Place, Table
+from vgtm_qp.problem.truss import increasing
+
+Coordinates = Literal["position", "pointing", "orientation", "x", "y", "z"]
+
+
+class EndEffector(Table):
+    """Which coordinates of the end effector follow the path, and how strictly."""
+
+    called: ClassVar[str] = "an end effector"
+    track: tuple[Annotated[Coordinates, Choice()], ...] = Field(
+        default=("position",),
+        min_length=1,
+        description="position, pointing (two angles), orientation (three), or x, y, z",
+    )
+    mode: Annotated[Literal["scaled", "hard", "elastic"], Choice()] = Field(
+        default="scaled",
+        description="scaled: slows down along the path; hard: stays on time or stops; elastic: may leave the "
+        "path, at the price of the weight end_effector",
+    )
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        for i, name in enumerate(self.track):
+            earlier = self.track[:i]
+            if name in earlier:
+                yield ("track", i), "each coordinate once"
+            elif (name in "xyz" and "position" in earlier) or (
+                name == "position" and {"x", "y", "z"} & set(earlier)
+            ):
+                yield ("track", i), "position, or single axes of it, not both"
+            elif {name, *earlier} >= {"pointing", "orientation"} and name in ("pointing", "orientation"):
+                yield ("track", i), "pointing or orientation, not both"
+
+
+class Waypoint(Table):
+    """A pose that the end effector passes at a time."""
+
+    called: ClassVar[str] = "a waypoint"
+    time: Seconds = Field(description="time since the start at the home pose, s")
+    position: Vector | None = Field(default=None, description="position in the base frame, m")
+    pointing: Direction | None = Field(
+        default=None, description="direction of the tip's z axis; need not be a unit vector"
+    )
+    rotation_vector: Vector | None = Field(
+        default=None, description="orientation relative to the base frame, rad"
+    )
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        if self.pointing is not None and self.rotation_vector is not None:
+            yield ("pointing",), "pointing or rotation_vector, not both"
+
+
+class WaypointManeuver(Table):
+    """From the home pose through waypoints, in equal steps of time."""
+
+    called: ClassVar[str] = "a maneuver through waypoints"
+    kind: Annotated[Literal["path"], Choice()] = "path"
+    steps: Annotated[int, Count(1, 1_000_000)] = Field(default=50, description="number of steps")
+    waypoint: tuple[Waypoint, ...] = Field(min_length=1, description="the waypoints, in the order of time")
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        yield from increasing("waypoint", [waypoint.time for waypoint in self.waypoint])
+
+
+class PathManeuver(Table):
+    """Along a path from a file, one step a row."""
+
+    called: ClassVar[str] = "a maneuver along a path file"
+    kind: Annotated[Literal["path"], Choice()] = "path"
+    path: File = Field(description="CSV file with the columns t,x,y,z and, if wanted, rx,ry,rz (s, m, rad)")
+    approach_steps: Annotated[int, Count(0, 1_000_000)] = Field(
+        default=0, description="steps of the straight run from the home tip to the first row"
+    )
+    approach_time: Seconds | None = Field(
+        default=None,
+        description="duration of that run, s; approach_steps mean row intervals where absent",
+    )
+
+
+class DeploymentManeuver(Table):
+    """From the stowed to the deployed truss, along a guide curve, tip first."""
+
+    called: ClassVar[str] = "a deployment"
+    kind: Annotated[Literal["deployment"], Choice()]
+    steps: Annotated[int, Count(1, 1_000_000)] = Field(default=150, description="number of steps")
+    duration: Seconds = Field(default=10.0, description="time from stowed to deployed, s")
+    stowed_batten: Length | None = Field(
+        default=None, description="length of the battens when stowed, m; 1.65 longerons where absent"
+    )
+    overlap: NonNegative = Field(
+        default=2.0, description="how many bays open at the same time besides the foremost"
+    )
+    guide: tuple[Vector, ...] | None = Field(
+        default=None,
+        min_length=2,
+        description="control vertices of the guide curve, m; straight up where absent",
+    )
+
+
+def _pick(value: Any) -> str | None:
+    kind = entry(value, "kind")
+    if kind == "deployment":
+        return "<deployment>"
+    if kind not in (None, "path") or not isinstance(value, Mapping | Table):
+        return None
+    has_path = entry(value, "path") is not None and entry(value, "waypoint") is None
+    return "<path file>" if has_path else "<waypoints>"
+
+
+Maneuver = Annotated[
+    Annotated[WaypointManeuver, Tag("<waypoints>")]
+    | Annotated[PathManeuver, Tag("<path file>")]
+    | Annotated[DeploymentManeuver, Tag("<deployment>")],
+    ByKey("kind", {"path": "<waypoints>", "deployment": "<deployment>"}, pick=_pick),
+]

@@ -1,0 +1,79 @@
+"""``[method]``: how the redundancy is resolved, and the weights of the null-space terms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from vgtm_qp.problem.fields import Choice, Flag, Length, Name, Weight
+from vgtm_qp.problem.table import Place, Table
+
+
+class Weights(Table):
+    """Weights of the terms of one step's QP; the terms are half squares of displacements over the step."""
+
+    called: ClassVar[str] = "[method.weights]"
+    node_rate: Weight = Field(default=1.0, description="node displacements, m^2; unit 1")
+    actuator_rate: Weight = Field(default=0.02, description="changes of actuator lengths, m^2; unit 1")
+    stroke_centring: Weight = Field(
+        default=0.02, description="actuator lengths after the step less their home lengths, m^2; unit 1"
+    )
+    curve_rate: Weight = Field(default=0.02, description="displacements of the control vertices, m^2; unit 1")
+    tracking: Weight = Field(
+        default=0.1, description="gaps between faces and curve after the step, m^2; unit 1"
+    )
+    tangent: Weight = Field(
+        default=0.05, description="angles between face normals and curve, rad^2; unit m^2/rad^2"
+    )
+    spacing: Weight = Field(
+        default=0.0, description="spacings of the curve nodes less those at home, m^2; unit 1"
+    )
+    smoothness: Weight = Field(
+        default=0.001, description="second differences of the control vertices, m^2; unit 1"
+    )
+    vertex_goal: Weight = Field(
+        default=1.0, description="gaps between control vertices and their goals, m^2; unit 1"
+    )
+    obstacle_potential: Weight = Field(
+        default=0.0,
+        description="potential of the obstacles within influence, for the pseudoinverse methods; unit m^2",
+    )
+    end_effector: Weight = Field(
+        default=1000.0,
+        description="penalty on the tip's gap to its goal in mode elastic, m or rad; unit m or m^2/rad",
+    )
+    progress: Weight = Field(
+        default=1000.0,
+        description="share of the step along the path that is given up in mode scaled, squared; unit m^2",
+    )
+
+
+class Method(Table):
+    """How each step is solved."""
+
+    called: ClassVar[str] = "[method]"
+    name: Annotated[Literal["qp", "pseudoinverse", "curve-pseudoinverse"], Choice()] = Field(
+        default="qp", description="the QP, eq. (28), or eqs. (37)-(39)"
+    )
+    tracking: Annotated[Literal["coupled", "recursive", "parallel", "none"], Choice()] = Field(
+        default="coupled",
+        description="truss and curve together; curve first, then bay after bay or all bays at once; no curve",
+    )
+    hard_tracking: Flag = Field(
+        default=False, description="whether faces stay on the curve exactly; elastic otherwise"
+    )
+    solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
+    retries: Flag = Field(
+        default=True, description="whether other ways out of a dead end are tried before giving up"
+    )
+    step_limit: Length | None = Field(
+        default=None,
+        description="greatest displacement of a node in one step, m; set from the members where absent",
+    )
+    weights: Weights = Field(default_factory=lambda: Weights(), description="weights of the null-space terms")
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        if self.hard_tracking and self.tracking == "none":
+            yield ("hard_tracking",), 'false, since tracking is "none"'

@@ -1,0 +1,103 @@
+"""``[[obstacle]]`` and ``[clearance]``: what the arm keeps away from, and how far."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, Tag
+
+from vgtm_qp.problem.fields import (
+    Angle,
+    ByKey,
+    Choice,
+    Distance,
+    Edges,
+    Factor,
+    File,
+    Flag,
+    Length,
+    Name,
+    Vector,
+)
+from vgtm_qp.problem.table import Place, Table
+
+
+class _Obstacle(Table):
+    name: Name = Field(description="its name in messages and results")
+    center: Vector = Field(description="position of its centre at time 0, m")
+    rotation_vector: Vector = Field(default=(0.0, 0.0, 0.0), description="attitude, rad")
+    velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="constant velocity, m/s")
+
+
+class Box(_Obstacle):
+    """A box centred at `center`."""
+
+    called: ClassVar[str] = "a box"
+    shape: Annotated[Literal["box"], Choice()]
+    size: Edges = Field(description="edge length, or [sx, sy, sz], m")
+
+
+class Sphere(_Obstacle):
+    """A sphere."""
+
+    called: ClassVar[str] = "a sphere"
+    shape: Annotated[Literal["sphere"], Choice()]
+    radius: Length = Field(description="radius, m")
+
+
+class Cylinder(_Obstacle):
+    """A cylinder centred at `center`, its axis along its own z."""
+
+    called: ClassVar[str] = "a cylinder"
+    shape: Annotated[Literal["cylinder"], Choice()]
+    radius: Length = Field(description="radius, m")
+    height: Length = Field(description="height along its axis, m")
+
+
+class Mesh(_Obstacle):
+    """A triangle mesh from a file."""
+
+    called: ClassVar[str] = "a mesh"
+    shape: Annotated[Literal["mesh"], Choice()]
+    file: File = Field(description="STL or OBJ file, relative to the problem file")
+    center: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="position of the mesh's own origin at time 0, m"
+    )
+    scale: Factor = Field(default=1.0, description="factor that brings the file's unit to metres")
+
+
+Obstacle = Annotated[
+    Annotated[Box, Tag("<box>")]
+    | Annotated[Sphere, Tag("<sphere>")]
+    | Annotated[Cylinder, Tag("<cylinder>")]
+    | Annotated[Mesh, Tag("<mesh>")],
+    ByKey("shape", {"box": "<box>", "sphere": "<sphere>", "cylinder": "<cylinder>", "mesh": "<mesh>"}),
+]
+
+
+class Clearance(Table):
+    """Distances, from surface to surface, that are kept at states and between them."""
+
+    called: ClassVar[str] = "[clearance]"
+    safe: Distance = Field(default=0.05, description="least distance from an obstacle, m")
+    influence: Length = Field(default=0.5, description="distance below which a pair is in the QP, m")
+    margin: Distance = Field(
+        default=0.001,
+        description="distance that the QP keeps over the least one, so that the exact check passes, m",
+    )
+    self_collision: Flag = Field(
+        default=True, description="whether members that share no node keep apart too"
+    )
+    self_safe: Distance | None = Field(
+        default=None, description="least distance between members, m; safe where absent"
+    )
+    minimum_angle: Angle = Field(
+        default=0.0, description="least angle between members that share a node, rad"
+    )
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        if self.influence <= self.safe:
+            yield ("influence",), f"a distance greater than safe, {self.safe:g} m"
+        if self.self_safe is not None and self.influence <= self.self_safe:
+            yield ("self_safe",), f"a distance less than influence, {self.influence:g} m"

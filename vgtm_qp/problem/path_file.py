@@ -1,0 +1,135 @@
+"""The CSV file of a path: one pose of the end effector a row."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vgtm_qp.errors import Mistake, ProblemError, nearest
+from vgtm_qp.problem.fields import GREATEST_LENGTH
+from vgtm_qp.problem.table import shown
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+_COLUMNS = ("t", "x", "y", "z")
+_TURNS = ("rx", "ry", "rz")
+_GREATEST_BYTES = 200_000_000
+_GREATEST_MISTAKES = 100
+
+
+@dataclass(frozen=True, eq=False)
+class PathTable:
+    """The rows of a path file.
+
+    Attributes
+    ----------
+    time : (K,)
+        Increasing, from 0 or later, s.
+    position : (K, 3)
+        In the base frame, m.
+    rotation_vector : (K, 3) or None
+        Orientation relative to the base frame, rad; None where the file has no such columns.
+    """
+
+    time: NDArray[np.float64]
+    position: NDArray[np.float64]
+    rotation_vector: NDArray[np.float64] | None
+
+
+def read_path(file: str | Path) -> PathTable:
+    """Read a path: a header ``t,x,y,z`` or ``t,x,y,z,rx,ry,rz``, in any order, and one row a step.
+
+    Raises
+    ------
+    ProblemError
+        The file is missing, is not text, or has wrong cells: each is named by line and column.
+    """
+    import numpy as np
+
+    header, rows = _read(Path(file))
+    mistakes: list[Mistake] = []
+    _check_header(header, mistakes)
+    if mistakes:
+        raise ProblemError(str(file), mistakes)
+    values = [_numbers(header, line, cells, mistakes) for line, cells in rows]
+    before = -math.inf
+    for (line, _), row in zip(rows, values, strict=True):
+        time = row.get("t", math.nan)
+        if time < 0:
+            mistakes.append(Mistake(f"line {line}, column t", f"{time:g}", "a time in seconds, 0 or more"))
+        elif time <= before:
+            expected = f"a time after that of the row before, {before:g} s"
+            mistakes.append(Mistake(f"line {line}, column t", f"{time:g}", expected))
+        if math.isfinite(time):
+            before = time
+    if not rows:
+        mistakes.append(Mistake("line 2", "nothing", "at least one row of numbers below the header"))
+    if mistakes:
+        raise ProblemError(str(file), mistakes[:_GREATEST_MISTAKES])
+    columns = {name: np.array([row[name] for row in values]) for name in header}
+    turns = np.column_stack([columns[name] for name in _TURNS]) if "rx" in columns else None
+    return PathTable(columns["t"], np.column_stack([columns[name] for name in "xyz"]), turns)
+
+
+def _read(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the header and the rows that are not empty, with their line numbers."""
+    try:
+        if not file.is_file():
+            raise ProblemError(str(file), [Mistake("file", "nothing", "a CSV file")])
+        if file.stat().st_size > _GREATEST_BYTES:
+            raise ProblemError(
+                str(file), [Mistake("file", "a huge file", f"less than {_GREATEST_BYTES} bytes")]
+            )
+        with file.open(encoding="utf-8-sig", newline="") as lines:
+            reader = csv.reader(lines, skipinitialspace=True)
+            rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(cells)]
+    except UnicodeDecodeError as error:
+        raise ProblemError(str(file), [Mistake("file", f"byte {error.start}", "text in UTF-8")]) from None
+    except csv.Error as error:
+        raise ProblemError(str(file), [Mistake("file", str(error), "comma-separated numbers")]) from None
+    except OSError as error:
+        raise ProblemError(str(file), [Mistake("file", error.strerror or "", "a readable file")]) from None
+    return (rows[0][1], rows[1:]) if rows else ([], [])
+
+
+def _check_header(header: list[str], mistakes: list[Mistake]) -> None:
+    known = (*_COLUMNS, *_TURNS)
+    expected = "the header t,x,y,z or t,x,y,z,rx,ry,rz"
+    if not header:
+        mistakes.append(Mistake("line 1", "nothing", expected))
+        return
+    for column, name in enumerate(header, start=1):
+        if name not in known:
+            mistakes.append(Mistake(f"line 1, column {column}", shown(name), expected + nearest(name, known)))
+        elif name in header[: column - 1]:
+            mistakes.append(Mistake(f"line 1, column {column}", shown(name), "each column once"))
+    needed = known if set(header) & set(_TURNS) else _COLUMNS
+    absent = [name for name in needed if name not in header]
+    if absent and not mistakes:
+        mistakes.append(
+            Mistake("line 1", shown(",".join(header)), f"{expected}; missing: {', '.join(absent)}")
+        )
+
+
+def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mistake]) -> dict[str, float]:
+    if len(cells) != len(header):
+        mistakes.append(
+            Mistake(f"line {line}", f"{len(cells)} cells", f"{len(header)} cells, as the header has")
+        )
+        return {}
+    row: dict[str, float] = {}
+    for name, cell in zip(header, cells, strict=True):
+        try:
+            row[name] = float(cell)
+        except ValueError:
+            row[name] = math.nan
+        # `not <=` refuses NaN with the infinities.
+        if not abs(row[name]) <= GREATEST_LENGTH:
+            mistakes.append(Mistake(f"line {line}, column {name}", shown(cell), "a finite number"))
+            del row[name]
+    return row

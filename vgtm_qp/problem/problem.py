@@ -1,0 +1,171 @@
+"""A whole problem: the arm, the shape it follows, the maneuver, the obstacles and the method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import Field, PrivateAttr, WithJsonSchema, model_validator
+
+from vgtm_qp.errors import Mistake
+from vgtm_qp.problem.arm import Arm
+from vgtm_qp.problem.fields import Name, expect
+from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
+from vgtm_qp.problem.method import Method
+from vgtm_qp.problem.obstacle import Clearance, Obstacle
+from vgtm_qp.problem.shape import Curve, Surface
+from vgtm_qp.problem.table import Place, Table, key_path, shown, value_at
+from vgtm_qp.problem.truss import PlateTruss, Truss, unique
+
+SCHEMA_VERSION = 1
+
+
+class Problem(Table):
+    """A problem as its file gives it; in Python, keywords and dictionaries of the same names make it too.
+
+    Files that it names are held as absolute paths; relative ones are taken from the problem file's folder, or
+    from the working directory where there is no problem file.
+
+    Raises
+    ------
+    ProblemError
+        With one :class:`~vgtm_qp.errors.Mistake` per mistake.
+    """
+
+    called: ClassVar[str] = "a problem"
+    schema_version: Annotated[
+        int,
+        Field(strict=True, ge=SCHEMA_VERSION, le=SCHEMA_VERSION),
+        WithJsonSchema({"const": SCHEMA_VERSION}),
+        expect(f"{SCHEMA_VERSION}, the version of the problem file that this release reads"),
+    ] = Field(default=SCHEMA_VERSION, description="version of the form of this file")
+    name: Name = Field(default="unnamed", description="title in tables and figures")
+    truss: Truss | None = Field(default=None, description="the arm: a truss")
+    arm: Arm | None = Field(default=None, description="a serial arm, in the place of a truss")
+    curve: Curve | None = Field(
+        default=None, description="the reference curve; a Bezier of 6 vertices where absent"
+    )
+    surface: Surface | None = Field(
+        default=None, description="the reference surface of a plate, in the place of a curve"
+    )
+    end_effector: EndEffector = Field(
+        default_factory=lambda: EndEffector(), description="which coordinates are steered"
+    )
+    maneuver: Maneuver = Field(description="where the end effector goes")
+    obstacle: tuple[Obstacle, ...] = Field(default=(), description="what the arm keeps away from")
+    clearance: Clearance = Field(default_factory=lambda: Clearance(), description="how far it keeps away")
+    method: Method = Field(default_factory=lambda: Method(), description="how each step is solved")
+
+    _source: Path | None = PrivateAttr(None)
+
+    @property
+    def source(self) -> Path | None:
+        """The file that the problem was read from, if any."""
+        return self._source
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the whole problem, defaults included, as JSON data of the form of the problem file."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    @classmethod
+    def from_dict(
+        cls, data: Mapping[str, Any], *, source: str | Path | None = None, check_files: bool = False
+    ) -> Self:
+        """Make a problem from what :meth:`to_dict` returned.
+
+        Parameters
+        ----------
+        data
+            JSON data of the form of the problem file.
+        source
+            File that the data came from: relative files are taken from its folder, and mistakes name it.
+        check_files
+            Whether files that the problem names must exist; not so for a result that was moved elsewhere.
+
+        Raises
+        ------
+        ProblemError
+            With one mistake per mistake.
+        """
+        context = {"source": source, "check_files": check_files}
+        if source is not None:
+            context["folder"] = Path(source).absolute().parent
+        problem = cls.model_validate(data, context=context)
+        problem._source = None if source is None else Path(source).absolute()
+        return problem
+
+    def replace(self, changes: Mapping[str, Any]) -> Self:
+        """Return a problem with some values changed and everything checked again.
+
+        Parameters
+        ----------
+        changes
+            From key paths to values: ``{"method.solver": "osqp", "maneuver.steps": 20}``.
+
+        Raises
+        ------
+        ProblemError
+            A key does not exist or a value is wrong.
+        """
+        data = self.to_dict()
+        for key, value in changes.items():
+            table = data
+            *outer, last = key.split(".")
+            for part in outer:
+                inner = table.get(part)
+                table[part] = table = dict(inner) if isinstance(inner, Mapping) else {}
+            table[last] = value
+        return self.from_dict(data, source=self._source)
+
+    def mistake(self, place: Place, expected: str) -> Mistake:
+        """Return a mistake that a later check found at a place such as ``("obstacle", 1, "center")``."""
+        return Mistake(key_path(self, place), shown(value_at(self, place)), expected)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_shape(cls, data: Any) -> Any:
+        """Add the default curve, or surface of a plate, where a truss or arm has neither."""
+        if not isinstance(data, Mapping) or data.get("curve") is not None or data.get("surface") is not None:
+            return data
+        truss = data.get("truss")
+        module = truss.get("module") if isinstance(truss, Mapping) else getattr(truss, "module", None)
+        return {**data, "surface" if module == "plate" else "curve": {}}
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        if self.truss is None and self.arm is None:
+            yield ("truss",), "a table [truss], or a table [arm] in its place"
+        if self.truss is not None and self.arm is not None:
+            yield ("arm",), "a truss or an arm, not both"
+        if isinstance(self.truss, PlateTruss):
+            if self.curve is not None:
+                yield ("curve",), "no curve, since a plate tracks a surface: [surface]"
+        elif self.surface is not None:
+            yield ("surface",), 'no surface, since only a truss with module = "plate" tracks one'
+        yield from unique("obstacle", "name", [obstacle.name for obstacle in self.obstacle])
+        if isinstance(self.maneuver, WaypointManeuver):
+            for i, waypoint in enumerate(self.maneuver.waypoint):
+                for key, expected in _unmet(self.end_effector, waypoint):
+                    yield ("maneuver", "waypoint", i, key), expected
+
+
+def _unmet(end_effector: EndEffector, waypoint: Waypoint) -> Iterator[tuple[str, str]]:
+    """Yield key and expectation of each coordinate that a waypoint lacks or gives in vain."""
+    tracked = set(end_effector.track)
+    turned = tracked & {"pointing", "orientation"}
+    if tracked & {"position", "x", "y", "z"}:
+        if waypoint.position is None:
+            yield "position", "three numbers [x, y, z], since end_effector.track has it"
+    elif waypoint.position is not None:
+        yield "position", 'no position, since end_effector.track lacks "position"'
+    if "orientation" in turned and waypoint.rotation_vector is None:
+        yield "rotation_vector", 'three numbers [rx, ry, rz], since end_effector.track has "orientation"'
+    if turned == {"pointing"} and waypoint.pointing is None and waypoint.rotation_vector is None:
+        yield "pointing", 'a direction [x, y, z], since end_effector.track has "pointing"'
+    if "pointing" not in turned and waypoint.pointing is not None:
+        yield "pointing", 'no pointing, since end_effector.track lacks "pointing"'
+    if not turned and waypoint.rotation_vector is not None:
+        yield (
+            "rotation_vector",
+            'no rotation_vector, since end_effector.track lacks "orientation" and "pointing"',
+        )

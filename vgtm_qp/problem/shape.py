@@ -1,0 +1,105 @@
+"""``[curve]`` and ``[surface]``: the reference shapes that a truss tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, Tag
+
+from vgtm_qp.problem.fields import ByKey, Choice, Count, Factor, NonNegative, Vector, exactly
+from vgtm_qp.problem.table import Place, Table
+from vgtm_qp.problem.truss import unique
+
+
+class VertexGoal(Table):
+    """A place that a control vertex is drawn to in the null space of the tip's motion."""
+
+    called: ClassVar[str] = "a control vertex goal"
+    index: Annotated[int, Count(0, 999)] = Field(
+        description="number of the control vertex, from 0 at the base"
+    )
+    position: Vector = Field(description="where it should go, m")
+
+
+class _Curve(Table):
+    control_vertices: Annotated[int, Count(3, 1000)] = Field(
+        default=6,
+        description="number V of control vertices; at most the number of bays plus 2 for the curve methods",
+    )
+    torsion_vertices: Annotated[int, Count(0, 1000)] = Field(
+        default=0,
+        description="number of torsion coordinates of the curve's frame; 0 is no torsion of its own",
+    )
+    nodes: Annotated[Literal["parameter", "arc-length"], Choice()] = Field(
+        default="parameter",
+        description="whether curve nodes keep their parameter or their share of the arc length",
+    )
+    control_vertex_goals: tuple[VertexGoal, ...] = Field(
+        default=(), description="places that control vertices are drawn to"
+    )
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        yield from unique("control_vertex_goals", "index", [goal.index for goal in self.control_vertex_goals])
+        for i, goal in enumerate(self.control_vertex_goals):
+            if goal.index >= self.control_vertices:
+                last = self.control_vertices - 1
+                yield ("control_vertex_goals", i, "index"), f"a control vertex, 0 to {last}"
+
+
+class BezierCurve(_Curve):
+    """One Bezier curve of degree V - 1."""
+
+    called: ClassVar[str] = "a Bezier curve"
+    family: Annotated[Literal["bezier"], Choice()] = "bezier"
+    control_vertices: Annotated[int, Count(3, 60)] = Field(
+        default=6, description="number V of control vertices"
+    )
+
+
+class BSplineCurve(_Curve):
+    """A clamped uniform B-spline."""
+
+    called: ClassVar[str] = "a B-spline curve"
+    family: Annotated[Literal["b-spline"], Choice()]
+    degree: Annotated[int, Count(1, 20)] = Field(
+        default=3, description="degree, less than the number of vertices"
+    )
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        yield from super()._contradictions()
+        if self.degree >= self.control_vertices:
+            yield ("degree",), f"a degree less than the number of control vertices, {self.control_vertices}"
+
+
+class BetaSplineCurve(_Curve):
+    """A uniform cubic Beta-spline through its end vertices."""
+
+    called: ClassVar[str] = "a Beta-spline curve"
+    family: Annotated[Literal["beta-spline"], Choice()]
+    bias: Factor = Field(
+        default=1.0, description="ratio of the speeds after and before a joint; 1 is unbiased"
+    )
+    tension: NonNegative = Field(default=0.0, description="pull towards the control vertices; 0 is none")
+
+
+Curve = Annotated[
+    Annotated[BezierCurve, Tag("<bezier>")]
+    | Annotated[BSplineCurve, Tag("<b-spline>")]
+    | Annotated[BetaSplineCurve, Tag("<beta-spline>")],
+    ByKey(
+        "family",
+        {"bezier": "<bezier>", "b-spline": "<b-spline>", "beta-spline": "<beta-spline>"},
+        default="bezier",
+    ),
+]
+
+
+class Surface(Table):
+    """A tensor-product Bezier surface, for plates."""
+
+    called: ClassVar[str] = "a surface"
+    control_vertices: Annotated[
+        tuple[Annotated[int, Count(2, 30)], Annotated[int, Count(2, 30)]],
+        exactly(2, "two integers [along, across]"),
+    ] = Field(default=(4, 4), description="numbers of control vertices along and across")

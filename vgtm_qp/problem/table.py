@@ -1,0 +1,172 @@
+"""The base of every table of a problem file: unknown keys refused, mistakes told in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
+from typing import Any, ClassVar, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails
+
+from vgtm_qp.errors import Mistake, ProblemError, nearest
+from vgtm_qp.problem.fields import entry, quoted, unexpected
+
+Place = tuple[str | int, ...]
+
+_MISSING = object()
+_nested: ContextVar[bool] = ContextVar("_nested", default=False)
+
+
+class Table(BaseModel):
+    """One table of a problem file: immutable, checked when made, in Python as in a file.
+
+    Raises
+    ------
+    ProblemError
+        With one :class:`~vgtm_qp.errors.Mistake` per mistake, those of the tables inside it too.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    called: ClassVar[str] = "this table"
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        """Yield place and expectation of each value that contradicts another one of this table."""
+        yield from ()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _explain(cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
+        # pydantic merges the errors of inner tables into those of the outer one, so only the outermost may
+        # turn them into the package's own exception.
+        outermost = not _nested.get()
+        token = _nested.set(True)
+        try:
+            try:
+                table = handler(data)
+            except ValidationError as error:
+                details = [cls._detail(found) for found in error.errors(include_url=False)]
+            else:
+                details = [
+                    InitErrorDetails(type=unexpected(phrase), loc=place, input=value_at(table, place))
+                    for place, phrase in table._contradictions()
+                ]
+                if not details:
+                    return table
+        finally:
+            _nested.reset(token)
+        wrong = ValidationError.from_exception_data(cls.__name__, details)
+        if not outermost:
+            raise wrong
+        source = (info.context or {}).get("source") or cls.called
+        raise ProblemError(str(source), mistakes_in(wrong, data)) from None
+
+    @classmethod
+    def _detail(cls, found: ErrorDetails) -> InitErrorDetails:
+        """Return an error of pydantic in the words of a problem file."""
+        kind, place, value = found["type"], found["loc"], found["input"]
+        context = found.get("ctx", {})
+        if kind == "expected":
+            phrase = found["msg"]
+        elif kind == "extra_forbidden":
+            keys, unknown = list(cls.model_fields), str(place[-1])
+            phrase = f"one of the keys of {cls.called}: {', '.join(keys)}{nearest(unknown, keys)}"
+        elif kind == "missing":
+            field = cls.model_fields.get(str(place[0])) if len(place) == 1 else None
+            about = f" ({field.description})" if field and field.description else ""
+            phrase, value = f"a value{about}: the key is required", _MISSING
+        elif kind == "choice" and isinstance(value, Mapping):
+            key, choices = context["key"], context["choices"].split(",")
+            place = (*place, key)
+            value = value.get(key, _MISSING)
+            hint = nearest(value, choices) if isinstance(value, str) else ""
+            phrase = f"one of {quoted(choices)}{hint}"
+        elif kind == "tuple_type" and isinstance(value, Mapping):
+            phrase = "an array of tables: [[...]] with two brackets, one for each entry"
+        elif kind in ("tuple_type", "list_type"):
+            phrase = "an array [...]"
+        elif kind == "too_short":
+            phrase = f"at least {context['min_length']} of them"
+        elif kind == "too_long":
+            phrase = f"at most {context['max_length']} of them"
+        elif kind in ("model_type", "model_attributes_type", "choice"):
+            phrase = "a table"
+        else:
+            phrase = found["msg"][:1].lower() + found["msg"][1:]
+        return InitErrorDetails(type=unexpected(phrase), loc=place, input=value)
+
+
+def mistakes_in(error: ValidationError, data: Any) -> list[Mistake]:
+    """Return each error of a validated `data` as a mistake with its key path."""
+    return [
+        Mistake(key_path(data, found["loc"]), shown(found["input"]), found["msg"])
+        for found in error.errors(include_url=False)
+    ]
+
+
+def key_path(data: Any, place: Place) -> str:
+    """Return a place in a problem as ``obstacle[1] ("right cube").size``.
+
+    Parameters
+    ----------
+    data
+        The table, or the mapping it is made from, that the place begins in.
+    place
+        Keys and indices from there; the tags of unions, ``"<...>"`` before a deeper key, are left out.
+    """
+    path = ""
+    for depth, part in enumerate(place):
+        if isinstance(part, int):
+            data = data[part] if isinstance(data, list | tuple) and part < len(data) else None
+            name = entry(data, "name")
+            path += f"[{part}]" + (f' ("{_line(name, 40)}")' if isinstance(name, str) else "")
+        elif part.startswith("<") and depth + 1 < len(place) and entry(data, part) is None:
+            continue
+        else:
+            data = entry(data, part)
+            path += ("." if path else "") + _line(part, 60)
+    return path or "problem"
+
+
+def shown(value: Any) -> str:
+    """Return a value as a problem file has it, on one short line."""
+    if value is _MISSING or value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{_line(value, 60)}"'
+    if isinstance(value, Mapping | BaseModel):
+        keys = list(value) if isinstance(value, Mapping) else list(type(value).model_fields)
+        return "a table of " + _line(", ".join(map(str, keys)), 60) if keys else "an empty table"
+    if isinstance(value, list | tuple):
+        if len(value) > 6:
+            return f"an array of {len(value)}"
+        if any(isinstance(item, Mapping | BaseModel | list | tuple) for item in value):
+            return f"an array of {len(value)} arrays or tables"
+        return f"[{', '.join(shown(item) for item in value)}]"
+    try:
+        return _line(str(value), 60)
+    except ValueError:
+        return "an integer of thousands of digits"
+
+
+def value_at(table: Table, place: Place) -> Any:
+    """Return the value at a place of a table."""
+    value: Any = table
+    for part in place:
+        value = value[part] if isinstance(part, int) else entry(value, part)
+    return value
+
+
+def _line(text: str, length: int) -> str:
+    text = "".join(letter if letter.isprintable() else " " for letter in text)
+    return text if len(text) <= length else text[: length - 3] + "..."
