@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -13,11 +14,8 @@ _LEAST_SINE = 0.1
 """A triangle with a smaller sine at the node does not orient a joint: its normal would turn too fast."""
 
 
-def axial_joints(
-    node_names: tuple[str, ...], home: Array, members: Index, stage: Index, offset: Array
-) -> Joints:
-    """Return joints whose members end `offset` (M, 2), m, away from their nodes, on the members' axes."""
-    triangle = joint_triangles(node_names, home, members, stage)
+def axial_joints(home: Array, members: Index, triangle: Index, offset: Array) -> Joints:
+    """Return joints whose members end `offset` (M, 2), m, from their nodes, on the members' axes at home."""
     direction = home[members[:, 1]] - home[members[:, 0]]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     outward = np.stack([direction, -direction], axis=1) * offset[:, :, None]
@@ -38,16 +36,29 @@ def joint_frames(X: Array, triangle: Index) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
-def joint_triangles(node_names: tuple[str, ...], home: Array, members: Index, stage: Index) -> Index:
+def joint_triangles(
+    node_names: Sequence[str],
+    home: Array,
+    members: Index,
+    stage: Index,
+    chosen: Mapping[int, tuple[int, ...]] | None = None,
+) -> Index:
     """Return (N, 3) the nodes whose triangle orients each node's joint, eq. (13), the node itself first.
 
     The two others are neighbours of the same or an earlier stage, so that no member's length depends on a
     later stage. Neighbours of the node's own stage come first, then the triangle with the largest sine.
 
+    Parameters
+    ----------
+    node_names, home, members, stage
+        As in :class:`vgtm_qp.truss.truss.Truss`.
+    chosen : mapping, optional
+        The two other nodes of some nodes' triangles, counter-clockwise about z.
+
     Raises
     ------
     TrussError
-        A node has no two such neighbours off one line.
+        A node has no two such neighbours off one line, or a chosen triangle lies on one.
     """
     neighbours: list[set[int]] = [set() for _ in node_names]
     for i, j in members.tolist():
@@ -58,6 +69,12 @@ def joint_triangles(node_names: tuple[str, ...], home: Array, members: Index, st
         neighbours[i].update(base)
     triangle = np.empty((len(node_names), 3), dtype=np.int64)
     for i, around in enumerate(neighbours):
+        if chosen and i in chosen:
+            triangle[i] = (i, *chosen[i])
+            if _normal(home, *triangle[i].tolist())[1] < _LEAST_SINE:
+                names = ", ".join(node_names[j] for j in triangle[i])
+                raise TrussError(f"the joint at node {node_names[i]}: {names} are nearly on one line")
+            continue
         earlier = sorted(j for j in around if j != i and stage[j] <= stage[i])
         best: tuple[int, float, int] | None = None
         for a, b in combinations(earlier, 2):

@@ -8,34 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, TypedDict, Unpack
+from typing import Unpack
 
 import numpy as np
 
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.joints import axial_joints
-from vgtm_qp.truss.truss import Array, Index, Mask, Truss
-
-
-class Limits(TypedDict, total=False):
-    """What every builder takes by keyword besides its dimensions."""
-
-    stroke: Sequence[float] | None
-    """Least and greatest length of an actuated member, m; the module's factors times home if not given."""
-    rate: float | None
-    """Greatest |dl/dt| of an actuated member, m/s; none if not given."""
-    acceleration: float | None
-    """Greatest |d2l/dt2| of an actuated member, m/s^2; none if not given."""
-    member_radius: float
-    """Radius of every member, m; 0.03 if not given."""
-    joint_offset: float
-    """Distance from node to member end, along the member at home, m; 0 (pin joints) if not given."""
-
-
-class _Member(NamedTuple):
-    name: str
-    nodes: tuple[int, int]
-    actuated: bool
+from vgtm_qp.truss.assembly import Limits, MemberRow, assemble
+from vgtm_qp.truss.truss import Array, Index, Truss
 
 
 def octahedral(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:
@@ -58,11 +37,11 @@ def octahedral(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limit
         A dimension is not positive, the bay would be flat, or a home length is outside its stroke.
     """
     _check_dimensions(bays, longeron=longeron, batten=batten)
-    members: list[_Member] = []
+    members: list[MemberRow] = []
     for layer in range(1, bays + 1):
         members += [*_zigzag(layer, actuated=False), *_battens(layer, actuated=True)]
     home = _antiprism(bays, longeron, batten)
-    return _assemble("octahedral", home, members, limits, (0.6, 1.5), trackable=("position",))
+    return _stacked("octahedral", home, members, limits, (0.6, 1.5), trackable=("position",))
 
 
 def double_octahedral(
@@ -88,11 +67,11 @@ def double_octahedral(
         As :func:`octahedral`.
     """
     _check_dimensions(bays, longeron=longeron, batten=batten)
-    members: list[_Member] = []
+    members: list[MemberRow] = []
     for layer in range(1, 2 * bays + 1):
         members += [*_zigzag(layer, actuated=False), *_battens(layer, actuated=layer % 2 == 1)]
     home = _antiprism(2 * bays, longeron, batten)
-    return _assemble(
+    return _stacked(
         "double-octahedral", home, members, limits, (0.6, 1.5), trackable=("position",), layers_per_bay=2
     )
 
@@ -115,12 +94,12 @@ def hexapod(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: 
         As :func:`octahedral`.
     """
     _check_dimensions(bays, longeron=longeron, batten=batten)
-    members: list[_Member] = []
+    members: list[MemberRow] = []
     for layer in range(1, bays + 1):
         members += [*_zigzag(layer, actuated=True), *_battens(layer, actuated=False)]
     home = _antiprism(bays, longeron, batten)
     trackable = ("position", "pointing", "orientation")
-    return _assemble("hexapod", home, members, limits, (0.7, 1.4), trackable=trackable)
+    return _stacked("hexapod", home, members, limits, (0.7, 1.4), trackable=trackable)
 
 
 def longeron(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:
@@ -144,18 +123,18 @@ def longeron(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits:
         A dimension is not positive or a home length is outside its stroke.
     """
     _check_dimensions(bays, longeron=longeron, batten=batten)
-    members: list[_Member] = []
+    members: list[MemberRow] = []
     for layer in range(1, bays + 1):
         below, above = 3 * (layer - 1), 3 * layer
         hand = 1 if layer % 2 else 2
-        members += [_Member(f"L{layer}-{i + 1}", (below + i, above + i), True) for i in range(3)]
+        members += [MemberRow(f"L{layer}-{i + 1}", (below + i, above + i), True) for i in range(3)]
         members += [
-            _Member(f"D{layer}-{i + 1}", (below + i, above + (i + hand) % 3), False) for i in range(3)
+            MemberRow(f"D{layer}-{i + 1}", (below + i, above + (i + hand) % 3), False) for i in range(3)
         ]
         members += _battens(layer, actuated=False)
     home = np.vstack([_triangle(batten, 0.0, layer * longeron) for layer in range(bays + 1)])
     trackable = ("position", "pointing", "orientation")
-    return _assemble("longeron", home, members, limits, (0.6, 1.4), trackable=trackable, face_stride=2)
+    return _stacked("longeron", home, members, limits, (0.6, 1.4), trackable=trackable, face_stride=2)
 
 
 def tetrahedral(
@@ -169,7 +148,7 @@ def tetrahedral(
     """Tetrahedra face on face (Boerdijk-Coxeter helix): each node hangs by three members on the three before.
 
     A bay is three nodes, and every node is a stage of its own. Members (i, i-1) and (i, i-2) are the battens
-    ``B`` and ``D``, members (i, i-3) the longerons ``L``. The home pose is a helix about z, theta its turn
+    ``B`` and ``D``, members (i, i-3) the longerons ``L``. The home pose is a helix about z, theta its turn a
     node, cos theta = -1/2 - L^2 / (6 b^2). Three successive nodes with the weights w, 1 - 2 w, w, where
     w = 1 / (2 (1 - cos theta)), have their mean on its axis (w = 0.3 where L = b). No face is normal to the
     axis, the base neither: its axis point is the origin.
@@ -197,12 +176,12 @@ def tetrahedral(
         raise TrussError(f"actuated is {list(actuated)}; expected one to three different numbers of 1, 2, 3")
     home, cosine = _helix(3 * (bays + 1), longeron, batten)
     members = [
-        _Member(f"{kind}{i // 3}-{i % 3 + 1}", (i - k, i), k in actuated)
+        MemberRow(f"{kind}{i // 3}-{i % 3 + 1}", (i - k, i), k in actuated)
         for i in range(3, len(home))
         for k, kind in ((1, "B"), (2, "D"), (3, "L"))
     ]
     weight = 1.0 / (2.0 * (1.0 - cosine))
-    return _assemble(
+    return _stacked(
         "tetrahedral",
         home,
         members,
@@ -261,24 +240,24 @@ def _helix(count: int, longeron: float, batten: float) -> tuple[Array, float]:
     return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), (steps - 1) * rise]), cosine
 
 
-def _zigzag(layer: int, *, actuated: bool) -> Iterator[_Member]:
+def _zigzag(layer: int, *, actuated: bool) -> Iterator[MemberRow]:
     """Yield the six members of an antiprism between `layer` and the layer below it."""
     # Odd layers are turned by 60 degrees: node i stands between nodes i and i+1 below. Even layers turn back.
     other = 1 if layer % 2 else 2
     pairs = [(i, (i + shift) % 3) for i in range(3) for shift in (0, other)]
     for place, (i, below) in enumerate(pairs, start=1):
-        yield _Member(f"L{layer}-{place}", (3 * (layer - 1) + below, 3 * layer + i), actuated)
+        yield MemberRow(f"L{layer}-{place}", (3 * (layer - 1) + below, 3 * layer + i), actuated)
 
 
-def _battens(layer: int, *, actuated: bool) -> Iterator[_Member]:
+def _battens(layer: int, *, actuated: bool) -> Iterator[MemberRow]:
     for i in range(3):
-        yield _Member(f"B{layer}-{i + 1}", (3 * layer + i, 3 * layer + (i + 1) % 3), actuated)
+        yield MemberRow(f"B{layer}-{i + 1}", (3 * layer + i, 3 * layer + (i + 1) % 3), actuated)
 
 
-def _assemble(
+def _stacked(
     module: str,
     home: Array,
-    members: Sequence[_Member],
+    members: Sequence[MemberRow],
     limits: Limits,
     stroke_factors: tuple[float, float],
     *,
@@ -290,80 +269,20 @@ def _assemble(
 ) -> Truss:
     """Assemble a truss of layers of three nodes; a face ends each bay, and all face frames are the base's."""
     nodes = np.arange(len(home))
-    layer = nodes // 3
-    stage = layer - 1 if stage is None else stage
-    node_names = tuple(f"n{i // 3}-{i % 3 + 1}" for i in range(len(home)))
-    member_names = tuple(member.name for member in members)
-    pairs = np.array([member.nodes for member in members], dtype=np.int64)
-    actuated = np.array([member.actuated for member in members])
-    lengths = np.linalg.norm(home[pairs[:, 0]] - home[pairs[:, 1]], axis=1)
     faces = nodes.reshape(-1, 3)[::layers_per_bay]
-    offset = limits.get("joint_offset", 0.0)
-    if not 0.0 <= 2.0 * offset < lengths.min():
-        raise TrussError(
-            f"joint_offset is {offset:g} m; expected at least 0 and less than half the shortest member, "
-            f"{lengths.min() / 2:g} m"
-        )
-    offsets = np.full((len(members), 2), offset)
-    return Truss(
-        module=module,
-        node_names=node_names,
-        member_names=member_names,
-        home=home,
-        base=layer == 0,
-        members=pairs,
-        actuated=actuated,
-        stroke=_strokes(member_names, lengths - 2.0 * offset, actuated, limits.get("stroke"), stroke_factors),
-        rate=_greatest(actuated, limits.get("rate"), "rate"),
-        acceleration=_greatest(actuated, limits.get("acceleration"), "acceleration"),
-        radius=np.full(len(members), _radius(limits.get("member_radius", 0.03))),
+    return assemble(
+        module,
+        tuple(f"n{i // 3}-{i % 3 + 1}" for i in range(len(home))),
+        home,
+        nodes // 3 - 1 if stage is None else stage,
+        members,
+        limits,
+        stroke_factors,
         faces=faces,
-        face_weights=np.tile(np.asarray(weights, dtype=np.float64), (len(faces), 1)),
-        face_frames=np.tile(np.eye(3), (len(faces), 1, 1)),
+        weights=weights,
         tip=faces[-1],
-        tip_weights=np.asarray(weights, dtype=np.float64),
-        tip_frame=np.eye(3),
-        stage=stage,
+        tip_weights=weights,
         bays=len(faces) - 1,
         trackable=trackable,
         face_stride=face_stride,
-        joints=axial_joints(node_names, home, pairs, stage, offsets) if offset > 0.0 else None,
     )
-
-
-def _strokes(
-    names: Sequence[str],
-    lengths: Array,
-    actuated: Mask,
-    stroke: Sequence[float] | None,
-    factors: tuple[float, float],
-) -> Array:
-    """(M, 2) least and greatest lengths, m; the home length twice where a member is fixed."""
-    strokes = np.column_stack([lengths, lengths])
-    if stroke is None:
-        strokes[actuated] *= factors
-        return strokes
-    least, greatest = stroke
-    if not 0.0 < least <= greatest:
-        raise TrussError(f"stroke is [{least:g}, {greatest:g}] m; expected 0 < least <= greatest")
-    strokes[actuated] = least, greatest
-    outside = (lengths < strokes[:, 0] - 1e-9) | (lengths > strokes[:, 1] + 1e-9)
-    if outside.any():
-        k = int(np.argmax(outside))
-        raise TrussError(
-            f"the home length of member {names[k]}, {lengths[k]:g} m, is outside its stroke "
-            f"[{least:g}, {greatest:g}] m"
-        )
-    return strokes
-
-
-def _greatest(actuated: Mask, limit: float | None, name: str) -> Array:
-    if limit is not None and not limit > 0.0:
-        raise TrussError(f"{name} is {limit:g}; expected a number greater than 0")
-    return np.where(actuated, np.inf if limit is None else limit, np.inf)
-
-
-def _radius(radius: float) -> float:
-    if not (math.isfinite(radius) and radius >= 0.0):
-        raise TrussError(f"member_radius is {radius:g} m; expected a finite radius of at least 0")
-    return radius

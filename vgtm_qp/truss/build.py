@@ -1,0 +1,96 @@
+"""From the ``[truss]`` table of a problem to the truss."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import numpy as np
+
+from vgtm_qp.errors import TrussError, nearest
+from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, PlateTruss, TetrahedralTruss
+from vgtm_qp.truss import modules
+from vgtm_qp.truss.assembly import Limits
+from vgtm_qp.truss.graph import truss_from_graph
+from vgtm_qp.truss.kinematics import member_ends
+from vgtm_qp.truss.plate import plate
+from vgtm_qp.truss.truss import Array, Truss
+
+_MODULES = {
+    "octahedral": modules.octahedral,
+    "double-octahedral": modules.double_octahedral,
+    "hexapod": modules.hexapod,
+    "longeron": modules.longeron,
+}
+
+
+def build_truss(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
+    """Build the truss of a problem; members locked from the start are fixed at their home length.
+
+    Parameters
+    ----------
+    spec
+        The validated ``[truss]`` table. Locks with a later time are left to the maneuver.
+
+    Raises
+    ------
+    TrussError
+        The truss is not statically determinate, or a locked member is not an actuated one.
+    """
+    truss = _unlocked(spec)
+    names = [lock.member for lock in spec.locked]
+    _check_actuated(truss, names)
+    return lock_members(truss, [lock.member for lock in spec.locked if lock.time == 0.0])
+
+
+def lock_members(truss: Truss, names: Iterable[str], X: Array | None = None) -> Truss:
+    """Return the truss with actuated members fixed at their length at node positions `X` (N, 3), or home.
+
+    Raises
+    ------
+    TrussError
+        A name is not that of an actuated member.
+    """
+    names = list(names)
+    if not names:
+        return truss
+    _check_actuated(truss, names)
+    locked = np.array([truss.member(name) for name in names])
+    ends = member_ends(truss, truss.home if X is None else X)[locked]
+    actuated, stroke = truss.actuated.copy(), truss.stroke.copy()
+    rate, acceleration = truss.rate.copy(), truss.acceleration.copy()
+    actuated[locked] = False
+    stroke[locked] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[:, None]
+    rate[locked] = acceleration[locked] = np.inf
+    return dataclasses.replace(truss, actuated=actuated, stroke=stroke, rate=rate, acceleration=acceleration)
+
+
+def _unlocked(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
+    if isinstance(spec, GraphTruss):
+        return truss_from_graph(spec)
+    limits = Limits(
+        stroke=spec.stroke,
+        rate=spec.rate,
+        acceleration=spec.acceleration,
+        member_radius=spec.member_radius,
+        joint_offset=spec.joint_offset,
+    )
+    if isinstance(spec, PlateTruss):
+        return plate(spec.rows, spec.columns, spacing=spec.spacing, depth=spec.depth, **limits)
+    if isinstance(spec, TetrahedralTruss):
+        return modules.tetrahedral(
+            spec.bays, longeron=spec.longeron, batten=spec.batten, actuated=spec.actuated, **limits
+        )
+    return _MODULES[spec.module](spec.bays, longeron=spec.longeron, batten=spec.batten, **limits)
+
+
+def _check_actuated(truss: Truss, names: Iterable[str]) -> None:
+    actuated = [truss.member_names[k] for k in truss.actuators]
+    for name in names:
+        if name not in actuated:
+            fixed = name in truss.member_names
+            what = f"member {name} has a fixed length" if fixed else f'no member is called "{name}"'
+            raise TrussError(
+                f"locked: {what}; expected one of the {len(actuated)} actuated members "
+                f"{', '.join(actuated[:6])}{', ...' if len(actuated) > 6 else ''}{nearest(name, actuated)}"
+            )

@@ -1,0 +1,200 @@
+"""Static determinacy: as many members as unknown coordinates, and a regular length Jacobian (section 3).
+
+A wrong truss is refused with the motion that no member hinders, or the members that hold one another in
+stress.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import qr
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
+
+from vgtm_qp.errors import TrussError
+from vgtm_qp.truss.truss import Array, Truss
+
+RANK_TOLERANCE = 1e-10
+"""Singular values below this fraction of the greatest one count as zero."""
+
+_DENSE_LIMIT = 450
+"""Above this many unknown coordinates, Lanczos iteration on a sparse LU beats the dense decomposition."""
+
+_NAMED = 6
+"""How many nodes or members a message names before it only counts the others."""
+
+
+@dataclass(frozen=True)
+class DeterminacyReport:
+    """How regular the square length Jacobian of a statically determinate truss is.
+
+    Attributes
+    ----------
+    members, coordinates : int
+        Number of members and of unknown node coordinates 3 (N - N_c); equal.
+    rank : int
+        Rank of the length Jacobian; equal to both.
+    smallest_singular_value, condition : float
+        Of the length Jacobian; both without unit. The smallest one is the least change of length, per metre
+        of node displacement, of any motion.
+    """
+
+    members: int
+    coordinates: int
+    rank: int
+    smallest_singular_value: float
+    condition: float
+
+
+def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
+    """Return d lengths / d unknown node coordinates, (M, 3 (N - N_c)), its columns in the order of ``free``.
+
+    Parameters
+    ----------
+    truss : Truss
+        Offset joints are differentiated through their frames, eqs. (19)-(21).
+    X : (N, 3), optional
+        Node positions, m; home if not given.
+    """
+    X = truss.home if X is None else np.asarray(X, dtype=np.float64)
+    if truss.joints is None:
+        nodes = truss.members
+        direction = X[nodes[:, 0]] - X[nodes[:, 1]]
+        direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        gradient = np.stack([direction, -direction], axis=1)
+    else:
+        from vgtm_qp.truss.kinematics import Kinematics
+
+        kinematics = Kinematics(truss, compiled=False)
+        kinematics.evaluate(X)
+        nodes, gradient = kinematics.member_nodes, kinematics.gradient
+    column = np.full(truss.node_count, -1, dtype=np.int64)
+    column[truss.free] = np.arange(len(truss.free))
+    rows = np.broadcast_to(np.arange(truss.member_count)[:, None, None], gradient.shape)
+    columns = 3 * column[nodes][:, :, None] + np.arange(3)
+    unknown = np.broadcast_to((column[nodes] >= 0)[:, :, None], gradient.shape)
+    shape = (truss.member_count, 3 * len(truss.free))
+    return sparse.csc_array((gradient[unknown], (rows[unknown], columns[unknown])), shape=shape)
+
+
+def check_determinacy(
+    truss: Truss, X: Array | None = None, J: sparse.sparray | Array | None = None
+) -> DeterminacyReport:
+    """Return the report of a statically determinate truss; refuse any other.
+
+    Parameters
+    ----------
+    truss : Truss
+        Its stages need not be set.
+    X : (N, 3), optional
+        Node positions, m; home if not given.
+    J : (M, 3 (N - N_c)), optional
+        Length Jacobian in the place of :func:`length_jacobian` at `X`.
+
+    Raises
+    ------
+    TrussError
+        The number of members is not 3 (N - N_c) or the length Jacobian is singular. The message names the
+        nodes of a free motion with their directions, and the members of a state of self-stress.
+    """
+    matrix = sparse.csc_array(length_jacobian(truss, X) if J is None else J)
+    members, coordinates = matrix.shape
+    if coordinates == 0:
+        raise TrussError("every node is fixed: nothing can move; expected at least one node that is not")
+    if members == coordinates:
+        smallest, greatest = _extreme_singular_values(matrix)
+        if smallest > RANK_TOLERANCE * greatest:
+            return DeterminacyReport(members, coordinates, coordinates, smallest, greatest / smallest)
+    raise TrussError(_refusal(truss, matrix))
+
+
+def _extreme_singular_values(J: sparse.csc_array) -> tuple[float, float]:
+    """Smallest and greatest singular value of a square matrix; 0 for the smallest of a singular one."""
+    size = J.shape[0]
+    if size <= _DENSE_LIMIT:
+        values = np.linalg.svd(J.toarray(), compute_uv=False)
+        return float(values[-1]), float(values[0])
+    # A fixed start makes the answer the same at every call.
+    start = np.random.default_rng(0).standard_normal(size)
+    gram = LinearOperator((size, size), matvec=lambda v: J.T @ (J @ v), dtype=np.float64)
+    greatest = float(np.sqrt(eigsh(gram, k=1, v0=start, tol=1e-4, return_eigenvectors=False)[0]))
+    try:
+        factor = splu(J)
+    except RuntimeError:
+        return 0.0, greatest
+    inverse = LinearOperator(
+        (size, size), matvec=lambda v: factor.solve(factor.solve(v, trans="T")), dtype=np.float64
+    )
+    largest = float(eigsh(inverse, k=1, v0=start, tol=1e-8, return_eigenvectors=False)[0])
+    return float(1.0 / np.sqrt(largest)) if np.isfinite(largest) and largest > 0.0 else 0.0, greatest
+
+
+def _refusal(truss: Truss, J: sparse.csc_array) -> str:
+    """Return the message for a truss that is not determinate, with its free motion and self-stress."""
+    members, coordinates = J.shape
+    motions, stresses = _null_spaces(J)
+    parts = [
+        f"the truss has {members} members for {coordinates} unknown coordinates (3 for each free node); "
+        "statically determinate is as many of both and no free motion"
+    ]
+    if motions.shape[1]:
+        names = _name_motion(truss, _localised(motions).reshape(-1, 3))
+        parts.append(f"{motions.shape[1]} free motion(s), one of them {names}: a member has to hinder it")
+    if stresses.shape[1]:
+        names = _name_members(truss, _localised(stresses))
+        parts.append(f"{stresses.shape[1]} redundant member(s), one of them among {names}: it has to go")
+    return ". ".join(parts)
+
+
+def _null_spaces(J: sparse.csc_array) -> tuple[Array, Array]:
+    """Return bases (columns) of free motions and states of self-stress; of large trusses a few only."""
+    if max(J.shape) > _DENSE_LIMIT:
+        return _sparse_null_space(J), _sparse_null_space(sparse.csc_array(J.T))
+    left, values, right = np.linalg.svd(J.toarray())
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
+    return right[rank:].T, left[:, rank:]
+
+
+def _sparse_null_space(J: sparse.csc_array) -> Array:
+    """Return up to ``_NAMED`` null vectors of J (columns), by Lanczos iteration on (J' J + small I)^-1."""
+    size = J.shape[1]
+    factor = splu(sparse.csc_array(J.T @ J + 1e-13 * sparse.eye_array(size)))
+    inverse = LinearOperator((size, size), matvec=factor.solve, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(size)
+    _, vectors = eigsh(inverse, k=_NAMED, v0=start)
+    return np.asarray(vectors[:, np.linalg.norm(J @ vectors, axis=0) < 1e-8])
+
+
+def _localised(basis: Array) -> Array:
+    """Return the vector with the fewest entries in the echelon form of a null space's `basis` (columns).
+
+    A singular vector mixes all the motions of a null space; the echelon form tells them apart.
+    """
+    _, _, pivots = qr(basis.T, pivoting=True, mode="economic")
+    echelon = basis @ np.linalg.inv(basis[pivots[: basis.shape[1]]])
+    echelon = echelon / np.abs(echelon).max(axis=0)
+    return np.asarray(echelon[:, np.argmin(np.count_nonzero(np.abs(echelon) > 1e-6, axis=0))])
+
+
+def _name_motion(truss: Truss, motion: Array) -> str:
+    size = np.linalg.norm(motion, axis=1)
+    order = [int(i) for i in np.argsort(-size, kind="stable") if size[i] > 1e-6 * size.max()]
+    names = [f"node {truss.node_names[truss.free[i]]} along {_direction(motion[i])}" for i in order[:_NAMED]]
+    return _listed(names, len(order), "nodes")
+
+
+def _direction(vector: Array) -> str:
+    unit = np.round(vector / np.linalg.norm(vector), 3) + 0.0
+    return f"({unit[0]:g}, {unit[1]:g}, {unit[2]:g})"
+
+
+def _name_members(truss: Truss, stress: Array) -> str:
+    order = [int(k) for k in np.argsort(-np.abs(stress), kind="stable") if abs(stress[k]) > 1e-6]
+    return _listed([truss.member_names[k] for k in order[:_NAMED]], len(order), "members")
+
+
+def _listed(names: list[str], count: int, what: str) -> str:
+    more = f" and {count - len(names)} more {what}" if count > len(names) else ""
+    return ", ".join(names) + more

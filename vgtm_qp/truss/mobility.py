@@ -1,0 +1,230 @@
+"""What a truss can move: its counts, free motions, and the coordinates of tip and faces that they reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse.linalg import splu
+
+from vgtm_qp.truss.determinacy import DeterminacyReport, check_determinacy, length_jacobian
+from vgtm_qp.truss.kinematics import Kinematics
+from vgtm_qp.truss.truss import Array, Index, Truss
+
+RANK_TOLERANCE = 1e-8
+"""Singular values of a tip or face Jacobian below this fraction of the greatest one count as zero."""
+
+_ROLL_REASON = (
+    ": where the arm is straight, a twist of two faces makes one of a node's two fixed longerons longer "
+    "and the other shorter, and no batten can undo that; bent, the arm can roll a little"
+)
+
+
+@dataclass(frozen=True)
+class TrussDescription:
+    """The counts of a truss and what its free motions reach at one configuration.
+
+    Attributes
+    ----------
+    module : str
+        Name of the module.
+    bays, nodes, base_nodes, fixed_members, actuated_members : int
+        Counts.
+    free_motions : int
+        Unknown coordinates less fixed members: what the actuators and nothing else decide.
+    trackable, face_stride
+        As in :class:`vgtm_qp.truss.truss.Truss`.
+    determinacy : DeterminacyReport
+        Rank and smallest singular value of the square length Jacobian.
+    tip_rank, tip_coordinates : int
+        Rank of the tip's Jacobian, and how many coordinates the tip has: 6, or 3 where it has no frame.
+    unreachable : tuple of str
+        Tip motions that no actuator can start, in words.
+    """
+
+    module: str
+    bays: int
+    nodes: int
+    base_nodes: int
+    fixed_members: int
+    actuated_members: int
+    free_motions: int
+    trackable: tuple[str, ...]
+    face_stride: int
+    determinacy: DeterminacyReport
+    tip_rank: int
+    tip_coordinates: int
+    unreachable: tuple[str, ...]
+
+    def __str__(self) -> str:
+        report = self.determinacy
+        which = "every face" if self.face_stride == 1 else f"every {self.face_stride}nd face"
+        lines = [
+            f"{self.module}: {self.bays} bays, {self.nodes} nodes ({self.base_nodes} given), "
+            f"{self.fixed_members} fixed and {self.actuated_members} actuated members",
+            f"statically determinate: {report.members} members, {report.coordinates} coordinates, "
+            f"rank {report.rank}, smallest singular value {report.smallest_singular_value:.3g}, "
+            f"condition {report.condition:.3g}",
+            f"{self.free_motions} free motions; {which} tracks {', '.join(self.trackable) or 'nothing'}",
+            f"tip: rank {self.tip_rank} of {self.tip_coordinates} coordinates",
+        ]
+        lines += [f"  cannot start: {motion}" for motion in self.unreachable]
+        return "\n".join(lines)
+
+
+def actuator_response(truss: Truss, rows: Array, X: Array | None = None) -> Array:
+    """Return (R, n_a) rates of R functions of the nodes for unit rates of each actuator, fixed members kept.
+
+    Parameters
+    ----------
+    truss : Truss
+        Statically determinate.
+    rows : (R, N, 3)
+        Derivatives of the functions with respect to all node positions; those of base nodes are left out.
+    X : (N, 3), optional
+        Node positions, m; home if not given.
+    """
+    J = length_jacobian(truss, X)
+    unknown = np.ascontiguousarray(rows[:, truss.free].reshape(len(rows), -1).T)
+    return np.asarray(splu(J).solve(unknown, trans="T").T[:, truss.actuators])
+
+
+def tip_response(truss: Truss, X: Array | None = None) -> Array:
+    """Return (6, n_a), or (3, n_a) where the tip has no frame: tip twist for unit rates of the actuators.
+
+    Three rows for the velocity of the tip's centroid, m/m, and three for its angular velocity, rad/m, both
+    in the base frame.
+    """
+    X = truss.home if X is None else X
+    kinematics = Kinematics(truss, compiled=False)
+    kinematics.evaluate(X)
+    spin = kinematics.tip_spin if kinematics.has_tip_frame else None
+    return actuator_response(truss, _pose_rows(truss, truss.tip, truss.tip_weights, spin), X)
+
+
+def face_response(truss: Truss, X: Array | None = None) -> Array:
+    """Return (F - 1, 6, n_a): twists of the faces beyond the base's for unit rates of the actuators."""
+    X = truss.home if X is None else X
+    kinematics = Kinematics(truss, compiled=False)
+    kinematics.evaluate(X)
+    rows = [
+        _pose_rows(truss, truss.faces[k], truss.face_weights[k], kinematics.face_spin[k])
+        for k in range(1, len(truss.faces))
+    ]
+    return actuator_response(truss, np.concatenate(rows), X).reshape(len(rows), 6, -1)
+
+
+def trackable_coordinates(truss: Truss, *, face_stride: int = 1) -> tuple[str, ...]:
+    """Return what the faces of a truss can track at home at once, by rank; see ``Truss.trackable``.
+
+    Parameters
+    ----------
+    truss : Truss
+        Statically determinate, with faces.
+    face_stride : int
+        Take every `face_stride`-th face only.
+    """
+    if len(truss.faces) <= face_stride:
+        return ()
+    taken = slice(face_stride, None, face_stride)
+    response = face_response(truss)[face_stride - 1 :: face_stride]
+    turns = np.swapaxes(truss.face_frames[taken], 1, 2) @ response[:, 3:] * _size(truss)
+    local = np.concatenate([response[:, :3], turns], axis=1)
+    tracked: tuple[str, ...] = ()
+    for coordinate, count in (("position", 3), ("pointing", 5), ("orientation", 6)):
+        rows = local[:, :count].reshape(-1, local.shape[-1])
+        if rows.shape[0] > rows.shape[1] or _rank(rows) < rows.shape[0]:
+            break
+        tracked += (coordinate,)
+    return tracked
+
+
+def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
+    """Return the counts of a truss, its determinacy and what its tip can do.
+
+    Parameters
+    ----------
+    truss : Truss
+        Any truss.
+    X : (N, 3), optional
+        Node positions, m; home if not given.
+
+    Raises
+    ------
+    TrussError
+        The truss is not statically determinate.
+    """
+    report = check_determinacy(truss, X)
+    response = tip_response(truss, X)
+    scaled = response.copy()
+    scaled[3:] *= _size(truss)
+    left, values, _ = np.linalg.svd(scaled)
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
+    fixed = int(np.count_nonzero(~truss.actuated))
+    return TrussDescription(
+        module=truss.module,
+        bays=truss.bays,
+        nodes=truss.node_count,
+        base_nodes=int(np.count_nonzero(truss.base)),
+        fixed_members=fixed,
+        actuated_members=truss.member_count - fixed,
+        free_motions=report.coordinates - fixed,
+        trackable=truss.trackable,
+        face_stride=truss.face_stride,
+        determinacy=report,
+        tip_rank=rank,
+        tip_coordinates=len(response),
+        unreachable=tuple(_in_words(twist, truss) for twist in _roll_first(left[:, rank:], truss).T),
+    )
+
+
+def _pose_rows(truss: Truss, nodes: Index, weights: Array, spin: Array | None) -> Array:
+    """Return (6, N, 3) rows of a weighted centroid and its frame's spin, or (3, N, 3) without `spin`."""
+    rows = np.zeros((3 if spin is None else 6, truss.node_count, 3))
+    rows[:3, nodes] = weights[None, :, None] * np.eye(3)[:, None, :]
+    if spin is not None:
+        rows[3:, nodes] = spin.reshape(3, len(nodes), 3)
+    return rows
+
+
+def _size(truss: Truss) -> float:
+    """Length that makes angular velocities comparable with velocities, m."""
+    return float(np.ptp(truss.home, axis=0).max())
+
+
+def _rank(rows: Array) -> int:
+    values = np.linalg.svd(rows, compute_uv=False)
+    return int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
+
+
+def _roll_first(missing: Array, truss: Truss) -> Array:
+    """Return another orthonormal basis (columns) of the twists `missing`, roll first where it is one of them.
+
+    A singular value decomposition mixes roll with the other missing twists; a person wants to read it by
+    itself.
+    """
+    if len(missing) < 6:
+        return missing
+    roll = np.concatenate([np.zeros(3), truss.tip_frame[:, 2]])
+    if np.linalg.norm(roll @ missing) < 1.0 - 1e-9:
+        return missing
+    basis, _ = np.linalg.qr(np.column_stack([roll, missing]))
+    return np.column_stack([roll, basis[:, 1 : missing.shape[1]]])
+
+
+def _in_words(twist: Array, truss: Truss) -> str:
+    """Return the words for a `twist` of the tip: velocity, angular velocity times the truss's size."""
+    velocity, spin = twist[:3], twist[3:]
+    if np.linalg.norm(spin) < 1e-6:
+        return f"motion along {_vector(velocity)}"
+    turn = f"a turn about {_vector(spin / np.linalg.norm(spin))}"
+    if np.linalg.norm(velocity) > 1e-6:
+        return f"{turn} with motion along {_vector(velocity / np.linalg.norm(velocity))}"
+    if abs(spin @ truss.tip_frame[:, 2]) < (1.0 - 1e-6) * np.linalg.norm(spin):
+        return turn
+    return f"roll, {turn}{_ROLL_REASON if 'octahedral' in truss.module else ''}"
+
+
+def _vector(vector: Array) -> str:
+    rounded = np.round(vector, 3) + 0.0
+    return f"({rounded[0]:g}, {rounded[1]:g}, {rounded[2]:g})"

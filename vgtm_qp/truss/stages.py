@@ -1,0 +1,86 @@
+"""The order in which the nodes of a truss can be placed, by matching members to nodes."""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
+
+from vgtm_qp.errors import TrussError
+from vgtm_qp.truss.truss import Index, Mask
+
+
+def placement_stages(base: Mask, members: Index) -> Index:
+    """Return (N,) the stage of each node, -1 for base nodes; the stages are the smallest possible ones.
+
+    Every node is given three members that place it. A node depends on the other nodes of its members, and
+    the nodes that depend on one another, the strong components of that relation, are a stage: one node
+    where it hangs on three nodes placed before, all three of a face that must be placed at once. Dulmage &
+    Mendelsohn, Can. J. Math. 10 (1958): the components are the same for every such choice of members.
+
+    Parameters
+    ----------
+    base : (N,) bool
+        Which nodes are given.
+    members : (M, Q) int
+        Nodes that each member's length depends on, M = 3 (number of other nodes); the first two are its own.
+
+    Raises
+    ------
+    TrussError
+        The members cannot be shared out so that every node has three.
+    """
+    free = np.flatnonzero(~base)
+    place = np.full(len(base), -1, dtype=np.int64)
+    place[free] = np.arange(len(free))
+    owner = _owners(place[members[:, :2]], len(free))
+
+    other = place[members]
+    source = np.broadcast_to(owner[:, None], other.shape)
+    linked = (other >= 0) & (other != source)
+    links = sparse.csr_array(
+        (np.ones(int(linked.sum())), (source[linked], other[linked])), shape=(len(free), len(free))
+    )
+    count, component = connected_components(links, connection="strong")
+
+    needs: list[set[int]] = [set() for _ in range(count)]
+    serves: list[set[int]] = [set() for _ in range(count)]
+    start, end = links.nonzero()
+    for a, b in zip(component[start].tolist(), component[end].tolist(), strict=True):
+        if a != b:
+            needs[a].add(b)
+            serves[b].add(a)
+    first = np.full(count, len(free))
+    np.minimum.at(first, component, np.arange(len(free)))
+    ready = [(int(first[c]), c) for c in range(count) if not needs[c]]
+    heapq.heapify(ready)
+    order = np.empty(count, dtype=np.int64)
+    for position in range(count):
+        _, done = heapq.heappop(ready)
+        order[done] = position
+        for c in serves[done]:
+            needs[c].discard(done)
+            if not needs[c]:
+                heapq.heappush(ready, (int(first[c]), c))
+
+    stage = np.full(len(base), -1, dtype=np.int64)
+    stage[free] = order[component]
+    return stage
+
+
+def _owners(ends: Index, count: int) -> Index:
+    """Return (M,) the free node that each member places, three to a node; `ends` are -1 at base nodes."""
+    rows, columns = np.nonzero(ends >= 0)
+    nodes = ends[rows, columns]
+    thrice = 3 * nodes[:, None] + np.arange(3)
+    graph = sparse.csr_array(
+        (np.ones(thrice.size), (np.repeat(rows, 3), thrice.reshape(-1))), shape=(len(ends), 3 * count)
+    )
+    match = maximum_bipartite_matching(graph, perm_type="column")
+    if len(ends) != 3 * count or (match < 0).any():
+        raise TrussError(
+            "the members cannot be shared out three to each free node: some part of the truss has too many"
+        )
+    return np.asarray(match // 3, dtype=np.int64)
