@@ -1,8 +1,7 @@
-"""Polynomials in Bernstein form on [0, 1]: basis tables, subdivision, products and safeguarded roots."""
+"""Polynomials in Bernstein form on [0, 1]: basis tables, subdivision and products."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from math import comb, perm
 
@@ -10,8 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-
-_NEWTON_STEPS = 100
 
 
 @cache
@@ -62,35 +59,7 @@ def _product(p: int, q: int) -> Array:
 
 
 def inner_product(a: Array, b: Array) -> Array:
-    """Dot product (..., p + q + 1) of the vector polynomials (..., p + 1, 3) and (..., q + 1, 3)."""
+    """Dot product (..., p + q + 1) of the vector polynomials (..., p + 1, n) and (..., q + 1, n)."""
     return np.asarray(
         np.einsum("kij,...ij->...k", _product(a.shape[-2] - 1, b.shape[-2] - 1), a @ np.swapaxes(b, -1, -2))
     )
-
-
-def increasing_roots(function: Callable[[Array], tuple[Array, Array]], low: Array, high: Array) -> Array:
-    """Roots of many functions at once, each negative at its `low` and positive at its `high`.
-
-    Newton's method, with bisection wherever a step leaves the bracket or shrinks by less than half.
-
-    Parameters
-    ----------
-    function : callable
-        Maps x of shape (n,) to values and slopes, both (n,).
-    low, high : (n,)
-        Brackets.
-    """
-    x = (low + high) / 2
-    previous = high - low
-    for _ in range(_NEWTON_STEPS):
-        value, slope = function(x)
-        low, high = np.where(value < 0, x, low), np.where(value < 0, high, x)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            newton = x - value / slope
-        good = (newton >= low) & (newton <= high) & (np.abs(newton - x) <= previous / 2)
-        new = np.where(good, newton, (low + high) / 2)
-        previous = np.abs(new - x)
-        x = new
-        if np.all(previous <= 2e-16):
-            break
-    return np.asarray(x)

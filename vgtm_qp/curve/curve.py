@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.curve.bernstein import Array, basis, increasing_roots
+from vgtm_qp.curve.bernstein import Array, basis
 from vgtm_qp.curve.families import CurveFamily
+from vgtm_qp.curve.roots import increasing_roots
 from vgtm_qp.errors import CurveError
 
 _FRAME_STEPS_PER_CELL = 4

@@ -1,4 +1,4 @@
-"""What a quadratic program needs of a curve: constant tables at its nodes, and its end conditions linear in p."""
+"""What a quadratic program takes from a curve: constant tables at its nodes, end conditions linear in p."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def base_conditions(control_vertices: int, center: ArrayLike, frame: ArrayLike) 
 
     Notes
     -----
-    Eq. (37) holds the tip only. These five rows say that the curve begins at the base along its normal; that p_1 is
-    on the outer side of the base is an inequality which a curve that starts so keeps in small steps.
+    Eq. (37) holds the tip only. These five rows say that the curve begins at the base, along its normal. That
+    p_1 is on the outer side is no equation: a curve that starts so keeps it in small steps.
     """
     center, across = np.asarray(center, dtype=float), np.asarray(frame, dtype=float)[:, :2].T
     matrix = np.zeros((5, 3 * control_vertices))
