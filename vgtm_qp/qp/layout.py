@@ -8,29 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.problem.method import Weights
 from vgtm_qp.truss.kinematics import member_nodes
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Null-space weights: each multiplies half a squared displacement in metres (radians), so it has unit 1/m^2.
-
-    ``node_rate`` is the metric on node displacements and must be positive: it makes the QP strictly convex.
-    ``progress`` is the reward for moving the tip on, per squared metre of wanted motion; an exact penalty.
-    """
-
-    node_rate: float = 1.0
-    actuator_rate: float = 0.02
-    stroke_centring: float = 0.02
-    curve_rate: float = 0.02
-    tracking: float = 0.1
-    tangent: float = 0.05
-    smoothness: float = 0.001
-    progress: float = 1e3
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.curve.families import CurveFamily, make_family
+from vgtm_qp.errors import Mistake, ProblemError
+from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.step.attempt import Solver
+from vgtm_qp.qp.solvers import StepSolver, make_solver
+from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
+from vgtm_qp.truss.build import build_truss
 from vgtm_qp.truss.kinematics import Kinematics
 from vgtm_qp.truss.truss import Truss
 
@@ -38,7 +45,7 @@ class Arm:
     kinematics: Kinematics
     layout: Layout
     task: TipTask
-    solver: Solver
+    solver: StepSolver
     monitor: Clearance
     home_lengths: Array
     control_vertices: Array
@@ -55,3 +62,117 @@ class Arm:
             lengths=frozen(self.home_lengths),
             length_rates=frozen(np.zeros(self.truss.member_count)),
         )
+
+
+def build_arm(problem: Problem) -> Arm:
+    """Return the arm of a problem, ready to move.
+
+    Raises
+    ------
+    ProblemError
+        The problem asks for what this arm cannot do at all; each mistake is named.
+    TrussError
+        The truss is not statically determinate.
+    """
+    _check_supported(problem)
+    truss = build_truss(problem.truss)
+    kinematics = Kinematics(truss)
+    kinematics.evaluate(truss.home)
+    task = TipTask(problem.end_effector.track, kinematics)
+    layout, control_vertices = _layout(problem, truss, task)
+    clearance = problem.clearance
+    monitor = Clearance(
+        truss.members,
+        truss.radius,
+        [make_obstacle(obstacle) for obstacle in problem.obstacle],
+        safe=clearance.safe,
+        influence=clearance.influence,
+        self_collision=clearance.self_collision,
+        member_names=truss.member_names,
+    )
+    return Arm(
+        truss=truss,
+        kinematics=kinematics,
+        layout=layout,
+        task=task,
+        solver=make_solver(problem.method.solver, layout),
+        monitor=monitor,
+        home_lengths=truss.home_lengths,
+        control_vertices=control_vertices,
+        safe=clearance.safe,
+        influence=clearance.influence,
+        dt=step_duration(problem.maneuver),
+    )
+
+
+def _check_supported(problem: Problem) -> None:
+    """Refuse, in one message, the parts of the contract that no method here serves."""
+    mistakes = []
+    if problem.truss is None:
+        mistakes.append(problem.mistake(("arm",), "[truss]; serial arms are not available in this version"))
+    elif problem.truss.module == "plate":
+        modules = "octahedral, double-octahedral, hexapod, longeron, tetrahedral or graph"
+        mistakes.append(problem.mistake(("truss", "module"), f"{modules}; plates are not available in this version"))
+    if problem.maneuver.kind != "path":
+        mistakes.append(problem.mistake(("maneuver", "kind"), '"path"; deployment is not available in this version'))
+    if mistakes:
+        raise ProblemError(str(problem.source or problem.name), mistakes)
+
+
+def make_obstacle(spec: Any) -> shapes.Obstacle:
+    """Return the obstacle of one ``[[obstacle]]`` table."""
+    rotation = rotation_from_vector(spec.rotation_vector)
+    if spec.shape == "box":
+        return shapes.box(spec.name, spec.center, spec.size, rotation, spec.velocity)
+    if spec.shape == "sphere":
+        return shapes.sphere(spec.name, spec.center, spec.radius, spec.velocity)
+    if spec.shape == "cylinder":
+        return shapes.cylinder(spec.name, spec.center, spec.radius, spec.height, rotation, spec.velocity)
+    return shapes.mesh(spec.name, spec.file, spec.center, rotation, spec.scale, spec.velocity)
+
+
+def _layout(problem: Problem, truss: Truss, task: TipTask) -> tuple[Layout, Array]:
+    """Return the QP's layout and the control vertices of the curve at home, (V, 3)."""
+    method = problem.method
+    if method.tracking == "none" or not len(truss.faces) or problem.curve is None:
+        empty = np.zeros((0, 0))
+        layout = Layout(truss, empty, empty, np.zeros(0, dtype=np.int64), task.row_names, method.weights)
+        return layout, np.zeros((0, 3))
+    spec = problem.curve
+    options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
+    family = make_family(spec.family, spec.control_vertices, **options)
+    centres = np.einsum("fk,fkc->fc", truss.face_weights, truss.home[truss.faces])
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
+    s = travelled[1:] / travelled[-1]
+    layout = Layout(
+        truss,
+        family.weights(s),
+        family.weights(s, 1),
+        np.arange(1, len(truss.faces)),
+        task.row_names,
+        method.weights,
+        hard_tracking=method.hard_tracking,
+    )
+    return layout, _fitted_vertices(family, s, centres)
+
+
+def _fitted_vertices(family: CurveFamily, s: Array, centres: Array) -> Array:
+    """Return the control vertices (V, 3) at home: on the straight axis, or fitted to the faces of a bent arm."""
+    start, end = centres[0], centres[-1]
+    vertices = start + np.outer(family.abscissae, end - start)
+    bent = np.max(np.abs(np.vstack([family.weights(0.0), family.weights(s)]) @ vertices - centres))
+    if bent > 1e-9 * float(np.linalg.norm(end - start)):
+        weights = family.weights(s)
+        second = np.diff(np.eye(len(vertices)), n=2, axis=0)
+        system = np.vstack([weights[:, 1:], 1e-3 * second[:, 1:]])
+        known = np.vstack([centres[1:] - np.outer(weights[:, 0], start), -1e-3 * np.outer(second[:, 0], start)])
+        vertices = np.vstack([start, np.linalg.lstsq(system, known, rcond=None)[0]])
+    return np.asarray(vertices)
+
+
+def step_duration(maneuver: Any) -> float:
+    """Return the nominal duration of a step, s."""
+    if hasattr(maneuver, "waypoint"):
+        return float(maneuver.waypoint[-1].time) / int(maneuver.steps)
+    times = np.asarray(read_path(maneuver.path).time)
+    return float(np.mean(np.diff(times))) if len(times) > 1 else float(times[0] or 1.0)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +12,12 @@ from scipy.linalg.lapack import dgesv
 from vgtm_qp.errors import SolverError
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.condensed import InfeasibleStepError
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.step.linearise import Linearisation, Target, clearance_rows
 from vgtm_qp.step.state import State
 
 Array = NDArray[np.float64]
-
-
-class Solver(Protocol):
-    """What solves the QP of a step."""
-
-    def solve(self, numbers: StepNumbers) -> StepSolution:
-        """Return the solution, or raise ``InfeasibleStepError`` or ``SolverError``."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -101,7 +92,7 @@ class Attempt:
     def __init__(
         self,
         linearisation: Linearisation,
-        solver: Solver,
+        solver: StepSolver,
         monitor: Clearance,
         safe: float,
         influence: float,

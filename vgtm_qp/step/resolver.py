@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.errors import GoalError
-from vgtm_qp.qp.layout import Layout
-from vgtm_qp.step.arm import Arm
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.attempt import Attempt, Outcome
 from vgtm_qp.step.limits import length_box
 from vgtm_qp.step.linearise import Linearisation, Target
@@ -47,6 +47,8 @@ class Step:
         Multiplier of each active row.
     reason : str
         Why the step was cut, empty where it was not.
+    qps : int
+        QPs solved.
     """
 
     status: StepStatus
@@ -56,15 +58,18 @@ class Step:
     multipliers: dict[str, float]
     reason: str
     qps: int
-    seconds: float = 0.0
+
+    @property
+    def blocked_by(self) -> tuple[str, ...]:
+        """Names of the obstacles, members and limits that held the arm back; the reason where there are none."""
+        return self.active or ((self.reason,) if self.reason else ())
 
 
 class Resolver:
     """Moves one arm step by step. Not to be shared by threads: use one per thread."""
 
-    def __init__(self, arm: Arm) -> None:
-        self.arm = arm
-        self.layout: Layout = arm.layout
+    def __init__(self, problem: Problem | Arm) -> None:
+        self.arm = arm = problem if isinstance(problem, Arm) else build_arm(problem)
         self._linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
         self._attempt = Attempt(self._linearisation, arm.solver, arm.monitor, arm.safe, arm.influence)
         self.state = arm.home_state()

@@ -1,0 +1,89 @@
+"""The path of a maneuver and the marks on it at which its steps end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import Mistake, ProblemError
+from vgtm_qp.problem import Problem, read_path
+from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
+from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Where the tip goes, in steps.
+
+    Attributes
+    ----------
+    path : Path
+        Poses over time, from the home pose at time 0, s.
+    marks : (S,)
+        Times at which the steps end if nothing slows them, s.
+    """
+
+    path: Path
+    marks: Array
+
+
+def make_plan(problem: Problem, position: Array, rotation: Array) -> Plan:
+    """Return the plan of a problem's maneuver from the home pose of the tip, `position` (3,) and `rotation` (3, 3).
+
+    Raises
+    ------
+    ProblemError
+        The maneuver is of a kind that has no path, or its file is wrong.
+    """
+    maneuver = problem.maneuver
+    if isinstance(maneuver, WaypointManeuver):
+        return _through_waypoints(maneuver, position, rotation)
+    if isinstance(maneuver, PathManeuver):
+        return _along_file(maneuver, position, rotation)
+    mistake = Mistake(
+        "maneuver.kind", '"deployment"', 'a path: "path" (deployment is not available in this version)'
+    )
+    raise ProblemError(str(problem.source or problem.name), [mistake])
+
+
+def _through_waypoints(maneuver: WaypointManeuver, position: Array, rotation: Array) -> Plan:
+    times, positions, rotations = [0.0], [position], [rotation]
+    for waypoint in maneuver.waypoint:
+        times.append(waypoint.time)
+        positions.append(
+            positions[-1] if waypoint.position is None else np.asarray(waypoint.position, dtype=float)
+        )
+        turned = rotations[-1]
+        if waypoint.pointing is not None:
+            wanted = np.asarray(waypoint.pointing, dtype=float)
+            turned = (
+                rotation_from_vector(turn_between(turned[:, 2], wanted / np.linalg.norm(wanted))) @ turned
+            )
+        elif waypoint.rotation_vector is not None:
+            turned = rotation_from_vector(waypoint.rotation_vector)
+        rotations.append(turned)
+    marks = times[-1] * np.arange(1, maneuver.steps + 1) / maneuver.steps
+    return Plan(Path(np.array(times), np.stack(positions), np.stack(rotations)), marks)
+
+
+def _along_file(maneuver: PathManeuver, position: Array, rotation: Array) -> Plan:
+    table = read_path(maneuver.path)
+    interval = float(np.mean(np.diff(table.time))) if len(table.time) > 1 else 1.0
+    approach = max(maneuver.approach_steps, 1)
+    duration = maneuver.approach_time or approach * interval
+    if not maneuver.approach_steps and table.time[0] > 0.0:
+        duration = float(table.time[0])
+    rows = duration + (table.time - table.time[0])
+    rotations = np.broadcast_to(rotation, (len(rows), 3, 3))
+    if table.rotation_vector is not None:
+        rotations = np.stack([rotation_from_vector(vector) for vector in table.rotation_vector])
+    path = Path(
+        np.concatenate([[0.0], rows]),
+        np.vstack([position, table.position]),
+        np.concatenate([rotation[None], rotations]),
+    )
+    return Plan(path, np.concatenate([duration * np.arange(1, approach) / approach, rows]))

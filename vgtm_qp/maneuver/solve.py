@@ -1,0 +1,182 @@
+"""The maneuver loop: step after step along the plan until it is done or no safe step is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.maneuver.manifest import arm_record, make_manifest, mesh_record
+from vgtm_qp.maneuver.plan import Plan, make_plan
+from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.resolver import Resolver, Step, StepStatus
+
+Array = NDArray[np.float64]
+
+_STALLED_PROGRESS = 1e-3
+_STALLED_STEPS = 10
+
+Progress = Callable[[float, Step], None]
+
+
+@dataclass
+class _Record:
+    """The rows of the result, grown step by step."""
+
+    rows: dict[str, list[Any]] = field(default_factory=dict)
+
+    def add(self, **values: Any) -> None:
+        for name, value in values.items():
+            self.rows.setdefault(name, []).append(value)
+
+    def array(self, name: str) -> Array:
+        return np.asarray(self.rows[name], dtype=float)
+
+
+def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = True) -> Maneuver:
+    """Solve a problem and return the maneuver, certified unless `verify` is False.
+
+    Parameters
+    ----------
+    problem
+        What `load_problem` returns.
+    progress
+        Called after each step with the part of the path that was covered, 0 to 1, and the step. An interrupt while
+        it runs, or in the loop, ends the maneuver there with what was solved.
+    verify
+        Check the result again from its nodes alone.
+
+    Raises
+    ------
+    ProblemError, TrussError, SolverError
+        The problem cannot be set up; no step was taken.
+    """
+    started = perf_counter()
+    resolver = Resolver(problem)
+    plan = make_plan(problem, *resolver.tip())
+    record = _Record()
+    _add_state(record, resolver, plan, 0.0, 0.0, dict.fromkeys(resolver.phases, 0.0))
+    setup_time = perf_counter() - started
+
+    status, blocked_by = "solved", ()
+    try:
+        last = _run(resolver, plan, record, progress)
+    except KeyboardInterrupt:
+        status, blocked_by = "blocked", ("interrupted",)
+    else:
+        if last is not None:
+            status, blocked_by = "blocked", last.blocked_by
+    maneuver = _assemble(problem, resolver, record, status, blocked_by, setup_time)
+    if not verify:
+        return maneuver
+    from vgtm_qp.verify import verify as check
+
+    return maneuver.with_certificate(check(maneuver))
+
+
+def _run(resolver: Resolver, plan: Plan, record: _Record, progress: Progress | None) -> Step | None:
+    """Step along the plan; return the step at which the arm stopped for good, or None where it came through."""
+    value, start, end = plan.path.start, plan.path.start, plan.path.end
+    stalled = 0
+    for k, mark in enumerate(plan.marks):
+        dt = float(mark - (plan.marks[k - 1] if k else start))
+        while value < mark:
+            before, clock = dict(resolver.phases), perf_counter()
+            step = resolver.follow(plan.path, value, float(mark), dt=dt)
+            seconds = perf_counter() - clock
+            if step.status is StepStatus.BLOCKED:
+                return step
+            value = (
+                float(mark)
+                if step.status is StepStatus.REACHED
+                else value + step.progress * (float(mark) - value)
+            )
+            phases = {name: total - before[name] for name, total in resolver.phases.items()}
+            _add_state(record, resolver, plan, value, seconds, phases)
+            stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
+            if stalled >= _STALLED_STEPS:
+                return step
+            if progress is not None:
+                progress((value - start) / (end - start), step)
+    return None
+
+
+def _add_state(
+    record: _Record, resolver: Resolver, plan: Plan, value: float, seconds: float, phases: dict[str, float]
+) -> None:
+    state, monitor = resolver.state, resolver.arm.monitor
+    position, rotation = resolver.tip()
+    target = plan.path.at(value)
+    record.add(
+        time=state.time,
+        nodes=state.nodes,
+        member_lengths=state.lengths,
+        control_vertices=state.control_vertices,
+        tip_position=position,
+        tip_rotation=rotation,
+        tip_target_position=target.position,
+        tip_target_rotation=target.rotation,
+        clearance=monitor.least(state.nodes, state.time, among="obstacles")[0],
+        self_clearance=monitor.least(state.nodes, state.time, among="members")[0],
+        progress=(value - plan.path.start) / (plan.path.end - plan.path.start),
+        step_time=seconds,
+        phase_time=list(phases.values()),
+    )
+
+
+def _assemble(
+    problem: Problem,
+    resolver: Resolver,
+    record: _Record,
+    status: str,
+    blocked_by: tuple[str, ...],
+    setup_time: float,
+) -> Maneuver:
+    truss, task = resolver.arm.truss, resolver.arm.task
+    meshes = {
+        obstacle.name: mesh_record(obstacle.file, len(pieces.pieces))
+        for obstacle, pieces in zip(problem.obstacle, resolver.arm.monitor.obstacles, strict=True)
+        if obstacle.shape == "mesh"
+    }
+    reached = float(record.rows["progress"][-1])
+    manifest = make_manifest(
+        problem.to_dict(),
+        arm_record(truss),
+        status=status,
+        reached=reached,
+        blocked_by=blocked_by,
+        method=problem.method.name,
+        solver=problem.method.solver,
+        setup_time=setup_time,
+        directory=Path(problem.source).parent if problem.source else Path.cwd(),
+        meshes=meshes,
+    )
+    rotation = record.array("tip_target_rotation")
+    count = len(record.rows["time"])
+    return Maneuver(
+        time=record.array("time"),
+        nodes=record.array("nodes"),
+        members=truss.members,
+        member_names=np.array(truss.member_names),
+        member_actuated=truss.actuated,
+        member_lengths=record.array("member_lengths"),
+        control_vertices=record.array("control_vertices").reshape(count, -1, 3),
+        tip_position=record.array("tip_position"),
+        tip_rotation=record.array("tip_rotation"),
+        tip_target_position=record.array("tip_target_position"),
+        clearance=record.array("clearance"),
+        self_clearance=record.array("self_clearance"),
+        progress=record.array("progress"),
+        step_time=record.array("step_time"),
+        phase_names=np.array(list(resolver.phases)),
+        phase_time=record.array("phase_time"),
+        manifest=manifest,
+        tip_target_rotation=rotation if task.turns == "orientation" else None,
+        tip_target_pointing=rotation[:, :, 2] if task.turns == "pointing" else None,
+    )
