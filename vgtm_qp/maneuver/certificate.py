@@ -1,0 +1,179 @@
+"""What a verification found: each measured quantity beside the tolerance that it was held against."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+from vgtm_qp.errors import ResultError
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One measured quantity.
+
+    Attributes
+    ----------
+    value : float or None
+        The worst value over the maneuver; None where there is nothing to measure (no obstacle, not tracked).
+    unit : str
+        Its unit.
+    bound : float or None
+        What it is held against; None where it is only reported.
+    side : "most" or "least"
+        Whether `bound` is the greatest or the least value allowed.
+    where : str
+        The state or step, the member and the obstacle of the worst value.
+    """
+
+    value: float | None
+    unit: str
+    bound: float | None = None
+    side: Literal["most", "least"] = "most"
+    where: str = ""
+
+    def __post_init__(self) -> None:
+        """Keep `value` finite: an infinite clearance is nothing to measure, all else is a failure."""
+        if self.value is None or math.isfinite(self.value):
+            return
+        nothing_near = self.side == "least" and self.value > 0.0
+        worst = sys.float_info.max * (-1.0 if self.side == "least" else 1.0)
+        object.__setattr__(self, "value", None if nothing_near else worst)
+
+    @property
+    def ok(self) -> bool:
+        """True where the value is within its bound, or there is no value or no bound."""
+        if self.value is None or self.bound is None:
+            return True
+        return self.value <= self.bound if self.side == "most" else self.value >= self.bound
+
+    def __str__(self) -> str:
+        value = "-" if self.value is None else f"{self.value:.6g} {self.unit}".rstrip()
+        bound = "" if self.bound is None else f"  (at {self.side} {self.bound:.9g})"
+        return f"{value}{bound}{'  ' + self.where if self.where else ''}"
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Result of ``verify``: worst values over all states of a maneuver, and between them.
+
+    A clearance is a surface distance: never less than ``-member radius``, the value of a member whose axis
+    touches an obstacle. Clearances between states are proven lower bounds, at most 1e-6 m below the least
+    distance.
+
+    Attributes
+    ----------
+    member_error : Measure
+        Greatest deviation of a fixed or locked member from its length, m.
+    base_error : Measure
+        Greatest motion of a base node away from where the problem holds it, m.
+    stroke_violation, rate_violation, acceleration_violation : Measure
+        How far actuated members pass their limits, m, m/s and m/s^2; zero where they keep them.
+    clearance, clearance_between : Measure
+        Least distance from members to obstacles at the states, and a lower bound of it between them, m.
+    self_clearance, self_clearance_between : Measure
+        The same between members that share no node, m.
+    member_angle : Measure
+        Least angle between members that share a node, rad.
+    tip_error : Measure
+        Greatest distance of the tip from its target over the tracked axes, m.
+    tip_direction_error : Measure
+        Greatest angle between tip and target direction or orientation, rad.
+    target_error : Measure
+        Greatest distance of a tip target from the path that the problem asks for, m.
+    array_error : Measure
+        Greatest difference between a stored array and the same recomputed from the nodes, m.
+    length_singular_value : Measure
+        Least singular value of the square length Jacobian along the maneuver.
+    tip_singular_value : Measure
+        Least singular value of the tip's translation with respect to the actuated lengths, m/m.
+    tip_error_per_millimetre : Measure
+        Greatest singular value of the same: mm at the tip for actuator errors whose squares sum to 1 mm^2.
+    contradictions : tuple of str
+        What in the file disagrees with itself or with its problem, one line each.
+    notes : tuple of str
+        What could not be checked, and why.
+    """
+
+    member_error: Measure
+    base_error: Measure
+    stroke_violation: Measure
+    rate_violation: Measure
+    acceleration_violation: Measure
+    clearance: Measure
+    clearance_between: Measure
+    self_clearance: Measure
+    self_clearance_between: Measure
+    member_angle: Measure
+    tip_error: Measure
+    tip_direction_error: Measure
+    target_error: Measure
+    array_error: Measure
+    length_singular_value: Measure
+    tip_singular_value: Measure
+    tip_error_per_millimetre: Measure
+    contradictions: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def measures(self) -> dict[str, Measure]:
+        """All measures by name."""
+        return {f.name: value for f in fields(self) if isinstance(value := getattr(self, f.name), Measure)}
+
+    @property
+    def ok(self) -> bool:
+        """True where every measure is within its tolerance and nothing contradicts."""
+        return not self.failures()
+
+    def failures(self) -> tuple[str, ...]:
+        """Return one line for each measure outside its tolerance and each contradiction."""
+        broken = [f"{_label(name)}: {measure}" for name, measure in self.measures.items() if not measure.ok]
+        return (*broken, *self.contradictions)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data that strict JSON can hold; `from_dict` reads it back."""
+        measures = {
+            name: {f.name: getattr(measure, f.name) for f in fields(measure)}
+            for name, measure in self.measures.items()
+        }
+        return {
+            "ok": self.ok,
+            **measures,
+            "contradictions": list(self.contradictions),
+            "notes": list(self.notes),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Certificate:
+        """Read what `to_dict` wrote.
+
+        Raises
+        ------
+        ResultError
+            A measure is missing or is not one.
+        """
+        texts = {"contradictions", "notes"}
+        try:
+            values: dict[str, Any] = {
+                f.name: tuple(data[f.name]) if f.name in texts else Measure(**data[f.name])
+                for f in fields(cls)
+            }
+            return cls(**values)
+        except (KeyError, TypeError) as error:
+            raise ResultError(f"the certificate is not complete: {error}") from None
+
+    def __str__(self) -> str:
+        rows = [
+            f"{'ok  ' if measure.ok else 'FAIL'}  {_label(name):<26}  {measure}"
+            for name, measure in self.measures.items()
+        ]
+        rows += [f"FAIL  {line}" for line in self.contradictions]
+        rows += [f"note  {line}" for line in self.notes]
+        return "\n".join(rows)
+
+
+def _label(name: str) -> str:
+    return name.replace("_", " ")

@@ -1,0 +1,203 @@
+"""The manifest of a result file: problem, arm, outcome and versions as strict JSON data."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import ResultError
+from vgtm_qp.maneuver.certificate import Certificate
+
+if TYPE_CHECKING:
+    from vgtm_qp.truss.truss import Truss
+
+SCHEMA_VERSION = 1
+"""Version of the result file that this package writes and reads."""
+
+STATUSES = ("solved", "blocked", "infeasible")
+
+_MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "blocked_by", "versions")
+
+
+def make_manifest(
+    problem: Mapping[str, Any],
+    arm: Mapping[str, Any],
+    *,
+    status: str,
+    reached: float,
+    blocked_by: Iterable[str] = (),
+    method: str,
+    solver: str,
+    setup_time: float,
+    directory: str | Path = ".",
+    meshes: Mapping[str, Mapping[str, Any]] | None = None,
+    path: Sequence[Sequence[float]] | None = None,
+) -> dict[str, Any]:
+    """Return the manifest of a result file.
+
+    Parameters
+    ----------
+    problem : mapping
+        The whole problem as JSON data, in the form of the problem file.
+    arm : mapping
+        What `arm_record` returns.
+    status : str
+        One of `STATUSES`.
+    reached : float
+        How far along the path, 0 to 1.
+    blocked_by : iterable of str
+        Names of what stopped it.
+    method, solver : str
+        As in the problem's ``[method]``.
+    setup_time : float
+        s.
+    directory : path
+        Where the relative paths of the problem start.
+    meshes : mapping, optional
+        What `mesh_record` returns for each mesh obstacle, by the obstacle's name.
+    path : (K, 3), optional
+        The positions in the problem's path file, m, so that the result can be verified without it.
+    """
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "problem": dict(problem),
+        "arm": dict(arm),
+        "status": status,
+        "reached": float(reached),
+        "blocked_by": list(blocked_by),
+        "method": method,
+        "solver": solver,
+        "setup_time": float(setup_time),
+        "directory": str(Path(directory).resolve()),
+        "meshes": {name: dict(record) for name, record in (meshes or {}).items()},
+        "path": None if path is None else [[float(number) for number in row] for row in path],
+        "versions": _versions(),
+        "certificate": None,
+    }
+
+
+def arm_record(truss: Truss) -> dict[str, Any]:
+    """Return what verification needs to know of `truss`, as JSON data; no limit is None.
+
+    Keys: ``module``, ``bays``, ``node_names``, ``home`` (N, 3), ``base`` (indices of given nodes),
+    ``member_names``, ``actuated``, ``length`` (M, at home), ``stroke`` (M, 2), ``rate``, ``acceleration``,
+    ``radius`` (M), ``tip`` (``nodes``, ``weights``, ``frame`` at home) and ``joints``
+    (``triangle``, ``offset``, see ``truss.Joints``; None for pin joints). Lengths in m.
+    """
+    joints = truss.joints
+    ends = truss.home[truss.members]
+    pin_lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    return {
+        "module": truss.module,
+        "bays": truss.bays,
+        "node_names": list(truss.node_names),
+        "home": truss.home.tolist(),
+        "base": np.flatnonzero(truss.base).tolist(),
+        "member_names": list(truss.member_names),
+        "actuated": truss.actuated.tolist(),
+        "length": (pin_lengths if joints is None else truss.home_lengths).tolist(),
+        "stroke": truss.stroke.tolist(),
+        "rate": _or_none(truss.rate),
+        "acceleration": _or_none(truss.acceleration),
+        "radius": truss.radius.tolist(),
+        "tip": {
+            "nodes": truss.tip.tolist(),
+            "weights": truss.tip_weights.tolist(),
+            "frame": truss.tip_frame.tolist(),
+        },
+        "joints": None
+        if joints is None
+        else {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
+    }
+
+
+def mesh_record(path: str | Path, triangles: int) -> dict[str, Any]:
+    """Return what ties a result to a mesh file: its SHA-256 and the number of its triangles."""
+    return {"sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(), "triangles": int(triangles)}
+
+
+def _or_none(limits: NDArray[np.float64]) -> list[float | None]:
+    return [limit if math.isfinite(limit) else None for limit in limits.tolist()]
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
+    for package in (
+        "vgtm-qp",
+        "numpy",
+        "casadi",
+        "daqp",
+        "osqp",
+        "piqp",
+        "python-fcl",
+        "qpsolvers",
+        "trimesh",
+    ):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def check_manifest(manifest: Any) -> dict[str, Any]:
+    """Return a copy of `manifest` that is plain strict JSON, or raise ResultError."""
+    if not isinstance(manifest, Mapping):
+        raise ResultError("the manifest is not a JSON object")
+    if manifest.get("schema_version") != SCHEMA_VERSION:
+        raise ResultError(
+            f"schema version {manifest.get('schema_version')!r}; this package reads version {SCHEMA_VERSION}"
+        )
+    missing = [key for key in _MANIFEST_KEYS if key not in manifest]
+    if missing:
+        raise ResultError(f"the manifest lacks {', '.join(missing)}")
+    copy: dict[str, Any] = json.loads(dump_manifest(manifest))
+    for key in ("problem", "arm", "versions"):
+        if not isinstance(copy[key], dict):
+            raise ResultError(f"manifest.{key} is not a JSON object")
+    if copy["status"] not in STATUSES:
+        raise ResultError(f"manifest.status is {copy['status']!r}; expected one of {', '.join(STATUSES)}")
+    reached = copy["reached"]
+    if isinstance(reached, bool) or not isinstance(reached, int | float) or not 0.0 <= reached <= 1.0:
+        raise ResultError(f"manifest.reached is {reached!r}; expected a number from 0 to 1")
+    names = copy["blocked_by"]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ResultError("manifest.blocked_by is not a list of names")
+    if copy.get("certificate") is not None:
+        if not isinstance(copy["certificate"], dict):
+            raise ResultError("manifest.certificate is not a JSON object")
+        Certificate.from_dict(copy["certificate"])
+    return copy
+
+
+def dump_manifest(manifest: Mapping[str, Any]) -> str:
+    """Return the one text of `manifest`; ResultError where strict JSON cannot hold it."""
+    try:
+        return json.dumps(
+            manifest, allow_nan=False, sort_keys=True, separators=(",", ":"), ensure_ascii=False
+        )
+    except (TypeError, ValueError) as error:
+        raise ResultError(f"the manifest is not strict JSON: {error}") from None
+
+
+def parse_manifest(array: NDArray[Any]) -> Any:
+    """Return the JSON data in the ``manifest`` array of a result file; ResultError where it is none."""
+    if array.dtype.kind != "U" or array.ndim != 0:
+        raise ResultError("the manifest is not one string")
+
+    def refuse(constant: str) -> None:
+        raise ResultError(f"the manifest holds {constant}, which strict JSON has not")
+
+    try:
+        return json.loads(str(array), parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise ResultError(f"the manifest is not JSON: {error}") from None

@@ -1,0 +1,243 @@
+"""The arm's geometry from its record in the manifest: member ends, tip frame, Jacobians, in plain NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import ResultError
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_DENSE_UNKNOWNS = 300
+"""Above this many free coordinates singular values come from a sparse factorisation."""
+
+
+class Arm:
+    """A truss as the manifest records it (``arm_record``).
+
+    Attributes
+    ----------
+    members : (M, 2) int
+        The two nodes of each member.
+    home : (N, 3)
+        Home positions of the nodes, m.
+    base, free : (N_c,) int, (N - N_c,) int
+        Given nodes, and the others.
+    actuated : (M,) bool
+        True where a member changes its length.
+    length, stroke, rate, acceleration, radius : (M,), (M, 2), (M,), (M,), (M,)
+        Home lengths and limits; inf where there is no limit.
+    triangle, offset : (N, 3) int or (N, 1) int, (M, 2, 3)
+        Nodes that orient each node's joint, and the members' ends in the joint frames, eqs. (12)-(13); the
+        node alone and zeros for pin joints.
+    """
+
+    def __init__(self, record: Mapping[str, Any], members: Index) -> None:
+        count = len(members)
+        try:
+            self.home = _numbers(record, "home", (None, 3))
+            nodes = len(self.home)
+            self.base = _indices(record["base"], "base", nodes)
+            self.member_names = tuple(str(name) for name in record["member_names"])
+            self.actuated = np.asarray(record["actuated"], dtype=np.bool_)
+            self.length = _numbers(record, "length", (count,))
+            self.stroke = _numbers(record, "stroke", (count, 2))
+            self.rate = _numbers(record, "rate", (count,))
+            self.acceleration = _numbers(record, "acceleration", (count,))
+            self.radius = _numbers(record, "radius", (count,))
+            tip, joints = record["tip"], record["joints"]
+            self.tip = _indices(tip["nodes"], "tip.nodes", nodes)
+            self.tip_weights = _numbers(tip, "weights", (len(self.tip),))
+            self.tip_frame = _numbers(tip, "frame", (3, 3))
+            if joints is None:
+                self.triangle = np.arange(nodes)[:, None]
+                self.offset = np.zeros((count, 2, 3))
+            else:
+                self.triangle = _indices(joints["triangle"], "joints.triangle", nodes).reshape(nodes, 3)
+                self.offset = _numbers(joints, "offset", (count, 2, 3))
+        except KeyError as error:
+            raise ResultError(f"manifest.arm lacks {error}") from None
+        except (TypeError, ValueError) as error:
+            raise ResultError(f"manifest.arm is malformed: {error}") from None
+        if len(self.member_names) != count or self.actuated.shape != (count,):
+            raise ResultError(f"manifest.arm does not describe {count} members, as array members does")
+        self.members = members
+        self.free = np.setdiff1d(np.arange(nodes), self.base)
+        self._tip_fit = polygon_frame(self.home[self.tip], None) if self.has_tip_frame else None
+
+    @property
+    def has_tip_frame(self) -> bool:
+        """True where the end effector has three nodes or more, so that it has an attitude."""
+        return bool(len(self.tip) >= 3)
+
+    @property
+    def has_pin_joints(self) -> bool:
+        """True where members end in their nodes, and so move along straight lines when the nodes do."""
+        return bool(self.triangle.shape[1] == 1)
+
+    def corners(self, member: Index) -> Index:
+        """Return (P, 2, 1 or 3) the nodes that place the two ends of each of the members (P,)."""
+        return np.asarray(self.triangle[self.members[member]])
+
+    def ends(self, nodes: Array, member: Index | None = None) -> Array:
+        """Return (P, 2, 3) the ends r_ik, eq. (13), m, of members (P,) at node positions `nodes` (N, 3)."""
+        member = np.arange(len(self.members)) if member is None else member
+        return self.ends_at(nodes[self.corners(member)], member)
+
+    def ends_at(self, corner: Array, member: Index) -> Array:
+        """Return (P, 2, 3) the same from the positions (P, 2, 1 or 3, 3) of the nodes in `corners`."""
+        if self.has_pin_joints:
+            return corner[:, :, 0]
+        origin = corner[:, :, 0]
+        to_first, to_second = _unit(corner[:, :, 1] - origin), _unit(corner[:, :, 2] - origin)
+        x = _unit(-(to_first + to_second))
+        z = _unit(np.cross(to_first, to_second))
+        y = np.cross(z, x)
+        offset = self.offset[member]
+        return np.asarray(origin + offset[..., :1] * x + offset[..., 1:2] * y + offset[..., 2:] * z)
+
+    def lengths(self, nodes: Array) -> Array:
+        """Return (M,) member lengths, m, at node positions (N, 3)."""
+        ends = self.ends(nodes)
+        return np.asarray(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
+
+    def tip_position(self, nodes: Array) -> Array:
+        """Return (..., 3) the end effector's position, m, at nodes (..., N, 3)."""
+        return np.asarray(np.einsum("k,...kc->...c", self.tip_weights, nodes[..., self.tip, :]))
+
+    def tip_rotation(self, nodes: Array) -> Array:
+        """Return (3, 3) the end effector's attitude at nodes (N, 3): that at home, turned by the best fit."""
+        if self._tip_fit is None:
+            return self.tip_frame
+        home_frame, angles = self._tip_fit
+        frame, _ = polygon_frame(nodes[self.tip], angles)
+        return np.asarray(frame @ home_frame.T @ self.tip_frame)
+
+    def length_gradient(self, nodes: Array) -> tuple[Array, Index]:
+        """Return (M, Q, 3) the gradients of the lengths with respect to (M, Q) nodes, m/m.
+
+        For offset joints by central differences of the joints' own corners: exact to about 1e-9.
+        """
+        member = np.arange(len(self.members))
+        corner = self.corners(member)
+        place = nodes[corner]
+        if self.has_pin_joints:
+            direction = _unit(place[:, 1, 0] - place[:, 0, 0])
+            return np.stack([-direction, direction], axis=1), self.members
+        step = 1e-6 * float(self.length.max())
+        gradient = np.empty((len(member), 2, 3, 3))
+        for e, c, axis in np.ndindex(2, 3, 3):
+            change = np.zeros((2, 3, 3))
+            change[e, c, axis] = step
+            ahead, behind = (self.ends_at(place + sign * change, member) for sign in (1.0, -1.0))
+            spans = [np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) for ends in (ahead, behind)]
+            gradient[:, e, c, axis] = (spans[0] - spans[1]) / (2.0 * step)
+        return gradient.reshape(-1, 6, 3), corner.reshape(-1, 6)
+
+    def singular_values(self, nodes: Array) -> tuple[float, float, float] | None:
+        """Return the least singular value of the length Jacobian, and the least and greatest of the tip's.
+
+        The length Jacobian is d lengths / d (free node positions), square in a determinate truss; the tip's
+        is d tip position / d actuated lengths. None where the truss is not determinate or has no actuator.
+        """
+        unknowns = 3 * len(self.free)
+        if unknowns != len(self.members) or not self.actuated.any():
+            return None
+        gradient, index = self.length_gradient(nodes)
+        column = np.full(len(self.home), -1)
+        column[self.free] = np.arange(len(self.free))
+        place = column[index]
+        row, slot = np.nonzero(place >= 0)
+        rows = np.repeat(row, 3)
+        columns = (3 * place[row, slot][:, None] + np.arange(3)).reshape(-1)
+        values = gradient[row, slot].reshape(-1)
+        tip = np.zeros((unknowns, 3))
+        for node, weight in zip(self.tip, self.tip_weights, strict=True):
+            if column[node] >= 0:
+                tip[3 * column[node] : 3 * column[node] + 3] += weight * np.eye(3)
+        if unknowns <= _DENSE_UNKNOWNS:
+            return self._dense_values(rows, columns, values, tip)
+        return self._sparse_values(rows, columns, values, tip)
+
+    def _dense_values(
+        self, rows: Index, columns: Index, values: Array, tip: Array
+    ) -> tuple[float, float, float]:
+        J = np.zeros((len(tip), len(tip)))
+        np.add.at(J, (rows, columns), values)
+        least = float(np.linalg.svd(J, compute_uv=False)[-1])
+        if least == 0.0:
+            return 0.0, 0.0, np.inf
+        return least, *_extremes(np.linalg.solve(J.T, tip)[self.actuated])
+
+    def _sparse_values(
+        self, rows: Index, columns: Index, values: Array, tip: Array
+    ) -> tuple[float, float, float]:
+        """Inverse power iteration on J^T J: it comes down to the least singular value from above."""
+        from scipy.sparse import csc_array
+        from scipy.sparse.linalg import splu
+
+        J = csc_array((values, (rows, columns)), shape=(len(tip), len(tip)))
+        try:
+            factors = splu(J)
+        except RuntimeError:
+            return 0.0, 0.0, np.inf
+        v = np.random.default_rng(0).normal(size=len(tip))
+        growth = 1.0
+        for _ in range(40):
+            v /= np.linalg.norm(v)
+            v = factors.solve(factors.solve(v, trans="T"))
+            growth = float(np.linalg.norm(v))
+        return float(1.0 / np.sqrt(growth)), *_extremes(factors.solve(tip, trans="T")[self.actuated])
+
+
+def polygon_frame(points: Array, angles: Array | None) -> tuple[Array, Array]:
+    """Return the (3, 3) frame fitted to a polygon (K, 3), and its nodes' polar angles (K,) in that frame.
+
+    z is the direction of the area vector. x is the direction in the plane from which the nodes' polar angles
+    differ least from `angles` (the planar Procrustes problem); any direction where `angles` is None.
+    """
+    spokes = points - points.mean(axis=0)
+    z = _unit(np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0))
+    seed = np.eye(3)[np.argmin(np.abs(z))]
+    u = _unit(np.cross(seed, z))
+    v = np.cross(z, u)
+    planar = spokes @ u + 1j * (spokes @ v)
+    if angles is not None:
+        turn = np.sum(planar * np.exp(-1j * angles))
+        turn /= abs(turn)
+        u, v = turn.real * u + turn.imag * v, turn.real * v - turn.imag * u
+        planar = planar / turn
+    return np.stack([u, v, z], axis=1), np.angle(planar)
+
+
+def _extremes(G: NDArray[Any]) -> tuple[float, float]:
+    values = np.linalg.svd(G, compute_uv=False)
+    least = float(values[-1]) if len(values) == 3 else 0.0
+    return least, float(values[0])
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _numbers(record: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> Array:
+    """Return ``record[key]`` as floats of that shape, inf for None."""
+    array = np.asarray(record[key], dtype=np.float64)
+    array = np.where(np.isnan(array), np.inf, array)
+    if array.ndim != len(shape) or any(
+        size not in (None, found) for size, found in zip(shape, array.shape, strict=True)
+    ):
+        raise ResultError(f"manifest.arm.{key} has shape {array.shape}; expected {shape}")
+    return array
+
+
+def _indices(values: Any, key: str, nodes: int) -> Index:
+    array = np.asarray(values, dtype=np.int64)
+    if array.size and not (array.min() >= 0 and array.max() < nodes):
+        raise ResultError(f"manifest.arm.{key} names a node outside 0..{nodes - 1}")
+    return array

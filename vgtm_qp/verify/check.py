@@ -1,0 +1,330 @@
+"""Lengths, limits, clearances and tip errors of a maneuver, from its nodes alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import ResultError
+from vgtm_qp.maneuver.certificate import Certificate, Measure
+from vgtm_qp.maneuver.result import Maneuver, load_result
+from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.clearance import AgainstBody, AgainstMembers, Encounters, Least, Motion
+from vgtm_qp.verify.obstacles import read_obstacles, rotation_matrix
+from vgtm_qp.verify.path import check_path
+
+Array = NDArray[np.float64]
+
+MEMBER_TOLERANCE = 1e-9
+"""Fixed and locked members, base nodes, m."""
+LIMIT_TOLERANCE = 1e-9
+"""Strokes, rates and accelerations, m, m/s, m/s^2."""
+CLEARANCE_TOLERANCE = 1e-9
+"""Clearances at states, m."""
+BETWEEN_TOLERANCE = 1e-4
+"""Clearances between states, m."""
+TIP_TOLERANCE = 1e-6
+"""Tip position and its target's distance from the path, m."""
+DIRECTION_TOLERANCE = 1e-6
+"""Tip direction and orientation, rad."""
+ARRAY_TOLERANCE = 1e-9
+"""Stored arrays against the same recomputed, m."""
+
+_SAFE = 0.05
+"""What a problem that does not say keeps from its obstacles, m."""
+_MANY_UNKNOWNS = 2000
+_FEW_STATES = 21
+
+
+def verify_file(path: str | Path) -> Certificate:
+    """Load a result file and verify it.
+
+    Raises
+    ------
+    ResultError
+        The file is cut, altered, of another version, or its arm record is malformed.
+    """
+    return verify(load_result(path))
+
+
+def verify(maneuver: Maneuver) -> Certificate:
+    """Return the certificate of `maneuver`, recomputed from its nodes and the problem in its manifest.
+
+    Raises
+    ------
+    ResultError
+        The arm record in the manifest is malformed, or describes another number of nodes.
+    """
+    manifest = maneuver.manifest
+    problem = manifest["problem"]
+    arm = Arm(manifest["arm"], maneuver.members)
+    if maneuver.nodes.shape[1] != len(arm.home):
+        raise ResultError(
+            f"array nodes holds {maneuver.nodes.shape[1]} nodes; manifest.arm describes {len(arm.home)}"
+        )
+    motion = Motion(arm, maneuver.time, maneuver.nodes)
+    lengths = np.linalg.norm(motion.ends[:, :, 1] - motion.ends[:, :, 0], axis=2)
+    names = arm.member_names
+
+    bodies, wrong, notes = read_obstacles(
+        problem, manifest.get("meshes") or {}, Path(manifest.get("directory") or ".")
+    )
+    rules = problem.get("clearance") or {}
+    safe = float(rules.get("safe", _SAFE))
+    self_safe = safe if rules.get("self_safe") is None else float(rules["self_safe"])
+    if not rules.get("self_collision", True):
+        self_safe = -np.inf
+    at, between, clearance = _clearances(motion, [AgainstBody(motion, body) for body in bodies])
+    self_at, self_between, self_clearance = _clearances(motion, [AgainstMembers(motion)])
+
+    tip = arm.tip_position(maneuver.nodes)
+    rotation = np.stack([arm.tip_rotation(state) for state in maneuver.nodes])
+    path = check_path(maneuver, tip)
+    moved = _base_error(arm, maneuver, problem)
+    differences = {
+        "member_lengths": np.abs(maneuver.member_lengths - lengths),
+        "tip_position": np.abs(maneuver.tip_position - tip),
+        "tip_rotation": np.abs(maneuver.tip_rotation - rotation),
+        "clearance": _clearance_difference(maneuver.clearance, clearance, arm),
+        "self_clearance": _clearance_difference(maneuver.self_clearance, self_clearance, arm),
+    }
+    furthest = max(differences, key=lambda name: float(np.max(differences[name], initial=0.0)))
+    values = _singular_values(arm, maneuver.nodes)
+    if len(maneuver.nodes) > _FEW_STATES and 3 * len(arm.free) > _MANY_UNKNOWNS:
+        notes.append(f"singular values are those of {_FEW_STATES} states")
+
+    return Certificate(
+        member_error=_worst(_held(arm, problem, maneuver.time, lengths), "m", MEMBER_TOLERANCE, names),
+        base_error=_worst(moved, "m", MEMBER_TOLERANCE, [f"node {k}" for k in arm.base]),
+        stroke_violation=_worst(_beyond_stroke(arm, lengths), "m", LIMIT_TOLERANCE, names),
+        rate_violation=_worst(_beyond_rate(arm, maneuver.time, lengths), "m/s", LIMIT_TOLERANCE, names),
+        acceleration_violation=_worst(
+            _beyond_acceleration(arm, maneuver.time, lengths), "m/s^2", LIMIT_TOLERANCE, names
+        ),
+        clearance=_least(at, safe - CLEARANCE_TOLERANCE),
+        clearance_between=_least(between, safe - BETWEEN_TOLERANCE),
+        self_clearance=_least(self_at, self_safe - CLEARANCE_TOLERANCE),
+        self_clearance_between=_least(self_between, self_safe - BETWEEN_TOLERANCE),
+        member_angle=_least(
+            _member_angle(motion), float(rules.get("minimum_angle") or -np.inf) - DIRECTION_TOLERANCE, "rad"
+        ),
+        tip_error=_worst(path.tip_error(tip), "m", None if path.is_elastic else TIP_TOLERANCE),
+        tip_direction_error=_worst(
+            path.direction_error(rotation), "rad", None if path.is_elastic else DIRECTION_TOLERANCE
+        ),
+        target_error=_worst(path.target_error, "m", TIP_TOLERANCE),
+        array_error=_worst(differences[furthest], "m", ARRAY_TOLERANCE, array=furthest),
+        length_singular_value=_least_of(values[:, 0], ""),
+        tip_singular_value=_least_of(values[:, 1], "m/m"),
+        tip_error_per_millimetre=_worst(values[:, 2] if len(values) else None, "mm", None),
+        contradictions=(
+            *wrong,
+            *path.contradictions,
+            *_record_contradictions(maneuver, arm),
+            *_outcome_contradictions(maneuver),
+        ),
+        notes=(*notes, *path.notes),
+    )
+
+
+def _clearances(motion: Motion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
+    """Return the least clearance at states, a bound of it between them, and the least at each state (T,)."""
+    count = len(motion.time)
+    each = [
+        min((pairs.at_state(state) for pairs in encounters), key=lambda least: least.value, default=Least())
+        for state in range(count)
+    ]
+    at = min(each, key=lambda least: least.value)
+    limit, bound = at, Least()
+    for step in range(count - 1):
+        for pairs in encounters:
+            limit, bound = pairs.between(step, limit, bound)
+    return at, min(bound, limit, key=lambda least: least.value), np.array([least.value for least in each])
+
+
+def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
+    """Return (T,) how far clearances differ; how deep a member is inside an obstacle is not compared."""
+    floor = -float(arm.radius.min(initial=np.inf))
+    with np.errstate(invalid="ignore"):
+        difference = np.abs(np.maximum(stored, floor) - np.maximum(found, floor))
+    return np.asarray(np.where(stored == found, 0.0, difference))
+
+
+def _held(arm: Arm, problem: Mapping[str, Any], time: Array, lengths: Array) -> Array:
+    """Return (T, M) how far fixed members are from their lengths, and locked ones from where they stuck."""
+    errors = np.where(arm.actuated, 0.0, np.abs(lengths - arm.length))
+    for entry in (problem.get("truss") or {}).get("locked") or ():
+        name, since = (
+            (entry, 0.0) if isinstance(entry, str) else (entry["member"], float(entry.get("time", 0.0)))
+        )
+        if name not in arm.member_names:
+            continue
+        k = arm.member_names.index(name)
+        rows = np.flatnonzero(time >= since)
+        if len(rows):
+            errors[rows, k] = np.maximum(errors[rows, k], np.abs(lengths[rows, k] - lengths[rows[0], k]))
+    return errors
+
+
+def _base_error(arm: Arm, maneuver: Maneuver, problem: Mapping[str, Any]) -> Array:
+    """Return (T, N_c) how far base nodes are from where the problem holds them, m.
+
+    A base that moves, eqs. (7)-(8), is held against its poses at their times, and to a rigid motion between.
+    """
+    found = maneuver.nodes[:, arm.base]
+    home = arm.home[arm.base]
+    poses = (problem.get("truss") or {}).get("base_motion") or ()
+    if not poses:
+        return np.asarray(np.linalg.norm(found - home, axis=2))
+    errors = np.stack([_rigid_error(home, state) for state in found])
+    for pose in poses:
+        for row in np.flatnonzero(np.abs(maneuver.time - float(pose["time"])) <= 1e-12):
+            turn, shift = (
+                np.asarray(pose.get(key) or (0.0,) * 3, dtype=float)
+                for key in ("rotation_vector", "position")
+            )
+            placed = home @ rotation_matrix(turn).T + shift
+            errors[row] = np.maximum(errors[row], np.linalg.norm(found[row] - placed, axis=1))
+    return errors
+
+
+def _rigid_error(home: Array, state: Array) -> Array:
+    """Return (N_c,) the distances of points from the rigid displacement of `home` that fits best (Kabsch)."""
+    spokes, moved = home - home.mean(axis=0), state - state.mean(axis=0)
+    u, _, vt = np.linalg.svd(spokes.T @ moved)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return np.asarray(np.linalg.norm(moved - spokes @ u @ mirror @ vt, axis=1))
+
+
+def _member_angle(motion: Motion) -> Least:
+    """Return the least angle at any state between two members that share a node, rad."""
+    members = motion.arm.members
+    node = members.reshape(-1)
+    order = np.argsort(node, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(node[order])) + 1)
+    corners = [np.stack(np.triu_indices(len(group), 1), axis=1) for group in groups]
+    pairs = np.concatenate([group[pair] for group, pair in zip(groups, corners, strict=True)])
+    least = Least()
+    for state, ends in enumerate(motion.ends):
+        along = ends[:, 1] - ends[:, 0]
+        leaving = np.stack([along, -along], axis=1).reshape(-1, 3)
+        first, second = leaving[pairs[:, 0]], leaving[pairs[:, 1]]
+        across = np.linalg.norm(np.cross(first, second), axis=1)
+        angles = np.arctan2(across, np.sum(first * second, axis=1))
+        if len(angles) and angles.min() < least.value:
+            names = " / ".join(motion.arm.member_names[k // 2] for k in pairs[int(np.argmin(angles))])
+            least = Least(float(angles.min()), f"state {state}: {names}")
+    return least
+
+
+def _beyond_stroke(arm: Arm, lengths: Array) -> Array:
+    """Return (T, M) how far actuated members are outside their strokes, m."""
+    outside = np.maximum(arm.stroke[:, 0] - lengths, lengths - arm.stroke[:, 1])
+    return np.asarray(np.where(arm.actuated, np.maximum(outside, 0.0), 0.0))
+
+
+def _beyond_rate(arm: Arm, time: Array, lengths: Array) -> Array:
+    """Return (T - 1, M) how far mean rates over the steps pass their limits, m/s."""
+    rates = np.diff(lengths, axis=0) / np.diff(time)[:, None]
+    return np.asarray(np.where(arm.actuated, np.maximum(np.abs(rates) - arm.rate, 0.0), 0.0))
+
+
+def _beyond_acceleration(arm: Arm, time: Array, lengths: Array) -> Array:
+    """Return (T - 2, M) how far accelerations pass their limits, m/s^2.
+
+    An acceleration is the change of the mean rate from step to step over the time between their middles.
+    """
+    rates = np.diff(lengths, axis=0) / np.diff(time)[:, None]
+    middles = (time[1:] + time[:-1]) / 2.0
+    changes = np.diff(rates, axis=0) / np.diff(middles)[:, None]
+    return np.asarray(np.where(arm.actuated, np.maximum(np.abs(changes) - arm.acceleration, 0.0), 0.0))
+
+
+def _singular_values(arm: Arm, nodes: Array) -> Array:
+    """Return (S, 3) least of the length Jacobian, least and greatest of the tip's, at S states."""
+    states = np.arange(len(nodes))
+    if 3 * len(arm.free) > _MANY_UNKNOWNS:
+        states = np.unique(np.linspace(0, len(nodes) - 1, _FEW_STATES).round().astype(int))
+    found = [values for state in states if (values := arm.singular_values(nodes[state])) is not None]
+    return np.array(found).reshape(-1, 3)
+
+
+def _worst(
+    errors: Array | None,
+    unit: str,
+    bound: float | None,
+    names: Sequence[str] = (),
+    *,
+    array: str = "",
+) -> Measure:
+    """Return the greatest of errors (T,) or (T, M, ...), with its row and the name in the second axis."""
+    if errors is None:
+        return Measure(None, unit, bound)
+    if not errors.size:
+        return Measure(0.0, unit, bound)
+    place = np.unravel_index(int(np.argmax(errors)), errors.shape)
+    value = float(errors[place])
+    parts = [array] if array else []
+    if value > 0.0:
+        parts.append(f"row {place[0]}")
+        if len(names) and len(place) > 1:
+            parts.append(names[int(place[1])])
+    return Measure(value, unit, bound, "most", ", ".join(parts))
+
+
+def _least(found: Least, bound: float, unit: str = "m") -> Measure:
+    return Measure(found.value, unit, bound if np.isfinite(bound) else None, "least", found.where)
+
+
+def _least_of(values: Array, unit: str) -> Measure:
+    return Measure(float(values.min()) if len(values) else None, unit, None, "least")
+
+
+def _record_contradictions(maneuver: Maneuver, arm: Arm) -> list[str]:
+    """Return where the arm record disagrees with the arrays, with itself or with the problem."""
+    found = []
+    if tuple(maneuver.member_names.tolist()) != arm.member_names:
+        found.append("array member_names differs from the arm record")
+    if not np.array_equal(maneuver.member_actuated, arm.actuated):
+        found.append("array member_actuated differs from the arm record")
+    off = np.abs(arm.lengths(arm.home) - arm.length)
+    if off.max(initial=0.0) > MEMBER_TOLERANCE:
+        k = int(np.argmax(off))
+        found.append(f"the arm record's length of {arm.member_names[k]} is {off[k]:.3g} m off its home nodes")
+    truss = maneuver.manifest["problem"].get("truss") or {}
+    entries = {str(entry["name"]): entry for entry in truss.get("member") or ()}
+    if entries and set(entries) != set(arm.member_names):
+        found.append("the members of the arm record are not those of the problem")
+    for name, recorded in (
+        ("member_radius", arm.radius),
+        ("stroke", arm.stroke),
+        ("rate", arm.rate),
+        ("acceleration", arm.acceleration),
+    ):
+        differing = []
+        for k, member in enumerate(arm.member_names):
+            if name != "member_radius" and not arm.actuated[k]:
+                continue
+            given = entries.get(member, {}).get(name.removeprefix("member_"))
+            wanted = truss.get(name) if given is None else given
+            if wanted is not None and not np.allclose(recorded[k], wanted, rtol=0.0, atol=LIMIT_TOLERANCE):
+                differing.append(f"{member} (problem: {wanted})")
+        if differing:
+            more = f" and {len(differing) - 1} more members" if len(differing) > 1 else ""
+            found.append(f"the arm record's {name} differs from the problem's at {differing[0]}{more}")
+    return found
+
+
+def _outcome_contradictions(maneuver: Maneuver) -> list[str]:
+    """Return where status, reached and progress disagree."""
+    found = []
+    if abs(maneuver.progress[-1] - maneuver.reached) > 1e-9:
+        found.append(f"reached is {maneuver.reached:.9g}; the last progress is {maneuver.progress[-1]:.9g}")
+    complete = maneuver.reached >= 1.0 - 1e-9
+    if (maneuver.status == "solved") != complete:
+        found.append(f'status is "{maneuver.status}", but the arm reached {maneuver.reached:.9g} of the path')
+    return found
