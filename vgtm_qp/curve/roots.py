@@ -35,8 +35,10 @@ def increasing_roots(function: Callable[[Array], tuple[Array, Array]], low: Arra
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             newton = np.clip(x - value / slope, low, high)
         step = np.abs(newton - x)
-        # A step this small is rounding: it must not throw the root back to the middle of its bracket.
-        new = np.where(step <= np.maximum(previous / 2, _CONVERGED), newton, (low + high) / 2)
+        # Where the function falls, Newton's step leads away from the root. And a step as small as
+        # rounding must not throw the root back to the middle of its bracket.
+        good = (slope > 0) & (step <= np.maximum(previous / 2, _CONVERGED))
+        new = np.where(good, newton, (low + high) / 2)
         previous = np.abs(new - x)
         x = new
         if np.all(previous <= _CONVERGED):
