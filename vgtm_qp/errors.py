@@ -32,6 +32,9 @@ class ProblemError(VgtmError):
         self.mistakes = tuple(mistakes)
         super().__init__("\n".join(f"{source}: {mistake}" for mistake in self.mistakes))
 
+    def __reduce__(self) -> tuple[type[ProblemError], tuple[str, tuple[Mistake, ...]]]:
+        return type(self), (self.source, self.mistakes)
+
 
 class TrussError(VgtmError):
     """A truss is not statically determinate, or its description contradicts itself."""
@@ -57,7 +60,12 @@ class MissingExtraError(VgtmError):
     """An optional dependency is absent; the message holds the pip line that brings it."""
 
     def __init__(self, extra: str, package: str) -> None:
+        self.extra = extra
+        self.package = package
         super().__init__(f"{package} is not installed: pip install 'vgtm-qp[{extra}]'")
+
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
+        return type(self), (self.extra, self.package)
 
 
 def nearest(name: str, choices: Iterable[str]) -> str:

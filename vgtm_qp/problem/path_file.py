@@ -100,8 +100,8 @@ def _read(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 def _check_header(header: list[str], mistakes: list[Mistake]) -> None:
     known = (*_COLUMNS, *_TURNS)
     expected = "the header t,x,y,z or t,x,y,z,rx,ry,rz"
-    if not header:
-        mistakes.append(Mistake("line 1", "nothing", expected))
+    if not set(header) & set(known):
+        mistakes.append(Mistake("line 1", shown(",".join(header) or None), expected))
         return
     for column, name in enumerate(header, start=1):
         if name not in known:

@@ -53,7 +53,9 @@ class Table(BaseModel):
             try:
                 table = handler(data)
             except ValidationError as error:
-                details = [cls._detail(found) for found in error.errors(include_url=False)]
+                details = [
+                    cls._detail(found) for found in error.errors(include_url=False) if not _echo(found)
+                ]
             else:
                 details = [
                     InitErrorDetails(type=unexpected(phrase), loc=place, input=value_at(table, place))
@@ -66,7 +68,7 @@ class Table(BaseModel):
         wrong = ValidationError.from_exception_data(cls.__name__, details)
         if not outermost:
             raise wrong
-        source = (info.context or {}).get("source") or cls.called
+        source = (info.context or {}).get("source") or cls.__name__
         raise ProblemError(str(source), mistakes_in(wrong, data)) from None
 
     @classmethod
@@ -102,6 +104,11 @@ class Table(BaseModel):
         else:
             phrase = found["msg"][:1].lower() + found["msg"][1:]
         return InitErrorDetails(type=unexpected(phrase), loc=place, input=value)
+
+
+def _echo(found: ErrorDetails) -> bool:
+    """Whether an array is called too short only because an entry, which has its own error, was left out."""
+    return found["type"] == "too_short" and len(found["input"]) >= found["ctx"]["min_length"]
 
 
 def mistakes_in(error: ValidationError, data: Any) -> list[Mistake]:
