@@ -14,12 +14,12 @@ from vgtm_qp.truss.truss import Truss
 def plate(
     rows: int, columns: int, *, spacing: float = 1.0, depth: float = 0.5**0.5, **limits: Unpack[Limits]
 ) -> Truss:
-    """Plate in the xz plane that grows along +z; its first two rows, with the apexes between them, are the base.
+    """Plate in the xz plane that grows along +z; its first two rows and the apexes between are the base.
 
-    Nodes ``n<row>-<column>`` of the surface and ``a<row>-<column>`` over the cells' centres, towards -y. A free
-    row is a stage: its surface nodes and the apexes below it. Three fixed legs ``G`` carry each apex;
-    longitudinals ``L``, transverses ``T``, one diagonal ``D`` a row, and the apexes' longitudinals ``M`` and one
-    transverse ``U`` are actuated. A diagonal in every cell and two bars ``U`` have the right count but a mechanism.
+    Nodes ``n<row>-<column>`` of the surface and ``a<row>-<column>`` over the cells' centres, towards -y. A
+    free row is a stage: its surface nodes and the apexes below it. Three fixed legs ``G`` carry each apex;
+    longitudinals ``L``, transverses ``T``, one diagonal ``D`` a row, and the apexes' longitudinals ``M`` and
+    one transverse ``U`` are actuated. A diagonal in every cell has the right count but leaves a mechanism.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def _row(i: int, columns: int) -> list[tuple[str, str, str]]:
     members: list[tuple[str, str, str]] = []
     for j in range(1, columns):
         apex = f"a{i - 1}-{j}"
-        # With three columns the second apex stands on the mirror image of the first one's legs: a symmetric row.
+        # With three columns the second apex stands on the mirror image of the first one's legs.
         mirrored = columns == 3 and j == 2
         feet = (
             (f"n{i - 1}-{j + 1}", f"n{i}-{j + 1}", f"n{i}-{j}")
