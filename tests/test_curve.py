@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from vgtm_qp.curve import Curve, b_spline, beta_spline, bezier, make_family, straight_curve
@@ -113,6 +114,25 @@ def test_frame_does_not_turn_about_the_tangent_without_torsion():
     # A closed form: along a plane curve the frame turns about the plane's normal and keeps that normal.
     flat = Curve(bezier(4), np.array([[0, 0, 0], [0, 0, 1], [1, 0, 2], [2, 0, 1.5]], dtype=float))
     np.testing.assert_allclose(flat.frame(s)[:, :, 1], np.tile([0.0, 1.0, 0.0], (400, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
+def test_frame_is_the_solution_of_its_differential_equation(family):
+    curve = bent_curve(family, seed=8, bend=0.15)
+
+    def transport(s, flat):
+        x, y, z = curve.frame_rate(min(s, 1.0))
+        return (np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ flat.reshape(3, 3)).ravel()
+
+    frame = curve.frame(0.0)
+    for start, end in zip(family.breaks[:-1], family.breaks[1:], strict=True):
+        inside = end - 1e-12
+        frame = (
+            solve_ivp(transport, (start, inside), frame.ravel(), rtol=1e-10, atol=1e-12)
+            .y[:, -1]
+            .reshape(3, 3)
+        )
+    np.testing.assert_allclose(curve.frame(1.0), frame, atol=1e-6)
 
 
 def test_frame_of_a_single_parameter_is_that_of_many():

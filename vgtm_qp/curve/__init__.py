@@ -4,6 +4,14 @@ from vgtm_qp.curve.closest import ClosestPoints, closest_to_box, closest_to_poin
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import FAMILIES, CurveFamily, b_spline, beta_spline, bezier, make_family
 from vgtm_qp.curve.linear import Conditions, NodeTables, base_conditions, node_tables, tip_condition
+from vgtm_qp.curve.redundancy import (
+    Refit,
+    add_control_vertices,
+    degree_of_redundancy,
+    excess_freedom,
+    refit,
+    remove_control_vertices,
+)
 
 __all__ = [
     "FAMILIES",
@@ -12,14 +20,20 @@ __all__ = [
     "Curve",
     "CurveFamily",
     "NodeTables",
+    "Refit",
+    "add_control_vertices",
     "b_spline",
     "base_conditions",
     "beta_spline",
     "bezier",
     "closest_to_box",
     "closest_to_point",
+    "degree_of_redundancy",
+    "excess_freedom",
     "make_family",
     "node_tables",
+    "refit",
+    "remove_control_vertices",
     "straight_curve",
     "tip_condition",
 ]

@@ -1,0 +1,204 @@
+"""Variable degree of redundancy, section 4.7: more or fewer control vertices for the same shape."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from vgtm_qp.curve.bernstein import Array
+from vgtm_qp.curve.curve import Curve
+from vgtm_qp.curve.families import CurveFamily, b_spline, beta_spline, bezier
+from vgtm_qp.errors import CurveError
+
+BASE_ROWS = 5
+"""Conditions that hold a curve at its base: p_0 in its place, p_1 on the base normal."""
+
+_LEAST_VERTICES = 3
+_SAMPLES = 100
+
+
+class Refit(NamedTuple):
+    """A curve that stands for another one, and the price.
+
+    Attributes
+    ----------
+    curve : Curve
+        The new curve; both ends and the direction of the base tangent are those of the old one, and so are
+        torsion and base frame.
+    change : float
+        Greatest distance between old and new position at the same s, m, sampled at 100 parameters a segment;
+        rounding error where the curve did not move.
+    """
+
+    curve: Curve
+    change: float
+
+
+def degree_of_redundancy(control_vertices: int, tip_rows: int, torsion_vertices: int = 0) -> int:
+    """Count the free motions of a curve held at base and tip, 3 V + T - 5 - tip rows; negative if too few."""
+    return 3 * control_vertices + torsion_vertices - BASE_ROWS - tip_rows
+
+
+def excess_freedom(curve_dof: int, arm_dof: int) -> str | None:
+    """Warn of a curve with more degrees of freedom than the arm that tracks it, or return None.
+
+    Parameters
+    ----------
+    curve_dof, arm_dof : int
+        Degrees of freedom, either both with the tip held or both with the tip free.
+    """
+    excess = curve_dof - arm_dof
+    if excess <= 0:
+        return None
+    return (
+        f"the reference curve has {curve_dof} degrees of freedom and the arm {arm_dof}: {excess} of them "
+        f"mean nothing to the arm; {-(-excess // 3)} control vertices fewer would do"
+    )
+
+
+def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
+    """Give a curve more control vertices without moving it.
+
+    A Bezier curve is raised in degree. A B-spline gets knots, each in the middle of the longest span. A
+    uniform Beta-spline has no exact way: it is fitted again, and moves by `change`.
+
+    Raises
+    ------
+    CurveError
+        `count` is negative.
+    """
+    _require_count(count)
+    raised = curve
+    for _ in range(count):
+        if curve.family.name == "bezier":
+            raised = _elevated(raised)
+        elif curve.family.name == "b-spline":
+            raised = _with_knot(raised)
+    if curve.family.name == "beta-spline" and count:
+        family = curve.family
+        return refit(curve, beta_spline(family.control_vertices + count, family.bias, family.tension))
+    return Refit(raised, _greatest_change(curve, raised))
+
+
+def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
+    """Give a curve fewer control vertices, by least squares; `change` says how far it moved.
+
+    A B-spline loses the knots that it misses least; once it has no more interior knots, its degree falls.
+
+    Raises
+    ------
+    CurveError
+        `count` is negative, or fewer than three control vertices would be left to keep both ends and the base
+        tangent.
+    """
+    _require_count(count)
+    lowered = curve
+    for _ in range(count):
+        fits = [refit(lowered, family) for family in _lower_families(lowered.family)]
+        lowered = min(fits, key=lambda fit: fit.change).curve
+    return Refit(lowered, _greatest_change(curve, lowered))
+
+
+def refit(curve: Curve, family: CurveFamily) -> Refit:
+    """Fit a curve of another family or number of control vertices: least squares of r(s) over 0 <= s <= 1.
+
+    Both ends and the direction of the base tangent are kept; the distance of p_1 from p_0 is free.
+
+    Raises
+    ------
+    CurveError
+        The family has fewer than three control vertices, or the curve has no tangent at its base.
+    """
+    vertices = family.control_vertices
+    if vertices < _LEAST_VERTICES:
+        raise CurveError(
+            f"a curve with {vertices} control vertices cannot keep both ends and the base tangent; use "
+            f"{_LEAST_VERTICES} or more"
+        )
+    start, end = curve.position(0.0), curve.position(1.0)
+    tangent = curve.tangent(0.0)
+    s, weight = _quadrature(curve.family, family)
+    table = family.weights(s)
+    known = np.outer(table[:, :2].sum(axis=1), start) + np.outer(table[:, -1], end)
+    # Unknowns: the distance from p_0 to p_1 along the tangent, then the vertices between p_1 and the last.
+    columns = np.concatenate([np.einsum("n,c->nc", table[:, 1], tangent)[..., None], _inner(table)], axis=2)
+    goal = (curve.position(s) - known) * weight[:, None]
+    matrix = (columns * weight[:, None, None]).reshape(goal.size, -1)
+    solution = np.linalg.lstsq(matrix, goal.ravel())[0]
+    if solution[0] <= 0.0:
+        # Least squares would turn the base tangent around: keep r'(0) itself instead.
+        kept = np.linalg.norm(curve.derivative(0.0)) / family.weights(0.0, 1)[1]
+        rest = np.linalg.lstsq(matrix[:, 1:], goal.ravel() - kept * matrix[:, 0])[0]
+        solution = np.concatenate([[kept], rest])
+    control = np.vstack([start, start + solution[0] * tangent, solution[1:].reshape(-1, 3), end])
+    fitted = replace(curve, family=family, control_vertices=control)
+    return Refit(fitted, _greatest_change(curve, fitted))
+
+
+def _inner(table: Array) -> Array:
+    """(n, 3, 3 (V - 3)) rows of the vertices between p_1 and the last."""
+    inner = table[:, 2:-1]
+    return np.asarray(np.kron(inner[:, None, :], np.eye(3)))
+
+
+def _quadrature(*families: CurveFamily) -> tuple[Array, Array]:
+    """Gauss points of the common segments, exact for squares, and the square roots of their weights."""
+    breaks = np.unique(np.concatenate([family.breaks for family in families]))
+    nodes, weights = np.polynomial.legendre.leggauss(max(family.degree for family in families) + 1)
+    width = np.diff(breaks)[:, None]
+    return (breaks[:-1, None] + width * (nodes + 1.0) / 2.0).ravel(), np.sqrt(width * weights / 2.0).ravel()
+
+
+def _greatest_change(old: Curve, new: Curve) -> float:
+    breaks = np.unique(np.concatenate([old.family.breaks, new.family.breaks]))
+    s = (breaks[:-1, None] + np.diff(breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)).ravel()
+    return float(np.linalg.norm(new.position(s) - old.position(s), axis=1).max())
+
+
+def _elevated(curve: Curve) -> Curve:
+    """Give a Bezier curve one control vertex more (degree elevation)."""
+    p = curve.control_vertices
+    fraction = (np.arange(1, len(p)) / len(p))[:, None]
+    raised = np.vstack([p[:1], fraction * p[:-1] + (1.0 - fraction) * p[1:], p[-1:]])
+    return replace(curve, family=bezier(len(raised)), control_vertices=raised)
+
+
+def _with_knot(curve: Curve) -> Curve:
+    """Give a B-spline one knot more, in the middle of its longest span (Boehm's insertion)."""
+    family, p = curve.family, curve.control_vertices
+    degree, knots = family.degree, family.knots
+    longest = int(np.argmax(np.diff(family.breaks)))
+    knot = (family.breaks[longest] + family.breaks[longest + 1]) / 2
+    span = int(np.searchsorted(knots, knot)) - 1
+    i = np.arange(span - degree + 1, span + 1)
+    share = ((knot - knots[i]) / (knots[i + degree] - knots[i]))[:, None]
+    raised = np.vstack([p[: i[0]], share * p[i] + (1.0 - share) * p[i - 1], p[span:]])
+    interior = np.insert(knots, span + 1, knot)[degree + 1 : -degree - 1]
+    return replace(curve, family=b_spline(len(raised), degree, interior), control_vertices=raised)
+
+
+def _lower_families(family: CurveFamily) -> list[CurveFamily]:
+    """Families with one control vertex less to choose from."""
+    vertices = family.control_vertices - 1
+    if vertices < _LEAST_VERTICES:
+        raise CurveError(
+            f"a curve with {family.control_vertices} control vertices cannot lose one and keep both ends and "
+            f"its base tangent; {_LEAST_VERTICES} are the least"
+        )
+    if family.name == "bezier":
+        return [bezier(vertices)]
+    if family.name == "beta-spline":
+        return [beta_spline(vertices, family.bias, family.tension)]
+    degree = family.degree
+    interior = family.knots[degree + 1 : -degree - 1]
+    if not interior.size:
+        return [b_spline(vertices, degree - 1)]
+    _, first = np.unique(interior, return_index=True)
+    return [b_spline(vertices, degree, np.delete(interior, k)) for k in first]
+
+
+def _require_count(count: int) -> None:
+    if count < 0:
+        raise CurveError(f"the number of control vertices to add or remove must be 0 or more, not {count}")
