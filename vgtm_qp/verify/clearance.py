@@ -184,7 +184,8 @@ class Encounters(ABC):
             if len(pair[0]):
                 pair = (pair[0][:_CHUNK], pair[1][:_CHUNK])
                 distance, _ = self.separation(self.place(step, pair, np.full(len(pair[0]), share)), pair)
-                return float(np.nextafter(distance.min(), np.inf))
+                # Boxes along the axes may be exactly as far apart as the pair: rounding must not drop it.
+                return float(distance.min()) + RESOLUTION
             reach *= 2.0
         return np.inf
 
