@@ -1,4 +1,4 @@
-"""Maneuvers made by hand, without the solver: a tripod whose apex follows from three lengths in closed form."""
+"""Maneuvers made by hand, without the solver: tripods whose apices follow from lengths in closed form."""
 
 from __future__ import annotations
 
@@ -73,14 +73,13 @@ def tripod(joints: Joints | None = None, home_lengths: Array | None = None) -> T
     )
 
 
-def problem_of(truss: Truss, tip: Array, time: float, **changes: Any) -> dict[str, Any]:
-    """Return a problem as JSON data whose path ends at `tip`."""
+def problem_of(changes: dict[str, Any]) -> dict[str, Any]:
+    """Return a problem of the tripod as JSON data, with `changes`."""
     problem: dict[str, Any] = {
         "schema_version": 1,
         "name": "tripod",
         "truss": {"module": "graph", "member_radius": RADIUS, "rate": 0.2, "acceleration": 0.2},
         "end_effector": {"track": ["position"], "mode": "scaled"},
-        "maneuver": {"steps": 1, "waypoint": [{"time": time, "position": tip.tolist()}]},
         "obstacle": [],
         "clearance": {"safe": 0.05, "self_collision": True},
     }
@@ -99,18 +98,17 @@ def maneuver_of(
     targets: Array | None = None,
     meshes: dict[str, Any] | None = None,
     directory: str = ".",
-    **changes: Any,
+    problem: dict[str, Any] | None = None,
 ) -> Maneuver:
-    """Return the maneuver through those states; clearances are taken over from `verify` where not given."""
+    """Return the maneuver through those states, to targets where its tip is if none are given."""
     count = len(nodes)
     tip = nodes[:, truss.tip].mean(axis=1)
     ends = nodes[:, truss.members]
     lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
     waypoints = [{"time": float(t), "position": p.tolist()} for t, p in zip(time[1:], tip[1:], strict=True)]
-    problem = problem_of(truss, tip[-1], float(time[-1]), **changes)
-    problem["maneuver"] = {"steps": count - 1, "waypoint": waypoints}
+    whole = {"maneuver": {"steps": count - 1, "waypoint": waypoints}, **problem_of(problem or {})}
     manifest = make_manifest(
-        problem,
+        whole,
         arm_record(truss),
         status=status,
         reached=reached,
@@ -140,3 +138,41 @@ def maneuver_of(
         phase_time=np.full((count, 2), 4e-4),
         manifest=manifest,
     )
+
+
+LENGTHS = np.array([1.4, 1.4, 1.4, 1.5, 1.5, 0.9])
+
+
+def swing(states: int = 11, duration: float = 6.0) -> tuple[Array, Array]:
+    """Return nodes (T, 5, 3) and times (T,) of a smooth motion of both actuators from rest to rest."""
+    share = np.linspace(0.0, 1.0, states)
+    share = 3 * share**2 - 2 * share**3
+    lengths = np.tile(LENGTHS, (states, 1))
+    lengths[:, 0] += 0.2 * share
+    lengths[:, 5] += 0.15 * share
+    return np.stack([place(row) for row in lengths]), np.linspace(0.0, duration, states)
+
+
+def found_clearances(maneuver: Maneuver) -> Maneuver:
+    """Return `maneuver` with the clearances that its own certificate can agree with."""
+    from dataclasses import replace
+    from pathlib import Path
+
+    from vgtm_qp.verify.arm import Arm
+    from vgtm_qp.verify.clearance import AgainstBody, AgainstMembers, Motion
+    from vgtm_qp.verify.obstacles import read_obstacles
+
+    manifest = maneuver.manifest
+    motion = Motion(Arm(manifest["arm"], maneuver.members), maneuver.time, maneuver.nodes)
+    bodies, _, _ = read_obstacles(manifest["problem"], manifest["meshes"], Path(manifest["directory"]))
+    states = range(len(maneuver.time))
+    bodily = [AgainstBody(motion, body) for body in bodies]
+    clear = [min([pairs.at_state(k).value for pairs in bodily], default=np.inf) for k in states]
+    own = [AgainstMembers(motion).at_state(k).value for k in states]
+    return replace(maneuver, clearance=np.array(clear), self_clearance=np.array(own))
+
+
+def good_maneuver(**changes: Any) -> Maneuver:
+    """Return a maneuver that deserves its certificate."""
+    nodes, time = swing()
+    return found_clearances(maneuver_of(nodes, time, tripod(), **changes))

@@ -187,11 +187,13 @@ class Arm:
         except RuntimeError:
             return 0.0, 0.0, np.inf
         v = np.random.default_rng(0).normal(size=len(tip))
-        growth = 1.0
-        for _ in range(40):
+        growth, before = 1.0, 0.0
+        for _ in range(300):
             v /= np.linalg.norm(v)
             v = factors.solve(factors.solve(v, trans="T"))
-            growth = float(np.linalg.norm(v))
+            before, growth = growth, float(np.linalg.norm(v))
+            if abs(growth - before) <= 1e-8 * growth:
+                break
         return float(1.0 / np.sqrt(growth)), *_extremes(factors.solve(tip, trans="T")[self.actuated])
 
 

@@ -13,7 +13,7 @@ from vgtm_qp.errors import ResultError
 from vgtm_qp.maneuver.certificate import Certificate, Measure
 from vgtm_qp.maneuver.result import Maneuver, load_result
 from vgtm_qp.verify.arm import Arm
-from vgtm_qp.verify.clearance import AgainstBody, AgainstMembers, Encounters, Least, Motion
+from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Encounters, Least, Motion
 from vgtm_qp.verify.obstacles import read_obstacles, rotation_matrix
 from vgtm_qp.verify.path import check_path
 
@@ -143,7 +143,10 @@ def _clearances(motion: Motion, encounters: Sequence[Encounters]) -> tuple[Least
     for step in range(count - 1):
         for pairs in encounters:
             limit, bound = pairs.between(step, limit, bound)
-    return at, min(bound, limit, key=lambda least: least.value), np.array([least.value for least in each])
+    # The bound is that of an interval; where it is as low as the clearance met there, the instant says more.
+    where = limit.where if bound.value >= limit.value - RESOLUTION else bound.where
+    between = Least(min(bound.value, limit.value), where)
+    return at, between, np.array([least.value for least in each])
 
 
 def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
