@@ -7,8 +7,20 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from vgtm_qp.problem.fields import Choice, Flag, Length, Name, Weight
+from vgtm_qp.problem.fields import Choice, Factor, Flag, Length, Name, Weight
 from vgtm_qp.problem.table import Place, Table
+
+NullSpaceTerm = Literal[
+    "node_rate",
+    "actuator_rate",
+    "stroke_centring",
+    "curve_rate",
+    "spacing",
+    "smoothness",
+    "obstacle_potential",
+]
+TRUSS_TERMS = ("node_rate", "actuator_rate", "stroke_centring", "obstacle_potential")
+CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 
 
 class Weights(Table):
@@ -50,6 +62,24 @@ class Weights(Table):
     )
 
 
+class Gains(Table):
+    """Gains of the null-space vector of eq. (38), where the curve is solved before the truss."""
+
+    called: ClassVar[str] = "[method.gains]"
+    spacing: Weight = Field(
+        default=1.0, description="spacings of the curve nodes less those at home, m^2; unit 1"
+    )
+    smoothness: Weight = Field(
+        default=0.1, description="second differences of the control vertices, m^2; unit 1"
+    )
+    curve_rate: Weight = Field(
+        default=1e-4, description="displacements of the control vertices in the null space, m^2; unit 1"
+    )
+    obstacle_potential: Weight = Field(
+        default=1e-3, description="potential of the obstacles within influence; unit m^2"
+    )
+
+
 class Method(Table):
     """How each step is solved."""
 
@@ -72,8 +102,38 @@ class Method(Table):
         default=None,
         description="greatest displacement of a node in one step, m; set from the members where absent",
     )
+    variant: Annotated[Literal["moore-penrose", "weighted", "damped", "truncated"], Choice()] = Field(
+        default="moore-penrose", description="pseudoinverse of eq. (28)"
+    )
+    algebra: Annotated[Literal["dense", "sparse"], Choice()] = Field(
+        default="dense", description="how eq. (28) is solved: dense matrices, or a banded KKT system"
+    )
+    correct: Flag = Field(
+        default=False,
+        description="whether the pseudoinverse methods correct lengths and tip after each step by Newton's "
+        "method; the paper does not",
+    )
+    null_space: tuple[Annotated[NullSpaceTerm, Choice()], ...] | None = Field(
+        default=None,
+        description="terms of the null-space vector of a pseudoinverse method; none if empty, and the usual "
+        "ones of that method where absent",
+    )
+    damping: Factor = Field(default=0.01, description="damping of the variant damped")
+    truncation: Factor = Field(
+        default=0.001, description="singular values below this part of the greatest are zero when truncated"
+    )
     weights: Weights = Field(default_factory=lambda: Weights(), description="weights of the null-space terms")
+    gains: Gains = Field(
+        default_factory=lambda: Gains(), description="gains of the curve's null-space vector, eq. (38)"
+    )
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.hard_tracking and self.tracking == "none":
             yield ("hard_tracking",), 'false, since tracking is "none"'
+        if self.variant == "truncated" and self.algebra == "sparse":
+            yield ("algebra",), '"dense", since the variant truncated needs the singular values'
+        known = {"pseudoinverse": TRUSS_TERMS, "curve-pseudoinverse": CURVE_TERMS}.get(self.name)
+        for i, term in enumerate(self.null_space or ()):
+            if known is not None and term not in known:
+                choices = ", ".join(f'"{name}"' for name in known)
+                yield ("null_space", i), f"a term of the method {self.name}: {choices}"
