@@ -72,6 +72,21 @@ class StepQP:
         """Return max |P z + q + A'y + w|, multipliers positive at upper and negative at lower bounds."""
         return float(np.max(np.abs(self.P @ z + self.q + self.A.T @ row_multipliers + column_multipliers)))
 
+    def complementarity_residual(self, z: Array, row_multipliers: Array, column_multipliers: Array) -> float:
+        """Return the greatest of min(|multiplier|, slack of its bound): what multipliers press on nothing.
+
+        A multiplier of the wrong sign has the slack of the other bound, one of a free row an infinite slack.
+        """
+        pairs = (
+            (row_multipliers, self.A @ z, self.row_lower, self.row_upper),
+            (column_multipliers, z, self.column_lower, self.column_upper),
+        )
+        worst = 0.0
+        for multiplier, x, lower, upper in pairs:
+            slack = np.where(multiplier > 0.0, upper - x, x - lower)
+            worst = max(worst, float(np.max(np.minimum(np.abs(multiplier), slack), initial=0.0)))
+        return worst
+
     def violated(self, z: Array, tolerance: float = 1e-9) -> list[tuple[str, float]]:
         """Return the names of rows and columns out of their bounds at `z` by more than `tolerance`, worst first."""
         value = self.A @ z

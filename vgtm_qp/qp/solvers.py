@@ -81,13 +81,19 @@ class FullSolver:
             The solver failed, or its answer has residuals above ``PRIMAL_TOLERANCE`` or ``DUAL_TOLERANCE``.
         """
         qp = self.builder.build(numbers)
-        same, self._structure = self.builder.structure == self._structure, self.builder.structure
+        same, self._structure = self.builder.structure == self._structure, None
+        if np.any(qp.row_lower > qp.row_upper) or np.any(qp.column_lower > qp.column_upper):
+            raise InfeasibleStepError("a lower bound is above its upper bound")
         z, y, w, iterations = self._answer(qp, same_structure=same)
+        if not all(np.all(np.isfinite(values)) for values in (z, y, w)):
+            raise SolverError("the answer holds values that are not finite numbers")
         primal = qp.primal_residual(z)
         scale = 1.0 + float(np.max(np.abs(qp.q))) + float(np.max(np.abs(y), initial=0.0))
-        dual = qp.dual_residual(z, y, w) / scale
+        dual = max(qp.dual_residual(z, y, w) / scale, qp.complementarity_residual(z, y / scale, w / scale))
         if not (primal <= PRIMAL_TOLERANCE and dual <= DUAL_TOLERANCE):
             raise SolverError(f"the answer has a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}")
+        # Only a good answer is a warm start: one that is not a number would stay in the solver for ever.
+        self._structure = self.builder.structure
         return self.builder.solution(z, y, w, iterations)
 
 

@@ -1,0 +1,183 @@
+"""Lengths, face frames, tip pose and every row of their Jacobians against finite differences, for every module."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arms import TRUSSES, central_differences, make_layout, random_pose
+from scipy.spatial.transform import Rotation
+
+from vgtm_qp.truss.kinematics import Kinematics, member_ends
+
+OFFSETS = (0.0, 0.12)
+
+
+@pytest.fixture(
+    params=[(name, offset) for name in TRUSSES for offset in OFFSETS], ids=lambda p: f"{p[0]}-{p[1]}"
+)
+def truss(request):
+    name, offset = request.param
+    return TRUSSES[name](joint_offset=offset)
+
+
+@pytest.fixture
+def kinematics(truss):
+    return Kinematics(truss, compiled=False)
+
+
+def lengths_of(truss, X):
+    ends = member_ends(truss, X)
+    return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+
+
+def spin_by_differences(rotation_at, X, h=1e-6):
+    """Angular velocity rows (..., 3, X.size) of a rotation that depends on X."""
+    columns = []
+    for step in h * np.eye(X.size):
+        ahead, behind = rotation_at(X + step.reshape(X.shape)), rotation_at(X - step.reshape(X.shape))
+        turn = ahead @ np.swapaxes(behind, -1, -2)
+        columns.append(
+            Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*turn.shape[:-1]) / (2 * h)
+        )
+    return np.stack(columns, axis=-1)
+
+
+def scattered(rows, nodes, count):
+    """Rows (..., 3K) with respect to K nodes as rows with respect to all nodes."""
+    out = np.zeros((*rows.shape[:-1], count, 3))
+    for slot, node in enumerate(nodes):
+        out[..., node, :] += rows[..., 3 * slot : 3 * slot + 3]
+    return out.reshape(*rows.shape[:-1], -1)
+
+
+def test_at_home_everything_is_as_the_truss_says(truss, kinematics):
+    kinematics.evaluate(truss.home)
+    np.testing.assert_allclose(kinematics.lengths, truss.home_lengths, atol=1e-14)
+    np.testing.assert_allclose(kinematics.face_rotation, truss.face_frames, atol=1e-14)
+    np.testing.assert_allclose(kinematics.tip_rotation, truss.tip_frame, atol=1e-14)
+    np.testing.assert_allclose(kinematics.tip_position(truss.home), truss.tip_weights @ truss.home[truss.tip])
+
+
+def test_lengths_are_those_between_member_ends_and_gradients_their_derivatives(truss, kinematics):
+    X = random_pose(truss, np.random.default_rng(1))
+    kinematics.evaluate(X)
+    np.testing.assert_allclose(kinematics.lengths, lengths_of(truss, X), atol=1e-14)
+    gradient = np.zeros((truss.member_count, truss.node_count, 3))
+    for slot in range(kinematics.member_nodes.shape[1]):
+        np.add.at(
+            gradient,
+            (np.arange(len(gradient)), kinematics.member_nodes[:, slot]),
+            kinematics.gradient[:, slot],
+        )
+    np.testing.assert_allclose(gradient, central_differences(lambda Y: lengths_of(truss, Y), X), atol=2e-9)
+
+
+def test_length_jacobian_has_the_free_nodes_columns_and_the_base_the_rest(truss, kinematics):
+    rng = np.random.default_rng(2)
+    X = random_pose(truss, rng)
+    layout, _ = make_layout(truss, kinematics)
+    kinematics.evaluate(X)
+    wanted = central_differences(lambda Y: lengths_of(truss, Y), X)
+    free = wanted[:, truss.free].reshape(truss.member_count, -1)
+    reused = np.zeros((truss.member_count, layout.node_columns))
+    for _ in range(2):
+        np.testing.assert_allclose(layout.length_jacobian(kinematics.gradient, reused), free, atol=2e-9)
+    np.testing.assert_allclose(layout.length_jacobian(kinematics.gradient), free, atol=2e-9)
+    moved = np.where(truss.base[:, None], rng.normal(size=X.shape), 0.0)
+    rate = layout.base_length_rate(kinematics.gradient, moved)
+    np.testing.assert_allclose(rate, np.einsum("mnc,nc->m", wanted, moved), atol=2e-8)
+    everywhere = rng.normal(size=X.shape)
+    only_base = np.where(truss.base[:, None], everywhere, 0.0)
+    np.testing.assert_allclose(
+        layout.base_length_rate(kinematics.gradient, everywhere),
+        layout.base_length_rate(kinematics.gradient, only_base),
+        atol=1e-12,
+    )
+
+
+def test_stages_order_the_length_jacobian_block_lower_triangular(truss):
+    nodes = truss.members if truss.joints is None else truss.joints.triangle[truss.members].reshape(-1, 6)
+    assert np.all(truss.stage[nodes].max(axis=1) <= truss.stage[truss.members].max(axis=1))
+
+
+def test_face_spins_are_the_angular_velocity_rows_of_the_face_frames(truss, kinematics):
+    X = random_pose(truss, np.random.default_rng(3))
+
+    def rotations(Y):
+        kinematics.evaluate(Y)
+        return kinematics.face_rotation.copy()
+
+    wanted = spin_by_differences(rotations, X)
+    kinematics.evaluate(X)
+    np.testing.assert_allclose(
+        kinematics.face_rotation @ kinematics.face_rotation.transpose(0, 2, 1),
+        np.broadcast_to(np.eye(3), kinematics.face_rotation.shape),
+        atol=1e-14,
+    )
+    for face, nodes in enumerate(truss.faces):
+        rows = scattered(kinematics.face_spin[face], nodes, truss.node_count)
+        np.testing.assert_allclose(rows, wanted[face], atol=5e-9)
+
+
+def test_tip_spin_is_the_angular_velocity_rows_of_the_tip_frame(truss, kinematics):
+    X = random_pose(truss, np.random.default_rng(4))
+
+    def rotation(Y):
+        kinematics.evaluate(Y)
+        return kinematics.tip_rotation.copy()
+
+    wanted = spin_by_differences(rotation, X)
+    kinematics.evaluate(X)
+    assert kinematics.has_tip_frame == (len(truss.tip) >= 3)
+    np.testing.assert_allclose(scattered(kinematics.tip_spin, truss.tip, truss.node_count), wanted, atol=5e-9)
+
+
+def test_a_rigid_motion_keeps_lengths_and_turns_frames_with_it(truss, kinematics):
+    rng = np.random.default_rng(5)
+    X = random_pose(truss, rng)
+    turn, shift = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3)
+    kinematics.evaluate(X)
+    lengths, faces, tip = (
+        kinematics.lengths.copy(),
+        kinematics.face_rotation.copy(),
+        kinematics.tip_rotation.copy(),
+    )
+    gradient, position = kinematics.gradient.copy(), kinematics.tip_position(X)
+    moved = X @ turn.T + shift
+    kinematics.evaluate(moved)
+    np.testing.assert_allclose(kinematics.lengths, lengths, atol=1e-13)
+    np.testing.assert_allclose(kinematics.face_rotation, turn @ faces, atol=1e-12)
+    np.testing.assert_allclose(kinematics.gradient, gradient @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(kinematics.tip_position(moved), turn @ position + shift, atol=1e-13)
+    if kinematics.has_tip_frame:
+        np.testing.assert_allclose(kinematics.tip_rotation, turn @ tip, atol=1e-12)
+
+
+def test_a_face_frame_prefers_no_node():
+    """The frame of a scaled, sheared and moved triangle is the same whichever of its nodes is named first."""
+    rng = np.random.default_rng(6)
+    truss = TRUSSES["octahedral"]()
+    X = random_pose(truss, rng, 0.2)
+    frames = []
+    for shift in range(3):
+        faces = np.roll(truss.faces, shift, axis=1)
+        kinematics = Kinematics(type(truss)(**{**vars_of(truss), "faces": faces}), compiled=False)
+        kinematics.evaluate(X)
+        frames.append(kinematics.face_rotation.copy())
+    np.testing.assert_allclose(frames[1], frames[0], atol=1e-12)
+    np.testing.assert_allclose(frames[2], frames[0], atol=1e-12)
+
+
+def vars_of(truss):
+    return {name: getattr(truss, name) for name in truss.__dataclass_fields__}
+
+
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_the_compiled_kernel_is_the_interpreted_one(offset):
+    truss = TRUSSES["octahedral"](joint_offset=offset)
+    compiled, interpreted = Kinematics(truss), Kinematics(truss, compiled=False)
+    X = random_pose(truss, np.random.default_rng(7))
+    for kinematics in (compiled, interpreted):
+        kinematics.evaluate(X)
+    for name in ("lengths", "gradient", "face_rotation", "face_spin", "tip_rotation", "tip_spin"):
+        np.testing.assert_allclose(getattr(compiled, name), getattr(interpreted, name), atol=1e-13)

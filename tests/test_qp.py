@@ -1,0 +1,407 @@
+"""The QP of a step: full and condensed forms agree, every answer satisfies KKT, and wrong answers are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arms import TRUSSES, make_layout, random_pose
+
+from vgtm_qp.errors import SolverError, VgtmError
+from vgtm_qp.qp.condensed import InfeasibleStepError
+from vgtm_qp.qp.full import FullBuilder
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.solvers import FullSolver, available_solvers, make_solver
+from vgtm_qp.truss.kinematics import Kinematics
+
+FULL_SOLVERS = ["osqp", "piqp", "clarabel"]
+SOLVERS = ["daqp", *FULL_SOLVERS]
+CURVES = ["none", "elastic", "hard"]
+
+# Faces that can keep to a curve exactly beside the tip's three rows: one less than would use up the motions.
+HARD = {"octahedral", "hexapod", "longeron", "tetrahedral-23", "tetrahedral-123"}
+
+CASES = [(name, curve) for name in TRUSSES for curve in CURVES if curve != "hard" or name in HARD]
+
+
+def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
+    """A layout and random numbers of its QP, feasible by construction, with bounds and clearance rows near active."""
+    rng = np.random.default_rng(seed)
+    truss = TRUSSES[name](joint_offset=joint_offset)
+    kinematics = Kinematics(truss, compiled=False)
+    track = ("position",)
+    if curve == "hard":
+        track = ("z",)
+    layout, task = make_layout(
+        truss, kinematics, track, vertices=0 if curve == "none" else 6, hard_tracking=curve == "hard"
+    )
+    X = random_pose(truss, rng, 0.03)
+    kinematics.evaluate(X)
+    count, vertices, tracked = len(truss.actuators), layout.vertices, len(layout.tracked)
+
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
+    actuators = 0.02 * rng.normal(size=count)
+    progress = 0.6
+    length_rhs = np.where(truss.actuated, 0.0, 0.002 * rng.normal(size=truss.member_count))
+    change = length_rhs.copy()
+    change[truss.actuators] += actuators
+    nodes = np.zeros_like(X)
+    nodes[truss.free] = np.linalg.solve(layout.length_jacobian(kinematics.gradient), change).reshape(-1, 3)
+
+    shift, base_rhs = 0.01 * rng.normal(size=3), 0.01 * rng.normal(size=2)
+    curve_step = 0.02 * rng.normal(size=(vertices, 3))
+    if vertices:
+        curve_step[0] = shift
+        curve_step[1] = shift + 0.01 * np.cross(axes[0], axes[1]) + base_rhs @ axes
+    centres = np.einsum("kf,kfc->kc", truss.face_weights[layout.tracked], nodes[truss.faces[layout.tracked]])
+    tip_jacobian = np.kron(truss.tip_weights, np.eye(3))[task.axes]
+    tip_rate = rng.normal(size=len(layout.tip_rows))
+    tip_rhs = tip_jacobian @ nodes[truss.tip].reshape(-1) - tip_rate * progress
+    if curve == "hard":
+        position_rhs = layout.curve_weights @ curve_step - centres
+    else:
+        position_rhs = 0.05 * rng.normal(size=(tracked, 3))
+
+    members = truss.members[rng.integers(truss.member_count, size=rows)]
+    others = truss.members[rng.integers(truss.member_count, size=rows)]
+    clearance_nodes = np.concatenate([members, others], axis=1)
+    normal = rng.normal(size=(rows, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    share = rng.uniform(size=(rows, 2))
+    scale = np.stack([1 - share[:, 0], share[:, 0], share[:, 1] - 1, -share[:, 1]], axis=1)
+    scale[:1, 2:] = 0.0
+    coefficients = scale[..., None] * normal[:, None, :]
+    value = np.einsum("rsc,rsc->r", coefficients, nodes[clearance_nodes])
+    numbers = StepNumbers(
+        gradient=kinematics.gradient.copy(),
+        length_rhs=length_rhs,
+        lower=actuators - rng.uniform(0.0, 0.03, count),
+        upper=actuators + rng.uniform(0.0, 0.03, count),
+        actuator_gradient=rng.normal(size=count),
+        tip_jacobian=tip_jacobian,
+        tip_rate=tip_rate,
+        tip_rhs=tip_rhs,
+        progress_lower=0.0,
+        progress_upper=1.0,
+        progress_gradient=-1.5,
+        progress_curvature=1.0,
+        position_rhs=position_rhs,
+        tangent_face=rng.normal(size=(tracked, 2, 9)),
+        tangent_curve=rng.normal(size=(tracked, 2, 3)),
+        tangent_rhs=0.1 * rng.normal(size=(tracked, 2)),
+        vertex_gradient=0.05 * rng.normal(size=(vertices, 3)),
+        base_displacement=shift,
+        base_axes=axes,
+        base_rhs=base_rhs,
+        clearance=ClearanceRows(
+            clearance_nodes,
+            coefficients,
+            value - rng.uniform(0.0, 0.01, rows),
+            lambda k: f"clearance: row {k}",
+        ),
+    )
+    return layout, numbers
+
+
+def contradiction(layout, numbers):
+    """Numbers whose clearance row asks for a jump that the strokes do not allow."""
+    truss = layout.truss
+    node = truss.free[-1]
+    rows = ClearanceRows(
+        np.full((1, 4), node), np.zeros((1, 4, 3)), np.array([5.0]), lambda k: "clearance: far"
+    )
+    rows.coefficients[0, 0, 2] = 1.0
+    return replace(numbers, clearance=rows)
+
+
+def full_point(builder, numbers, solution):
+    """The full QP's unknowns at a solution: its displacements, and the gaps that follow from them."""
+    layout, truss = builder.layout, builder.layout.truss
+    parts = [solution.nodes[truss.free].reshape(-1), solution.actuators, solution.vertices.reshape(-1)]
+    if layout.vertices:
+        faces = truss.faces[layout.tracked]
+        centres = np.einsum("kf,kfc->kc", truss.face_weights[layout.tracked], solution.nodes[faces])
+        gap = centres - layout.curve_weights @ solution.vertices + numbers.position_rhs
+        tangent = np.einsum("kaf,kf->ka", numbers.tangent_face, solution.nodes[faces].reshape(-1, 9))
+        tangent += np.einsum("kac,kc->ka", numbers.tangent_curve, layout.curve_slopes @ solution.vertices)
+        parts += [gap.reshape(-1), (tangent + numbers.tangent_rhs).reshape(-1)]
+    return np.concatenate([*parts, [solution.progress]])
+
+
+def stationarity(builder, qp, z, solution):
+    """What is left of the gradient by the solution's multipliers and the best ones of rows that it does not report."""
+    clearance = len(solution.clearance_multipliers)
+    known = np.zeros(len(z))
+    known[builder.column["actuators"]] = solution.actuator_multipliers
+    rows = np.zeros(len(qp.row_lower))
+    if clearance:
+        rows[-clearance:] = -solution.clearance_multipliers
+    gradient = qp.P @ z + qp.q + known + qp.A.T @ rows
+    equal = qp.row_lower == qp.row_upper
+    pinned = np.flatnonzero((qp.column_upper - z < 1e-9) | (z - qp.column_lower < 1e-9))
+    actuators = builder.column["actuators"]
+    pinned = pinned[(pinned < actuators.start) | (pinned >= actuators.stop)]
+    columns = np.hstack([qp.A[equal].toarray().T, np.eye(len(z))[:, pinned]])
+    best = np.linalg.lstsq(columns, -gradient, rcond=None)[0]
+    return float(np.max(np.abs(gradient + columns @ best)))
+
+
+def exact_point(qp, z):
+    """The minimiser over the rows and bounds that are active at `z`: what a solver's answer is off by is removed."""
+    value = qp.A @ z
+    rows = (value - qp.row_lower < 1e-6) | (qp.row_upper - value < 1e-6)
+    columns = (z - qp.column_lower < 1e-6) | (qp.column_upper - z < 1e-6)
+    row_target = np.where(value - qp.row_lower < 1e-6, qp.row_lower, qp.row_upper)[rows]
+    column_target = np.where(z - qp.column_lower < 1e-6, qp.column_lower, qp.column_upper)[columns]
+    active = np.vstack([qp.A.toarray()[rows], np.eye(len(z))[columns]])
+    target = np.concatenate([row_target, column_target])
+    size = len(target)
+    system = np.block([[qp.P.toarray(), active.T], [active, np.zeros((size, size))]])
+    return np.linalg.lstsq(system, np.concatenate([-qp.q, target]), rcond=None)[0][: len(z)]
+
+
+@pytest.mark.parametrize(("name", "curve"), CASES)
+def test_condensed_answer_satisfies_the_full_qp(name, curve):
+    clearance = strokes = 0
+    for seed in range(4):
+        layout, numbers = make_case(name, curve, seed=seed, joint_offset=0.1 * (seed % 2))
+        solution = make_solver("daqp", layout).solve(numbers)
+        builder = FullBuilder(layout)
+        qp = builder.build(numbers)
+        z = full_point(builder, numbers, solution)
+        assert qp.primal_residual(z) < 1e-9, qp.violated(z)
+        assert not qp.violated(z, 1e-9)
+        scale = 1.0 + float(np.max(np.abs(solution.actuator_multipliers)))
+        assert stationarity(builder, qp, z, solution) < 1e-9 * scale
+        y, w = solution.clearance_multipliers, solution.actuator_multipliers
+        assert np.all(y >= -1e-9)
+        slack = (qp.A @ z - qp.row_lower)[len(qp.row_lower) - len(y) :]
+        assert np.all(np.minimum(y, slack) < 1e-9)
+        at_bound = np.where(w > 0, numbers.upper - solution.actuators, solution.actuators - numbers.lower)
+        assert np.all(np.minimum(np.abs(w), at_bound) < 1e-9)
+        clearance += int(np.sum(y > 1e-6))
+        strokes += int(np.sum(np.abs(w) > 1e-6))
+        fixed = qp.P @ z @ z / 2 + qp.q @ z
+        nearby = exact_point(qp, z)
+        assert fixed == pytest.approx(qp.P @ nearby @ nearby / 2 + qp.q @ nearby, abs=1e-10)
+    assert strokes > 0
+    assert clearance > 0
+
+
+@pytest.mark.parametrize("solver", FULL_SOLVERS)
+@pytest.mark.parametrize(("name", "curve"), CASES)
+def test_full_and_condensed_forms_have_the_same_answer(name, curve, solver):
+    layout, numbers = make_case(name, curve, seed=11)
+    answers = [make_solver(which, layout).solve(numbers) for which in ("daqp", solver)]
+    builder = FullBuilder(layout)
+    qp = builder.build(numbers)
+    condensed, full = (full_point(builder, numbers, answer) for answer in answers)
+    np.testing.assert_allclose(full, condensed, atol=3e-6)
+    np.testing.assert_allclose(exact_point(qp, full), condensed, atol=1e-9)
+    for which in ("actuator_multipliers", "clearance_multipliers"):
+        np.testing.assert_allclose(getattr(answers[1], which), getattr(answers[0], which), atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_solver_gives_the_same_answers_whatever_it_solved_before(solver):
+    """Changed values, changed near pairs, infeasible QPs between: nothing of them may stay in the solver."""
+    layout, first = make_case("octahedral", seed=21)
+    cases = [first] + [
+        make_case("octahedral", seed=s, rows=r)[1] for s, r in ((22, 5), (23, 0), (24, 2), (25, 5))
+    ]
+    for case in cases[1:]:
+        case.gradient = case.gradient.copy()
+    reused = make_solver(solver, layout)
+    for numbers in (*cases, first):
+        with pytest.raises(InfeasibleStepError):
+            reused.solve(contradiction(layout, numbers))
+        for wrong in (np.nan, np.inf):
+            with pytest.raises(SolverError):
+                reused.solve(
+                    replace(numbers, actuator_gradient=np.full_like(numbers.actuator_gradient, wrong))
+                )
+        answer, fresh = reused.solve(numbers), make_solver(solver, layout).solve(numbers)
+        np.testing.assert_allclose(answer.nodes, fresh.nodes, atol=1e-6)
+        np.testing.assert_allclose(answer.actuator_multipliers, fresh.actuator_multipliers, atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_an_answer_does_not_change_when_the_solver_goes_on(solver):
+    layout, numbers = make_case("octahedral", seed=31)
+    reused = make_solver(solver, layout)
+    answer = reused.solve(numbers)
+    kept = {name: np.copy(getattr(answer, name)) for name in StepSolution.__dataclass_fields__}
+    before = {name: np.copy(getattr(numbers, name)) for name in ("gradient", "lower", "upper", "tip_rhs")}
+    reused.solve(make_case("octahedral", seed=32)[1])
+    for name, value in kept.items():
+        np.testing.assert_array_equal(getattr(answer, name), value)
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(numbers, name), value)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("curve", CURVES)
+def test_contradicting_rows_are_infeasible_for_every_solver(solver, curve):
+    layout, numbers = make_case("octahedral", curve, seed=41)
+    with pytest.raises(InfeasibleStepError):
+        make_solver(solver, layout).solve(contradiction(layout, numbers))
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_rows_that_contradict_by_a_millimetre_are_not_called_solved(solver):
+    layout, numbers = make_case("octahedral", seed=42)
+    rows = numbers.clearance
+    opposed = ClearanceRows(
+        rows.nodes[[0, 0]], np.stack([rows.coefficients[0], -rows.coefficients[0]]), np.array([1e-3, 0.0])
+    )
+    with pytest.raises(SolverError):
+        make_solver(solver, layout).solve(replace(numbers, clearance=opposed))
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_box_that_contradicts_itself_is_refused(solver):
+    layout, numbers = make_case("octahedral", seed=43)
+    upper = numbers.upper.copy()
+    upper[1] = numbers.lower[1] - 1e-3
+    with pytest.raises(SolverError):
+        make_solver(solver, layout).solve(replace(numbers, upper=upper))
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_row_that_is_not_a_number_is_refused(solver):
+    layout, numbers = make_case("octahedral", seed=44)
+    tip_rhs = numbers.tip_rhs.copy()
+    tip_rhs[0] = np.nan
+    with pytest.raises(SolverError):
+        make_solver(solver, layout).solve(replace(numbers, tip_rhs=tip_rhs))
+
+
+def test_a_singular_truss_is_named():
+    layout, numbers = make_case("octahedral", seed=45)
+    gradient = numbers.gradient.copy()
+    gradient[-1] = 0.0
+    with pytest.raises(SolverError, match="singular"):
+        make_solver("daqp", layout).solve(replace(numbers, gradient=gradient))
+
+
+def test_unknown_solvers_are_named_with_the_choices():
+    layout, _ = make_case("octahedral")
+    with pytest.raises(SolverError, match=r'no solver "ospq".*did you mean "osqp".*daqp, .*piqp'):
+        make_solver("ospq", layout)
+    assert issubclass(SolverError, VgtmError)
+    assert issubclass(InfeasibleStepError, SolverError)
+    choices = available_solvers()
+    assert choices[0] == "daqp"
+    assert set(SOLVERS) <= set(choices)
+    assert len(set(choices)) == len(choices)
+
+
+def test_every_solver_on_the_list_solves():
+    layout, numbers = make_case("octahedral", seed=46)
+    wanted = make_solver("daqp", layout).solve(numbers)
+    for name in available_solvers():
+        found = make_solver(name, layout).solve(numbers)
+        np.testing.assert_allclose(found.nodes, wanted.nodes, atol=1e-5, err_msg=name)
+
+
+def good_answer(layout, numbers):
+    """The exact answer with all its multipliers, from one solver run through the public surface of the full QP."""
+    kept = {}
+    from vgtm_qp.qp.solvers import _Piqp
+
+    piqp = _Piqp()
+
+    def answer(qp, *, same_structure):
+        kept["answer"] = piqp(qp, same_structure=same_structure)
+        return kept["answer"]
+
+    FullSolver(layout, answer).solve(numbers)
+    return kept["answer"]
+
+
+GARBAGE = {
+    "zero": lambda z, y, w: (0 * z, 0 * y, 0 * w),
+    "random": lambda z, y, w: (np.random.default_rng(0).normal(size=z.shape), y, w),
+    "not a number": lambda z, y, w: (np.full_like(z, np.nan), y, w),
+    "one not a number": lambda z, y, w: (np.where(np.arange(len(z)) == len(z) - 1, np.nan, z), y, w),
+    "infinite": lambda z, y, w: (np.full_like(z, np.inf), y, w),
+    "a millimetre off": lambda z, y, w: (z + 1e-3, y, w),
+    "ten micrometres off": lambda z, y, w: (z + 1e-5 * np.cos(np.arange(len(z))), y, w),
+    "no multipliers": lambda z, y, w: (z, 0 * y, 0 * w),
+    "wrong signs": lambda z, y, w: (z, -y, -w),
+    "multipliers not numbers": lambda z, y, w: (z, np.full_like(y, np.nan), w),
+}
+
+
+@pytest.mark.parametrize("kind", GARBAGE)
+def test_garbage_with_a_good_status_is_refused(kind):
+    layout, numbers = make_case("octahedral", seed=51)
+    answer = GARBAGE[kind](*good_answer(layout, numbers)[:3])
+    with pytest.raises(SolverError):
+        FullSolver(layout, lambda qp, *, same_structure: (*answer, 1)).solve(numbers)
+
+
+def test_a_feasible_answer_that_is_not_optimal_is_refused():
+    """Multipliers on columns without bounds would make any point stationary: they are no multipliers."""
+    layout, numbers = make_case("octahedral", seed=52)
+    other = make_solver("daqp", layout).solve(replace(numbers, actuator_gradient=-numbers.actuator_gradient))
+    builder = FullBuilder(layout)
+    z = full_point(builder, numbers, other)
+    qp = builder.build(numbers)
+    assert qp.primal_residual(z) < 1e-9
+    y = np.zeros(len(qp.row_lower))
+    w = -(qp.P @ z + qp.q)
+    assert qp.dual_residual(z, y, w) < 1e-12
+    with pytest.raises(SolverError):
+        FullSolver(layout, lambda qp, *, same_structure: (z, y, w, 1)).solve(numbers)
+
+
+def test_garbage_from_a_library_is_refused(monkeypatch):
+    import qpsolvers
+
+    layout, numbers = make_case("octahedral", seed=53)
+    solve = qpsolvers.solve_problem
+
+    def feasible_for_another_objective(problem, **options):
+        changed = qpsolvers.Problem(
+            problem.P, -problem.q, problem.G, problem.h, problem.A, problem.b, problem.lb, problem.ub
+        )
+        return solve(changed, **options)
+
+    monkeypatch.setattr(qpsolvers, "solve_problem", feasible_for_another_objective)
+    with pytest.raises(SolverError):
+        make_solver("clarabel", layout).solve(numbers)
+
+
+def test_the_full_qp_names_and_measures_every_row_and_column():
+    layout, numbers = make_case("octahedral", "elastic", seed=61)
+    qp = FullBuilder(layout).build(numbers)
+    assert qp.A.shape == (len(qp.rows), len(qp.columns)) == (len(qp.row_lower), len(qp.q))
+    assert len({label.name for label in qp.columns}) == len(qp.columns)
+    assert {label.unit for label in qp.columns} <= {"m", "rad", "1"}
+    assert {label.unit for label in qp.rows} <= {"m", "rad"}
+    names = [label.name for label in qp.rows]
+    assert len(set(names)) == len(names)
+    assert {"member: L1-1", "actuator: B2-3", "tip x", "clearance: row 4"} <= set(names)
+    z = np.zeros(len(qp.q))
+    violated = dict(qp.violated(z, 1e-12))
+    assert max(violated.values()) == pytest.approx(qp.primal_residual(z))
+    assert list(violated.values()) == sorted(violated.values(), reverse=True)
+    text = str(qp)
+    assert f"{len(qp.columns)} columns, {len(qp.rows)} rows" in text
+    assert np.all(np.linalg.eigvalsh(qp.P.toarray()) > -1e-12)
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_the_structure_token_changes_with_the_near_pairs_only(curve):
+    layout, numbers = make_case("octahedral", curve, seed=62)
+    builder = FullBuilder(layout)
+    builder.build(numbers)
+    token = builder.structure
+    first = builder.build(numbers).A.toarray()
+    assert builder.structure == token
+    fewer = make_case("octahedral", curve, seed=63, rows=2)[1]
+    builder.build(fewer)
+    assert builder.structure != token
+    np.testing.assert_array_equal(builder.build(numbers).A.toarray(), first)
