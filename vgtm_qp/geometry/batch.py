@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -16,35 +14,27 @@ _CAPACITIES = (16, 128, 1024)
 
 
 class Batch:
-    """A CasADi function of column vectors, evaluated on rows.
+    """A CasADi function of column vectors, evaluated on rows; its outputs stand side by side in one array.
 
     Capacities are compiled when first needed. Not for two threads at once.
     """
 
     def __init__(self, function: ca.Function) -> None:
-        self._function = function
-        self._kernels: dict[int, tuple[Kernel, list[Array], list[Array]]] = {}
+        arguments = function.sx_in()
+        outputs = ca.cse(ca.vertcat(*function.call(arguments)))
+        self._function = ca.Function(function.name(), arguments, [outputs])
+        self._kernels: dict[int, tuple[Kernel, list[Array], Array]] = {}
 
-    def _kernel(self, capacity: int) -> tuple[Kernel, list[Array], list[Array]]:
+    def _kernel(self, capacity: int) -> tuple[Kernel, list[Array], Array]:
         if capacity not in self._kernels:
-            kernel = Kernel(
-                self._function.map(f"{self._function.name()}_{capacity}", "serial", capacity, [], [])
-            )
-            self._kernels[capacity] = (
-                kernel,
-                [x.reshape(capacity, -1) for x in kernel.inputs],
-                [x.reshape(capacity, -1) for x in kernel.outputs],
-            )
+            name = f"{self._function.name()}_{capacity}"
+            kernel = Kernel(self._function.map(name, "serial", capacity, [], []))
+            inputs = [x.reshape(capacity, -1) for x in kernel.inputs]
+            self._kernels[capacity] = kernel, inputs, kernel.outputs[0].reshape(capacity, -1)
         return self._kernels[capacity]
 
-    def __call__(self, *rows: Array) -> Sequence[Array]:
-        """Evaluate on `rows`, one (K, width) array per argument.
-
-        Returns
-        -------
-        sequence of (K, width) arrays
-            Views that the next call overwrites.
-        """
+    def __call__(self, *rows: Array) -> Array:
+        """Evaluate on `rows`, one (K, width) array per argument, and return a new (K, outputs) array."""
         count = len(rows[0])
         capacity = _capacity(count)
         if count <= capacity:
@@ -53,18 +43,17 @@ class Batch:
         start = 0
         while start < count:
             capacity = _capacity(count - start)
-            stop = min(start + capacity, count)
-            parts.append([x.copy() for x in self._part(capacity, rows, start, stop)])
-            start = stop
-        return [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+            parts.append(self._part(capacity, rows, start, min(start + capacity, count)))
+            start += capacity
+        return np.concatenate(parts)
 
-    def _part(self, capacity: int, rows: Sequence[Array], start: int, stop: int) -> list[Array]:
-        kernel, inputs, outputs = self._kernel(capacity)
+    def _part(self, capacity: int, rows: tuple[Array, ...], start: int, stop: int) -> Array:
+        kernel, inputs, output = self._kernel(capacity)
         size = stop - start
         for target, source in zip(inputs, rows, strict=True):
             target[:size] = source[start:stop]
         kernel()
-        return [x[:size] for x in outputs]
+        return output[:size].copy()
 
 
 def _capacity(count: int) -> int:

@@ -16,6 +16,10 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
+SECOND_CONTACT = 0.2
+"""Two contacts of a member with one piece are apart by this fraction of its length, at least."""
+
+
 @dataclass(frozen=True, eq=False)
 class Members:
     """The arm as capsules: ``nodes`` (M, 2) int and ``radius`` (M,)."""
@@ -28,6 +32,26 @@ class Members:
         shift = X - reference
         moved = np.sqrt(np.einsum("ic,ic->i", shift, shift))
         return np.asarray(np.maximum(moved[self.nodes[:, 0]], moved[self.nodes[:, 1]]))
+
+
+class Contacts:
+    """Outputs of ``distance_function`` for K pairs, distances from surface to surface.
+
+    Attributes
+    ----------
+    distance, distance_second, t, t_second, s, s_second : (K,)
+    normal, normal_second, point, point_second : (K, 3)
+    two : (K,) bool
+        Whether the second contact is worth a row of its own.
+    """
+
+    def __init__(self, rows: Array) -> None:
+        self.rows = rows
+        self.distance, self.distance_second, self.t, self.t_second = rows[:, :4].T
+        self.normal, self.normal_second = rows[:, 4:7], rows[:, 7:10]
+        self.point, self.point_second = rows[:, 10:13], rows[:, 13:16]
+        self.s, self.s_second = rows[:, 16], rows[:, 17]
+        self.two = np.abs(self.t_second - self.t) >= SECOND_CONTACT
 
 
 class Group:
@@ -46,6 +70,7 @@ class Group:
     ) -> None:
         self.shape, self.member, self.other = shape, member, other
         self.is_self = shape == "segment"
+        self.moving = pieces.moving and not self.is_self
         self.distance = np.zeros(len(member))
         self._members, self._pieces, self._kernels = members, pieces, kernels
         self.nodes = members.nodes[member]
@@ -70,7 +95,7 @@ class Group:
         bound = self.distance - motion[self.member]
         if self.is_self:
             bound -= motion[self.other]
-        elif self._pieces.moving:
+        elif self.moving:
             bound -= self.speed * abs(elapsed)
         return np.asarray(bound)
 
@@ -84,23 +109,20 @@ class Group:
             return X[self.other_nodes[rows]].reshape(-1, 6)
         return np.asarray(self._pieces.at(time)[self.other[rows]])
 
-    def exact(self, X: Array, time: float, rows: Index) -> list[Array]:
-        """Return the outputs of ``distance_function``, the distances from surface to surface; copies."""
-        return self.exact_of(self.segments(X, rows), self.others(X, time, rows), rows)
+    def contacts(self, X: Array, time: float, rows: Index) -> Contacts:
+        """Return exact contacts of some pairs."""
+        return self.contacts_of(self.segments(X, rows), self.others(X, time, rows), rows)
 
-    def exact_of(self, segments: Array, others: Array, rows: Index) -> list[Array]:
+    def contacts_of(self, segments: Array, others: Array, rows: Index) -> Contacts:
         """Return the same for given ends and parameters."""
-        outputs = [x.copy() for x in self._kernels.distance(self.shape)(segments, others)]
-        radius = self.radius[rows, None]
-        outputs[0] -= radius
-        outputs[5] -= radius
-        return outputs
+        answer = self._kernels.distance(self.shape)(segments, others)
+        answer[:, :2] -= self.radius[rows, None]
+        return Contacts(answer)
 
     def sweep(self, a: Array, b: Array, other_a: Array, other_b: Array, rows: Index) -> Array:
-        """Return bound, and surface distances at the start, middle and end (k, 4), of ``sweep_function``."""
+        """Return the outputs of ``sweep_function`` (k, 3), distances from surface to surface."""
         arguments = (a, b, other_a, other_b) if self.is_self else (a, b, other_a)
-        columns = self._kernels.sweep(self.shape)(*arguments)
-        return np.hstack(columns) - self.radius[rows, None]
+        return np.asarray(self._kernels.sweep(self.shape)(*arguments) - self.radius[rows, None])
 
     def displacement(self, duration: float, rows: Index) -> Array:
         """Return how far the obstacles move in `duration`, (k, 3)."""
@@ -144,7 +166,8 @@ class Candidates:
         self_horizon: float | None,
     ) -> None:
         self.reference, self.time = X.copy(), time
-        self.horizon, self.self_horizon = horizon, np.inf if self_horizon is None else self_horizon
+        self.horizon = horizon if len(pieces) else np.inf
+        self.self_horizon = np.inf if self_horizon is None else self_horizon
         self._members, self._fastest = members, float(pieces.speed.max(initial=0.0))
         self.groups: list[Group] = []
         ends = X[members.nodes]
@@ -163,7 +186,7 @@ class Candidates:
     def _add(self, group: Group, horizon: float) -> None:
         rows = np.arange(len(group.member))
         if len(rows):
-            group.distance = group.exact(self.reference, self.time, rows)[0][:, 0]
+            group.distance = group.contacts(self.reference, self.time, rows).distance
             self.groups.append(group.select(group.distance < horizon))
 
     def refresh(self, X: Array, time: float) -> None:
@@ -172,7 +195,7 @@ class Candidates:
         self.horizon, self.self_horizon = self.beyond(motion, time)
         self.reference, self.time = X.copy(), time
         for group in self.groups:
-            group.distance = group.exact(X, time, np.arange(len(group.member)))[0][:, 0]
+            group.distance = group.contacts(X, time, np.arange(len(group.member))).distance
 
     def motion(self, X: Array) -> Array:
         """Return the motion of each member since the reference, (M,)."""

@@ -3,123 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vgtm_qp.geometry.candidates import Candidates, Group, Kernels, Members
+from vgtm_qp.geometry.candidates import Candidates, Contacts, Group, Kernels, Members
 from vgtm_qp.geometry.fcl_queries import FclQueries
-from vgtm_qp.geometry.shapes import Obstacle, Pieces
+from vgtm_qp.geometry.pairs import BetweenReport, Names, NearPairs, Pair, join
+from vgtm_qp.geometry.shapes import GeometryError, Obstacle, Pieces
+from vgtm_qp.geometry.solids import Solid
 from vgtm_qp.geometry.sweep import Found, sweep_group
+
+__all__ = ["BetweenReport", "Clearance", "NearPairs", "Pair"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
-_SECOND_CONTACT = 0.2
-"""Fraction of a member's length that two contacts of it with one piece are apart, at least."""
-
-
-class Pair(NamedTuple):
-    """A member and a piece of an obstacle, or another member."""
-
-    member: int
-    other: int
-    is_self: bool
-
-
-@dataclass(frozen=True, eq=False)
-class NearPairs:
-    """K near pairs of surfaces.
-
-    Attributes
-    ----------
-    member : (K,) int
-    other : (K,) int
-        Piece index, or the other member.
-    is_self : (K,) bool
-    distance : (K,)
-        From surface to surface, m; negative where they intersect.
-    normal : (K, 3)
-        Unit, from the obstacle or other member to the member: the gradient of `distance` with respect to the
-        witness point.
-    t, t_other : (K,)
-        Parameters of the witness points on the member and, for self pairs, on the other member (else 0).
-    normal_speed : (K,)
-        Velocity of the obstacle along `normal`, m/s.
-    point : (K, 3)
-        Witness point on the piece, or on the other member's axis, m.
-    names : Names
-        What :meth:`name` reads.
-    """
-
-    member: Index
-    other: Index
-    is_self: Mask
-    distance: Array
-    normal: Array
-    t: Array
-    t_other: Array
-    normal_speed: Array
-    point: Array
-    names: Names
-
-    def __len__(self) -> int:
-        return len(self.member)
-
-    def name(self, k: int) -> str:
-        """Return the name of row `k`: ``"clearance: member L3-2 / right cube"``."""
-        return self.names.clearance(Pair(int(self.member[k]), int(self.other[k]), bool(self.is_self[k])))
-
-
-@dataclass(frozen=True)
-class Names:
-    """Names of members and of the obstacle that each piece belongs to."""
-
-    members: tuple[str, ...]
-    obstacles: tuple[str, ...]
-    owner: tuple[int, ...]
-
-    def clearance(self, pair: Pair) -> str:
-        """Return the name of a clearance row."""
-        other = (
-            f"member {self.members[pair.other]}" if pair.is_self else self.obstacles[self.owner[pair.other]]
-        )
-        return f"clearance: member {self.members[pair.member]} / {other}"
-
-
-@dataclass(frozen=True, eq=False)
-class BetweenReport:
-    """What was proven about a motion from one state to the next.
-
-    Attributes
-    ----------
-    certified : bool
-        No pair comes below the floor. False may also mean that the proof was not found.
-    clearance : float
-        Proven lower bound of the surface distances over the motion; the least distance found where not
-        certified.
-    fraction : (F,)
-        For each failing pair, where on the motion (0 < s < 1) the least distance was found.
-    failing : NearPairs
-        The failing pairs there, one row each.
-    """
-
-    certified: bool
-    clearance: float
-    fraction: Array
-    failing: NearPairs
-
-    def failing_parameters(self, apart: float = 0.05) -> list[float]:
-        """Return the fractions, worst pair first, without those nearer than `apart` to a worse one."""
-        chosen: list[float] = []
-        for k in np.argsort(self.failing.distance, kind="stable"):
-            s = float(self.fraction[k])
-            if all(abs(s - c) > apart for c in chosen):
-                chosen.append(s)
-        return chosen
+_AMONG = {"all": (False, True), "obstacles": (False,), "members": (True,)}
+_FIRST = 16
 
 
 class Clearance:
@@ -174,6 +76,11 @@ class Clearance:
         self._kernels = Kernels()
         self._candidates: Candidates | None = None
         self._wasted = 0
+        self._solids = {
+            k: Solid(o.pieces[:, :9].reshape(-1, 3, 3), o.velocity)
+            for k, o in enumerate(self.obstacles)
+            if o.shape == "triangle" and o.solid
+        }
 
     def near(
         self,
@@ -184,6 +91,9 @@ class Clearance:
         self_reach: float | None = None,
     ) -> NearPairs:
         """Return all pairs whose surfaces are nearer than `reach`, exact.
+
+        A pair has two rows where the nearest point of a member is not unique. Of the triangles of a mesh
+        only those stay that differ in normal or in the part of the member they face.
 
         Parameters
         ----------
@@ -206,60 +116,63 @@ class Clearance:
             limit = self_reach if group.is_self else reach
             rows = np.flatnonzero(group.lower(motion, elapsed) < limit)
             if len(rows):
-                part = self._near_rows(group, X, time, rows, limit, use_fcl)
-                wasted += len(rows) - len(part)
-                parts.append(part)
-        self._tire(candidates, X, time, wasted)
-        return _join(parts, self.names)
-
-    def _tire(self, candidates: Candidates, X: Array, time: float, wasted: int) -> None:
-        """Renew the reference once the pairs evaluated for nothing have cost as much as that."""
+                contacts = self._contacts(group, X, time, rows, limit, use_fcl)
+                first = np.flatnonzero(contacts.distance < limit)
+                wasted += len(rows) - len(first)
+                second = first[contacts.two[first] & (contacts.distance_second[first] < limit)]
+                part = self._pairs(group, rows, contacts, first, second)
+                parts.append(self._distinct(part) if group.shape == "triangle" else part)
         self._wasted += wasted
         if self._wasted > sum(len(g.member) for g in candidates.groups):
+            # The pairs evaluated for nothing since the last time have cost as much as a new reference does.
             candidates.refresh(X, time)
             self._wasted = 0
+        return self._with_enclosed(join(parts, self.names), X, time)
 
-    def _near_rows(
+    def _contacts(
         self, group: Group, X: Array, time: float, rows: Index, limit: float, use_fcl: bool
-    ) -> NearPairs:
+    ) -> Contacts:
         segments, others = group.segments(X, rows), group.others(X, time, rows)
-        outputs = group.exact_of(segments, others, rows)
-        kept = np.flatnonzero(outputs[0][:, 0] < limit)
+        contacts = group.contacts_of(segments, others, rows)
         if use_fcl and group.shape in FclQueries.SHAPES:
-            asked = kept[outputs[0][kept, 0] < self.fcl_reach]
-            self.fcl.improve(
-                group.shape, group.other[rows], group.radius[rows], segments, others, outputs, asked
-            )
-        second = kept[
-            (np.abs(outputs[4][kept, 0] - outputs[1][kept, 0]) >= _SECOND_CONTACT)
-            & (outputs[5][kept, 0] < limit)
-        ]
-        return self._pairs(group, rows, segments, outputs, kept, second)
+            asked = np.flatnonzero(contacts.distance < min(self.fcl_reach, limit))
+            radius = group.radius[rows]
+            self.fcl.improve(group.shape, group.other[rows], radius, segments, others, contacts, asked)
+        return contacts
 
-    def _pairs(
-        self, group: Group, rows: Index, segments: Array, outputs: list[Array], first: Index, second: Index
-    ) -> NearPairs:
+    def _pairs(self, group: Group, rows: Index, contacts: Contacts, first: Index, second: Index) -> NearPairs:
         """Return the rows `first` by their witness points and `second` by their other contacts."""
-        both = np.concatenate([first, second])
-        member, other = group.member[rows[both]], group.other[rows[both]]
-        count = len(first)
+        c = contacts
+        distance, t, s = c.distance[first], c.t[first], c.s[first]
+        normal, point = c.normal[first], c.point[first]
+        if len(second):
+            distance = np.concatenate([distance, c.distance_second[second]])
+            t, s = np.concatenate([t, c.t_second[second]]), np.concatenate([s, c.s_second[second]])
+            normal = np.concatenate([normal, c.normal_second[second]])
+            point = np.concatenate([point, c.point_second[second]])
+            first = np.concatenate([first, second])
+        member, other = group.member[rows[first]], group.other[rows[first]]
+        speed = self._normal_speed(normal, other) if not group.is_self else np.zeros(len(first))
+        is_self = np.full(len(first), group.is_self)
+        return NearPairs(member, other, is_self, distance, normal, t, s, speed, point, self.names)
 
-        def column(k: int, k_second: int) -> Array:
-            values: Array = outputs[k][both]
-            values[count:] = outputs[k_second][second]
-            return values
+    def _normal_speed(self, normal: Array, piece: Index) -> Array:
+        if not self.pieces.moving:
+            return np.zeros(len(piece))
+        return np.asarray(np.einsum("kc,kc->k", normal, self.pieces.velocity[piece]))
 
-        t, distance, normal = column(1, 4)[:, 0], column(0, 5)[:, 0], column(2, 6)
-        if group.is_self:
-            t_other, speed = column(7, 8)[:, 0], np.zeros(len(both))
-        else:
-            t_other = np.zeros(len(both))
-            speed = np.einsum("kc,kc->k", normal, self.pieces.velocity[other])
-        ends = segments[both]
-        axis = ends[:, :3] + t[:, None] * (ends[:, 3:] - ends[:, :3])
-        point = axis - (distance + group.radius[rows[both]])[:, None] * normal
-        is_self = np.full(len(both), group.is_self)
-        return NearPairs(member, other, is_self, distance, normal, t, t_other, speed, point, self.names)
+    def _distinct(self, pairs: NearPairs) -> NearPairs:
+        """Return the nearest of the rows alike in member, mesh, normal and place on the member."""
+        order = np.argsort(pairs.distance, kind="stable")
+        like = np.column_stack(
+            [
+                pairs.member[order],
+                self.pieces.obstacle[pairs.other[order]],
+                np.round(2.0 * pairs.normal[order]),
+                np.round(4.0 * pairs.t[order]),
+            ]
+        )
+        return pairs.select(order[np.sort(np.unique(like, axis=0, return_index=True)[1])])
 
     def least(self, X: Array, time: float = 0.0, *, among: str = "all") -> tuple[float, Pair | None]:
         """Return the exact least surface distance and its pair; ``(inf, None)`` where there is no pair.
@@ -269,56 +182,38 @@ class Clearance:
         among : {"all", "obstacles", "members"}
             Pairs with obstacles, pairs of members, or both.
         """
-        wanted = {"all": (False, True), "obstacles": (False,), "members": (True,)}[among]
+        wanted = _AMONG[among]
         best, pair = np.inf, None
-        reach, self_reach = self.influence, self.self_influence
-        extent = float(np.ptp(X, axis=0).sum()) + self._spread(X, time)
+        enclosed = self._enclosed(X, time) if False in wanted else None
+        if enclosed is not None:
+            k = int(np.argmin(enclosed.distance))
+            best, pair = float(enclosed.distance[k]), enclosed.pair(k)
+        reach = self_reach = 0.0
         while True:
             candidates, motion = self._covering(X, time, reach, self_reach)
             for group in candidates.groups:
                 if group.is_self in wanted:
-                    distance, row = self._least_of(group, candidates, motion, X, time, best)
-                    if distance < best:
+                    lower = group.lower(motion, time - candidates.time)
+                    distance, row = _least_of(group, lower, X, time, best)
+                    if row >= 0:
                         best, pair = (
                             distance,
                             Pair(int(group.member[row]), int(group.other[row]), group.is_self),
                         )
-            enough = all(
-                best <= r or r > extent
-                for r, s in ((reach, False), (self_reach, True))
-                if self._asks(s, wanted)
-            )
-            if enough:
+            far, far_self = candidates.beyond(motion, time)
+            extent = self._extent(X, time) if best > min(far, far_self) else 0.0
+            search = False in wanted and len(self.pieces) > 0 and far < min(best, extent)
+            search_self = True in wanted and far_self < min(best, extent)
+            if not (search or search_self):
                 return best, pair
-            if self._asks(False, wanted) and best > reach:
-                reach = max(2.0 * reach, 1e-3)
-            if self._asks(True, wanted) and best > self_reach:
-                self_reach = max(2.0 * self_reach, 1e-3)
+            reach = 2.0 * max(far, self.influence) if search else reach
+            self_reach = 2.0 * max(far_self, self.self_influence) if search_self else self_reach
 
-    def _asks(self, is_self: bool, wanted: tuple[bool, ...]) -> bool:
-        return is_self in wanted and (self.self_collision if is_self else len(self.pieces) > 0)
-
-    def _spread(self, X: Array, time: float) -> float:
-        """Return a length that no distance to an obstacle exceeds."""
-        if not len(self.pieces):
-            return 0.0
+    def _extent(self, X: Array, time: float) -> float:
+        """Return a length that no distance exceeds."""
         centers = self.pieces.center + time * self.pieces.velocity
-        return float(np.linalg.norm(centers - X[0], axis=1).max())
-
-    @staticmethod
-    def _least_of(
-        group: Group, candidates: Candidates, motion: Array, X: Array, time: float, best: float
-    ) -> tuple[float, int]:
-        """Return the least distance of a group below `best` and its row, by way of the lower bounds."""
-        lower = group.lower(motion, time - candidates.time)
-        row = int(np.argmin(lower)) if len(lower) else -1
-        if row < 0 or lower[row] >= best:
-            return np.inf, -1
-        best = min(best, float(group.exact(X, time, np.array([row]))[0][0, 0]))
-        rows = np.flatnonzero(lower <= best)
-        distance = group.exact(X, time, rows)[0][:, 0]
-        k = int(np.argmin(distance))
-        return float(distance[k]), int(rows[k])
+        points = np.vstack([X, centers])
+        return float(np.linalg.norm(np.ptp(points, axis=0)))
 
     def between(
         self, start: Array, end: Array, start_time: float, end_time: float, floor: float
@@ -337,6 +232,11 @@ class Clearance:
             s; the obstacles move meanwhile.
         floor : float
             m; not negative.
+
+        Raises
+        ------
+        GeometryError
+            A position is not finite; so do `near` and `least`.
         """
         floor = max(floor, 0.0)
         candidates, motion = self._covering(start, start_time, floor, floor, end, end_time)
@@ -345,7 +245,7 @@ class Clearance:
         found: list[tuple[Group, Found]] = []
         for group in candidates.groups:
             lower = group.lower(motion, elapsed)
-            open_ = lower < floor
+            open_ = ~(lower >= floor)
             proven = min(proven, float(lower[~open_].min(initial=np.inf)))
             rows = np.flatnonzero(open_)
             if len(rows):
@@ -353,18 +253,69 @@ class Clearance:
                 proven = min(proven, result.proven)
                 if len(result.rows):
                     found.append((group, result))
-        failing = _join([self._failing(g, r, start, end, start_time, end_time) for g, r in found], self.names)
-        fraction = np.concatenate([np.zeros(0), *(r.fraction for _, r in found)])
-        least = min(proven, float(failing.distance.min(initial=np.inf)))
-        return BetweenReport(not found, least, fraction, failing)
+        parts = [self._failing(g, r, start, end, start_time, end_time) for g, r in found]
+        fractions = [r.fraction for _, r in found]
+        enclosed = self._enclosed(start, start_time)
+        if enclosed is not None:
+            parts.append(enclosed)
+            fractions.append(np.full(len(enclosed), 1.0 / 32.0))
+        failing = join(parts, self.names)
+        least = min([proven, float(failing.distance.min(initial=np.inf)), *(r.worst for _, r in found)])
+        return BetweenReport(not parts, least, np.concatenate([np.zeros(0), *fractions]), failing)
 
     def _failing(
         self, group: Group, found: Found, start: Array, end: Array, start_time: float, end_time: float
     ) -> NearPairs:
         segments, others = found.placed(group, start, end, start_time, end_time)
-        outputs = group.exact_of(segments, others, found.rows)
         every = np.arange(len(found.rows))
-        return self._pairs(group, found.rows, segments, outputs, every, every[:0])
+        contacts = group.contacts_of(segments, others, found.rows)
+        return self._pairs(group, found.rows, contacts, every, every[:0])
+
+    def _enclosed(self, X: Array, time: float) -> NearPairs | None:
+        """Return the members with an end inside a closed mesh, at minus their distance to its surface."""
+        parts = []
+        for obstacle, solid in self._solids.items():
+            inside = solid.contains(X, time)
+            member = np.flatnonzero(inside[self.members].any(axis=1))
+            if not len(member):
+                continue
+            piece = np.flatnonzero(self.pieces.obstacle == obstacle)
+            group = Group(
+                "triangle",
+                np.repeat(member, len(piece)),
+                np.tile(piece, len(member)),
+                self._members,
+                self.pieces,
+                self._kernels,
+            )
+            contacts = group.contacts(X, time, np.arange(len(group.member)))
+            nearest = contacts.distance.reshape(len(member), -1).argmin(axis=1) + len(piece) * np.arange(
+                len(member)
+            )
+            pairs = self._pairs(group, np.arange(len(group.member)), contacts, nearest, nearest[:0])
+            radius = self.radius[member]
+            depth = pairs.distance + radius
+            outward = np.where(depth > 0.0, -1.0, 1.0)
+            parts.append(
+                replace(
+                    pairs,
+                    distance=-depth - radius,
+                    normal=outward[:, None] * pairs.normal,
+                    normal_speed=outward * pairs.normal_speed,
+                )
+            )
+        return join(parts, self.names) if parts else None
+
+    def _with_enclosed(self, pairs: NearPairs, X: Array, time: float) -> NearPairs:
+        """Return `pairs` with one row that leads out for each member inside a closed mesh."""
+        enclosed = self._enclosed(X, time)
+        if enclosed is None:
+            return pairs
+        inside = np.zeros((len(self.members), len(self.obstacles)), dtype=bool)
+        inside[enclosed.member, self.pieces.obstacle[enclosed.other]] = True
+        owner = self.pieces.obstacle[np.where(pairs.is_self, 0, pairs.other)]
+        kept = pairs.is_self | ~inside[pairs.member, owner]
+        return join([pairs.select(kept), enclosed], self.names)
 
     def _covering(
         self,
@@ -385,6 +336,9 @@ class Clearance:
             far, far_self = candidates.beyond(motion, last)
             if far >= reach and far_self >= self_reach:
                 return candidates, motion
+        # What is not a number fails the comparisons above and comes here.
+        if not (np.isfinite(X).all() and (end is None or np.isfinite(end).all())):
+            raise GeometryError("node positions must be finite numbers")
         travel = 0.0 if end is None else float(self._members.motion(end, X).max(initial=0.0))
         drift = 0.0 if end_time is None else float(self.pieces.speed.max(initial=0.0)) * abs(end_time - time)
         horizon = max(reach, self.influence) + self.influence + travel + drift
@@ -413,14 +367,16 @@ class Clearance:
         return max(times, key=lambda t: abs(t - candidates.time))
 
 
-_COLUMNS = ("member", "other", "is_self", "distance", "normal", "t", "t_other", "normal_speed", "point")
-
-
-def _join(parts: list[NearPairs], names: Names) -> NearPairs:
-    if len(parts) == 1:
-        return parts[0]
-    if not parts:
-        none, index, rows = np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        return NearPairs(index, index, np.zeros(0, dtype=bool), none, rows, none, none, none, rows, names)
-    columns = {key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS}
-    return NearPairs(**columns, names=names)
+def _least_of(group: Group, lower: Array, X: Array, time: float, best: float) -> tuple[float, int]:
+    """Return the least distance below `best` and its row, or (best, -1), evaluating what the bounds leave."""
+    row = -1
+    first = np.arange(len(lower)) if len(lower) <= _FIRST else np.argpartition(lower, _FIRST)[:_FIRST]
+    rows = first[lower[first] < best]
+    while len(rows):
+        distance = group.contacts(X, time, rows).distance
+        k = int(np.argmin(distance))
+        if distance[k] < best:
+            best, row = float(distance[k]), int(rows[k])
+        lower[first] = np.inf
+        rows = first = np.flatnonzero(lower < best)
+    return best, row

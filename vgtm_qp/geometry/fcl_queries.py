@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.batch import Batch
+from vgtm_qp.geometry.candidates import Contacts
 from vgtm_qp.geometry.exact import plane_function
 from vgtm_qp.geometry.shapes import Pieces
 
@@ -68,18 +69,17 @@ class FclQueries:
         radius: Array,
         segments: Array,
         parameters: Array,
-        outputs: list[Array],
+        contacts: Contacts,
         rows: Index,
     ) -> None:
-        """Ask FCL for `rows` and write the answers that hold into `outputs` (distance, t, normal).
+        """Ask FCL for `rows` and write the answers that hold into `contacts`.
 
         Parameters
         ----------
         pieces, radius, segments, parameters
             (K,) piece indices, (K,) radii, (K, 6) ends, (K, 15) parameters at this time.
-        outputs
-            Exact outputs of ``distance_function`` (surface to surface), which stay where FCL's answer is
-            refused.
+        contacts
+            Exact, from surface to surface; they stay where FCL's answer is refused.
         """
         if not len(rows):
             return
@@ -93,18 +93,21 @@ class FclQueries:
             normal = gap / length[:, None]
         if shape not in self._planes:
             self._planes[shape] = Batch(plane_function(shape))
-        proven = self._planes[shape](ends, parameters[rows], normal)[0][:, 0]
+        proven = self._planes[shape](ends, parameters[rows], normal)[:, 0]
         # Comparisons with NaN are false: a penetration, where FCL gives no normal, is refused too.
         holds = (answers[:, 0] > 0.0) & (np.abs(answers[:, 0] - proven) <= _CERTIFIED)
         self.asked += len(rows)
         self.replaced += int(len(rows) - np.count_nonzero(holds))
+        contacts.distance[rows[holds]] = proven[holds] - radius[rows[holds]]
+        # Where the nearest point is not unique, FCL may give one between the two ends of the contact.
+        holds &= ~contacts.two[rows]
         good = rows[holds]
         axis = ends[holds, 3:] - ends[holds, :3]
         offset = answers[holds, 1:4] - ends[holds, :3]
         square = np.maximum(np.einsum("kc,kc->k", axis, axis), 1e-300)
-        outputs[0][good, 0] = proven[holds] - radius[good]
-        outputs[1][good, 0] = np.clip(np.einsum("kc,kc->k", axis, offset) / square, 0.0, 1.0)
-        outputs[2][good] = normal[holds]
+        contacts.t[good] = np.clip(np.einsum("kc,kc->k", axis, offset) / square, 0.0, 1.0)
+        contacts.normal[good] = normal[holds]
+        contacts.point[good] = answers[holds, 4:7]
 
     def _ask(self, pieces: Index, ends: Array, parameters: Array) -> Array:
         """Return FCL's distance and witness points on member and piece, (K, 7)."""

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 _MESH_FORMATS = (".stl", ".obj", ".ply", ".off")
 
 
-class ObstacleError(VgtmError):
-    """An obstacle has no volume, is not a number, or its mesh cannot be read."""
+class GeometryError(VgtmError):
+    """An obstacle has no volume or cannot be read, or a position is not a number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def box(
 
     Raises
     ------
-    ObstacleError
+    GeometryError
         A number is not finite, a size is not positive, or `rotation` is not a rotation.
     """
     half = 0.5 * np.broadcast_to(np.asarray(size, dtype=float), 3)
@@ -126,7 +126,7 @@ def mesh(
 
     Raises
     ------
-    ObstacleError
+    GeometryError
         The file is missing or cannot be read, it holds no triangle, or a number is wrong.
     """
     import trimesh
@@ -137,7 +137,7 @@ def mesh(
     else:
         surface = _read(name, Path(source))
     if len(surface.faces) == 0:
-        raise ObstacleError(f'obstacle "{name}": the mesh holds no triangle')
+        raise GeometryError(f'obstacle "{name}": the mesh holds no triangle')
     solid = bool(surface.is_watertight)
     if solid:
         surface.fix_normals()
@@ -145,7 +145,7 @@ def mesh(
     corners = _positive(name, np.array([scale]))[0] * np.asarray(surface.triangles, dtype=float)
     corners = corners @ turn.T + _vector(name, "center", center)
     if not np.isfinite(corners).all():
-        raise ObstacleError(f'obstacle "{name}": the mesh holds a coordinate that is not finite')
+        raise GeometryError(f'obstacle "{name}": the mesh holds a coordinate that is not finite')
     pieces = np.zeros((len(corners), WIDTH))
     pieces[:, :9] = corners.reshape(-1, 9)
     return Obstacle(name, "triangle", pieces, _vector(name, "velocity", velocity), solid)
@@ -155,11 +155,11 @@ def _read(name: str, path: Path) -> object:
     import trimesh
 
     if path.suffix.lower() not in _MESH_FORMATS:
-        raise ObstacleError(f'obstacle "{name}": {path.name} is not one of {", ".join(_MESH_FORMATS)}')
+        raise GeometryError(f'obstacle "{name}": {path.name} is not one of {", ".join(_MESH_FORMATS)}')
     try:
         return trimesh.load_mesh(path)
     except Exception as error:  # a reader of foreign files raises anything
-        raise ObstacleError(f'obstacle "{name}": cannot read {path}: {error}') from None
+        raise GeometryError(f'obstacle "{name}": cannot read {path}: {error}') from None
 
 
 def _placed(
@@ -175,13 +175,13 @@ def _placed(
 def _vector(name: str, what: str, values: ArrayLike) -> Array:
     vector = np.array(values, dtype=float)
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ObstacleError(f'obstacle "{name}": {what} must be three finite numbers, not {values!r}')
+        raise GeometryError(f'obstacle "{name}": {what} must be three finite numbers, not {values!r}')
     return vector
 
 
 def _positive(name: str, sizes: Array) -> Array:
     if not (np.isfinite(sizes).all() and (sizes > 0.0).all()):
-        raise ObstacleError(f'obstacle "{name}": sizes must be positive, not {sizes.tolist()}')
+        raise GeometryError(f'obstacle "{name}": sizes must be positive, not {sizes.tolist()}')
     return sizes
 
 
@@ -194,7 +194,7 @@ def _rotation(name: str, rotation: ArrayLike | None) -> Array:
         or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-9)
         or np.linalg.det(turn) < 0
     ):
-        raise ObstacleError(f'obstacle "{name}": rotation must be a right-handed orthonormal 3 x 3 matrix')
+        raise GeometryError(f'obstacle "{name}": rotation must be a right-handed orthonormal 3 x 3 matrix')
     return turn
 
 

@@ -27,12 +27,15 @@ class Found:
     rows : (F,) int
         Rows of the group that were not certified.
     fraction : (F,)
-        Where on the motion each of those was found nearest, in (0, 1).
+        Where on the motion each of those was found nearest, 0 < s <= 1.
+    worst : float
+        Least distance found of those, m.
     """
 
     proven: float
     rows: Index
     fraction: Array
+    worst: float = np.inf
 
     def placed(
         self, group: Group, start: Array, end: Array, start_time: float, end_time: float
@@ -65,8 +68,13 @@ class _Motion:
         self.others = group.others(start, start_time, rows)
         if group.is_self:
             self.other_change = group.others(end, end_time, rows) - self.others
-        else:
+        elif group.moving:
             self.change -= np.tile(group.displacement(end_time - start_time, rows), 2)
+
+    def whole(self) -> tuple[Array, Array, Array, Array]:
+        """Return segments at the start and the end, and parameters at the start and the end."""
+        others = self.others + self.other_change if self._is_self else self.others
+        return self.segments, self.segments + self.change, self.others, others
 
     def at(self, k: Index, fraction: Array) -> tuple[Array, Array]:
         """Return segments and parameters of the pairs `k` at their `fraction`."""
@@ -82,34 +90,29 @@ def sweep_group(
 ) -> Found:
     """Return which of the pairs `rows` stay above `floor` over the motion, provably."""
     motion = _Motion(group, rows, start, end, start_time, end_time)
-    k = np.arange(len(rows))
-    left, right = np.zeros(len(rows)), np.ones(len(rows))
-    failed = np.zeros(len(rows), dtype=bool)
-    worst = np.full(len(rows), np.inf)
-    fraction = np.full(len(rows), 0.5)
-    proven = np.full(len(rows), np.inf)
+    count = len(rows)
+    k, left, right = np.arange(count), np.zeros(count), np.ones(count)
+    answer = group.sweep(*motion.whole(), rows)
+    if (answer[:, 0] >= floor).all():
+        return Found(float(answer[:, 0].min()), rows[:0], left[:0])
+    failed = np.zeros(count, dtype=bool)
+    worst, proven = np.full(count, np.inf), np.full(count, np.inf)
+    fraction = np.full(count, 0.5)
     for depth in range(_DEPTH + 1):
-        a, other_a = motion.at(k, left)
-        b, other_b = motion.at(k, right)
-        answer = group.sweep(a, b, other_a, other_b, rows[k])
-        bound = answer[:, 0]
-        exact = answer[:, 1:]
-        nearest = exact.argmin(axis=1)
-        least = exact[np.arange(len(k)), nearest]
-        # The negation also catches what is not a number.
-        open_ = ~(bound >= floor)
-        below = ~(least >= floor)
-        if not open_.any():
-            np.minimum.at(proven, k, bound)
-            break
-        where = np.where(nearest == 0, left, np.where(nearest == 1, 0.5 * (left + right), right))
-        for i in np.flatnonzero(open_ & (least < worst[k])):
-            if least[i] < worst[k[i]]:
-                worst[k[i]], fraction[k[i]] = least[i], where[i]
-        failed[k[below]] = True
+        if depth:
+            a, other_a = motion.at(k, left)
+            b, other_b = motion.at(k, right)
+            answer = group.sweep(a, b, other_a, other_b, rows[k])
+        # Negated comparisons also catch what is not a number.
+        open_ = ~(answer[:, 0] >= floor)
+        np.minimum.at(proven, k[~open_], answer[~open_, 0])
+        for distance, where in ((answer[:, 1], left), (answer[:, 2], right)):
+            np.minimum.at(worst, k, distance)
+            here = distance == worst[k]
+            fraction[k[here]] = where[here]
+            failed[k[~(distance >= floor)]] = True
         if depth == _DEPTH:
             failed[k[open_]] = True
-        np.minimum.at(proven, k[~open_], bound[~open_])
         split = open_ & ~failed[k]
         if not split.any():
             break
@@ -118,11 +121,9 @@ def sweep_group(
         k = np.concatenate([k[split], k[split]])
     chosen = np.flatnonzero(failed)
     kept = float(proven[~failed].min(initial=np.inf))
-    if not len(chosen):
-        return Found(kept, rows[chosen], fraction[chosen])
-    return Found(
-        kept, rows[chosen], _nearest_fraction(group, motion, rows, chosen, worst[chosen], fraction[chosen])
-    )
+    if len(chosen):
+        fraction[chosen] = _nearest_fraction(group, motion, rows, chosen, worst[chosen], fraction[chosen])
+    return Found(kept, rows[chosen], fraction[chosen], float(worst[chosen].min(initial=np.inf)))
 
 
 def _nearest_fraction(
@@ -131,7 +132,7 @@ def _nearest_fraction(
     """Return where the `chosen` pairs are nearest: the best of the point known and of even samples."""
     k = np.repeat(chosen, len(_SAMPLES))
     segments, others = motion.at(k, np.tile(_SAMPLES, len(chosen)))
-    distance = group.exact_of(segments, others, rows[k])[0].reshape(len(chosen), -1)
+    distance = group.contacts_of(segments, others, rows[k]).distance.reshape(len(chosen), -1)
     best = distance.argmin(axis=1)
     better = distance[np.arange(len(chosen)), best] < worst
-    return np.clip(np.where(better, _SAMPLES[best], fraction), _SAMPLES[0], _SAMPLES[-1])
+    return np.asarray(np.maximum(np.where(better, _SAMPLES[best], fraction), _SAMPLES[0]))

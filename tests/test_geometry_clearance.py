@@ -1,0 +1,378 @@
+import numpy as np
+import pytest
+from geometry_reference import octahedral_arm, segment_distance
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
+
+SHIFT = {"box": [0], "sphere": [0], "cylinder": [0], "triangle": [0, 3, 6]}
+TETRAHEDRON = ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+def piece_at(clearance, piece, time):
+    row = clearance.pieces.parameters[piece].copy()
+    for first in SHIFT[str(clearance.pieces.shape[piece])]:
+        row[first : first + 3] += time * clearance.pieces.velocity[piece]
+    return row
+
+
+def brute_force(clearance, X, time):
+    """Surface distance of each pair (member, other, is_self); minus the radii where axes intersect."""
+    ends = X[clearance.members].reshape(-1, 6)
+    distances = {}
+    for m, radius in enumerate(clearance.radius):
+        for p, shape in enumerate(clearance.pieces.shape):
+            axis = segment_distance(str(shape), ends[m], piece_at(clearance, p, time))
+            distances[m, p, False] = axis - radius
+        for k in range(m + 1, len(clearance.radius) if clearance.self_collision else 0):
+            if not set(clearance.members[m]) & set(clearance.members[k]):
+                axis = segment_distance("segment", ends[m], ends[k])
+                distances[m, k, True] = axis - radius - clearance.radius[k]
+    return distances
+
+
+def random_scene(rng, *, still=False, round_numbers=False):
+    def vector(bound):
+        v = rng.uniform(-bound, bound, 3)
+        return np.round(4.0 * v) / 4.0 if round_numbers else v
+
+    def turn():
+        return (
+            np.eye(3) if round_numbers else Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+        )
+
+    def speed():
+        return np.zeros(3) if still else rng.normal(size=3) * 0.3
+
+    nodes = np.array([vector(1.5) for _ in range(6)])
+    members = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
+    obstacles = [
+        box("box", vector(2.0), rng.choice([0.25, 0.5, 0.75], 3), turn(), speed()),
+        sphere("ball", vector(2.0), 0.25, speed()),
+        cylinder("post", vector(2.0), 0.25, 1.0, turn(), speed()),
+        mesh("wedge", TETRAHEDRON, vector(2.0), turn(), 0.5, speed()),
+    ]
+    return nodes, Clearance(members, 0.03, obstacles, safe=0.08, influence=0.5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.booleans())
+def test_near_pairs_and_least_distances_along_a_walk(seed, round_numbers):
+    rng = np.random.default_rng(seed)
+    X, clearance = random_scene(rng, round_numbers=round_numbers)
+    for step in range(5):
+        time = 0.1 * step
+        expected = brute_force(clearance, X, time)
+        near = clearance.near(X, time, self_reach=0.4)
+        found = {tuple(near.pair(k)): float(near.distance[k]) for k in reversed(np.argsort(near.distance))}
+        meshes = [m for m in expected if not m[2] and clearance.pieces.shape[m[1]] == "triangle"]
+        for key, distance in expected.items():
+            if key not in meshes and distance < (0.4 if key[2] else 0.5) - 1e-9:
+                assert found[key] <= distance + 1e-9
+                assert found[key] >= distance - 1e-9 or distance <= -0.029
+        assert all(distance <= expected[key] + 1e-9 for key, distance in found.items())
+        for member in range(len(clearance.members)):
+            least = min(expected[key] for key in meshes if key[0] == member)
+            if least < 0.5 - 1e-9:
+                nearest = min(d for key, d in found.items() if key in meshes and key[0] == member)
+                assert nearest <= least + 1e-9
+        for among, is_self in (("obstacles", False), ("members", True)):
+            least, pair = clearance.least(X, time, among=among)
+            reference = min(d for key, d in expected.items() if key[2] == is_self)
+            assert pair is not None
+            assert least <= reference + 1e-9
+            assert least >= reference - 1e-9 or reference <= -0.029
+        assert clearance.least(X, time)[0] == min(
+            clearance.least(X, time, among=among)[0] for among in ("obstacles", "members")
+        )
+        X = X + (rng.choice([0.02, 0.2]) if not round_numbers else 0.25) * np.round(
+            rng.normal(size=X.shape), 0
+        )
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31))
+def test_carried_bounds_never_exceed_the_distance(seed):
+    rng = np.random.default_rng(seed)
+    X, clearance = random_scene(rng)
+    clearance.near(X, 0.0)
+    candidates = clearance._candidates
+    for step in range(4):
+        X, time = X + 0.1 * rng.normal(size=X.shape), 0.05 * step
+        expected = brute_force(clearance, X, time)
+        listed = set()
+        motion = candidates.motion(X)
+        for group in candidates.groups:
+            lower = group.lower(motion, time - candidates.time)
+            for k in range(len(lower)):
+                key = (int(group.member[k]), int(group.other[k]), group.is_self)
+                listed.add(key)
+                assert lower[k] <= expected[key] + 1e-9
+        far, far_self = candidates.beyond(motion, time)
+        for key in expected.keys() - listed:
+            assert (far_self if key[2] else far) <= expected[key] + 1e-9
+        candidates.refresh(X, time)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.02, 1.5), st.floats(0.0, 0.3))
+def test_between_never_certifies_what_sampling_refutes(seed, size, floor):
+    rng = np.random.default_rng(seed)
+    X, clearance = random_scene(rng)
+    end = X + size * rng.normal(size=X.shape)
+    report = clearance.between(X, end, 1.0, 1.5, floor)
+    s = np.linspace(0.0, 1.0, 60)
+    sampled = min(clearance.least(X + f * (end - X), 1.0 + 0.5 * f)[0] for f in s)
+    if report.certified:
+        assert sampled >= floor - 1e-12
+        assert floor - 1e-12 <= report.clearance <= sampled + 1e-12
+    else:
+        assert len(report.failing) == len(report.fraction) >= 1
+        assert ((report.fraction > 0.0) & (report.fraction <= 1.0)).all()
+        for k, f in enumerate(report.fraction):
+            exact = brute_force(clearance, X + f * (end - X), 1.0 + 0.5 * f)
+            assert float(report.failing.distance[k]) <= exact[report.failing.pair(k)] + 1e-9
+    if sampled < floor - 1e-9:
+        assert not report.certified
+        assert report.clearance < floor
+        assert report.failing_parameters()
+
+
+def test_between_certifies_what_is_clear_and_shows_where_it_is_not():
+    X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+    clearance = Clearance([(0, 1)], 0.03, [box("cube", (1.0, 0.0, 1.0), 0.4)], safe=0.08, influence=0.5)
+    aside, past = X + np.array([0.65, 0.0, 0.0]), X + np.array([2.0, 0.0, 0.0])
+    assert clearance.between(X, aside, 0.0, 1.0, 0.0799).certified
+    report = clearance.between(X, past, 0.0, 1.0, 0.08)
+    assert not report.certified
+    assert report.failing.name(0) == "clearance: member 0 / cube"
+    assert report.fraction[0] == pytest.approx(0.5, abs=0.1)
+    assert report.clearance < 0.0
+    fleeing = Clearance(
+        [(0, 1)],
+        0.03,
+        [box("cube", (1.0, 0.0, 1.0), 0.4, velocity=(2.0, 0.0, 0.0))],
+        safe=0.08,
+        influence=0.5,
+    )
+    assert fleeing.between(X, past, 0.0, 1.0, 0.08).certified
+    chasing = Clearance(
+        [(0, 1)],
+        0.03,
+        [box("cube", (1.0, 0.0, 1.0), 0.4, velocity=(-3.0, 0.0, 0.0))],
+        safe=0.08,
+        influence=0.5,
+    )
+    assert not chasing.between(X, X, 0.0, 1.0, 0.08).certified
+
+
+def test_a_path_round_an_edge_is_certified_down_to_its_dip():
+    clearance = Clearance([(0, 1)], 0.03, [box("cube", (0.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5)
+    axis = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    reach = 0.11
+    angle = np.array([0.6, 0.9])
+    start, end = (axis + np.array([0.5 + reach * np.cos(a), 0.5 + reach * np.sin(a), 0.0]) for a in angle)
+    dip = reach * np.cos(0.15) - 0.03
+    assert clearance.between(start, end, 0.0, 0.0, dip - 1e-6).certified
+    assert not clearance.between(start, end, 0.0, 0.0, dip + 1e-6).certified
+
+
+def test_what_is_not_a_number_is_refused():
+    X, members = octahedral_arm(2)
+    clearance = Clearance(members, 0.03, [sphere("ball", (3.0, 0.0, 1.0), 0.5)], safe=0.08, influence=0.5)
+    bad = X.copy()
+    bad[4, 1] = np.nan
+    for ask in (clearance.near, clearance.least, lambda Y: clearance.between(X, Y, 0.0, 0.0, 0.05)):
+        with pytest.raises(GeometryError, match="finite"):
+            ask(bad)
+
+
+@pytest.mark.parametrize("bays", [1, 5])
+def test_straight_arm_beside_cubes_on_round_coordinates(bays):
+    X, members = octahedral_arm(bays)
+    X = np.round(4.0 * X) / 4.0
+    cubes = [box("right", (1.25, 0.0, 0.75), 0.5), box("left", (-1.5, 0.25, 1.0), 0.5)]
+    clearance = Clearance(members, 0.03, cubes, safe=0.08, influence=2.0, fcl_reach=2.0)
+    expected = brute_force(clearance, X, 0.0)
+    for use_fcl in (True, False):
+        near = clearance.near(X, reach=2.0, use_fcl=use_fcl)
+        for k in range(len(near)):
+            if not near.is_self[k]:
+                assert near.distance[k] <= expected[near.pair(k)] + 0.02 * 1.5
+        least = {}
+        for k in range(len(near)):
+            least[near.pair(k)] = min(least.get(near.pair(k), np.inf), float(near.distance[k]))
+        for pair, distance in least.items():
+            assert distance == pytest.approx(expected[pair], abs=1e-9)
+    assert clearance.fcl.asked > 0
+
+
+def test_fcl_answers_that_do_not_hold_are_replaced():
+    X = np.array([[1.0, 0.5, 0.0], [1.0, 2.0, 0.0]])
+    clearance = Clearance([(0, 1)], 0.0, [box("cube", (1.0, 0.0, 0.75), 0.5)], safe=0.3, influence=1.0)
+    near = clearance.near(X)
+    assert near.distance[0] == pytest.approx(np.hypot(0.25, 0.5), abs=1e-12)
+    assert (clearance.fcl.asked, clearance.fcl.replaced) == (1, 1)
+    through = clearance.near(X - (0.0, 1.5, -0.75))
+    assert through.distance[0] < -0.1
+    assert clearance.fcl.replaced == 2
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**31), st.booleans(), st.sampled_from(["box", "sphere", "cylinder"]))
+def test_fcl_and_its_guard_agree_with_the_closed_form(seed, round_numbers, shape):
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-1.5, 1.5, size=(2, 3))
+    X = np.round(4.0 * X) / 4.0 if round_numbers else X
+    turn = Rotation.from_euler("xyz", rng.integers(0, 8, 3) * 45.0, degrees=True).as_matrix()
+    obstacle = {
+        "box": box("o", (0.0, 0.0, 0.25), (0.5, 0.75, 1.0), turn),
+        "sphere": sphere("o", (0.0, 0.0, 0.25), 0.5),
+        "cylinder": cylinder("o", (0.0, 0.0, 0.25), 0.5, 1.0, turn),
+    }[shape]
+    clearance = Clearance([(0, 1)], 0.0, [obstacle], safe=4.0, influence=5.0)
+    by_fcl, exact = clearance.near(X), clearance.near(X, use_fcl=False)
+    assert clearance.fcl.asked == 1
+    assert by_fcl.distance[0] <= exact.distance[0] + 1e-9
+    assert by_fcl.distance[0] == pytest.approx(exact.distance[0], abs=2e-9)
+    assert len(by_fcl) == len(exact)
+
+
+def test_parallel_member_has_two_rows():
+    X = np.array([[-1.0, 0.0, 0.6], [1.0, 0.0, 0.6]])
+    clearance = Clearance([(0, 1)], 0.03, [box("cube", (0.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5)
+    near = clearance.near(X)
+    assert sorted(near.t) == pytest.approx([0.25, 0.75])
+    assert near.distance == pytest.approx([0.07, 0.07])
+    np.testing.assert_allclose(near.normal, [[0, 0, 1], [0, 0, 1]], atol=1e-12)
+
+
+def test_rows_predict_the_change_of_distance():
+    rng = np.random.default_rng(3)
+    X, clearance = random_scene(rng)
+    near = clearance.near(X, 0.0, reach=1.5, self_reach=1.0, use_fcl=False)
+    step = 1e-6
+    change = step * rng.normal(size=X.shape)
+    later = clearance.near(X + change, step, reach=1.6, self_reach=1.1, use_fcl=False)
+    after = {}
+    for k in range(len(later)):
+        after.setdefault((later.pair(k), round(float(later.t[k]), 3)), float(later.distance[k]))
+    compared = 0
+    for k in range(len(near)):
+        key = (near.pair(k), round(float(near.t[k]), 3))
+        if key not in after:
+            continue
+        i, j = clearance.members[near.member[k]]
+        moved = (1.0 - near.t[k]) * change[i] + near.t[k] * change[j]
+        if near.is_self[k]:
+            i, j = clearance.members[near.other[k]]
+            moved = moved - (1.0 - near.t_other[k]) * change[i] - near.t_other[k] * change[j]
+        expected = near.normal[k] @ moved - near.normal_speed[k] * step
+        assert after[key] - near.distance[k] == pytest.approx(expected, abs=1e-3 * step)
+        compared += 1
+    assert compared > 10
+
+
+def test_far_and_absent_obstacles():
+    X, members = octahedral_arm(1)
+    far = Clearance(members, 0.03, [sphere("moon", (1000.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5)
+    expected = min(brute_force(far, X, 0.0)[m, 0, False] for m in range(len(members)))
+    assert far.least(X, among="obstacles")[0] == pytest.approx(expected, abs=1e-9)
+    empty = Clearance(members, 0.03, safe=0.08, influence=0.5, self_collision=False)
+    assert empty.least(X) == (np.inf, None)
+    assert len(empty.near(X)) == 0
+    report = empty.between(X, X + 1.0, 0.0, 1.0, 0.08)
+    assert report.certified
+    assert report.clearance == np.inf
+
+
+def test_names():
+    clearance = Clearance(
+        [(0, 1), (2, 3)],
+        0.03,
+        [box("right cube", (0.3, 0.0, 0.5), 0.4)],
+        safe=0.08,
+        influence=0.5,
+        member_names=["L3-2", "B1-1"],
+    )
+    X = np.array([[0.0, 0, 0], [0, 0, 1], [0.0, 0.2, 0], [0, 0.2, 1]])
+    near = clearance.near(X)
+    names = {near.name(k) for k in range(len(near))}
+    assert names == {
+        "clearance: member L3-2 / right cube",
+        "clearance: member B1-1 / right cube",
+        "clearance: member L3-2 / member B1-1",
+    }
+
+
+def test_closed_mesh_equals_the_box_it_bounds_and_is_solid():
+    import trimesh
+
+    surface = trimesh.creation.box((1.0, 0.8, 0.6))
+    arrays = (surface.vertices, surface.faces)
+    solid = Clearance([(0, 1)], 0.02, [mesh("part", arrays)], safe=0.08, influence=2.0)
+    cube = Clearance([(0, 1)], 0.02, [box("part", (0, 0, 0), (1.0, 0.8, 0.6))], safe=0.08, influence=2.0)
+    rng = np.random.default_rng(0)
+    outside = 0
+    for _ in range(60):
+        X = rng.uniform(-1.2, 1.2, size=(2, 3))
+        expected = cube.least(X)[0]
+        answer = solid.least(X)[0]
+        if expected > -0.02:
+            outside += 1
+            assert answer == pytest.approx(expected, abs=1e-12)
+        else:
+            assert answer <= -0.02
+    assert outside > 10
+    inside = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    near = solid.near(inside)
+    assert len(near) == 1
+    assert near.distance[0] == pytest.approx(-0.2 - 0.02)
+    np.testing.assert_allclose(near.normal[0], [1.0, 0.0, 0.0], atol=1e-12)
+    assert not solid.between(inside, inside + 0.01, 0.0, 0.0, 0.0).certified
+
+
+def test_mesh_from_a_file(tmp_path):
+    import trimesh
+
+    path = tmp_path / "part.stl"
+    trimesh.creation.icosphere(2, 0.5).export(path)
+    obstacle = mesh("ball", path, center=(1.0, 0.0, 0.0), scale=2.0)
+    assert obstacle.solid
+    assert len(obstacle.pieces) == 320
+    clearance = Clearance([(0, 1)], 0.0, [obstacle], safe=0.08, influence=1.0)
+    X = np.array([[-0.5, 0.0, -1.0], [-0.5, 0.0, 1.0]])
+    assert clearance.least(X)[0] == pytest.approx(0.5, abs=0.02)
+    near = clearance.near(X)
+    assert 1 <= len(near) < 20
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: box("o", (0, 0, 0), 0.0), "positive"),
+        (lambda path: box("o", (0, 0, np.nan), 1.0), "center"),
+        (lambda path: box("o", (0, 0, 0), 1.0, 2.0 * np.eye(3)), "rotation"),
+        (lambda path: sphere("o", (0, 0, 0), -1.0), "positive"),
+        (lambda path: cylinder("o", (0, 0, 0), 1.0, np.inf), "positive"),
+        (lambda path: sphere("o", (0, 0, 0), 1.0, (np.inf, 0, 0)), "velocity"),
+        (lambda path: mesh("o", path / "none.stl"), "cannot read"),
+        (lambda path: mesh("o", path / "part.step"), "not one of"),
+        (lambda path: mesh("o", (np.zeros((0, 3)), np.zeros((0, 3), dtype=int))), "no triangle"),
+    ],
+)
+def test_wrong_obstacles(make, message, tmp_path):
+    with pytest.raises(GeometryError, match=message):
+        make(tmp_path)
+
+
+def test_long_arm_keeps_few_candidates():
+    X, members = octahedral_arm(200)
+    clearance = Clearance(members, 0.03, [box("cube", (1.2, 0.0, 80.0), 0.5)], safe=0.08, influence=0.5)
+    clearance.near(X)
+    clearance.least(X)
+    listed = sum(len(group.member) for group in clearance._candidates.groups)
+    assert listed < 30 * len(members)

@@ -1,0 +1,217 @@
+import numpy as np
+import pytest
+from geometry_reference import POINT, segment_distance
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vgtm_qp.geometry.batch import Batch
+from vgtm_qp.geometry.exact import SHAPES, distance_function, plane_function, sweep_function, width
+
+FIELDS = distance_function("box").name_out()
+SIZES = [distance_function("box").nnz_out(i) for i in range(len(FIELDS))]
+BATCH = {shape: Batch(distance_function(shape)) for shape in SHAPES}
+
+
+def contact(shape, ends, piece):
+    row = BATCH[shape](ends[None], piece[None])[0]
+    parts = np.split(row, np.cumsum(SIZES)[:-1])
+    return {name: part if part.size > 1 else float(part[0]) for name, part in zip(FIELDS, parts, strict=True)}
+
+
+def vectors(count, bound=2.0):
+    """Coordinates in general position, and round ones that make members parallel to faces and edges."""
+    general = st.lists(st.floats(-bound, bound), min_size=count, max_size=count)
+    steps = st.integers(-int(4 * bound), int(4 * bound)).map(lambda k: k / 4.0)
+    return st.one_of(general, st.lists(steps, min_size=count, max_size=count)).map(np.array)
+
+
+rotations = st.one_of(
+    st.integers(0, 2**31).map(lambda seed: Rotation.random(random_state=seed).as_matrix()),
+    st.tuples(*[st.integers(0, 7)] * 3).map(
+        lambda k: Rotation.from_euler("xyz", [45 * a for a in k], degrees=True).as_matrix()
+    ),
+    st.just(np.eye(3)),
+)
+
+
+@st.composite
+def pieces(draw, shape):
+    piece = np.zeros(width(shape))
+    if shape == "segment":
+        piece[:] = draw(vectors(6))
+    elif shape == "triangle":
+        piece[:9] = draw(vectors(9))
+    else:
+        piece[:3] = draw(vectors(3, 1.0))
+        sizes = st.one_of(st.floats(0.05, 1.5), st.sampled_from([0.25, 0.5, 1.0]))
+        if shape == "sphere":
+            piece[3] = draw(sizes)
+        else:
+            piece[3:12] = draw(rotations).ravel()
+            piece[12:15] = [draw(sizes) for _ in range(3)]
+    return piece
+
+
+cases = st.sampled_from(SHAPES).flatmap(lambda shape: st.tuples(st.just(shape), vectors(6), pieces(shape)))
+
+
+@settings(max_examples=500, deadline=None)
+@given(cases)
+def test_distance_is_exact_and_never_over_estimated(case):
+    shape, ends, piece = case
+    expected = segment_distance(shape, ends, piece)
+    answer = contact(shape, ends, piece)
+    assert all(np.isfinite(value).all() for value in answer.values())
+    if shape == "sphere" or expected > 1e-9:
+        assert answer["distance"] <= expected + 1e-12
+        assert answer["distance"] >= expected - 1e-9
+    else:
+        assert answer["distance"] <= 1e-9
+    assert np.linalg.norm(answer["normal"]) == pytest.approx(1.0, abs=1e-9)
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases)
+def test_witness_points_and_second_contact_are_where_they_say(case):
+    shape, ends, piece = case
+    answer = contact(shape, ends, piece)
+    assume(answer["distance"] > 1e-6)
+    for suffix in ("", "_second"):
+        t, normal, distance = answer[f"t{suffix}"], answer[f"normal{suffix}"], answer[f"distance{suffix}"]
+        assert 0.0 <= t <= 1.0
+        on_member = ends[:3] + t * (ends[3:] - ends[:3])
+        assert distance == pytest.approx(float(POINT[shape](on_member, piece)), abs=1e-10)
+        point = answer[f"point{suffix}"]
+        np.testing.assert_allclose(point, on_member - distance * normal, atol=1e-12)
+        assert float(POINT[shape](point, piece)) <= 1e-8
+    assert answer["distance_second"] <= answer["distance"] + 0.02 * np.linalg.norm(ends[3:] - ends[:3]) + 1e-9
+    if shape == "segment":
+        np.testing.assert_allclose(
+            answer["point"], piece[:3] + answer["s"] * (piece[3:] - piece[:3]), atol=1e-9
+        )
+
+
+@settings(max_examples=200, deadline=None)
+@given(cases)
+def test_normal_is_the_gradient_of_the_distance(case):
+    shape, ends, piece = case
+    answer = contact(shape, ends, piece)
+    # Where two witness points are equally near the distance has a kink.
+    assume(answer["distance"] > 0.05 and abs(answer["t_second"] - answer["t"]) < 1e-12)
+    expected = np.concatenate([(1.0 - answer["t"]) * answer["normal"], answer["t"] * answer["normal"]])
+    step = 1e-6
+    slopes = np.empty((6, 2))
+    for i in range(6):
+        for j, sign in enumerate((1.0, -1.0)):
+            moved = ends.copy()
+            moved[i] += sign * step
+            slopes[i, j] = sign * (contact(shape, moved, piece)["distance"] - answer["distance"]) / step
+    smooth = np.abs(slopes[:, 0] - slopes[:, 1]).max() < 1e-3
+    assume(smooth)
+    np.testing.assert_allclose(slopes.mean(axis=1), expected, atol=1e-5)
+
+
+@settings(max_examples=200, deadline=None)
+@given(vectors(6, 1.0), pieces("box"), st.integers(0, 2**31))
+def test_depth_in_a_box_is_the_least_way_out(ends, piece, seed):
+    answer = contact("box", ends, piece)
+    depth = -answer["distance"]
+    assume(depth > 1e-6)
+    out = ends + np.tile((depth + 1e-9) * answer["normal"], 2)
+    assert segment_distance("box", out, piece) >= 0.0
+    assert contact("box", out, piece)["distance"] > -1e-8
+    directions = np.random.default_rng(seed).normal(size=(30, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    inside = ends + np.tile(0.99 * depth * directions, 2)
+    assert (BATCH["box"](inside, np.tile(piece, (30, 1)))[:, 0] <= 1e-9).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(vectors(6, 1.0), pieces("cylinder"))
+def test_normal_in_a_cylinder_leads_out(ends, piece):
+    answer = contact("cylinder", ends, piece)
+    assume(segment_distance("cylinder", ends, piece) == 0.0)
+    assert -1e-12 <= answer["distance"] <= 1e-12
+    out = ends + np.tile((piece[12] + piece[13] + 1e-6) * answer["normal"], 2)
+    assert contact("cylinder", out, piece)["distance"] >= 0.0
+    assert abs(answer["normal"] @ piece[3:12].reshape(3, 3)[:, 2]) == pytest.approx(1.0) or (
+        answer["normal"] @ piece[3:12].reshape(3, 3)[:, 2] == pytest.approx(0.0, abs=1e-9)
+    )
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases, vectors(6), st.floats(0.001, 1.0))
+def test_distance_changes_by_no_more_than_the_ends_move(case, motion, size):
+    shape, ends, piece = case
+    moved = ends + size * motion
+    travel = max(np.linalg.norm(size * motion[:3]), np.linalg.norm(size * motion[3:]))
+    before, after = contact(shape, ends, piece), contact(shape, moved, piece)
+    assert abs(before["distance"] - after["distance"]) <= travel + 1e-12
+
+
+def test_member_parallel_to_a_face_has_a_contact_at_each_end_of_the_overlap():
+    piece = np.r_[0.0, 0.0, 0.0, np.eye(3).ravel(), 0.5, 0.5, 0.5]
+    answer = contact("box", np.array([-1.0, 0.0, 0.8, 1.0, 0.0, 0.8]), piece)
+    assert (answer["t"], answer["t_second"]) == pytest.approx((0.25, 0.75))
+    assert (answer["distance"], answer["distance_second"]) == pytest.approx((0.3, 0.3))
+
+
+def test_issue_508_case():
+    piece = np.r_[1.0, 0.0, 0.75, np.eye(3).ravel(), 0.25, 0.25, 0.25]
+    ends = np.array([1.0, 0.5, 0.0, 1.0, 2.0, 0.0])
+    assert contact("box", ends, piece)["distance"] == pytest.approx(np.sqrt(0.25**2 + 0.5**2), abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("other", "distance"),
+    [
+        ([0, 1, 0, 1, 1, 0], 1.0),
+        ([2, 0, 0, 3, 0, 0], 1.0),
+        ([0.5, -1, 0, 0.5, 1, 0], 0.0),
+        ([0.5, 0, 0, 2, 0, 0], 0.0),
+        ([3, 4, 0, 3, 4, 0], np.hypot(2, 4)),
+        ([0, 1e-9, 0, 1, -1e-9, 0], 0.0),
+    ],
+)
+def test_degenerate_segments(other, distance):
+    answer = contact("segment", np.array([0.0, 0, 0, 1, 0, 0]), np.array(other, dtype=float))
+    assert answer["distance"] == pytest.approx(distance, abs=1e-15)
+    assert np.linalg.norm(answer["normal"]) == pytest.approx(1.0)
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases, vectors(3))
+def test_a_plane_never_gives_more_than_the_distance(case, direction):
+    shape, ends, piece = case
+    assume(np.linalg.norm(direction) > 1e-3)
+    normal = direction / np.linalg.norm(direction)
+    gap = float(plane_function(shape)(ends, piece, normal))
+    assert gap <= max(segment_distance(shape, ends, piece), 0.0 if shape != "sphere" else -np.inf) + 1e-12
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases, vectors(6), vectors(6), st.floats(0.01, 1.0))
+def test_sweep_bound_holds_at_every_instant(case, motion, other_motion, size):
+    shape, ends, piece = case
+    end = ends + size * motion
+    arguments = [ends, end, piece]
+    moved = piece
+    if shape == "segment":
+        moved = piece + size * other_motion
+        arguments.append(moved)
+    bound, at_start, at_end = (float(x) for x in sweep_function(shape)(*arguments))
+    s = np.linspace(0.0, 1.0, 41)[:, None]
+    sampled = BATCH[shape](ends + s * (end - ends), piece + s * (moved - piece))[:, 0]
+    assert bound <= sampled.min() + 1e-12
+    assert (at_start, at_end) == pytest.approx((sampled[0], sampled[-1]), abs=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 65, 300, 1500])
+def test_batches_of_any_size_equal_single_rows(count):
+    rng = np.random.default_rng(count)
+    ends, others = rng.normal(size=(count, 6)), rng.normal(size=(count, 6))
+    rows = BATCH["segment"](ends, others)
+    assert rows.shape == (count, sum(SIZES))
+    for k in {0, count // 2, count - 1}:
+        np.testing.assert_array_equal(rows[k], BATCH["segment"](ends[k : k + 1], others[k : k + 1])[0])
