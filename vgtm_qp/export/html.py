@@ -1,0 +1,69 @@
+"""One offline HTML file with a play bar: the maneuver in three dimensions, for anyone with a browser."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.view.drawing import camera_for, drawing_of_maneuver, resampled
+from vgtm_qp.view.scene import ArmScene, viser_server
+
+_LONGEST = 20.0
+
+
+def write_html(maneuver: Maneuver, path: str | Path, *, frames: int = 200) -> Path:
+    """Write the maneuver as one file that needs neither a network nor a server, and return its path.
+
+    Parameters
+    ----------
+    maneuver
+        Played in its own time, or in 20 s where it is longer.
+    path
+        File to write.
+    frames
+        Number of pictures; between the states the nodes move on straight lines, as the certificate has it.
+
+    Raises
+    ------
+    MissingExtraError
+        viser is not installed.
+    """
+    drawing = drawing_of_maneuver(maneuver)
+    time, nodes, vertices = maneuver.time, maneuver.nodes, maneuver.control_vertices
+    at = np.linspace(time[0], time[-1], frames) if len(time) > 1 else time
+    moving, curves = resampled(time, nodes, at), resampled(time, vertices, at)
+    clearance = resampled(time, np.where(np.isfinite(maneuver.clearance), maneuver.clearance, -1.0), at)
+    tip = maneuver.tip_position
+
+    with viser_server() as server:
+        scene = ArmScene(server, drawing, nodes[0], vertices[0])
+        if len(tip) > 1:
+            scene.add_path("/tip path", tip)
+        scene.look(camera_for(drawing, nodes, tip))
+        top = nodes[..., 2].max() + 0.12 * np.ptp(nodes[..., 2])
+        read_out = server.scene.add_label(
+            "/read-out", "", position=(*nodes[0].mean(axis=0)[:2], top), anchor="bottom-center"
+        )
+        recording = server.get_scene_serializer()
+        pause = min(float(time[-1] - time[0]), _LONGEST) / max(len(at) - 1, 1)
+        for k, moment in enumerate(at):
+            scene.move(moving[k], curves[k], float(moment), coarse=True)
+            read_out.text = _read_out(maneuver, float(moment), float(clearance[k]))
+            recording.insert_sleep(pause)
+        page = recording.as_html()
+    title = escape(f"{drawing.name or 'maneuver'} ({maneuver.status})")
+    path = Path(path)
+    path.write_text(page.replace("<title>Viser</title>", f"<title>{title}</title>", 1), encoding="utf-8")
+    return path
+
+
+def _read_out(maneuver: Maneuver, time: float, clearance: float) -> str:
+    text = f"{time:.1f} s"
+    if np.isfinite(maneuver.clearance).any():
+        text += f"   clearance {1000.0 * clearance:.0f} mm"
+    if time >= maneuver.time[-1] and maneuver.status != "solved":
+        text += f"   {maneuver.status}: {', '.join(maneuver.blocked_by[:2])}"
+    return text

@@ -1,0 +1,171 @@
+"""Actuator lengths over time, as a table, a ROS 2 bag and a trajectory message."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import MissingExtraError
+from vgtm_qp.maneuver.result import Maneuver
+
+Array = NDArray[np.float64]
+
+STATES_TOPIC = "/joint_states"
+TRAJECTORY_TOPIC = "/joint_trajectory"
+
+_HEADER = """std_msgs/Header header
+{own}
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec"""
+
+_JOINT_STATE = _HEADER.format(own="string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort")
+
+_JOINT_TRAJECTORY = (
+    _HEADER.format(own="string[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points")
+    + """
+================================================================================
+MSG: trajectory_msgs/JointTrajectoryPoint
+float64[] positions
+float64[] velocities
+float64[] accelerations
+float64[] effort
+builtin_interfaces/Duration time_from_start
+================================================================================
+MSG: builtin_interfaces/Duration
+int32 sec
+uint32 nanosec"""
+)
+
+
+def actuator_names(maneuver: Maneuver) -> list[str]:
+    """Return the names of the actuated members, the joints of every trajectory here."""
+    return [str(name) for name in maneuver.member_names[maneuver.member_actuated]]
+
+
+def actuator_lengths(maneuver: Maneuver) -> Array:
+    """Return (T, n_a) lengths of the actuated members, m."""
+    return maneuver.member_lengths[:, maneuver.member_actuated]
+
+
+def step_rates(maneuver: Maneuver) -> Array:
+    """Return (T, n_a) mean rates over the step that led to each state, m/s: what the rate limit is held against."""
+    lengths = actuator_lengths(maneuver)
+    rates = np.zeros_like(lengths)
+    rates[1:] = np.diff(lengths, axis=0) / np.diff(maneuver.time)[:, None]
+    return rates
+
+
+def through_rates(maneuver: Maneuver) -> Array:
+    """Return (T, n_a) rates with which a controller passes the states, m/s: central, and rest at both ends.
+
+    A central rate lies between the mean rates of its two steps, so it keeps the limits that they keep.
+    """
+    rates = np.zeros_like(actuator_lengths(maneuver))
+    steps, durations = step_rates(maneuver)[1:], np.diff(maneuver.time)[:, None]
+    rates[1:-1] = (durations[1:] * steps[:-1] + durations[:-1] * steps[1:]) / (durations[1:] + durations[:-1])
+    return rates
+
+
+def write_csv(maneuver: Maneuver, path: str | Path) -> Path:
+    """Write one row a state: time, length of each actuator, rate of each over the step before; m and s."""
+    names = actuator_names(maneuver)
+    path = Path(path)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(
+            ["time [s]", *(f"{name} [m]" for name in names), *(f"d {name}/dt [m/s]" for name in names)]
+        )
+        for row in np.column_stack([maneuver.time, actuator_lengths(maneuver), step_rates(maneuver)]):
+            writer.writerow([repr(float(value)) for value in row])
+    return path
+
+
+def joint_trajectory(maneuver: Maneuver) -> dict[str, Any]:
+    """Return the maneuver as the fields of a ``trajectory_msgs/msg/JointTrajectory``; positions are lengths, m."""
+    start = float(maneuver.time[0])
+    points = [
+        {
+            "positions": [float(value) for value in lengths],
+            "velocities": [float(value) for value in rates],
+            "accelerations": [],
+            "effort": [],
+            "time_from_start": _split(float(time) - start),
+        }
+        for time, lengths, rates in zip(
+            maneuver.time, actuator_lengths(maneuver), through_rates(maneuver), strict=True
+        )
+    ]
+    return {
+        "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "base"},
+        "joint_names": actuator_names(maneuver),
+        "points": points,
+    }
+
+
+def write_ros(maneuver: Maneuver, path: str | Path) -> Path:
+    """Write a JointTrajectory as YAML, in the form that ``ros2 topic pub`` takes.
+
+    Raises
+    ------
+    MissingExtraError
+        pyyaml is not installed.
+    """
+    try:
+        import yaml
+    except ImportError:
+        raise MissingExtraError("export", "pyyaml") from None
+    path = Path(path)
+    text = yaml.safe_dump(joint_trajectory(maneuver), sort_keys=False, default_flow_style=None, width=10_000)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def write_mcap(maneuver: Maneuver, path: str | Path) -> Path:
+    """Write a ROS 2 bag: one JointState a state, and the whole JointTrajectory at its start.
+
+    Raises
+    ------
+    MissingExtraError
+        mcap-ros2-support is not installed.
+    """
+    try:
+        from mcap_ros2.writer import Writer
+    except ImportError:
+        raise MissingExtraError("export", "mcap-ros2-support") from None
+    names, lengths, rates = actuator_names(maneuver), actuator_lengths(maneuver), through_rates(maneuver)
+    path = Path(path)
+    with path.open("wb") as file, Writer(file) as writer:
+        state_schema = writer.register_msgdef("sensor_msgs/msg/JointState", _JOINT_STATE)
+        trajectory_schema = writer.register_msgdef("trajectory_msgs/msg/JointTrajectory", _JOINT_TRAJECTORY)
+        first = _nanoseconds(float(maneuver.time[0]))
+        writer.write_message(TRAJECTORY_TOPIC, trajectory_schema, joint_trajectory(maneuver), first, first)
+        for k, time in enumerate(maneuver.time):
+            message = {
+                "header": {"stamp": _split(float(time)), "frame_id": "base"},
+                "name": names,
+                "position": lengths[k].tolist(),
+                "velocity": rates[k].tolist(),
+                "effort": [],
+            }
+            stamp = _nanoseconds(float(time))
+            writer.write_message(STATES_TOPIC, state_schema, message, stamp, stamp, sequence=k)
+    return path
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(1e9 * seconds)
+
+
+def _split(seconds: float) -> dict[str, int]:
+    whole, rest = divmod(_nanoseconds(seconds), 1_000_000_000)
+    return {"sec": whole, "nanosec": rest}

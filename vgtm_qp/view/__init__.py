@@ -1,0 +1,1 @@
+"""What a person sees: the scene, the live page and the plots."""

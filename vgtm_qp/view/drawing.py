@@ -1,0 +1,213 @@
+"""What there is to draw of an arm: member ends, colours by stroke, the curve, obstacles and a camera. No renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.curve.families import make_family
+from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.path import rotation_from_vector
+from vgtm_qp.verify.arm import Arm
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+FIXED_COLOUR = (0.70, 0.72, 0.74)
+OBSTACLE_COLOUR = (0.90, 0.62, 0.0)
+CURVE_COLOUR = (0.0, 0.45, 0.34)
+POLYGON_COLOUR = (0.35, 0.62, 0.53)
+PATH_COLOUR = (0.10, 0.10, 0.12)
+_STROKE_COLOURS = np.array([(0.05, 0.30, 0.80), (0.66, 0.48, 0.72), (0.84, 0.10, 0.12)])
+"""Shortest, middle and longest; told apart in every common form of colour blindness and from the fixed grey."""
+
+_CURVE_POINTS = 49
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleMesh:
+    """The surface of an obstacle.
+
+    Attributes
+    ----------
+    name : str
+    vertices, faces : (K, 3), (F, 3) int
+        Triangles about the obstacle's own origin, turned into the base frame, m.
+    center, velocity : (3,)
+        Position of that origin at time 0, m, and its velocity, m/s.
+    """
+
+    name: str
+    vertices: Array
+    faces: Index
+    center: Array
+    velocity: Array
+
+    def position(self, time: float) -> Array:
+        """Return (3,) the position of the obstacle's origin at `time`, s, in m."""
+        return np.asarray(self.center + time * self.velocity)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """An arm and its surroundings, ready to be drawn at any configuration.
+
+    Attributes
+    ----------
+    name : str
+    arm : Arm
+        Member ends, radii and strokes.
+    curve_weights : (K, V)
+        Weights of points along the curve; V = 0 where there is no curve.
+    obstacles : tuple of ObstacleMesh
+    """
+
+    name: str
+    arm: Arm
+    curve_weights: Array
+    obstacles: tuple[ObstacleMesh, ...]
+
+    def ends(self, nodes: Array) -> Array:
+        """Return (M, 2, 3) the two ends of each member at `nodes` (N, 3), m."""
+        return self.arm.ends(nodes)
+
+    def curve(self, control_vertices: Array) -> Array:
+        """Return (K, 3) points along the curve with `control_vertices` (V, 3), m; K = 0 without a curve."""
+        return np.asarray(self.curve_weights @ control_vertices)
+
+    def stroke_share(self, lengths: Array) -> Array:
+        """Return (M,) lengths (M,) as shares of the stroke, 0 shortest to 1 longest; NaN for fixed members."""
+        low, high = self.arm.stroke.T
+        share = np.full(len(low), np.nan)
+        moving = self.arm.actuated & (high > low)
+        share[moving] = np.clip((lengths - low)[moving] / (high - low)[moving], 0.0, 1.0)
+        return share
+
+    def colours(self, lengths: Array) -> Array:
+        """Return (M, 3) colours, 0 to 1: blue for short to red for long, grey for fixed members."""
+        share = self.stroke_share(lengths)
+        colours = stroke_colours(np.nan_to_num(share, nan=0.5))
+        colours[np.isnan(share)] = FIXED_COLOUR
+        return colours
+
+
+def stroke_colours(share: Array) -> Array:
+    """Return (..., 3) colours, 0 to 1, of shares (...,) of a stroke."""
+    knots = np.linspace(0.0, 1.0, len(_STROKE_COLOURS))
+    return np.stack([np.interp(share, knots, channel) for channel in _STROKE_COLOURS.T], axis=-1)
+
+
+def drawing_of_maneuver(maneuver: Maneuver) -> Drawing:
+    """Return the drawing of a result, from its manifest.
+
+    Raises
+    ------
+    ResultError
+        The arm record in the manifest is malformed.
+    """
+    manifest = maneuver.manifest
+    return _drawing(
+        manifest["problem"],
+        Arm(manifest["arm"], maneuver.members),
+        maneuver.control_vertices.shape[1],
+        Path(manifest.get("directory") or "."),
+    )
+
+
+def drawing_of_problem(problem: Problem, record: Mapping[str, Any], members: Index, vertices: int) -> Drawing:
+    """Return the drawing of a problem whose arm has the record `arm_record(truss)` and `vertices` control vertices."""
+    directory = problem.source.parent if problem.source else Path.cwd()
+    return _drawing(problem.to_dict(), Arm(record, members), vertices, directory)
+
+
+def _drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory: Path) -> Drawing:
+    weights = np.zeros((0, vertices))
+    spec = problem.get("curve")
+    if vertices and spec:
+        options = {key: spec[key] for key in ("degree", "bias", "tension") if key in spec}
+        family = make_family(spec.get("family", "bezier"), vertices, **options)
+        weights = family.weights(np.linspace(0.0, 1.0, _CURVE_POINTS))
+    obstacles = obstacle_meshes(problem.get("obstacle") or (), directory)
+    return Drawing(str(problem.get("name", "")), arm, weights, obstacles)
+
+
+def obstacle_meshes(entries: Sequence[Mapping[str, Any]], directory: Path) -> tuple[ObstacleMesh, ...]:
+    """Return the surfaces of ``[[obstacle]]`` tables; a mesh whose file is gone is left out."""
+    found = []
+    for entry in entries:
+        surface = _surface(entry, directory)
+        if surface is None:
+            continue
+        turn = rotation_from_vector(entry.get("rotation_vector") or (0.0, 0.0, 0.0))
+        found.append(
+            ObstacleMesh(
+                name=str(entry["name"]),
+                vertices=np.asarray(surface.vertices, dtype=float) @ turn.T,
+                faces=np.asarray(surface.faces, dtype=np.int64),
+                center=np.asarray(entry.get("center") or (0.0, 0.0, 0.0), dtype=float),
+                velocity=np.asarray(entry.get("velocity") or (0.0, 0.0, 0.0), dtype=float),
+            )
+        )
+    return tuple(found)
+
+
+def _surface(entry: Mapping[str, Any], directory: Path) -> Any:
+    import trimesh
+
+    shape = entry["shape"]
+    if shape == "box":
+        return trimesh.creation.box(extents=np.broadcast_to(np.asarray(entry["size"], dtype=float), 3))
+    if shape == "sphere":
+        return trimesh.creation.icosphere(subdivisions=3, radius=float(entry["radius"]))
+    if shape == "cylinder":
+        return trimesh.creation.cylinder(
+            radius=float(entry["radius"]), height=float(entry["height"]), sections=48
+        )
+    path = directory / str(entry["file"])
+    if not path.is_file():
+        return None
+    surface = trimesh.load_mesh(path)
+    surface.apply_scale(float(entry.get("scale") or 1.0))
+    return surface
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Where to look from: `position` and `target` (3,), m, and the vertical field of view, rad."""
+
+    position: Array
+    target: Array
+    field_of_view: float
+
+
+def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
+    """Return a camera that sees all states (T, N, 3) and the obstacles, across the way that the tip (T, 3) goes."""
+    points = [nodes.reshape(-1, 3)]
+    points += [mesh.vertices + mesh.center for mesh in drawing.obstacles]
+    cloud = np.concatenate(points)
+    low, high = np.percentile(points[0], (0, 100), axis=0)
+    reach = float(np.linalg.norm(high - low))
+    near = np.all(np.abs(cloud - (low + high) / 2) < 1.2 * reach, axis=1)
+    low, high = cloud[near].min(axis=0), cloud[near].max(axis=0)
+    target = (low + high) / 2
+    away = tip[int(np.argmax(np.linalg.norm((tip - tip[0])[:, :2], axis=1)))] - tip[0]
+    heading = np.arctan2(away[1], away[0]) if np.linalg.norm(away[:2]) > 1e-6 * reach else 0.0
+    azimuth, elevation, field_of_view = heading - np.radians(62.0), np.radians(14.0), np.radians(32.0)
+    direction = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
+    distance = 0.56 * float(np.linalg.norm(high - low)) / np.tan(field_of_view / 2)
+    return Camera(target + distance * direction, target, float(field_of_view))
+
+
+def resampled(time: Array, values: Array, at: Array) -> Array:
+    """Return `values` (T, ...) at times `at`, on straight lines between the states, as the certificate has it."""
+    flat = values.reshape(len(time), -1)
+    columns = [np.interp(at, time, column) for column in flat.T]
+    return np.stack(columns, axis=1).reshape(len(at), *values.shape[1:]) if columns else values[: len(at)]
