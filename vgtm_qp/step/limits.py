@@ -22,19 +22,35 @@ def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
 
 
 def length_box(
-    length: Array, speed: Array, stroke: Array, rate: Array, acceleration: Array, dt: float
+    length: Array,
+    speed: Array,
+    stroke: Array,
+    rate: Array,
+    acceleration: Array,
+    dt: float,
+    last_dt: float | None = None,
 ) -> tuple[Array, Array]:
-    """Return the least and greatest lengths (n_a,) after a step of `dt` from `length`, with `speed` before it, m.
+    """Return the least and greatest lengths (n_a,) after a step of `dt` from `length`, m.
 
     Rate, acceleration and the speed from which the actuator still brakes before the end of its stroke are
     intersected. Where they contradict one another (a start outside a limit) the acceleration gives way, then the
     rate; an actuator outside its stroke may only come back.
+
+    Parameters
+    ----------
+    speed : (n_a,)
+        Mean speed over the step before, m/s.
+    last_dt
+        Duration of that step, s; `dt` by default. An acceleration is a change of mean speed over the time between
+        the middles of two steps.
     """
+    interval = dt if last_dt is None else 0.5 * (dt + last_dt)
     low, high = np.minimum(stroke[:, 0], length), np.maximum(stroke[:, 1], length)
     fastest = np.minimum(rate, braking_speed(high - length, acceleration, dt))
     slowest = -np.minimum(rate, braking_speed(length - low, acceleration, dt))
     with np.errstate(invalid="ignore"):
-        least, greatest = speed - acceleration * dt, speed + acceleration * dt
-    upper = np.clip(greatest, slowest, fastest)
-    lower = np.clip(least, slowest, fastest)
-    return np.maximum(low, length + lower * dt), np.minimum(high, length + upper * dt)
+        least, greatest = speed - acceleration * interval, speed + acceleration * interval
+    lower = np.maximum(low, length + np.clip(least, slowest, fastest) * dt)
+    upper = np.minimum(high, length + np.clip(greatest, slowest, fastest) * dt)
+    # Where both mean the same length, rounding must not set them in the wrong order.
+    return lower, np.maximum(lower, upper)

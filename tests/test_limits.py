@@ -1,0 +1,113 @@
+"""Stroke, rate and acceleration as one box: it never contradicts itself and whatever stays in it stays allowed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vgtm_qp.step.limits import braking_speed, length_box
+
+positive = st.floats(0.01, 10.0)
+limit = st.one_of(st.just(np.inf), positive)
+share = st.one_of(st.sampled_from([0.0, 1.0]), st.floats(0.0, 1.0))
+
+
+def one(*values):
+    return (np.array([value], dtype=float) for value in values)
+
+
+@settings(max_examples=300, deadline=None)
+@given(distance=st.floats(0.0, 5.0), acceleration=positive, dt=st.sampled_from([1e-3, 0.01, 0.2, 1.0, 3.0]))
+def test_braking_speed_is_the_greatest_from_which_steps_stop_in_time(distance, acceleration, dt):
+    def braking_distance(speed):
+        steps = np.arange(int(np.ceil(speed / (acceleration * dt))) + 1)
+        return float(np.sum(np.maximum(speed - acceleration * dt * steps, 0.0)) * dt)
+
+    speed = float(braking_speed(np.array([distance]), np.array([acceleration]), dt)[0])
+    assert braking_distance(speed) == pytest.approx(distance, abs=1e-9 * (1.0 + distance))
+    assert braking_distance(speed + 1e-6) > distance
+
+
+def test_without_an_acceleration_limit_any_speed_brakes():
+    assert braking_speed(np.array([0.0, 1.0]), np.array([np.inf, np.inf]), 0.1).tolist() == [np.inf, np.inf]
+    assert braking_speed(np.array([-1.0]), np.array([2.0]), 0.1).tolist() == [0.0]
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    start=share,
+    least=st.floats(0.1, 2.0),
+    travel=st.floats(0.0, 2.0),
+    rate=limit,
+    acceleration=limit,
+    dt=st.floats(1e-3, 2.0),
+    choices=st.lists(share, min_size=1, max_size=40),
+)
+def test_lengths_that_stay_in_their_boxes_keep_every_limit(
+    start, least, travel, rate, acceleration, dt, choices
+):
+    stroke = np.array([[least, least + travel]])
+    length, speed, rates, accelerations = one(least + start * travel, 0.0, rate, acceleration)
+    for choice in choices:
+        lower, upper = length_box(length, speed, stroke, rates, accelerations, dt)
+        assert lower[0] <= upper[0]
+        after = lower + choice * (upper - lower)
+        change = (after - length) / dt
+        assert stroke[0, 0] - 1e-12 <= after[0] <= stroke[0, 1] + 1e-12
+        assert abs(change[0]) <= rate + 1e-12 / dt
+        assert abs(change[0] - speed[0]) <= acceleration * dt + 1e-12 / dt
+        length, speed = after, change
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    length=st.floats(0.0, 4.0),
+    speed=st.floats(-20.0, 20.0),
+    least=st.floats(0.5, 2.0),
+    travel=st.floats(0.0, 1.0),
+    rate=limit,
+    acceleration=limit,
+    dt=st.floats(1e-3, 2.0),
+)
+def test_a_start_outside_any_limit_has_a_box_that_leads_back(
+    length, speed, least, travel, rate, acceleration, dt
+):
+    stroke = np.array([[least, least + travel]])
+    lengths, speeds, rates, accelerations = one(length, speed, rate, acceleration)
+    lower, upper = length_box(lengths, speeds, stroke, rates, accelerations, dt)
+    assert lower[0] <= upper[0]
+    assert np.isfinite([lower[0], upper[0]]).all()
+    assert lower[0] >= min(least, length) - 1e-12
+    assert upper[0] <= max(least + travel, length) + 1e-12
+    assert abs(lower[0] - length) <= rate * dt + 1e-12
+    assert abs(upper[0] - length) <= rate * dt + 1e-12
+
+
+def test_an_actuator_outside_its_stroke_comes_back_by_its_own_limits():
+    stroke = np.array([[0.6, 1.5]])
+    length, speed = np.array([1.7]), np.array([0.0])
+    rate, acceleration, dt = np.array([0.5]), np.array([0.4]), 0.1
+    for _ in range(100):
+        before, speed_before = length, speed
+        length, upper = length_box(length, speed, stroke, rate, acceleration, dt)
+        assert upper[0] <= max(before[0], 1.5) + 1e-15
+        speed = (length - before) / dt
+        assert abs(speed[0]) <= 0.5 + 1e-12
+        assert abs(speed[0] - speed_before[0]) <= 0.04 + 1e-12
+    assert length[0] == pytest.approx(0.6, abs=1e-9)
+
+
+def test_each_actuator_has_its_own_box():
+    rng = np.random.default_rng(0)
+    count = 20
+    stroke = np.sort(rng.uniform(0.5, 2.0, (count, 2)), axis=1)
+    length = stroke[:, 0] + rng.uniform(size=count) * np.diff(stroke, axis=1)[:, 0]
+    speed, rate = rng.uniform(-0.2, 0.2, count), rng.uniform(0.2, 1.0, count)
+    acceleration = np.where(rng.uniform(size=count) < 0.3, np.inf, rng.uniform(0.1, 1.0, count))
+    together = length_box(length, speed, stroke, rate, acceleration, 0.2)
+    for k in range(count):
+        row = slice(k, k + 1)
+        alone = length_box(length[row], speed[row], stroke[row], rate[row], acceleration[row], 0.2)
+        assert (together[0][k], together[1][k]) == (alone[0][0], alone[1][0])
