@@ -64,8 +64,7 @@ class CondensedSolver:
         self._constant_hessian = np.zeros((self._size, self._size))
         index = np.arange(actuators)
         self._constant_hessian[index, index] = weights.actuator_rate + weights.stroke_centring
-        second = second_difference(vertices)
-        self._vertex_hessian = weights.curve_rate * np.eye(vertices) + weights.smoothness * second.T @ second
+        self._vertex_hessian = weights.curve_rate * np.eye(vertices) + weights.smoothness * layout.polygon_bending
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Solve one QP.
@@ -113,7 +112,7 @@ class CondensedSolver:
         if flag == -1:
             raise InfeasibleStepError("the hard rows of the step contradict one another")
         multipliers = np.asarray(info["lam"])
-        self._check(x, multipliers, flag, hessian, gradient, constraint, lower, upper)
+        check_answer(x, multipliers, flag, hessian, gradient, constraint, lower, upper)
 
         displacement = np.zeros((truss.node_count, 3))
         displacement[truss.free] = (response @ x[:count] + particular).reshape(-1, 3)
@@ -207,22 +206,23 @@ class CondensedSolver:
         sense[size : size + tip + hard] = 5
         return constraint, lower, upper, sense
 
-    @staticmethod
-    def _check(
-        x: Array, y: Array, flag: int, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
-    ) -> None:
-        """Refuse an answer whose primal or dual residual is too large, whatever status it came with."""
-        values = np.concatenate([x, constraint @ x])
-        primal = max(float(np.max(values - upper)), float(np.max(lower - values)))
-        stationarity = hessian @ x + gradient + y[: len(x)] + constraint.T @ y[len(x) :]
-        scale = 1.0 + float(np.max(np.abs(gradient))) + float(np.max(np.abs(y)))
-        dual = float(np.max(np.abs(stationarity))) / scale
-        if not (primal <= 1e-8 and dual <= 1e-8):
-            raise SolverError(
-                f"daqp (exit flag {flag}) left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
-            )
 
+def check_answer(
+    x: Array, y: Array, flag: int, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
+) -> None:
+    """Refuse an answer of DAQP whose primal or dual residual is too large, whatever status it came with.
 
-def second_difference(count: int) -> Array:
-    """Return the (count - 2, count) second-difference matrix of the control polygon."""
-    return np.diff(np.eye(count), n=2, axis=0) if count > 2 else np.zeros((0, count))
+    Raises
+    ------
+    SolverError
+        A residual is above 1e-8, the dual one relative to the greatest gradient or multiplier.
+    """
+    size = len(x)
+    values = np.concatenate([x, constraint @ x])
+    primal = max(float((values - upper).max()), float((lower - values).max()))
+    stationarity = hessian @ x + gradient + y[:size] + y[size:] @ constraint
+    dual = float(np.abs(stationarity).max()) / (1.0 + float(np.abs(gradient).max()) + float(np.abs(y).max()))
+    if not (primal <= 1e-8 and dual <= 1e-8):
+        raise SolverError(
+            f"daqp (exit flag {flag}) left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
+        )

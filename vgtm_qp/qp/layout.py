@@ -67,6 +67,17 @@ class Layout:
         """(M, Q) nodes that each member's length depends on."""
         return member_nodes(self.truss)
 
+    @property
+    def has_tip_frame(self) -> bool:
+        """Whether the end effector has an orientation: its tip has three nodes or more."""
+        return len(self.truss.tip) >= 3
+
+    @cached_property
+    def polygon_bending(self) -> Array:
+        """(V, V) D'D with D the second difference of the control vertices."""
+        second = np.diff(np.eye(self.vertices), n=2, axis=0) if self.vertices > 2 else np.zeros((0, self.vertices))
+        return np.asarray(second.T @ second)
+
     @cached_property
     def fixed(self) -> Index:
         """(n_l,) indices of the fixed members."""

@@ -14,7 +14,11 @@ from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.solvers import StepSolver, make_solver
+from vgtm_qp.qp.fused import FusedSolver
+from vgtm_qp.qp.graph import elimination_stages
+from vgtm_qp.qp.solvers import DEFAULT_SOLVER, make_solver
+from vgtm_qp.step.engine import Engine, FusedEngine, PlainEngine
+from vgtm_qp.step.linearise import Linearisation
 from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
@@ -23,6 +27,9 @@ from vgtm_qp.truss.kinematics import Kinematics
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
+
+FUSED_ACTUATORS = 60
+"""Up to so many actuators the dense condensed QP is the faster one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +42,8 @@ class Arm:
         Member lengths at home, m: what fixed members must keep.
     control_vertices : (V, 3)
         The curve at home, m.
-    safe, influence : float
-        Least clearance, and the distance from which pairs enter the QP, m.
+    safe, self_safe, influence : float
+        Least clearance to obstacles and between members, and the distance from which pairs enter the QP, m.
     dt : float
         Duration of a step, s.
     """
@@ -45,11 +52,12 @@ class Arm:
     kinematics: Kinematics
     layout: Layout
     task: TipTask
-    solver: StepSolver
+    engine: Engine
     monitor: Clearance
     home_lengths: Array
     control_vertices: Array
     safe: float
+    self_safe: float
     influence: float
     dt: float
 
@@ -61,6 +69,7 @@ class Arm:
             control_vertices=frozen(self.control_vertices),
             lengths=frozen(self.home_lengths),
             length_rates=frozen(np.zeros(self.truss.member_count)),
+            motion=frozen(np.zeros_like(self.truss.home)),
         )
 
 
@@ -95,14 +104,31 @@ def build_arm(problem: Problem) -> Arm:
         kinematics=kinematics,
         layout=layout,
         task=task,
-        solver=make_solver(problem.method.solver, layout),
+        engine=make_engine(problem.method.solver, layout, kinematics, task),
         monitor=monitor,
         home_lengths=truss.home_lengths,
         control_vertices=control_vertices,
         safe=clearance.safe,
+        self_safe=clearance.between_members,
         influence=clearance.influence,
         dt=step_duration(problem.maneuver),
     )
+
+
+def make_engine(solver: str, layout: Layout, kinematics: Kinematics, task: TipTask) -> Engine:
+    """Return the engine that solves the steps of an arm with the solver of that name.
+
+    Raises
+    ------
+    SolverError
+        There is no such solver, or it is not installed.
+    """
+    if solver == DEFAULT_SOLVER:
+        stages = elimination_stages(layout)
+        if stages is not None and len(layout.truss.actuators) <= FUSED_ACTUATORS:
+            return FusedEngine(FusedSolver(layout, stages, task.axes), task)
+    linearisation = Linearisation(layout, kinematics, task, layout.truss.home_lengths)
+    return PlainEngine(linearisation, make_solver(solver, layout))
 
 
 def _check_supported(problem: Problem) -> None:

@@ -7,15 +7,15 @@ from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgesv
-
 from vgtm_qp.errors import SolverError
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.condensed import InfeasibleStepError
+from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
-from vgtm_qp.qp.solvers import StepSolver
-from vgtm_qp.step.linearise import Linearisation, Target, clearance_rows
+from vgtm_qp.step.engine import Engine
+from vgtm_qp.step.linearise import Target, clearance_rows
 from vgtm_qp.step.state import State
+from vgtm_qp.step.task import TipTask
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,8 @@ Array = NDArray[np.float64]
 class Tolerances:
     """What an accepted state is held against: lengths and tip in m (rad), clearance in m below `safe`.
 
-    They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide.
+    They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. After a
+    first QP that moves a node by more than `first`, m, a correction is always due.
     """
 
     member: float = 1e-10
@@ -33,6 +34,7 @@ class Tolerances:
     clearance: float = 1e-10
     between: float = 5e-5
     margin: float = 1e-8
+    first: float = 1e-3
 
 
 @dataclass
@@ -40,7 +42,7 @@ class Phases:
     """Seconds spent in each phase of a step."""
 
     seconds: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(("kinematics", "distance", "qp", "correction", "acceptance"), 0.0)
+        default_factory=lambda: dict.fromkeys(("distance", "qp", "correction", "acceptance"), 0.0)
     )
     _mark: float = field(default_factory=perf_counter)
 
@@ -62,8 +64,10 @@ class Outcome:
     Attributes
     ----------
     accepted : bool
-    nodes, control_vertices : arrays
+    closed : Closed or None
         The new configuration, valid where accepted.
+    control_vertices : (V, 3)
+        The new curve, m.
     progress : float
         How much of the target's piece of path was covered, 0 to 1.
     reason : str
@@ -77,7 +81,7 @@ class Outcome:
     """
 
     accepted: bool
-    nodes: Array
+    closed: Closed | None
     control_vertices: Array
     progress: float
     reason: str
@@ -91,75 +95,84 @@ class Attempt:
 
     def __init__(
         self,
-        linearisation: Linearisation,
-        solver: StepSolver,
+        engine: Engine,
+        task: TipTask,
         monitor: Clearance,
         safe: float,
+        self_safe: float,
         influence: float,
         *,
         tolerances: Tolerances | None = None,
         max_qps: int = 8,
     ) -> None:
-        self.linearisation = linearisation
-        self.solver = solver
+        self.engine = engine
+        self.task = task
         self.monitor = monitor
         self.safe = safe
+        self.self_safe = self_safe
         self.influence = influence
         self.tolerances = tolerances or Tolerances()
         self.max_qps = max_qps
         self.phases = Phases()
-        layout = linearisation.layout
-        self._jacobian = np.zeros((layout.node_columns, layout.node_columns))
 
-    def run(self, state: State, target: Target) -> Outcome:
-        """Return the outcome of moving from `state` along the target's piece of path; no state is changed."""
-        tolerance, phases = self.tolerances, self.phases
+    def run(self, state: State, target: Target, share: float = 1.0) -> Outcome:
+        """Return the outcome of moving from `state` along the target's piece of path; no state is changed.
+
+        `share` is the length of the piece as a part of the step before: what the motion guessed from it is scaled by.
+        """
+        tolerance, phases, span = self.tolerances, self.phases, target.end - target.start
         phases.start()
-        X, vertices, progress = np.array(state.nodes), np.array(state.control_vertices), 0.0
+        X, vertices, progress = state.nodes, state.control_vertices, 0.0
+        Y = X + (0.5 * share) * state.motion
         stations: list[float] = []
-        motion_solution: StepSolution | None = None
-        motion_rows: ClearanceRows | None = None
+        first: StepSolution | None = None
+        first_rows: ClearanceRows | None = None
+        closed: Closed | None = None
 
         def outcome(reason: str, count: int) -> Outcome:
-            return Outcome(not reason, X, vertices, progress, reason, motion_solution, motion_rows, count)
+            return Outcome(not reason, closed, vertices, progress, reason, first, first_rows, count)
 
         for count in range(1, self.max_qps + 1):
-            rows = self._rows(state, X, target.time if count > 1 else state.time, stations, motion=count == 1)
+            motion = count == 1
+            rows = self._rows(state, X, state.time if motion else target.time, stations, motion=motion)
             phases.add("distance")
-            numbers = self.linearisation.numbers(X, vertices, target, progress, rows, motion=count == 1)
-            phases.add("kinematics")
+            goal = target.path.at(target.start + progress * span)
             try:
-                solution = self.solver.solve(numbers)
+                solution = self.engine.solve(
+                    X, Y if motion else X, vertices, target, goal, progress, rows, motion=motion
+                )
             except InfeasibleStepError:
                 return outcome("infeasible", count)
             except SolverError as error:
                 return outcome(str(error), count)
             finally:
                 phases.add("qp")
-            if count == 1:
-                motion_solution, motion_rows = solution, rows
+            if motion:
+                first, first_rows = solution, rows
             X = X + solution.nodes
             if target.base is not None:
-                base = self.linearisation.layout.truss.base
-                X[base] = target.base[base]
+                X = np.where(self.task.base[:, None], target.base, X)
             vertices = vertices + solution.vertices
             progress = min(max(progress + solution.progress, 0.0), 1.0)
-            if not np.all(np.isfinite(X)):
+            moved = float(np.abs(solution.nodes).max())
+            if not moved < np.inf:
                 return outcome("singular pose", count)
-            if count == 1 and float(np.max(np.abs(solution.nodes))) > 1e-3:
+            if motion and moved > tolerance.first:
                 continue
-            if not self._close_lengths(X, target):
-                phases.add("correction")
-                continue
-            error = self._tip_error(X, target, progress)
+            closed = self.engine.close(X, target, tolerance.member)
+            X = closed.X
+            goal = target.path.at(target.start + progress * span)
+            error = self.task.residual(closed.tip_position, closed.tip_rotation, goal)[0]
             phases.add("correction")
-            if error > tolerance.tip:
+            if closed.error > tolerance.member or float(np.abs(error).max()) > tolerance.tip:
                 continue
-            least = self.monitor.least(X, target.time)[0]
-            if least < self.safe - tolerance.clearance:
+            floors = np.array([self.safe, self.self_safe])
+            if not self.monitor.keeps(X, target.time, *(floors - tolerance.clearance)):
                 phases.add("acceptance")
                 continue
-            report = self.monitor.between(state.nodes, X, state.time, target.time, self.safe - tolerance.between)
+            report = self.monitor.between(
+                state.nodes, X, state.time, target.time, *(floors - tolerance.between)
+            )
             phases.add("acceptance")
             if report.certified:
                 return outcome("", count)
@@ -170,37 +183,13 @@ class Attempt:
 
     def _rows(self, state: State, X: Array, time: float, stations: list[float], *, motion: bool) -> ClearanceRows:
         """Return the clearance rows at `X` and, as the end state moves them too, at the `stations` on the way there."""
-        safe = self.safe + self.tolerances.margin
-        rows = clearance_rows(self.monitor, self.monitor.near(X, time, self.influence), safe)
+        margin = self.tolerances.margin
+        safe = (self.safe + margin, self.self_safe + margin)
+        rows = clearance_rows(self.monitor, self.monitor.near(X, time, self.influence), *safe)
         if motion:
             np.minimum(rows.lower, 0.0, out=rows.lower)
         for s in stations:
             between = state.nodes + s * (X - state.nodes)
             pairs = self.monitor.near(between, state.time + s * (time - state.time), 1.5 * self.safe)
-            rows = rows.joined(clearance_rows(self.monitor, pairs, safe, s))
+            rows = rows.joined(clearance_rows(self.monitor, pairs, *safe, s))
         return rows
-
-    def _tip_error(self, X: Array, target: Target, progress: float) -> float:
-        goal = target.path.at(target.start + progress * (target.end - target.start))
-        return float(np.max(np.abs(self.linearisation.task.rows(X, goal).error), initial=0.0))
-
-    def _close_lengths(self, X: Array, target: Target) -> bool:
-        """Newton on the lengths alone: fixed members to their length, actuators into their box; `X` is corrected."""
-        layout, kinematics = self.linearisation.layout, self.linearisation.kinematics
-        wanted = self.linearisation.home_lengths.copy()
-        actuators, free = layout.truss.actuators, layout.truss.free
-        for _ in range(4):
-            kinematics.evaluate(X)
-            wanted[actuators] = np.clip(kinematics.lengths[actuators], target.lower, target.upper)
-            error = wanted - kinematics.lengths
-            worst = float(np.max(np.abs(error)))
-            if worst <= self.tolerances.member:
-                return True
-            if not worst < 1e-2:
-                return False
-            layout.length_jacobian(kinematics.gradient, self._jacobian)
-            _, _, step, info = dgesv(self._jacobian, error)
-            if info != 0:
-                return False
-            X[free] += step.reshape(-1, 3)
-        return False

@@ -61,7 +61,15 @@ class Linearisation:
         return float(np.max(np.abs(self.kinematics.lengths[self.layout.fixed] - self._fixed_lengths), initial=0.0))
 
     def numbers(
-        self, X: Array, vertices: Array, target: Target, progress: float, clearance: ClearanceRows, *, motion: bool
+        self,
+        X: Array,
+        vertices: Array,
+        target: Target,
+        progress: float,
+        clearance: ClearanceRows,
+        *,
+        motion: bool,
+        at: Array | None = None,
     ) -> StepNumbers:
         """Return the QP's numbers at node positions `X` (N, 3) and control vertices (V, 3).
 
@@ -72,9 +80,16 @@ class Linearisation:
         motion
             True for the QP that moves the arm; False for a correction, which returns to the constraints on the
             shortest way, without the gradients of the null-space objectives.
+        at
+            (N, 3) where the Jacobians are taken, m; `X` by default.
         """
         layout, kinematics, weights = self.layout, self.kinematics, self.layout.weights
-        kinematics.evaluate(X)
+        kinematics.evaluate(X if at is None else at)
+        gradient, face_spin = kinematics.gradient, kinematics.face_spin
+        tip_spin = kinematics.tip_spin
+        if at is not None:
+            gradient, face_spin, tip_spin = gradient.copy(), face_spin.copy(), tip_spin.copy()
+            kinematics.evaluate(X)
         actuators, tracked = layout.truss.actuators, layout.tracked
 
         length_rhs = np.zeros(layout.truss.member_count)
@@ -82,12 +97,12 @@ class Linearisation:
         shift = np.zeros(3)
         if target.base is not None:
             moved = np.where(layout.truss.base[:, None], target.base - X, 0.0)
-            length_rhs -= layout.base_length_rate(kinematics.gradient, moved)
+            length_rhs -= layout.base_length_rate(gradient, moved)
         length = kinematics.lengths[actuators]
 
         span = target.end - target.start
         goal = target.path.at(target.start + progress * span)
-        tip = self.task.rows(X, goal)
+        tip = self.task.rows(X, goal, tip_spin)
         rate = tip.rate * span
         curvature = weights.progress * max(float(rate @ rate), 1e-12)
 
@@ -105,7 +120,7 @@ class Linearisation:
             tangents = slopes / speed
             axes = kinematics.face_rotation[tracked][:, :, :2].transpose(0, 2, 1)
             turn = np.cross(axes, tangents[:, None, :])
-            tangent_face = np.einsum("kac,kcf->kaf", turn, kinematics.face_spin[tracked])
+            tangent_face = np.einsum("kac,kcf->kaf", turn, face_spin[tracked])
             along = np.einsum("kac,kc->ka", axes, tangents)
             tangent_curve = (axes - along[..., None] * tangents[:, None, :]) / speed[:, None]
             if motion:
@@ -118,7 +133,7 @@ class Linearisation:
                 shift = layout.truss.face_weights[0] @ target.base[face] - vertices[0]
             base_rhs = -base_axes @ (vertices[1] - vertices[0])
         return StepNumbers(
-            gradient=kinematics.gradient,
+            gradient=gradient,
             length_rhs=length_rhs,
             lower=target.lower - length,
             upper=target.upper - length,
@@ -144,8 +159,10 @@ class Linearisation:
         )
 
 
-def clearance_rows(monitor: Clearance, pairs: NearPairs, safe: float, fraction: float = 1.0) -> ClearanceRows:
-    """Return the rows n . d(witness) >= safe - distance for near `pairs`.
+def clearance_rows(
+    monitor: Clearance, pairs: NearPairs, safe: float, self_safe: float, fraction: float = 1.0
+) -> ClearanceRows:
+    """Return the rows n . d(witness) >= safe - distance for near `pairs`, with `self_safe` between members.
 
     `fraction` is where on the straight way to the end of the step the pairs were found: a displacement of the end state
     moves that point by so much of it. A pair that is already too near may not come nearer, but is not asked to jump.
@@ -160,4 +177,4 @@ def clearance_rows(monitor: Clearance, pairs: NearPairs, safe: float, fraction: 
     other = np.where(pairs.is_self, fraction, 0.0)
     coefficients[:, 2] = -((1.0 - pairs.t_other) * other)[:, None] * pairs.normal
     coefficients[:, 3] = -(pairs.t_other * other)[:, None] * pairs.normal
-    return ClearanceRows(nodes, coefficients, safe - pairs.distance, pairs.name)
+    return ClearanceRows(nodes, coefficients, np.where(pairs.is_self, self_safe, safe) - pairs.distance, pairs.name)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,6 +92,10 @@ class Path:
     knots: Array
     positions: Array
     rotations: Array
+    _knots: list[float] = field(init=False, repr=False)
+    _turned: list[bool] = field(init=False, repr=False)
+    _velocity: Array = field(init=False, repr=False)
+    _spin: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         numbers = np.concatenate([np.ravel(self.knots), np.ravel(self.positions), np.ravel(self.rotations)])
@@ -97,6 +103,12 @@ class Path:
             raise GoalError("a goal must be made of finite numbers; the state of the arm is unchanged")
         if np.any(np.diff(self.knots) <= 0):
             raise GoalError("the times of a path must increase strictly")
+        turns = [vector_from_rotation(b @ a.T) for a, b in pairwise(self.rotations)]
+        widths = np.diff(self.knots)[:, None]
+        object.__setattr__(self, "_knots", self.knots.tolist())
+        object.__setattr__(self, "_turned", [bool(np.any(turn)) for turn in turns])
+        object.__setattr__(self, "_velocity", np.diff(self.positions, axis=0) / widths)
+        object.__setattr__(self, "_spin", np.stack(turns) / widths)
 
     @property
     def start(self) -> float:
@@ -110,17 +122,17 @@ class Path:
 
     def at(self, value: float) -> PathPoint:
         """Return pose and rate at `value`; the rate is that of the piece which follows."""
-        k = int(np.clip(np.searchsorted(self.knots, value, side="right") - 1, 0, len(self.knots) - 2))
-        width = float(self.knots[k + 1] - self.knots[k])
-        fraction = min(max((value - float(self.knots[k])) / width, 0.0), 1.0)
-        step = self.positions[k + 1] - self.positions[k]
-        turn = vector_from_rotation(self.rotations[k + 1] @ self.rotations[k].T)
-        return PathPoint(
-            position=self.positions[k] + fraction * step,
-            rotation=rotation_from_vector(fraction * turn) @ self.rotations[k],
-            velocity=step / width,
-            spin=turn / width,
-        )
+        knots = self._knots
+        k = min(max(bisect_right(knots, value) - 1, 0), len(knots) - 2)
+        along = min(max(value, knots[k]), knots[k + 1]) - knots[k]
+        rotation = self.rotations[k]
+        if self._turned[k]:
+            rotation = rotation_from_vector(along * self._spin[k]) @ rotation
+        if along == knots[k + 1] - knots[k]:
+            position = self.positions[k + 1]
+        else:
+            position = self.positions[k] + along * self._velocity[k]
+        return PathPoint(position, rotation, self._velocity[k], self._spin[k])
 
     def length(self) -> float:
         """Return the length of the path of the position, m."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -13,7 +13,7 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.attempt import Attempt, Outcome
 from vgtm_qp.step.limits import length_box
-from vgtm_qp.step.linearise import Linearisation, Target
+from vgtm_qp.step.linearise import Target
 from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
 from vgtm_qp.step.state import State, frozen
 
@@ -70,8 +70,9 @@ class Resolver:
 
     def __init__(self, problem: Problem | Arm) -> None:
         self.arm = arm = problem if isinstance(problem, Arm) else build_arm(problem)
-        self._linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
-        self._attempt = Attempt(self._linearisation, arm.solver, arm.monitor, arm.safe, arm.influence)
+        self._attempt = Attempt(
+            arm.engine, arm.task, arm.monitor, arm.safe, arm.self_safe, arm.influence
+        )
         self.state = arm.home_state()
 
     @property
@@ -103,8 +104,10 @@ class Resolver:
         Raises
         ------
         GoalError
-            The goal is not three finite numbers, or names a coordinate that is not tracked; the state is unchanged.
+            The goal is not three finite numbers, names a coordinate that is not tracked or the direction twice, or
+            `dt` is not a positive number; the state is unchanged.
         """
+        self._check_tracked(position=position, pointing=pointing, rotation_vector=rotation_vector)
         here, rotation = self.tip()
         there = here if position is None else _vector(position, "position")
         if pointing is not None:
@@ -120,6 +123,17 @@ class Resolver:
         path = Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation, turned]))
         return self.follow(path, 0.0, 1.0, dt=dt)
 
+    def _check_tracked(self, **goal: ArrayLike | None) -> None:
+        """Refuse a goal for coordinates that no row of the QP steers, and two goals for one."""
+        task = self.arm.task
+        served = {"position": bool(len(task.axes)), "pointing": bool(task.turns), "rotation_vector": bool(task.turns)}
+        for name, value in goal.items():
+            if value is not None and not served[name]:
+                tracked = ", ".join(task.track)
+                raise GoalError(f"{name} is not tracked, only {tracked}; the state of the arm is unchanged")
+        if goal["pointing"] is not None and goal["rotation_vector"] is not None:
+            raise GoalError("give pointing or rotation_vector, not both; the state of the arm is unchanged")
+
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
         kinematics = self.arm.kinematics
@@ -127,8 +141,16 @@ class Resolver:
         return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None, smallest: float = 1 / 64) -> Step:
-        """Move along `path` from its value `start` towards `end` in one step; pieces are halved until one is safe."""
+        """Move along `path` from its value `start` towards `end` in one step; pieces are halved until one is safe.
+
+        Raises
+        ------
+        GoalError
+            `dt` is not a positive number; the state is unchanged.
+        """
         dt = self.arm.dt if dt is None else dt
+        if not (np.isfinite(dt) and dt > 0.0):
+            raise GoalError(f"dt must be a positive number of seconds, not {dt!r}; the state of the arm is unchanged")
         state, actuators = self.state, self.arm.truss.actuators
         truss = self.arm.truss
         lower, upper = length_box(
@@ -138,11 +160,12 @@ class Resolver:
             truss.rate[actuators],
             truss.acceleration[actuators],
             dt,
+            state.duration or None,
         )
         share, outcome = 1.0, None
         while share >= smallest:
             target = Target(path, start, start + share * (end - start), lower, upper, state.time + dt)
-            outcome = self._attempt.run(state, target)
+            outcome = self._attempt.run(state, target, share)
             if outcome.accepted:
                 break
             share /= 2
@@ -151,14 +174,17 @@ class Resolver:
         if not outcome.accepted:
             return Step(StepStatus.BLOCKED, 0.0, state, active, multipliers, outcome.reason, outcome.iterations)
         progress = share * outcome.progress
-        lengths = frozen(self.arm.kinematics.lengths)
-        self.state = replace(
-            state,
+        closed = outcome.closed
+        assert closed is not None
+        self.state = State(
             time=state.time + dt,
-            nodes=frozen(outcome.nodes),
+            nodes=frozen(closed.X),
             control_vertices=frozen(outcome.control_vertices),
-            lengths=lengths,
-            length_rates=frozen((lengths - state.lengths) / dt),
+            lengths=frozen(closed.lengths),
+            length_rates=frozen((closed.lengths - state.lengths) / dt),
+            motion=frozen(closed.X - state.nodes),
+            duration=dt,
+            duration=dt,
         )
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return Step(status, progress, self.state, active, multipliers, "", outcome.iterations)
@@ -179,7 +205,10 @@ class Resolver:
 
 
 def _vector(value: ArrayLike, name: str) -> Array:
-    vector = np.asarray(value, dtype=float)
+    try:
+        vector = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
     if vector.shape != (3,) or not np.all(np.isfinite(vector)):
         raise GoalError(f"{name} must be three finite numbers, not {value!r}; the state of the arm is unchanged")
     return vector

@@ -33,6 +33,10 @@ class State:
         Member lengths, m.
     length_rates : (M,)
         Rate of each length over the step that led here, m/s.
+    motion : (N, 3)
+        Displacement of the nodes over that step, m: the guess for the next one, at whose middle it is linearised.
+    duration : float
+        Duration of that step, s; 0 at home, where the arm rests.
     """
 
     time: float
@@ -40,3 +44,5 @@ class State:
     control_vertices: Array
     lengths: Array
     length_rates: Array
+    motion: Array
+    duration: float = 0.0

@@ -56,24 +56,35 @@ class TipTask:
         self.track = tuple(track)
         self.row_names = tuple(rows)
         self.axes = np.array([_AXES[row[-1]] for row in rows if row in ("tip x", "tip y", "tip z")], dtype=np.int64)
+        self.base = kinematics.truss.base
         self._kinematics = kinematics
         weights = kinematics.truss.tip_weights
         self._position_jacobian = np.kron(weights, np.eye(3))[self.axes]
 
-    def rows(self, X: Array, goal: PathPoint) -> TipRows:
-        """Return the rows at node positions `X`, at which the kinematics was evaluated, towards `goal`."""
+    def residual(self, position: Array, rotation: Array, goal: PathPoint) -> tuple[Array, Array, Array | None]:
+        """Return error (n_e,) goal minus value, rate (n_e,) along the path, and how the angular velocity is combined.
+
+        The last is (r, 3), whose rows times the tip's angular velocity are the tracked turns; None without any.
+        """
+        error, rate = (goal.position - position)[self.axes], goal.velocity[self.axes]
+        if self.turns is None:
+            return error, rate, None
+        if self.turns == "pointing":
+            across = rotation[:, :2].T
+            turn = turn_between(rotation[:, 2], goal.rotation[:, 2])
+        else:
+            across = np.eye(3)
+            turn = vector_from_rotation(goal.rotation @ rotation.T)
+        return np.concatenate([error, across @ turn]), np.concatenate([rate, across @ goal.spin]), across
+
+    def rows(self, X: Array, goal: PathPoint, spin: Array | None = None) -> TipRows:
+        """Return the rows at node positions `X`, at which the kinematics was evaluated, towards `goal`.
+
+        `spin` (3, 3 K_tip) are the tip's angular-velocity rows if they are to be taken elsewhere.
+        """
         kinematics = self._kinematics
-        error = goal.position - kinematics.tip_position(X)
-        jacobian, rate, residual = [self._position_jacobian], [goal.velocity[self.axes]], [error[self.axes]]
-        if self.turns:
-            rotation, spin = kinematics.tip_rotation, kinematics.tip_spin
-            if self.turns == "pointing":
-                across = rotation[:, :2].T
-                turn = turn_between(rotation[:, 2], goal.rotation[:, 2])
-            else:
-                across = np.eye(3)
-                turn = vector_from_rotation(goal.rotation @ rotation.T)
-            jacobian.append(across @ spin)
-            rate.append(across @ goal.spin)
-            residual.append(across @ turn)
-        return TipRows(np.concatenate(jacobian), np.concatenate(rate), np.concatenate(residual))
+        error, rate, across = self.residual(kinematics.tip_position(X), kinematics.tip_rotation, goal)
+        jacobian = self._position_jacobian
+        if across is not None:
+            jacobian = np.concatenate([jacobian, across @ (kinematics.tip_spin if spin is None else spin)])
+        return TipRows(jacobian, rate, error)

@@ -66,7 +66,7 @@ def frame_function(count: int) -> ca.Function:
     return ca.Function("frame", [nodes, cosines, sines, alignment], [fitted @ alignment, ca.densify(spin)])
 
 
-def _frame_constants(home: Array, rotation: Array) -> tuple[Array, Array, Array]:
+def frame_constants(home: Array, rotation: Array) -> tuple[Array, Array, Array]:
     """Return the polar angles' cosines and sines, and the alignment that makes the frame at `home` equal `rotation`."""
     centred = home - home.mean(axis=0)
     normal = np.sum(np.cross(centred, np.roll(centred, -1, axis=0)), axis=0)
@@ -188,7 +188,7 @@ def _frames(home: Array, rotations: Array, X: ca.MX, nodes: Index) -> list[ca.MX
     if not len(home):
         return [ca.MX(0, 0), ca.MX(0, 0)]
     constants = [
-        _frame_constants(points, rotation) for points, rotation in zip(home, rotations, strict=False)
+        frame_constants(points, rotation) for points, rotation in zip(home, rotations, strict=False)
     ]
     cosines, sines, alignments = (np.stack(column) for column in zip(*constants, strict=True))
     function = frame_function(home.shape[1]).map(len(home))

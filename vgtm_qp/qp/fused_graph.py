@@ -1,0 +1,226 @@
+"""The two compiled functions of a step for arms whose bays can be eliminated one after another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.qp.graph import Constants, Frames, Stage, TrussGraph
+from vgtm_qp.qp.layout import Layout
+
+Array = NDArray[np.float64]
+
+NEWTON_STEPS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """A CasADi function and the constants to bind to its last arguments."""
+
+    function: ca.Function
+    constants: list[Array]
+
+
+class _Symbols:
+    """Arguments that both functions share."""
+
+    def __init__(self, layout: Layout) -> None:
+        truss = layout.truss
+        self.X = ca.MX.sym("X", 3, truss.node_count)
+        self.lower = ca.MX.sym("lower", len(truss.actuators))
+        self.upper = ca.MX.sym("upper", len(truss.actuators))
+        self.constants = Constants()
+        self.home_lengths = self.constants.add("home_lengths", truss.home_lengths)
+        self.fixed = (~truss.actuated).astype(float)
+
+
+def length_function(layout: Layout, stages: list[Stage]) -> Bound:
+    """Return X (3, N), lower, upper (n_a) -> X after Newton on the lengths, lengths there, worst error, tip pose.
+
+    Fixed members go to their home lengths, actuators to the nearest length in their box.
+    """
+    symbols, truss = _Symbols(layout), layout.truss
+    graph = TrussGraph(layout, stages, symbols.constants)
+    actuators = truss.actuators.tolist()
+    X = symbols.X
+    wanted = symbols.home_lengths
+
+    def aims(lengths: ca.MX) -> ca.MX:
+        aim = symbols.home_lengths * 1.0
+        aim[actuators] = ca.fmax(symbols.lower, ca.fmin(symbols.upper, lengths[actuators]))
+        return aim
+
+    lengths, gradients = graph.lengths(X)
+    for _ in range(NEWTON_STEPS):
+        X = graph.newton(X, aims(lengths), lengths, gradients)
+        lengths, gradients = graph.lengths(X)
+    wanted = aims(lengths)
+    position = X[:, truss.tip.tolist()] @ ca.DM(truss.tip_weights)
+    rotation = ca.MX.eye(3)
+    if layout.has_tip_frame:
+        rotation, _ = _tip_frames(layout, symbols.constants).at(X)
+    outputs = [X, lengths, ca.norm_inf(wanted - lengths), position, ca.densify(rotation)]
+    inputs = [symbols.X, symbols.lower, symbols.upper, *symbols.constants.symbols]
+    return Bound(ca.Function("lengths", inputs, outputs), symbols.constants.values)
+
+
+def row_function(layout: Layout, stages: list[Stage]) -> Bound:
+    """Return the function that linearises and condenses the QP of a step.
+
+    Arguments: X, Y (3, N), where residuals and where Jacobians are evaluated; base (3, N), positions that base nodes
+    take; p (3, V); lower, upper (n_a); motion, 1 for the QP that moves the arm and 0 for corrections.
+
+    Results: R (3 (N - N_c) + 5 K, n_a + q + 1), whose Gram matrix is the objective's; tip spin and position rows
+    (6, n_a + 1); actuator box and gradient (n_a, 3); tip position (3); tip rotation (3, 3); gradient of the curve's
+    own objectives (q); offsets (3, V) of the control vertices; base normal (3).
+    """
+    symbols, truss = _Symbols(layout), layout.truss
+    constants = symbols.constants
+    graph = TrussGraph(layout, stages, constants)
+    X, Y = symbols.X, ca.MX.sym("Y", 3, truss.node_count)
+    base, motion = ca.MX.sym("base", 3, truss.node_count), ca.MX.sym("motion")
+    vertices = ca.MX.sym("p", 3, layout.vertices)
+    weights = layout.weights
+    node_rate, centring, tracking, tangent, curve_rate, smoothness = ca.vertsplit(
+        constants.add(
+            "weights",
+            np.array(
+                [
+                    weights.node_rate,
+                    weights.stroke_centring,
+                    1.0 if layout.hard_tracking else weights.tracking,
+                    weights.tangent,
+                    weights.curve_rate,
+                    weights.smoothness,
+                ]
+            ),
+        )
+    )
+    lengths, _ = graph.lengths(X)
+    _, gradients = graph.lengths(Y)
+    given = np.flatnonzero(truss.base).tolist()
+    moved = ca.MX.zeros(3, truss.node_count)
+    moved[:, given] = (base - X)[:, given]
+    corners = layout.member_nodes
+    terms = gradients * ca.vec(moved[:, corners.reshape(-1).tolist()])
+    base_rate = ca.sum1(ca.reshape(terms, 3 * corners.shape[1], truss.member_count)).T
+    response = graph.response(gradients, symbols.fixed * (symbols.home_lengths - lengths) - base_rate)
+
+    actuators = truss.actuators.tolist()
+    strokes = lengths[actuators]
+    box = ca.horzcat(
+        symbols.lower - strokes,
+        symbols.upper - strokes,
+        motion * centring * (strokes - symbols.home_lengths[actuators]),
+    )
+    place = {int(node): 3 * k for k, node in enumerate(truss.free)}
+
+    def displacement(nodes: list[int]) -> ca.MX:
+        """Rows (3 K, n_a + 1) of the displacement of nodes; base nodes move as they are told."""
+        zero = ca.MX.zeros(3, len(actuators))
+        parts = [
+            response[place[node] : place[node] + 3, :] if node in place else ca.horzcat(zero, moved[:, node])
+            for node in nodes
+        ]
+        return ca.vertcat(*parts)
+
+    tip = displacement(truss.tip.tolist())
+    tip_rows = ca.DM(np.kron(truss.tip_weights, np.eye(3))) @ tip
+    rotation = ca.MX.eye(3)
+    if layout.has_tip_frame:
+        frames = _tip_frames(layout, constants)
+        rotation, _ = frames.at(X)
+        _, spin = frames.at(Y)
+        tip_rows = ca.vertcat(tip_rows, spin @ tip)
+    else:
+        tip_rows = ca.vertcat(tip_rows, ca.MX.zeros(3, len(actuators) + 1))
+
+    top = ca.sqrt(node_rate) * response
+    curve_gradient, offset, normal = ca.MX.zeros(0, 1), ca.MX.zeros(3, 0), ca.MX.zeros(3)
+    gaps: list[ca.MX] = []
+    tilts: list[ca.MX] = []
+    if layout.vertices:
+        faces = Frames(truss.home[truss.faces], truss.face_frames, truss.faces, constants, "face")
+        rotations, _ = faces.at(X)
+        _, spins = faces.at(Y)
+        curve_weights = constants.add("curve_weights", layout.curve_weights)
+        curve_slopes = constants.add("curve_slopes", layout.curve_slopes)
+        centre = (X + moved)[:, truss.faces[0].tolist()] @ ca.DM(truss.face_weights[0])
+        axes, normal = rotations[:, :2], rotations[:, 2]
+        offset = ca.MX.zeros(3, layout.vertices)
+        offset[:, 0] = centre - vertices[:, 0]
+        offset[:, 1] = offset[:, 0] - axes @ (axes.T @ (vertices[:, 1] - vertices[:, 0]))
+        curve_node = _curve_node(layout, len(actuators))
+        residual = 1.0 if layout.hard_tracking else motion
+        for k, face in enumerate(layout.tracked.tolist()):
+            nodes = truss.faces[face].tolist()
+            gap, tilt = curve_node(
+                X[:, nodes],
+                displacement(nodes),
+                rotations[:, 3 * face : 3 * face + 3],
+                spins[:, 9 * face : 9 * face + 9],
+                vertices,
+                offset,
+                normal,
+                curve_weights[:, k],
+                curve_slopes[:, k],
+                truss.face_weights[face],
+                residual,
+                motion,
+            )
+            gaps.append(ca.sqrt(tracking) * gap)
+            tilts.append(ca.sqrt(tangent) * tilt)
+        top = ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, 3 * layout.vertices - 5), top[:, -1])
+        bend = ca.DM(layout.polygon_bending)
+        pull = curve_rate * offset + smoothness * ((offset + motion * vertices) @ bend)
+        curve_gradient = ca.vertcat(ca.dot(pull[:, 1], normal), ca.vec(pull[:, 2:]))
+    inputs = [X, Y, base, vertices, symbols.lower, symbols.upper, motion, *constants.symbols]
+    results = [
+        ca.vertcat(top, *gaps, *tilts),
+        tip_rows,
+        box,
+        X[:, truss.tip.tolist()] @ ca.DM(truss.tip_weights),
+        rotation,
+        curve_gradient,
+        offset,
+        normal,
+    ]
+    return Bound(ca.Function("rows", inputs, [ca.densify(result) for result in results]), constants.values)
+
+
+def _tip_frames(layout: Layout, constants: Constants) -> Frames:
+    truss = layout.truss
+    return Frames(truss.home[truss.tip][None], truss.tip_frame[None], truss.tip[None], constants, "tip")
+
+
+def _curve_node(layout: Layout, actuators: int) -> ca.Function:
+    """Return the tracking rows (3, n) and tangent rows (2, n) of one curve node, n = n_a + q + 1."""
+    count = layout.vertices
+    nodes, motion_rows = ca.SX.sym("nodes", 3, 3), ca.SX.sym("rows", 9, actuators + 1)
+    rotation, spin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("spin", 3, 9)
+    vertices, offset, normal = ca.SX.sym("p", 3, count), ca.SX.sym("offset", 3, count), ca.SX.sym("normal", 3)
+    weights, slopes, face = ca.SX.sym("w", count), ca.SX.sym("dw", count), ca.SX.sym("face", 3)
+    gap_on, tilt_on = ca.SX.sym("gap_on"), ca.SX.sym("tilt_on")
+
+    identity = ca.SX.eye(3)
+    centre = ca.kron(face.T, identity) @ motion_rows
+    curve = ca.horzcat(weights[1] * normal, ca.kron(weights[2:].T, identity))
+    gap = gap_on * (nodes @ face - vertices @ weights) + centre[:, -1] - offset @ weights
+    gap_rows = ca.horzcat(centre[:, :-1], -curve, gap)
+
+    slope = vertices @ slopes
+    speed = ca.norm_2(slope)
+    tangent = slope / speed
+    tilts = []
+    for a in range(2):
+        axis = rotation[:, a]
+        along = ca.dot(axis, tangent)
+        turn = ca.cross(axis, tangent).T @ spin @ motion_rows
+        across = ((axis - along * tangent) / speed).T
+        free = ca.horzcat(slopes[1] * (across @ normal), ca.kron(slopes[2:].T, across))
+        tilts.append(ca.horzcat(turn[:, :-1], free, tilt_on * along + turn[:, -1] + across @ (offset @ slopes)))
+    inputs = [nodes, motion_rows, rotation, spin, vertices, offset, normal, weights, slopes, face, gap_on, tilt_on]
+    return ca.Function("curve_node", inputs, [ca.densify(gap_rows), ca.densify(ca.vertcat(*tilts))])
