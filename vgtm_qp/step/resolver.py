@@ -184,7 +184,6 @@ class Resolver:
             length_rates=frozen((closed.lengths - state.lengths) / dt),
             motion=frozen(closed.X - state.nodes),
             duration=dt,
-            duration=dt,
         )
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return Step(status, progress, self.state, active, multipliers, "", outcome.iterations)
