@@ -215,10 +215,33 @@ class Clearance:
         points = np.vstack([X, centers])
         return float(np.linalg.norm(np.ptp(points, axis=0)))
 
+    def keeps(self, X: Array, time: float, floor: float, self_floor: float | None = None) -> bool:
+        """Return whether no surface distance is below its floor; cheaper than :meth:`least`.
+
+        Parameters
+        ----------
+        floor, self_floor : float
+            For obstacles and, if it differs, between members, m.
+        """
+        self_floor = floor if self_floor is None else self_floor
+        candidates, motion = self._covering(X, time, max(floor, 0.0), max(self_floor, 0.0))
+        for group in candidates.groups:
+            least = self_floor if group.is_self else floor
+            rows = np.flatnonzero(~(group.lower(motion, time - candidates.time) >= least))
+            if len(rows) and not (group.contacts(X, time, rows).distance >= least).all():
+                return False
+        return self._enclosed(X, time) is None
+
     def between(
-        self, start: Array, end: Array, start_time: float, end_time: float, floor: float
+        self,
+        start: Array,
+        end: Array,
+        start_time: float,
+        end_time: float,
+        floor: float,
+        self_floor: float | None = None,
     ) -> BetweenReport:
-        """Prove that no surface distance falls below `floor` while the nodes move on straight lines.
+        """Prove that no surface distance falls below its floor while the nodes move on straight lines.
 
         Motion bounds first, then fixed separating planes, then halves of the time for the pairs that are
         left. What is not proven after twelve halvings is refused: the answer may be a false alarm, never a
@@ -230,8 +253,8 @@ class Clearance:
             Node positions, m.
         start_time, end_time : float
             s; the obstacles move meanwhile.
-        floor : float
-            m; not negative.
+        floor, self_floor : float
+            For obstacles and, if it differs, between members, m; not negative.
 
         Raises
         ------
@@ -239,17 +262,18 @@ class Clearance:
             A position is not finite; so do `near` and `least`.
         """
         floor = max(floor, 0.0)
-        candidates, motion = self._covering(start, start_time, floor, floor, end, end_time)
+        self_floor = floor if self_floor is None else max(self_floor, 0.0)
+        candidates, motion = self._covering(start, start_time, floor, self_floor, end, end_time)
         elapsed = max(abs(start_time - candidates.time), abs(end_time - candidates.time))
         proven = min(candidates.beyond(motion, candidates.time + elapsed))
         found: list[tuple[Group, Found]] = []
         for group in candidates.groups:
-            lower = group.lower(motion, elapsed)
-            open_ = ~(lower >= floor)
+            lower, least = group.lower(motion, elapsed), self_floor if group.is_self else floor
+            open_ = ~(lower >= least)
             proven = min(proven, float(lower[~open_].min(initial=np.inf)))
             rows = np.flatnonzero(open_)
             if len(rows):
-                result = sweep_group(group, rows, start, end, start_time, end_time, floor)
+                result = sweep_group(group, rows, start, end, start_time, end_time, least)
                 proven = min(proven, result.proven)
                 if len(result.rows):
                     found.append((group, result))

@@ -90,11 +90,20 @@ class Clearance(Table):
         default=True, description="whether members that share no node keep apart too"
     )
     self_safe: Distance | None = Field(
-        default=None, description="least distance between members, m; safe where absent"
+        default=None, description="least distance between members, m; a quarter of safe where absent"
     )
     minimum_angle: Angle = Field(
         default=0.0, description="least angle between members that share a node, rad"
     )
+
+    @property
+    def between_members(self) -> float:
+        """Least distance from surface to surface of members that share no node, m.
+
+        A quarter of `safe` where the problem does not say: the arm's own shape is known far better than where the
+        obstacles are, and battens and longerons of a bent bay come near one another by their nature.
+        """
+        return 0.25 * self.safe if self.self_safe is None else self.self_safe
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.influence <= self.safe:

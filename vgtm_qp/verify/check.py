@@ -36,6 +36,8 @@ ARRAY_TOLERANCE = 1e-9
 
 _SAFE = 0.05
 """What a problem that does not say keeps from its obstacles, m."""
+_SELF_SHARE = 0.25
+"""What it keeps between members, as a share of that."""
 _MANY_UNKNOWNS = 2000
 _FEW_STATES = 21
 
@@ -75,7 +77,7 @@ def verify(maneuver: Maneuver) -> Certificate:
     )
     rules = problem.get("clearance") or {}
     safe = float(rules.get("safe", _SAFE))
-    self_safe = safe if rules.get("self_safe") is None else float(rules["self_safe"])
+    self_safe = _SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
     if not rules.get("self_collision", True):
         self_safe = -np.inf
     at, between, clearance = _clearances(motion, [AgainstBody(motion, body) for body in bodies])

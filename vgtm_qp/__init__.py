@@ -1,0 +1,112 @@
+"""Moves highly redundant arms through clutter: one quadratic program a step, every step certified."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vgtm_qp.errors import (
+        CurveError,
+        GoalError,
+        MissingExtraError,
+        Mistake,
+        ProblemError,
+        ResultError,
+        SolverError,
+        TrussError,
+        VgtmError,
+    )
+    from vgtm_qp.maneuver.certificate import Certificate, Measure
+    from vgtm_qp.maneuver.result import Maneuver, load_result
+    from vgtm_qp.maneuver.solve import solve
+    from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
+    from vgtm_qp.step.resolver import Resolver, Step, StepStatus
+    from vgtm_qp.truss.build import build_truss
+    from vgtm_qp.truss.mobility import describe
+    from vgtm_qp.truss.truss import Truss
+    from vgtm_qp.verify import verify, verify_file
+
+_HOMES = {
+    "vgtm_qp.errors": (
+        "CurveError",
+        "GoalError",
+        "MissingExtraError",
+        "Mistake",
+        "ProblemError",
+        "ResultError",
+        "SolverError",
+        "TrussError",
+        "VgtmError",
+    ),
+    "vgtm_qp.maneuver.certificate": ("Certificate", "Measure"),
+    "vgtm_qp.maneuver.result": ("Maneuver", "load_result"),
+    "vgtm_qp.maneuver.solve": ("solve",),
+    "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
+    "vgtm_qp.step.resolver": ("Resolver", "Step", "StepStatus"),
+    "vgtm_qp.truss.build": ("build_truss",),
+    "vgtm_qp.truss.mobility": ("describe",),
+    "vgtm_qp.truss.truss": ("Truss",),
+    "vgtm_qp.verify": ("verify", "verify_file"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Certificate",
+    "CurveError",
+    "GoalError",
+    "Maneuver",
+    "Measure",
+    "MissingExtraError",
+    "Mistake",
+    "Problem",
+    "ProblemError",
+    "Resolver",
+    "ResultError",
+    "SolverError",
+    "Step",
+    "StepStatus",
+    "Truss",
+    "TrussError",
+    "VgtmError",
+    "build_truss",
+    "bundled_problems",
+    "describe",
+    "load_problem",
+    "load_result",
+    "problem_schema",
+    "solve",
+    "verify",
+    "verify_file",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used, so that ``vgtm --help`` pays for none of them (PEP 562)."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("vgtm-qp")
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    value = getattr(import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__, "__version__"]
+
+
+class _Package(ModuleType):
+    """Keeps the function ``vgtm_qp.verify`` where the import system would put the package of that name."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _HOME_OF and isinstance(value, ModuleType):
+            return
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
