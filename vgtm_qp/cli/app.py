@@ -1,0 +1,103 @@
+"""The application: its commands, and what becomes of every way in which one can fail."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+
+from cyclopts import App, CycloptsError, UnknownOptionError
+
+from vgtm_qp.cli.check import check
+from vgtm_qp.cli.doctor import doctor
+from vgtm_qp.cli.list import list_problems
+from vgtm_qp.cli.output import ExitCode, document, note
+from vgtm_qp.cli.schema import schema
+from vgtm_qp.cli.solve import solve
+from vgtm_qp.cli.verify import verify
+from vgtm_qp.errors import ProblemError, VgtmError
+
+_EPILOGUE = (
+    "Exit codes: 0 solved and verified; 1 internal error; 2 wrong usage or problem file; 3 blocked or "
+    "infeasible, the partial result is written; 4 verification failed; 130 interrupted, what was solved is on disk."
+)
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"vgtm {version('vgtm-qp')}"
+    except PackageNotFoundError:
+        return "vgtm, not installed"
+
+
+app = App(
+    name="vgtm",
+    help="Moves highly redundant arms through clutter: one quadratic program a step, every step certified.",
+    help_epilogue=_EPILOGUE,
+    help_format="plaintext",
+    version=_version,
+    suppress_keyboard_interrupt=False,
+)
+_COMMANDS: dict[str, Callable[..., int | None]] = {
+    "solve": solve,
+    "verify": verify,
+    "check": check,
+    "list": list_problems,
+    "schema": schema,
+    "doctor": doctor,
+}
+for order, (name, command) in enumerate(_COMMANDS.items()):
+    app.command(command, name=name, sort_key=order)
+
+
+def main(tokens: Sequence[str] | None = None) -> int:
+    """Run one command line, that of the process by default, and return its exit code."""
+    given = list(sys.argv[1:] if tokens is None else tokens)
+    as_json = "--json" in given
+    try:
+        code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
+        return ExitCode.SOLVED if code is None else int(code)
+    except CycloptsError as error:
+        return _failed(f"{error}{_hint(error)}", ExitCode.USAGE, as_json)
+    except ProblemError as error:
+        return _failed(str(error), ExitCode.USAGE, as_json, mistakes=_mistakes(error))
+    except VgtmError as error:
+        return _failed(str(error), ExitCode.USAGE, as_json)
+    except KeyboardInterrupt:
+        return _failed("interrupted before there was anything to keep", ExitCode.INTERRUPTED, as_json)
+    except OSError as error:
+        return _failed(f"the system refuses: {error}", ExitCode.INTERNAL, as_json)
+    except Exception as error:
+        note(traceback.format_exc().rstrip())
+        message = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
+        return _failed(message, ExitCode.INTERNAL, as_json)
+
+
+def _failed(
+    message: str, code: ExitCode, as_json: bool, *, mistakes: Sequence[dict[str, str]] = ()
+) -> ExitCode:
+    # Each line of a ProblemError begins with the file that it is about.
+    note(message if mistakes else f"vgtm: {message}")
+    if as_json:
+        document({"error": message, "mistakes": list(mistakes)})
+    return code
+
+
+def _hint(error: CycloptsError) -> str:
+    """Return the options there are, for an unknown one, and where to read more."""
+    command = " ".join(("vgtm", *(error.command_chain or ())))
+    choices = ""
+    if isinstance(error, UnknownOptionError):
+        names = [name for argument in error.argument_collection for name in argument.names]
+        options = [name for name in names if name.startswith("-")]
+        choices = f" Options: {', '.join(options)}." if options else ""
+    return f"{choices} See {command} --help."
+
+
+def _mistakes(error: ProblemError) -> list[dict[str, str]]:
+    return [
+        {"file": error.source, "key": mistake.key, "value": mistake.value, "expected": mistake.expected}
+        for mistake in error.mistakes
+    ]

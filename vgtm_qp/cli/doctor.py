@@ -1,0 +1,146 @@
+"""``vgtm doctor``: what this machine has of what the package can use."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from vgtm_qp.cli.output import ExitCode, Json, document, say, table
+
+_CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
+_EXTRAS = {
+    "view": ("viser",),
+    "export": ("viser", "mcap", "mcap-ros2-support", "pillow", "pyyaml"),
+    "mujoco": ("mujoco",),
+    "cluster": ("dask", "distributed"),
+    "test": ("hypothesis", "jsonschema", "mypy", "playwright", "pytest", "pytest-xdist", "rosbags", "ruff"),
+}
+
+
+def doctor(*, json: Json = False) -> int:
+    """Show versions, solvers, the C compiler and its cache, and whether kernels and FCL work.
+
+    Exit code 1 if something fails that every maneuver needs.
+    """
+    import platform
+
+    from vgtm_qp.compiled import cache_directory, compiler
+
+    cache = cache_directory()
+    found: dict[str, Any] = {
+        "versions": {"python": platform.python_version(), "system": platform.platform()}
+        | {name: _version(name) for name in ("vgtm-qp", *_CORE)},
+        "solvers": _tried(_solvers),
+        "compiler": compiler(),
+        "cache": {"folder": str(cache), "kernels": _kernels_in(cache), "hindrance": _hindrance(cache)},
+        "kernels": _tried(_kernels),
+        "fcl": _tried(_fcl),
+        "extras": {extra: [name for name in names if not _version(name)] for extra, names in _EXTRAS.items()},
+    }
+    needed = ("solvers", "kernels", "fcl")
+    broken = [name for name in needed if not found[name]["ok"]]
+    broken += [name for name in _CORE if not found["versions"][name]]
+    found["ok"] = not broken
+    if json:
+        document(found)
+    else:
+        say(_report(found))
+        say(f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order")
+    return ExitCode.INTERNAL if broken else ExitCode.SOLVED
+
+
+def _report(found: dict[str, Any]) -> str:
+    cache = found["cache"]
+    rows = [(name, version or "NOT INSTALLED") for name, version in found["versions"].items()]
+    rows += [
+        ("QP solvers", found["solvers"]["says"]),
+        (
+            "C compiler",
+            found["compiler"] or "none found: CasADi interprets the kernels, 4 to 10 times slower",
+        ),
+        ("kernel cache", f"{cache['folder']}, {cache['kernels']} kernels" + cache["hindrance"]),
+        ("kernels", found["kernels"]["says"]),
+        ("FCL", found["fcl"]["says"]),
+    ]
+    for extra, missing in found["extras"].items():
+        state = f"missing {', '.join(missing)}: pip install 'vgtm-qp[{extra}]'" if missing else "installed"
+        rows.append((f"extra [{extra}]", state))
+    return table(rows, indent="")
+
+
+def _version(package: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _tried(trial: Callable[[], str]) -> dict[str, Any]:
+    """Return what a trial says, or how it failed: a broken library can raise anything, and is to be named."""
+    try:
+        return {"ok": True, "says": trial()}
+    except Exception as error:
+        return {"ok": False, "says": f"FAILS: {type(error).__name__}: {error}"}
+
+
+def _solvers() -> str:
+    from vgtm_qp.qp.solvers import available_solvers
+
+    return ", ".join(available_solvers())
+
+
+def _kernels_in(folder: Path) -> int:
+    return len(list(folder.glob("*.so"))) if folder.is_dir() else 0
+
+
+def _hindrance(folder: Path) -> str:
+    from vgtm_qp.cli.files import why_not_writable
+
+    hindrance = why_not_writable(folder)
+    return f"; CANNOT BE WRITTEN, every process compiles again: {hindrance}" if hindrance else ""
+
+
+def _kernels() -> str:
+    """Compile a kernel in an empty cache and compare its value."""
+    import casadi as ca
+
+    from vgtm_qp.compiled import Kernel, compiler
+
+    x = ca.SX.sym("x", 2)
+    before = os.environ.get("VGTM_CACHE")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["VGTM_CACHE"] = folder
+        try:
+            kernel = Kernel(ca.Function("doctor", [x], [ca.sqrt(ca.dot(x, x))]))
+        finally:
+            if before is None:
+                del os.environ["VGTM_CACHE"]
+            else:
+                os.environ["VGTM_CACHE"] = before
+        kernel.inputs[0][:] = 3.0, 4.0
+        kernel()
+    if abs(float(kernel.outputs[0][0]) - 5.0) > 1e-12:
+        raise ArithmeticError(f"sqrt(3^2 + 4^2) = {kernel.outputs[0][0]}")
+    if kernel.is_compiled:
+        return "compile, load and give the right value"
+    reason = "no C compiler" if compiler() is None else "the C compiler fails"
+    return f"interpreted by CasADi, 4 to 10 times slower: {reason}"
+
+
+def _fcl() -> str:
+    """Ask FCL for the distance from a capsule to a box, 0.5 m."""
+    import fcl
+    import numpy as np
+
+    box = fcl.CollisionObject(fcl.Box(1.0, 1.0, 1.0), fcl.Transform())
+    capsule = fcl.CollisionObject(fcl.Capsule(0.25, 1.0), fcl.Transform(np.array([1.25, 0.0, 0.0])))
+    result = fcl.DistanceResult()
+    distance = fcl.distance(box, capsule, fcl.DistanceRequest(enable_signed_distance=True), result)
+    if abs(distance - 0.5) > 1e-3:
+        raise ArithmeticError(f"the distance of a capsule 0.5 m from a box is {distance}")
+    return "distance queries give the right value"

@@ -1,0 +1,125 @@
+"""``vgtm solve``: solve a problem, verify the maneuver, write it, print a short table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from vgtm_qp.cli.output import ExitCode, Json, document, note, say, table
+from vgtm_qp.cli.verify import outcome_code
+
+if TYPE_CHECKING:
+    from vgtm_qp.problem import Problem
+
+MethodName = Literal["qp", "pseudoinverse", "curve-pseudoinverse"]
+
+_KEYS = {"method.name": "--method", "method.solver": "--solver", "maneuver.steps": "--steps"}
+
+
+def solve(
+    problem: Annotated[str, Parameter(help="problem file, or the name of a bundled problem (vgtm list)")],
+    /,
+    *,
+    output: Annotated[
+        Path | None,
+        Parameter(name=["--output", "-o"], help="result file; NAME.npz in this folder by default"),
+    ] = None,
+    method: Annotated[MethodName | None, Parameter(help="in the place of the problem's method")] = None,
+    solver: Annotated[str | None, Parameter(help="QP solver, in the place of the problem's")] = None,
+    steps: Annotated[int | None, Parameter(help="number of steps, in the place of the problem's")] = None,
+    figure: Annotated[
+        Path | None, Parameter(help="draw frames of the maneuver too: .pdf, .png or .svg")
+    ] = None,
+    json: Json = False,
+) -> int:
+    """Solve a problem, verify the maneuver, write the result and print a short table.
+
+    A maneuver that is blocked or interrupted is written as far as it came, and says so.
+    """
+    from vgtm_qp.cli.files import check_writable
+    from vgtm_qp.cli.progress import following
+    from vgtm_qp.problem import load_problem
+
+    loaded = _changed(
+        load_problem(problem), {"method.name": method, "method.solver": solver, "maneuver.steps": steps}
+    )
+    name = loaded.source.stem if loaded.source else "result"
+    result = Path(f"{name}.npz") if output is None else output
+    check_writable(result, "--output", (".npz",))
+    if figure is not None:
+        check_writable(figure, "--figure", (".pdf", ".png", ".svg"))
+
+    from vgtm_qp.maneuver.solve import solve as run
+    from vgtm_qp.verify import verify as certify
+
+    with following(loaded.name, shown=not json) as progress:
+        maneuver = run(loaded, progress=progress, verify=False)
+    # Written before it is verified, so that an interrupt of the verification loses nothing.
+    maneuver.save(result)
+    maneuver = maneuver.with_certificate(certify(maneuver))
+    maneuver.save(result)
+    if figure is not None:
+        from vgtm_qp.view.figure import plot_frames, save_figure
+
+        save_figure(plot_frames(maneuver), figure)
+
+    summary = maneuver.summary(result)
+    if json:
+        document(summary | ({"figure": str(figure)} if figure else {}))
+    else:
+        say(_report(summary))
+        say(f"result: {result}" + (f"\nfigure: {figure}" if figure else ""))
+    if "interrupted" in maneuver.blocked_by:
+        note(f"vgtm: interrupted; what was solved is in {result}")
+        return ExitCode.INTERRUPTED
+    return outcome_code(maneuver)
+
+
+def _changed(problem: Problem, changes: dict[str, Any]) -> Problem:
+    """Return the problem with the options of the command line, which name their own mistakes."""
+    from dataclasses import replace
+
+    from vgtm_qp.errors import ProblemError
+
+    wanted = {key: value for key, value in changes.items() if value is not None}
+    if not wanted:
+        return problem
+    try:
+        return problem.replace(wanted)
+    except ProblemError as error:
+        mistakes = [replace(mistake, key=_KEYS.get(mistake.key, mistake.key)) for mistake in error.mistakes]
+        raise ProblemError("command line", mistakes) from None
+
+
+def _report(summary: dict[str, Any]) -> str:
+    verified = "verified" if summary["verified"] else "VERIFICATION FAILED"
+    lines = [f"{summary['name']}: {summary['status']}, {verified}"]
+    if summary["blocked_by"]:
+        lines += [f"  stopped by {name}" for name in summary["blocked_by"][:4]]
+    lines += [f"  not within tolerance: {line}" for line in summary["failures"]]
+    step = summary["step_time"]
+    rows = [
+        ("path covered", f"{100 * summary['reached']:.4g} % in {summary['steps']} steps"),
+        ("clearance at states", _number(summary["min_clearance"], "m", "nothing near")),
+        ("clearance between states", _number(summary["min_clearance_between"], "m", "nothing near")),
+        ("clearance of members from members", _number(summary["min_self_clearance"], "m", "not watched")),
+        ("error of fixed members", _number(summary["max_member_error"], "m")),
+        ("stroke violation", _number(summary["max_stroke_violation"], "m")),
+        ("rate violation", _number(summary["max_rate_violation"], "m/s")),
+        ("tip error", _number(summary["max_tip_error"], "m", "not tracked")),
+        ("tip direction error", _number(summary["max_tip_direction_error"], "rad", "not tracked")),
+        ("time of a step, median and 99 %", f"{_milliseconds(step['median'])}, {_milliseconds(step['p99'])}"),
+        ("set-up", _milliseconds(summary["setup_time"])),
+        ("method and solver", f"{summary['method']}, {summary['solver']}"),
+    ]
+    return "\n".join([*lines, table(rows)])
+
+
+def _number(value: float | None, unit: str, absent: str = "-") -> str:
+    return absent if value is None else f"{value:.6g} {unit}"
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{1000 * seconds:.3g} ms"
