@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.manifest import arm_record, make_manifest, mesh_record
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.problem import Problem
+from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
 
 Array = NDArray[np.float64]
@@ -59,6 +61,9 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     """
     started = perf_counter()
     resolver = Resolver(problem)
+    mistakes = check_problem(problem, resolver.arm)
+    if mistakes:
+        raise ProblemError(str(problem.source or problem.name), mistakes)
     plan = make_plan(problem, *resolver.tip())
     record = _Record()
     _add_state(record, resolver, plan, 0.0, 0.0, dict.fromkeys(resolver.phases, 0.0))
