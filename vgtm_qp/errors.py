@@ -56,6 +56,10 @@ class ResultError(VgtmError):
     """A result file is cut, altered, or of another version."""
 
 
+class ExportError(VgtmError):
+    """A maneuver cannot be written in the wanted form, or replayed there."""
+
+
 class MissingExtraError(VgtmError):
     """An optional dependency is absent; the message holds the pip line that brings it."""
 

@@ -58,7 +58,7 @@ def actuator_lengths(maneuver: Maneuver) -> Array:
 
 
 def step_rates(maneuver: Maneuver) -> Array:
-    """Return (T, n_a) mean rates over the step that led to each state, m/s: what the rate limit is held against."""
+    """Return (T, n_a) mean rates over the step that led to each state, m/s, as the rate limit has them."""
     lengths = actuator_lengths(maneuver)
     rates = np.zeros_like(lengths)
     rates[1:] = np.diff(lengths, axis=0) / np.diff(maneuver.time)[:, None]
@@ -91,7 +91,7 @@ def write_csv(maneuver: Maneuver, path: str | Path) -> Path:
 
 
 def joint_trajectory(maneuver: Maneuver) -> dict[str, Any]:
-    """Return the maneuver as the fields of a ``trajectory_msgs/msg/JointTrajectory``; positions are lengths, m."""
+    """Return the fields of a ``trajectory_msgs/msg/JointTrajectory``; its positions are lengths, m."""
     start = float(maneuver.time[0])
     points = [
         {

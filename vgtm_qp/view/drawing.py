@@ -1,4 +1,4 @@
-"""What there is to draw of an arm: member ends, colours by stroke, the curve, obstacles and a camera. No renderer."""
+"""What there is to draw of an arm, for any renderer: member ends, colours, curve, obstacles and a camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CURVE_COLOUR = (0.0, 0.45, 0.34)
 POLYGON_COLOUR = (0.35, 0.62, 0.53)
 PATH_COLOUR = (0.10, 0.10, 0.12)
 _STROKE_COLOURS = np.array([(0.05, 0.30, 0.80), (0.66, 0.48, 0.72), (0.84, 0.10, 0.12)])
-"""Shortest, middle and longest; told apart in every common form of colour blindness and from the fixed grey."""
+"""Shortest, middle and longest; told apart by the colour-blind, and from the fixed grey."""
 
 _CURVE_POINTS = 49
 
@@ -82,7 +82,7 @@ class Drawing:
         return np.asarray(self.curve_weights @ control_vertices)
 
     def stroke_share(self, lengths: Array) -> Array:
-        """Return (M,) lengths (M,) as shares of the stroke, 0 shortest to 1 longest; NaN for fixed members."""
+        """Return (M,) lengths (M,) as shares of the stroke, 0 to 1 for longest; NaN for fixed members."""
         low, high = self.arm.stroke.T
         share = np.full(len(low), np.nan)
         moving = self.arm.actuated & (high > low)
@@ -121,7 +121,7 @@ def drawing_of_maneuver(maneuver: Maneuver) -> Drawing:
 
 
 def drawing_of_problem(problem: Problem, record: Mapping[str, Any], members: Index, vertices: int) -> Drawing:
-    """Return the drawing of a problem whose arm has the record `arm_record(truss)` and `vertices` control vertices."""
+    """Return the drawing of a problem from the `arm_record` of its arm and number of control vertices."""
     directory = problem.source.parent if problem.source else Path.cwd()
     return _drawing(problem.to_dict(), Arm(record, members), vertices, directory)
 
@@ -187,7 +187,7 @@ class Camera:
 
 
 def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
-    """Return a camera that sees all states (T, N, 3) and the obstacles, across the way that the tip (T, 3) goes."""
+    """Return a camera that sees all states (T, N, 3) and the obstacles, across the way of the tip (T, 3)."""
     points = [nodes.reshape(-1, 3)]
     points += [mesh.vertices + mesh.center for mesh in drawing.obstacles]
     cloud = np.concatenate(points)
@@ -207,7 +207,7 @@ def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
 
 
 def resampled(time: Array, values: Array, at: Array) -> Array:
-    """Return `values` (T, ...) at times `at`, on straight lines between the states, as the certificate has it."""
+    """Return `values` (T, ...) at times `at`, on straight lines between the states as in the certificate."""
     flat = values.reshape(len(time), -1)
     columns = [np.interp(at, time, column) for column in flat.T]
     return np.stack(columns, axis=1).reshape(len(at), *values.shape[1:]) if columns else values[: len(at)]

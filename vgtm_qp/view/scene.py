@@ -205,7 +205,7 @@ class ArmScene:
 
 
 def _placement(ends: Array) -> tuple[Array, Array, Array]:
-    """Return middles (K, 3), quaternions (K, 4) that turn z along, and spans (K,), m, of segments (K, 2, 3)."""
+    """Return middles (K, 3), quaternions (K, 4) that turn z along, and spans (K,) of segments (K, 2, 3), m."""
     along = ends[:, 1] - ends[:, 0]
     span = np.linalg.norm(along, axis=1)
     direction = along / np.maximum(span, 1e-12)[:, None]
@@ -224,6 +224,6 @@ def _rgb(colours: Any) -> NDArray[np.uint8]:
 
 
 def _instance_rgb(colours: Any) -> NDArray[np.uint8]:
-    """Return colours as batched meshes want them: the renderer takes those as linear light, all others as sRGB."""
+    """Return colours for batched meshes: the renderer takes those as linear light, all others as sRGB."""
     colours = np.asarray(colours)
     return _rgb(np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4))

@@ -1,0 +1,262 @@
+"""Replays a maneuver in MuJoCo, exactly and under gravity, beside what the certificate says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import MissingExtraError
+from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf
+from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.clearance import AgainstBody, Motion
+from vgtm_qp.verify.obstacles import read_obstacles
+from vgtm_qp.view.drawing import obstacle_meshes
+
+Array = NDArray[np.float64]
+
+_SETTLING_STEPS = 200
+_PROBED_TIP_MOTION = 1e-4
+_PROBED_STATES = 51
+
+
+@dataclass(frozen=True, eq=False)
+class Following:
+    """How a replay followed a maneuver, over its states.
+
+    Attributes
+    ----------
+    nodes : (T, N, 3)
+        Where the nodes were, m.
+    length_error, tip_error : (T,)
+        Greatest error of a member length, and distance of the tip from where it should be, m.
+    actuator_error : (T,)
+        Root of the summed squares of the errors of the actuated lengths, m.
+    clearance : (T,)
+        Least distance from members to obstacles at the states, m; inf without obstacles.
+    contacts : int
+        Time steps in which MuJoCo found a node in contact with an obstacle.
+    """
+
+    nodes: Array
+    length_error: Array
+    tip_error: Array
+    actuator_error: Array
+    clearance: Array
+    contacts: int
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """A kinematic and a physical replay of one maneuver.
+
+    Attributes
+    ----------
+    kinematic, physics : Following
+    tip_error_per_millimetre : float
+        mm at the tip for actuator errors whose squares sum to 1 mm^2, by pushing each actuator in the simulation.
+    probed_state : int
+        The state at which that was measured: the one where it is greatest.
+    certified_tip_error_per_millimetre : float
+        The same from the Jacobian, as the certificate has it.
+    """
+
+    kinematic: Following
+    physics: Following
+    tip_error_per_millimetre: float
+    probed_state: int
+    certified_tip_error_per_millimetre: float
+
+    def rows(self) -> list[tuple[str, str, str, str]]:
+        """Return the table: quantity, certificate, kinematic replay, physics replay."""
+        exact, real = self.kinematic, self.physics
+        expected = self.certified_tip_error_per_millimetre * real.actuator_error
+        return [
+            ("greatest length error [mm]", "0", _mm(exact.length_error.max()), _mm(real.length_error.max())),
+            (
+                "greatest tip error [mm]",
+                f"at most {_mm(expected.max())}",
+                _mm(exact.tip_error.max()),
+                _mm(real.tip_error.max()),
+            ),
+            (
+                "tip error at the end [mm]",
+                f"at most {_mm(expected[-1])}",
+                _mm(exact.tip_error[-1]),
+                _mm(real.tip_error[-1]),
+            ),
+            ("least clearance [mm]", "-", _mm(exact.clearance.min()), _mm(real.clearance.min())),
+            ("steps with a node in contact", "0", str(exact.contacts), str(real.contacts)),
+            (
+                "tip error per mm of actuator error [mm]",
+                f"{self.certified_tip_error_per_millimetre:.4g}",
+                "-",
+                f"{self.tip_error_per_millimetre:.4g}",
+            ),
+        ]
+
+
+def replay(maneuver: Maneuver) -> Replay:
+    """Replay a maneuver in MuJoCo, as it was solved and under gravity.
+
+    The physics replay drives the length of every member through equality constraints, in straight lines between
+    the states; gravity pulls at the nodes. The nodes' masses are `vgtm_qp.export.mjcf.node_masses`.
+
+    Raises
+    ------
+    MissingExtraError
+        MuJoCo is not installed.
+    ExportError
+        The truss has offset joints.
+    """
+    simulation = _Simulation(maneuver)
+    kinematic = simulation.kinematic()
+    physics = simulation.physics()
+    state, certified = simulation.most_sensitive_state()
+    return Replay(kinematic, physics, simulation.measured_sensitivity(state, certified), state, certified)
+
+
+class _Simulation:
+    """The MuJoCo model of one maneuver, its data, and where the maneuver's parts are in them."""
+
+    def __init__(self, maneuver: Maneuver) -> None:
+        try:
+            import mujoco
+        except ImportError:
+            raise MissingExtraError("mujoco", "mujoco") from None
+        self._mujoco, self._maneuver = mujoco, maneuver
+        self._arm = arm = Arm(maneuver.manifest["arm"], maneuver.members)
+        self._model: Any = mujoco.MjModel.from_xml_string(mjcf(maneuver))
+        self._data: Any = mujoco.MjData(self._model)
+        self._free = np.setdiff1d(np.arange(len(arm.home)), arm.base)
+        self._base = np.sort(arm.base)
+        manifest = maneuver.manifest
+        directory = Path(manifest.get("directory") or ".")
+        meshes = obstacle_meshes(manifest["problem"].get("obstacle") or (), directory)
+        self._moving = [mesh for mesh in meshes if mesh.velocity.any()]
+        self._bodies = read_obstacles(manifest["problem"], manifest.get("meshes") or {}, directory)[0]
+        self._home_lengths = np.array(self._model.tendon_length0)
+        self._tip = maneuver.tip_position
+
+    def kinematic(self) -> Following:
+        """Put the nodes where they should be and read the lengths that MuJoCo finds."""
+        count = len(self._maneuver.time)
+        nodes, lengths = np.empty_like(self._maneuver.nodes), np.empty_like(self._maneuver.member_lengths)
+        contacts = 0
+        for k in range(count):
+            self._place(k)
+            self._mujoco.mj_forward(self._model, self._data)
+            nodes[k], lengths[k] = self._data.site_xpos, self._data.ten_length
+            contacts += bool(self._data.ncon)
+        return self._following(nodes, lengths, contacts)
+
+    def physics(self) -> Following:
+        """Let the lengths be constraints that move from state to state, and gravity pull."""
+        maneuver, model, data = self._maneuver, self._model, self._data
+        nodes, lengths = np.empty_like(maneuver.nodes), np.empty_like(maneuver.member_lengths)
+        self._hold(0)
+        self._settle()
+        nodes[0], lengths[0] = data.site_xpos, data.ten_length
+        contacts = 0
+        for k in range(1, len(maneuver.time)):
+            duration = float(maneuver.time[k] - maneuver.time[k - 1])
+            steps = max(1, round(duration / model.opt.timestep))
+            for share in np.arange(1, steps + 1) / steps:
+                self._command(k - 1, float(share))
+                self._mujoco.mj_step(model, data)
+                contacts += bool(data.ncon)
+            self._mujoco.mj_fwdPosition(model, data)
+            nodes[k], lengths[k] = data.site_xpos, data.ten_length
+        return self._following(nodes, lengths, contacts)
+
+    def most_sensitive_state(self) -> tuple[int, float]:
+        """Return the state where actuator errors move the tip furthest, and how far, mm/mm, by the Jacobian."""
+        states = np.unique(np.linspace(0, len(self._tip) - 1, _PROBED_STATES).round().astype(int))
+        values = [
+            found[2] if (found := self._arm.singular_values(self._maneuver.nodes[k])) else 0.0 for k in states
+        ]
+        worst = int(np.argmax(values))
+        return int(states[worst]), float(values[worst])
+
+    def measured_sensitivity(self, state: int, expected: float) -> float:
+        """Return the same by lengthening one actuator after another and waiting for the tip.
+
+        Without gravity, whose sag takes a nearly singular pose away from its singularity, and each by so little that
+        the tip should move by a tenth of a millimetre: near a singularity it soon moves less than in proportion.
+        """
+        data, probe = self._data, _PROBED_TIP_MOTION / max(expected, 1.0)
+        gravity = self._model.opt.gravity.copy()
+        self._model.opt.gravity[:] = 0.0
+        self._hold(state)
+        self._settle()
+        start, velocity, before = data.qpos.copy(), data.qvel.copy(), self._tip_now()
+        targets = self._model.eq_data[:, 0].copy()
+        moved = []
+        for k in np.flatnonzero(self._arm.actuated):
+            data.qpos[:], data.qvel[:] = start, velocity
+            self._model.eq_data[k, 0] = targets[k] + probe
+            self._settle()
+            moved.append((self._tip_now() - before) / probe)
+            self._model.eq_data[k, 0] = targets[k]
+        self._model.opt.gravity[:] = gravity
+        return float(np.linalg.norm(np.array(moved), ord=2)) if moved else 0.0
+
+    def _hold(self, state: int) -> None:
+        """Rest at a state with every length a constraint."""
+        self._mujoco.mj_resetData(self._model, self._data)
+        self._model.opt.disableactuator |= 1 << ACTUATOR_GROUP
+        self._data.eq_active[:] = 1
+        self._place(state)
+        self._command(state, 0.0)
+
+    def _place(self, state: int) -> None:
+        maneuver, data = self._maneuver, self._data
+        data.qpos[:] = (maneuver.nodes[state] - self._arm.home)[self._free].ravel()
+        self._place_mocap(maneuver.nodes[state], float(maneuver.time[state]))
+
+    def _place_mocap(self, nodes: Array, time: float) -> None:
+        count = len(self._base)
+        self._data.mocap_pos[:count] = nodes[self._base]
+        for k, mesh in enumerate(self._moving):
+            self._data.mocap_pos[count + k] = mesh.position(time)
+
+    def _command(self, state: int, share: float) -> None:
+        """Ask for the lengths a `share` of the way from `state` to the next."""
+        maneuver = self._maneuver
+        after = min(state + 1, len(maneuver.time) - 1)
+
+        def between(values: Array) -> Array:
+            return np.asarray((1.0 - share) * values[state] + share * values[after])
+
+        self._model.eq_data[:, 0] = between(maneuver.member_lengths) - self._home_lengths
+        self._place_mocap(between(maneuver.nodes), float(between(maneuver.time)))
+
+    def _settle(self) -> None:
+        for _ in range(_SETTLING_STEPS):
+            self._mujoco.mj_step(self._model, self._data)
+        self._mujoco.mj_fwdPosition(self._model, self._data)
+
+    def _tip_now(self) -> Array:
+        return self._arm.tip_position(np.asarray(self._data.site_xpos))
+
+    def _following(self, nodes: Array, lengths: Array, contacts: int) -> Following:
+        errors = lengths - self._maneuver.member_lengths
+        motion = Motion(self._arm, self._maneuver.time, nodes)
+        pairs = [AgainstBody(motion, body) for body in self._bodies]
+        least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(nodes))]
+        return Following(
+            nodes=nodes,
+            length_error=np.abs(errors).max(axis=1),
+            tip_error=np.linalg.norm(self._arm.tip_position(nodes) - self._tip, axis=1),
+            actuator_error=np.linalg.norm(errors[:, self._arm.actuated], axis=1),
+            clearance=np.array(least),
+            contacts=contacts,
+        )
+
+
+def _mm(value: float) -> str:
+    return f"{1000.0 * value:.4g}"
