@@ -73,7 +73,8 @@ def test_near_pairs_and_least_distances_along_a_walk(seed, round_numbers):
             if key not in meshes and distance < (0.4 if key[2] else 0.5) - 1e-9:
                 assert found[key] <= distance + 1e-9
                 assert found[key] >= distance - 1e-9 or distance <= -0.029
-        assert all(distance <= expected[key] + 1e-9 for key, distance in found.items())
+        # Of a mesh triangle only its second contact may have stayed.
+        assert all(distance <= expected[key] + 1e-9 for key, distance in found.items() if key not in meshes)
         for member in range(len(clearance.members)):
             least = min(expected[key] for key in meshes if key[0] == member)
             if least < 0.5 - 1e-9:
@@ -104,14 +105,15 @@ def test_carried_bounds_never_exceed_the_distance(seed):
         X, time = X + 0.1 * rng.normal(size=X.shape), 0.05 * step
         expected = brute_force(clearance, X, time)
         listed = set()
-        motion = candidates.motion(X)
+        motion = candidates.motion(X, time)
         for group in candidates.groups:
-            lower = group.lower(motion, time - candidates.time)
-            for k in range(len(lower)):
-                key = (int(group.member[k]), int(group.other[k]), group.is_self)
-                listed.add(key)
-                assert lower[k] <= expected[key] + 1e-9
-        far, far_self = candidates.beyond(motion, time)
+            for limit in (0.1, np.inf):
+                lower, others = group.lower(motion, limit)
+                for k in range(len(group)):
+                    key = (int(group.member[k]), int(group.other[k]), group.is_self)
+                    listed.add(key)
+                    assert (lower[k] if k < len(lower) else others) <= expected[key] + 1e-9
+        far, far_self = candidates.beyond(motion)
         for key in expected.keys() - listed:
             assert (far_self if key[2] else far) <= expected[key] + 1e-9
         candidates.refresh(X, time)
@@ -374,5 +376,5 @@ def test_long_arm_keeps_few_candidates():
     clearance = Clearance(members, 0.03, [box("cube", (1.2, 0.0, 80.0), 0.5)], safe=0.08, influence=0.5)
     clearance.near(X)
     clearance.least(X)
-    listed = sum(len(group.member) for group in clearance._candidates.groups)
+    listed = sum(map(len, clearance._candidates.groups))
     assert listed < 30 * len(members)

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vgtm_qp.geometry.candidates import Candidates, Contacts, Group, Kernels, Members
+from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.fcl_queries import FclQueries
+from vgtm_qp.geometry.groups import Contacts, Group, Kernels, Members, Motion
 from vgtm_qp.geometry.pairs import BetweenReport, Names, NearPairs, Pair, join
 from vgtm_qp.geometry.shapes import GeometryError, Obstacle, Pieces
 from vgtm_qp.geometry.solids import Solid
@@ -109,21 +110,20 @@ class Clearance:
         reach = self.influence if reach is None else reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
         candidates, motion = self._covering(X, time, reach, self_reach)
-        elapsed = time - candidates.time
         parts = []
         wasted = 0
         for group in candidates.groups:
             limit = self_reach if group.is_self else reach
-            rows = np.flatnonzero(group.lower(motion, elapsed) < limit)
+            rows = np.flatnonzero(group.lower(motion, limit)[0] < limit)
             if len(rows):
                 contacts = self._contacts(group, X, time, rows, limit, use_fcl)
                 first = np.flatnonzero(contacts.distance < limit)
                 wasted += len(rows) - len(first)
-                second = first[contacts.two[first] & (contacts.distance_second[first] < limit)]
+                second = first[contacts.two()[first] & (contacts.distance_second[first] < limit)]
                 part = self._pairs(group, rows, contacts, first, second)
                 parts.append(self._distinct(part) if group.shape == "triangle" else part)
         self._wasted += wasted
-        if self._wasted > sum(len(g.member) for g in candidates.groups):
+        if self._wasted > sum(map(len, candidates.groups)):
             # The pairs evaluated for nothing since the last time have cost as much as a new reference does.
             candidates.refresh(X, time)
             self._wasted = 0
@@ -193,14 +193,13 @@ class Clearance:
             candidates, motion = self._covering(X, time, reach, self_reach)
             for group in candidates.groups:
                 if group.is_self in wanted:
-                    lower = group.lower(motion, time - candidates.time)
-                    distance, row = _least_of(group, lower, X, time, best)
+                    distance, row = _least_of(group, motion, X, time, best)
                     if row >= 0:
                         best, pair = (
                             distance,
                             Pair(int(group.member[row]), int(group.other[row]), group.is_self),
                         )
-            far, far_self = candidates.beyond(motion, time)
+            far, far_self = candidates.beyond(motion)
             extent = self._extent(X, time) if best > min(far, far_self) else 0.0
             search = False in wanted and len(self.pieces) > 0 and far < min(best, extent)
             search_self = True in wanted and far_self < min(best, extent)
@@ -227,7 +226,7 @@ class Clearance:
         candidates, motion = self._covering(X, time, max(floor, 0.0), max(self_floor, 0.0))
         for group in candidates.groups:
             least = self_floor if group.is_self else floor
-            rows = np.flatnonzero(~(group.lower(motion, time - candidates.time) >= least))
+            rows = np.flatnonzero(~(group.lower(motion, least)[0] >= least))
             if len(rows) and not (group.contacts(X, time, rows).distance >= least).all():
                 return False
         return self._enclosed(X, time) is None
@@ -264,13 +263,13 @@ class Clearance:
         floor = max(floor, 0.0)
         self_floor = floor if self_floor is None else max(self_floor, 0.0)
         candidates, motion = self._covering(start, start_time, floor, self_floor, end, end_time)
-        elapsed = max(abs(start_time - candidates.time), abs(end_time - candidates.time))
-        proven = min(candidates.beyond(motion, candidates.time + elapsed))
+        proven = min(candidates.beyond(motion))
         found: list[tuple[Group, Found]] = []
         for group in candidates.groups:
-            lower, least = group.lower(motion, elapsed), self_floor if group.is_self else floor
+            least = self_floor if group.is_self else floor
+            lower, others = group.lower(motion, least)
             open_ = ~(lower >= least)
-            proven = min(proven, float(lower[~open_].min(initial=np.inf)))
+            proven = min(proven, others, float(lower[~open_].min(initial=np.inf)))
             rows = np.flatnonzero(open_)
             if len(rows):
                 result = sweep_group(group, rows, start, end, start_time, end_time, least)
@@ -349,22 +348,22 @@ class Clearance:
         self_reach: float,
         end: Array | None = None,
         end_time: float | None = None,
-    ) -> tuple[Candidates, Array]:
+    ) -> tuple[Candidates, Motion]:
         """Return candidates with every pair nearer than the reaches, and the motion since their reference.
 
         With an `end` they hold on the whole straight way there, and the motion is the greatest on it.
         """
         candidates = self._candidates
         if candidates is not None:
-            motion, last = self._motion(candidates, X, end), self._last(candidates, time, end_time)
-            far, far_self = candidates.beyond(motion, last)
+            motion = candidates.motion(X, time, end, end_time)
+            far, far_self = candidates.beyond(motion)
             if far >= reach and far_self >= self_reach:
                 return candidates, motion
         # What is not a number fails the comparisons above and comes here.
         if not (np.isfinite(X).all() and (end is None or np.isfinite(end).all())):
             raise GeometryError("node positions must be finite numbers")
-        travel = 0.0 if end is None else float(self._members.motion(end, X).max(initial=0.0))
-        drift = 0.0 if end_time is None else float(self.pieces.speed.max(initial=0.0)) * abs(end_time - time)
+        travel = 0.0 if end is None else float(self._members.moved(end, X).max(initial=0.0))
+        drift = 0.0 if end_time is None else self.pieces.fastest * abs(end_time - time)
         horizon = max(reach, self.influence) + self.influence + travel + drift
         self_horizon = max(self_reach, self.self_influence) + self.self_influence + 2.0 * travel
         self._candidates = candidates = Candidates(
@@ -377,30 +376,22 @@ class Clearance:
             self_horizon if self.self_collision else None,
         )
         self._wasted = 0
-        return candidates, self._motion(candidates, X, end)
-
-    @staticmethod
-    def _motion(candidates: Candidates, X: Array, end: Array | None) -> Array:
-        motion = candidates.motion(X)
-        return motion if end is None else np.maximum(motion, candidates.motion(end))
-
-    @staticmethod
-    def _last(candidates: Candidates, time: float, end_time: float | None) -> float:
-        """Return which of the two times is farther from that of the candidates."""
-        times = (time,) if end_time is None else (time, end_time)
-        return max(times, key=lambda t: abs(t - candidates.time))
+        return candidates, candidates.motion(X, time, end, end_time)
 
 
-def _least_of(group: Group, lower: Array, X: Array, time: float, best: float) -> tuple[float, int]:
+def _least_of(group: Group, motion: Motion, X: Array, time: float, best: float) -> tuple[float, int]:
     """Return the least distance below `best` and its row, or (best, -1), evaluating what the bounds leave."""
-    row = -1
-    first = np.arange(len(lower)) if len(lower) <= _FIRST else np.argpartition(lower, _FIRST)[:_FIRST]
-    rows = first[lower[first] < best]
-    while len(rows):
+    # The nearest pairs at the reference are likely to be so still; they make `best` small for the others.
+    rows, row = np.arange(min(len(group), _FIRST)), -1
+    distance = group.contacts(X, time, rows).distance
+    k = int(np.argmin(distance))
+    if distance[k] < best:
+        best, row = float(distance[k]), k
+    rows = np.flatnonzero(group.lower(motion, best)[0] < best)
+    rows = rows[rows >= _FIRST]
+    if len(rows):
         distance = group.contacts(X, time, rows).distance
         k = int(np.argmin(distance))
         if distance[k] < best:
             best, row = float(distance[k]), int(rows[k])
-        lower[first] = np.inf
-        rows = first = np.flatnonzero(lower < best)
     return best, row

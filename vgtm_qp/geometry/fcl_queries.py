@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.candidates import Contacts
 from vgtm_qp.geometry.exact import plane_function
+from vgtm_qp.geometry.groups import Contacts
 from vgtm_qp.geometry.shapes import Pieces
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ class FclQueries:
         self.replaced += int(len(rows) - np.count_nonzero(holds))
         contacts.distance[rows[holds]] = proven[holds] - radius[rows[holds]]
         # Where the nearest point is not unique, FCL may give one between the two ends of the contact.
-        holds &= ~contacts.two[rows]
+        holds &= ~contacts.two()[rows]
         good = rows[holds]
         axis = ends[holds, 3:] - ends[holds, :3]
         offset = answers[holds, 1:4] - ends[holds, :3]

@@ -210,6 +210,8 @@ class Pieces:
         Index of the obstacle each belongs to.
     velocity : (P, 3)
     speed : (P,)
+    fastest : float
+        Greatest speed, m/s.
     center, radius : (P, 3), (P,)
         Bounding spheres at time 0.
     """
@@ -224,7 +226,8 @@ class Pieces:
         spheres = [o.bounding_spheres() for o in obstacles]
         self.center = np.vstack([np.zeros((0, 3)), *(s[0] for s in spheres)])
         self.radius = np.concatenate([np.zeros(0), *(s[1] for s in spheres)])
-        self.moving = bool(self.speed.any())
+        self.fastest = float(self.speed.max(initial=0.0))
+        self.moving = self.fastest > 0.0
         self._shift = np.zeros_like(self.parameters)
         self._shift[:, :3] = self.velocity
         triangles = self.shape == "triangle"

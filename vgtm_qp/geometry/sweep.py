@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.geometry.candidates import Group
+from vgtm_qp.geometry.groups import Group
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -1,0 +1,170 @@
+"""Pairs of one shape as arrays: exact contacts, and lower bounds that shrink by what the members moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.geometry.batch import Batch
+from vgtm_qp.geometry.exact import distance_function, sweep_function
+from vgtm_qp.geometry.shapes import Pieces
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+SECOND_CONTACT = 0.2
+"""Two contacts of a member with one piece are apart by this fraction of its length, at least."""
+
+
+class Motion(NamedTuple):
+    """How far each member (M,) is from where it was, at most, the greatest of that, and the time since."""
+
+    members: Array
+    greatest: float
+    elapsed: float
+
+
+@dataclass(frozen=True, eq=False)
+class Members:
+    """The arm as capsules: ``nodes`` (M, 2) int and ``radius`` (M,)."""
+
+    nodes: Index
+    radius: Array
+
+    def moved(self, X: Array, reference: Array) -> Array:
+        """Return how far any point of each member is from where it was, at most, (M,)."""
+        shift = X - reference
+        moved = np.sqrt(np.einsum("ic,ic->i", shift, shift))
+        return np.asarray(np.maximum(moved[self.nodes[:, 0]], moved[self.nodes[:, 1]]))
+
+
+class Contacts:
+    """Outputs of ``distance_function`` for K pairs, distances from surface to surface.
+
+    Attributes
+    ----------
+    distance, distance_second, t, t_second, s, s_second : (K,)
+    normal, normal_second, point, point_second : (K, 3)
+    """
+
+    def __init__(self, rows: Array) -> None:
+        self.distance, self.distance_second, self.t, self.t_second = rows[:, :4].T
+        self.normal, self.normal_second = rows[:, 4:7], rows[:, 7:10]
+        self.point, self.point_second = rows[:, 10:13], rows[:, 13:16]
+        self.s, self.s_second = rows[:, 16], rows[:, 17]
+
+    def two(self) -> NDArray[np.bool_]:
+        """Return whether the second contact is worth a row of its own, (K,)."""
+        return np.asarray(np.abs(self.t_second - self.t) >= SECOND_CONTACT)
+
+
+class Kernels:
+    """The batched kernels of each shape, built when first needed."""
+
+    def __init__(self) -> None:
+        self._distance: dict[str, Batch] = {}
+        self._sweep: dict[str, Batch] = {}
+
+    def distance(self, shape: str) -> Batch:
+        """Return the batch of ``distance_function(shape)``."""
+        if shape not in self._distance:
+            self._distance[shape] = Batch(distance_function(shape))
+        return self._distance[shape]
+
+    def sweep(self, shape: str) -> Batch:
+        """Return the batch of ``sweep_function(shape)``."""
+        if shape not in self._sweep:
+            self._sweep[shape] = Batch(sweep_function(shape))
+        return self._sweep[shape]
+
+
+class Group:
+    """Pairs of one shape: members against pieces, or against members for ``"segment"``.
+
+    Attributes
+    ----------
+    member, other : (C,) int
+        `other` is a piece or, for ``"segment"``, a member.
+    distance : (C,)
+        Surface distance at the reference configuration, m, ascending once :meth:`keep_near` was called.
+    is_self, moving : bool
+        Whether these are pairs of members; whether some obstacle moves.
+    """
+
+    def __init__(
+        self, shape: str, member: Index, other: Index, members: Members, pieces: Pieces, kernels: Kernels
+    ) -> None:
+        self.shape, self.is_self = shape, shape == "segment"
+        self.moving = pieces.moving and not self.is_self
+        self._members, self._pieces, self._kernels = members, pieces, kernels
+        self._set(member, other)
+
+    def _set(self, member: Index, other: Index) -> None:
+        members = self._members
+        self.member, self.other = member, other
+        self.distance = np.zeros(len(member))
+        self.nodes, self.radius = members.nodes[member], members.radius[member]
+        self.other_nodes = members.nodes[other] if self.is_self else self.nodes
+        if self.is_self:
+            self.radius = self.radius + members.radius[other]
+        self.speed = self._pieces.speed[other] if self.moving else np.zeros(0)
+
+    def __len__(self) -> int:
+        return len(self.member)
+
+    def keep_near(self, X: Array, time: float, horizon: float) -> None:
+        """Make `X` the reference: drop the pairs from `horizon` on and sort the others by distance."""
+        distance = self.contacts(X, time, np.arange(len(self))).distance
+        order = np.argsort(distance, kind="stable")
+        order = order[: np.searchsorted(distance[order], horizon)]
+        self._set(self.member[order], self.other[order])
+        self.distance = distance[order]
+
+    def lower(self, motion: Motion, limit: float) -> tuple[Array, float]:
+        """Return lower bounds of the surface distances of the first pairs, and one of all the others.
+
+        Those others cannot have come nearer than `limit`.
+        """
+        shrink = (2.0 if self.is_self else 1.0) * motion.greatest
+        if self.moving:
+            shrink += self._pieces.fastest * motion.elapsed
+        # Only near the head of the sorted list can the motion have mattered.
+        count = len(self) if len(self) <= 64 else int(np.searchsorted(self.distance, limit + shrink))
+        bound = self.distance[:count] - motion.members[self.member[:count]]
+        if self.is_self:
+            bound -= motion.members[self.other[:count]]
+        elif self.moving:
+            bound -= self.speed[:count] * motion.elapsed
+        return bound, float(self.distance[count] - shrink) if count < len(self) else np.inf
+
+    def segments(self, X: Array, rows: Index) -> Array:
+        """Return the members' ends (k, 6)."""
+        return X[self.nodes[rows]].reshape(-1, 6)
+
+    def others(self, X: Array, time: float, rows: Index) -> Array:
+        """Return the parameters of what the members are compared with (k, width)."""
+        if self.is_self:
+            return X[self.other_nodes[rows]].reshape(-1, 6)
+        return np.asarray(self._pieces.at(time)[self.other[rows]])
+
+    def contacts(self, X: Array, time: float, rows: Index) -> Contacts:
+        """Return exact contacts of some pairs."""
+        return self.contacts_of(self.segments(X, rows), self.others(X, time, rows), rows)
+
+    def contacts_of(self, segments: Array, others: Array, rows: Index) -> Contacts:
+        """Return the same for given ends and parameters."""
+        answer = self._kernels.distance(self.shape)(segments, others)
+        answer[:, :2] -= self.radius[rows, None]
+        return Contacts(answer)
+
+    def sweep(self, a: Array, b: Array, other_a: Array, other_b: Array, rows: Index) -> Array:
+        """Return the outputs of ``sweep_function`` (k, 3), distances from surface to surface."""
+        arguments = (a, b, other_a, other_b) if self.is_self else (a, b, other_a)
+        return np.asarray(self._kernels.sweep(self.shape)(*arguments) - self.radius[rows, None])
+
+    def displacement(self, duration: float, rows: Index) -> Array:
+        """Return how far the obstacles move in `duration`, (k, 3)."""
+        return np.asarray(self._pieces.velocity[self.other[rows]] * duration)
