@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import ResultError
 from vgtm_qp.maneuver.certificate import Certificate
 from vgtm_qp.maneuver.manifest import check_manifest, dump_manifest, parse_manifest
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -236,6 +239,13 @@ class Maneuver:
         except OSError as error:
             raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
         return path
+
+    def plot(self, **options: Any) -> Figure:
+        """Return a figure of states side by side; see `vgtm_qp.view.figure.plot_frames` for the options."""
+        # Imported here, against the way of the data, since only who plots should pay for matplotlib.
+        from vgtm_qp.view.figure import plot_frames
+
+        return plot_frames(self, **options)
 
     @classmethod
     def load(cls, path: str | Path) -> Maneuver:

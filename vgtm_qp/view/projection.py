@@ -1,0 +1,125 @@
+"""Parallel projection of a scene onto paper, and what is drawn before what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.view.drawing import ObstacleMesh
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_MANY_FACES = 4000
+_SHARP = np.radians(20.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """A parallel projection.
+
+    Attributes
+    ----------
+    axes : (3, 3)
+        Rows: to the right on paper, up on paper, and towards the viewer.
+    """
+
+    axes: Array
+
+    @classmethod
+    def looking(cls, azimuth: float, elevation: float) -> Projection:
+        """Return the view from `azimuth` about +z and `elevation` above the x-y plane, rad; +z is up."""
+        toward = np.array(
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+            ]
+        )
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        return cls(np.stack([right, np.cross(toward, right), toward]))
+
+    def flat(self, points: Array) -> Array:
+        """Return (..., 2) the places on paper of points (..., 3), m."""
+        return np.asarray(points @ self.axes[:2].T)
+
+    def depth(self, points: Array) -> Array:
+        """Return (...,) how near to the viewer points (..., 3) are, m."""
+        return np.asarray(points @ self.axes[2])
+
+
+class Surface:
+    """An obstacle's surface as it is drawn: outline, edges seen and hidden, and what is in front of it."""
+
+    def __init__(self, mesh: ObstacleMesh, projection: Projection) -> None:
+        import trimesh
+
+        self.mesh, self.projection = mesh, projection
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+        self.vertices = np.asarray(solid.vertices, dtype=float)
+        self.faces = np.asarray(solid.faces)
+        self.normals = np.asarray(solid.face_normals, dtype=float)
+        self.facing = self.normals @ projection.axes[2] > 0.0
+        sharp = np.asarray(solid.face_adjacency_angles) > _SHARP
+        self._sharp_edges = np.asarray(solid.face_adjacency_edges)[sharp]
+        self._beside = np.asarray(solid.face_adjacency)[sharp]
+
+    @cached_property
+    def is_convex(self) -> bool:
+        """Whether every vertex is on the inner side of every face; a large mesh counts as not convex."""
+        if len(self.faces) > _MANY_FACES:
+            return False
+        heights = self.normals @ self.vertices.T
+        planes = np.einsum("fc,fc->f", self.normals, self.vertices[self.faces[:, 0]])
+        return bool(np.all(heights <= planes[:, None] + 1e-6 * float(np.ptp(self.vertices))))
+
+    def depth(self, time: float) -> float:
+        """Return how near to the viewer its middle is at `time`, m."""
+        middle = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
+        return float(self.projection.depth(middle + self.mesh.position(time)))
+
+    def polygons(self, time: float) -> list[Array]:
+        """Return the polygons (K, 2) that its shape on paper is filled by."""
+        flat = self.projection.flat(self.vertices + self.mesh.position(time))
+        if self.is_convex:
+            from scipy.spatial import ConvexHull
+
+            return [flat[ConvexHull(flat).vertices]]
+        return list(flat[self.faces[self.facing]])
+
+    def edges(self, time: float, *, seen: bool) -> Array:
+        """Return (K, 2, 2) its sharp edges on paper that are seen, or that it hides itself."""
+        flat = self.projection.flat(self.vertices + self.mesh.position(time))
+        return np.asarray(flat[self._sharp_edges[self.facing[self._beside].any(axis=1) == seen]])
+
+    def is_before(self, points: Array, time: float) -> NDArray[np.bool_]:
+        """Return (K,) whether points (K, 3) are drawn over it: not inside or behind it for the viewer.
+
+        A point whose line of sight meets a convex body is before it just if it is outside one of the planes
+        of the faces that the viewer sees.
+        """
+        shifted = points - self.mesh.position(time)
+        if not self.is_convex:
+            return self.projection.depth(points) > self.depth(time)
+        corners = self.vertices[self.faces[self.facing, 0]]
+        normals = self.normals[self.facing]
+        return np.asarray((shifted @ normals.T > np.einsum("fc,fc->f", normals, corners)).any(axis=1))
+
+
+def layers(points: Array, surfaces: list[Surface], time: float) -> Index:
+    """Return (K,) how many of the surfaces, farthest first, have been drawn before each point (K, 3) is."""
+    order = np.zeros(len(points), dtype=np.int64)
+    for k, surface in enumerate(surfaces, start=1):
+        order[surface.is_before(points, time)] = k
+    return order
+
+
+def pieces(ends: Array, count: int) -> Array:
+    """Return (M * count, 2, 3) members (M, 2, 3) in `count` pieces that overlap a little, without seams."""
+    share = np.linspace(0.0, 1.0, count + 1)
+    shares = np.clip(np.stack([share[:-1] - 0.1 / count, share[1:] + 0.1 / count], axis=1), 0.0, 1.0)
+    along = ends[:, 1] - ends[:, 0]
+    return np.asarray(ends[:, None, None, 0] + shares[..., None] * along[:, None, None]).reshape(-1, 2, 3)
