@@ -218,11 +218,18 @@ def check_answer(
         A residual is above 1e-8, the dual one relative to the greatest gradient or multiplier.
     """
     size = len(x)
-    values = np.concatenate([x, constraint @ x])
+    values = np.concatenate((x, constraint @ x))
     primal = max(float((values - upper).max()), float((lower - values).max()))
-    stationarity = hessian @ x + gradient + y[:size] + y[size:] @ constraint
-    dual = float(np.abs(stationarity).max()) / (1.0 + float(np.abs(gradient).max()) + float(np.abs(y).max()))
+    stationarity = hessian @ x
+    stationarity += gradient
+    stationarity += y[:size]
+    stationarity += y[size:] @ constraint
+    dual = _largest(stationarity) / (1.0 + _largest(gradient) + _largest(y))
     if not (primal <= 1e-8 and dual <= 1e-8):
         raise SolverError(
             f"daqp (exit flag {flag}) left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
         )
+
+
+def _largest(vector: Array) -> float:
+    return max(float(vector.max()), -float(vector.min()))

@@ -20,6 +20,9 @@ from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 
 Array = NDArray[np.float64]
 
+_EQUALITY = 5
+"""DAQP's mark for a row that is always active."""
+
 
 @dataclass(frozen=True)
 class TipGoal:
@@ -98,6 +101,7 @@ class FusedSolver:
         self._constant = np.zeros((self._size - 1, self._size - 1))
         self._tracked = 3 * len(layout.tracked)
         self._hard = self._tracked if layout.hard_tracking else 0
+        self._reserve(self._size + 64)
         if self._hard:
             self._soft = np.ones(self._stack.shape[1])
             self._soft[nodes : nodes + self._hard] = 0.0
@@ -132,30 +136,35 @@ class FusedSolver:
         gradient[-1] = curvature * (progress - 2.0)
 
         tip, hard, near = len(rate), self._hard, len(clearance)
-        constraint = np.zeros((tip + hard + near, size))
-        lower, upper = np.full(size + tip + hard + near, -UNBOUNDED), np.full(size + tip + hard + near, UNBOUNDED)
+        rows = tip + hard + near
+        if size + rows > len(self._lower):
+            self._reserve(2 * (size + rows))
+        constraint = self._constraint[:rows]
+        lower, upper, sense = self._lower[: size + rows], self._upper[: size + rows], self._sense[: size + rows]
         lower[:count], upper[:count] = self._box[0], self._box[1]
         lower[size - 1], upper[size - 1] = -progress, 1.0 - progress
-        positions = len(self._position_axes)
-        rows = self._tip[self._position_axes]
+        tip_rows = self._tip[self._position_axes]
         if goal.across is not None:
-            rows = np.concatenate([rows, goal.across @ self._tip[3:]])
-        constraint[:tip, :count] = rows[:, :-1]
+            tip_rows = np.concatenate([tip_rows, goal.across @ self._tip[3:]])
+        constraint[:tip, :count] = tip_rows[:, :-1]
         constraint[:tip, -1] = -rate
-        lower[size : size + tip] = goal.error - rows[:, -1]
-        del positions
+        lower[size : size + tip] = goal.error - tip_rows[:, -1]
+        equal = size + tip + hard
         if hard:
             block = self._stack[:, self.layout.node_columns : self.layout.node_columns + hard]
             constraint[tip : tip + hard, :-1] = block[:-1].T
-            lower[size + tip : size + tip + hard] = -block[-1]
-        upper[size : size + tip + hard] = lower[size : size + tip + hard]
+            lower[size + tip : equal] = -block[-1]
+        upper[size:equal] = lower[size:equal]
+        sense[size:equal] = _EQUALITY
         if near:
             spread = self._spread_rows(clearance)
-            response = spread @ self._response[:count].T
-            constraint[tip + hard :, :count] = response * self._scale
-            lower[size + tip + hard :] = clearance.lower - (spread @ self._response[-1]) * self._scale
-        sense = np.zeros(size + tip + hard + near, dtype=np.int32)
-        sense[size : size + tip + hard] = 5
+            answer = spread @ self._response.T
+            answer *= self._scale
+            constraint[tip + hard :, :count] = answer[:, :count]
+            constraint[tip + hard :, count:] = 0.0
+            np.subtract(clearance.lower, answer[:, -1], out=lower[equal:])
+            upper[equal:] = UNBOUNDED
+            sense[equal:] = 0
         x, _, flag, info = daqp.solve(
             hessian, gradient, constraint, upper, lower, sense, primal_tol=FEASIBILITY, eps_prox=0.0
         )
@@ -166,8 +175,7 @@ class FusedSolver:
 
         truss = self.layout.truss
         nodes = np.zeros((truss.node_count, 3))
-        moved = x[:count] @ self._response[:count]
-        moved += self._response[-1]
+        moved = x[:count] @ self._response[:count] + self._response[-1]
         moved *= self._scale
         nodes[truss.free] = moved.reshape(-1, 3)
         vertices = np.array(self._offset)
@@ -199,6 +207,12 @@ class FusedSolver:
                 break
         out = kernel.outputs
         return Closed(out[0].reshape(-1, 3).copy(), out[1].copy(), error, out[3].copy(), out[4].reshape(3, 3).T.copy())
+
+    def _reserve(self, rows: int) -> None:
+        """Make room for bounds of all unknowns and `rows` less so many constraints."""
+        self._constraint = np.zeros((rows - self._size, self._size))
+        self._lower, self._upper = np.full(rows, -UNBOUNDED), np.full(rows, UNBOUNDED)
+        self._sense = np.zeros(rows, dtype=np.int32)
 
     def _assemble(self) -> tuple[Array, Array]:
         """Return Hessian and gradient of the objective but for the progress along the path."""

@@ -20,6 +20,10 @@ from vgtm_qp.step.task import TipTask
 Array = NDArray[np.float64]
 
 
+_MOTION_MARGIN = 3.0
+"""A member may move by so many times what is expected of it before a pair that matters can be missed."""
+
+
 @dataclass(frozen=True)
 class Tolerances:
     """What an accepted state is held against: lengths and tip in m (rad), clearance in m below `safe`.
@@ -123,7 +127,9 @@ class Attempt:
         tolerance, phases, span = self.tolerances, self.phases, target.end - target.start
         phases.start()
         X, vertices, progress = state.nodes, state.control_vertices, 0.0
-        Y = X + (0.5 * share) * state.motion
+        guess = share * state.motion
+        Y = X + 0.5 * guess
+        reach = _MOTION_MARGIN * self._expected(target, guess)
         stations: list[float] = []
         first: StepSolution | None = None
         first_rows: ClearanceRows | None = None
@@ -134,7 +140,7 @@ class Attempt:
 
         for count in range(1, self.max_qps + 1):
             motion = count == 1
-            rows = self._rows(state, X, state.time if motion else target.time, stations, motion=motion)
+            rows = self._rows(state, X, state.time if motion else target.time, stations, reach, motion=motion)
             phases.add("distance")
             goal = target.path.at(target.start + progress * span)
             try:
@@ -157,6 +163,7 @@ class Attempt:
             moved = float(np.abs(solution.nodes).max())
             if not moved < np.inf:
                 return outcome("singular pose", count)
+            reach = moved
             if motion and moved > tolerance.first:
                 continue
             closed = self.engine.close(X, target, tolerance.member)
@@ -166,12 +173,18 @@ class Attempt:
             phases.add("correction")
             if closed.error > tolerance.member or float(np.abs(error).max()) > tolerance.tip:
                 continue
-            floors = np.array([self.safe, self.self_safe])
-            if not self.monitor.keeps(X, target.time, *(floors - tolerance.clearance)):
+            if not self.monitor.keeps(
+                X, target.time, self.safe - tolerance.clearance, self.self_safe - tolerance.clearance
+            ):
                 phases.add("acceptance")
                 continue
             report = self.monitor.between(
-                state.nodes, X, state.time, target.time, *(floors - tolerance.between)
+                state.nodes,
+                X,
+                state.time,
+                target.time,
+                self.safe - tolerance.between,
+                max(self.self_safe - tolerance.between, 0.0),
             )
             phases.add("acceptance")
             if report.certified:
@@ -181,11 +194,32 @@ class Attempt:
                 return outcome("clearance between the states", count)
         return outcome("no convergence", self.max_qps)
 
-    def _rows(self, state: State, X: Array, time: float, stations: list[float], *, motion: bool) -> ClearanceRows:
-        """Return the clearance rows at `X` and, as the end state moves them too, at the `stations` on the way there."""
+    def _expected(self, target: Target, guess: Array) -> float:
+        """Return about how far a node moves in the step, m; anything where the arm was at rest."""
+        last = float(np.abs(guess).max())
+        if last == 0.0:
+            return self.influence
+        way = target.path.at(target.end).position - target.path.at(target.start).position
+        return max(last, float(np.abs(way).max()))
+
+    def _rows(
+        self, state: State, X: Array, time: float, stations: list[float], reach: float, *, motion: bool
+    ) -> ClearanceRows:
+        """Return the clearance rows at `X` and, as the end state moves them too, at the `stations` on the way there.
+
+        Pairs that are further from their floor than `reach`, m, cannot become active in the QP. A pair that was
+        missed because a member moved further than expected is found by the check of the new state, and corrected.
+        """
         margin = self.tolerances.margin
         safe = (self.safe + margin, self.self_safe + margin)
-        rows = clearance_rows(self.monitor, self.monitor.near(X, time, self.influence), *safe)
+        near = self.monitor.near(
+            X,
+            time,
+            min(self.influence, self.safe + reach),
+            use_fcl=motion,
+            self_reach=min(self.influence, self.self_safe + 2.0 * reach),
+        )
+        rows = clearance_rows(self.monitor, near, *safe)
         if motion:
             np.minimum(rows.lower, 0.0, out=rows.lower)
         for s in stations:

@@ -44,8 +44,10 @@ def length_box(
         Duration of that step, s; `dt` by default. An acceleration is a change of mean speed over the time between
         the middles of two steps.
     """
-    interval = dt if last_dt is None else 0.5 * (dt + last_dt)
     low, high = np.minimum(stroke[:, 0], length), np.maximum(stroke[:, 1], length)
+    if np.isinf(acceleration).all():
+        return np.maximum(low, length - rate * dt), np.minimum(high, length + rate * dt)
+    interval = dt if last_dt is None else 0.5 * (dt + last_dt)
     fastest = np.minimum(rate, braking_speed(high - length, acceleration, dt))
     slowest = -np.minimum(rate, braking_speed(length - low, acceleration, dt))
     with np.errstate(invalid="ignore"):

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
+from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.arm import Arm, build_arm
-from vgtm_qp.step.attempt import Attempt, Outcome
+from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.limits import length_box
 from vgtm_qp.step.linearise import Target
 from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
@@ -41,10 +43,6 @@ class Step:
         The part of the way that was covered, 0 to 1.
     state : State
         The state after the step.
-    active : tuple of str
-        Names of the rows that were active in the QP, most decisive first.
-    multipliers : dict
-        Multiplier of each active row.
     reason : str
         Why the step was cut, empty where it was not.
     qps : int
@@ -54,10 +52,31 @@ class Step:
     status: StepStatus
     progress: float
     state: State
-    active: tuple[str, ...]
-    multipliers: dict[str, float]
     reason: str
     qps: int
+    _members: tuple[str, ...] = field(repr=False)
+    _solution: StepSolution | None = field(default=None, repr=False)
+    _rows: ClearanceRows | None = field(default=None, repr=False)
+
+    @cached_property
+    def multipliers(self) -> dict[str, float]:
+        """Multipliers of the rows that were active in the QP that moved the arm, by name, the greatest first."""
+        if self._solution is None or self._rows is None:
+            return {}
+        found: dict[str, float] = {}
+        pressing = self._solution.clearance_multipliers
+        for k in np.flatnonzero(pressing > 1e-9):
+            name = self._rows.name(int(k))
+            found[name] = max(found.get(name, 0.0), float(pressing[k]))
+        strokes = np.abs(self._solution.actuator_multipliers)
+        for k in np.flatnonzero(strokes > 1e-9):
+            found[f"stroke: {self._members[k]}"] = float(strokes[k])
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        """Names of the rows that were active in that QP, most decisive first."""
+        return tuple(self.multipliers)
 
     @property
     def blocked_by(self) -> tuple[str, ...]:
@@ -74,6 +93,13 @@ class Resolver:
             arm.engine, arm.task, arm.monitor, arm.safe, arm.self_safe, arm.influence
         )
         self.state = arm.home_state()
+        truss = arm.truss
+        self._actuator_names = tuple(truss.member_names[k] for k in truss.actuators)
+        self._limits = (
+            truss.stroke[truss.actuators],
+            truss.rate[truss.actuators],
+            truss.acceleration[truss.actuators],
+        )
 
     @property
     def phases(self) -> dict[str, float]:
@@ -152,15 +178,8 @@ class Resolver:
         if not (np.isfinite(dt) and dt > 0.0):
             raise GoalError(f"dt must be a positive number of seconds, not {dt!r}; the state of the arm is unchanged")
         state, actuators = self.state, self.arm.truss.actuators
-        truss = self.arm.truss
         lower, upper = length_box(
-            state.lengths[actuators],
-            state.length_rates[actuators],
-            truss.stroke[actuators],
-            truss.rate[actuators],
-            truss.acceleration[actuators],
-            dt,
-            state.duration or None,
+            state.lengths[actuators], state.length_rates[actuators], *self._limits, dt, state.duration or None
         )
         share, outcome = 1.0, None
         while share >= smallest:
@@ -170,9 +189,9 @@ class Resolver:
                 break
             share /= 2
         assert outcome is not None
-        active, multipliers = self._active(outcome)
+        told = (self._actuator_names, outcome.solution, outcome.rows)
         if not outcome.accepted:
-            return Step(StepStatus.BLOCKED, 0.0, state, active, multipliers, outcome.reason, outcome.iterations)
+            return Step(StepStatus.BLOCKED, 0.0, state, outcome.reason, outcome.iterations, *told)
         progress = share * outcome.progress
         closed = outcome.closed
         assert closed is not None
@@ -186,21 +205,7 @@ class Resolver:
             duration=dt,
         )
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
-        return Step(status, progress, self.state, active, multipliers, "", outcome.iterations)
-
-    def _active(self, outcome: Outcome) -> tuple[tuple[str, ...], dict[str, float]]:
-        solution, rows = outcome.solution, outcome.rows
-        if solution is None or rows is None:
-            return (), {}
-        found: dict[str, float] = {}
-        for k in np.flatnonzero(solution.clearance_multipliers > 1e-9):
-            name = rows.name(int(k))
-            found[name] = max(found.get(name, 0.0), float(solution.clearance_multipliers[k]))
-        names = self.arm.truss.member_names
-        for k in np.flatnonzero(np.abs(solution.actuator_multipliers) > 1e-9):
-            found[f"stroke: {names[self.arm.truss.actuators[k]]}"] = float(abs(solution.actuator_multipliers[k]))
-        ordered = dict(sorted(found.items(), key=lambda item: -item[1]))
-        return tuple(ordered), ordered
+        return Step(status, progress, self.state, "", outcome.iterations, *told)
 
 
 def _vector(value: ArrayLike, name: str) -> Array:
