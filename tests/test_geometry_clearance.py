@@ -86,9 +86,11 @@ def test_near_pairs_and_least_distances_along_a_walk(seed, round_numbers):
             assert pair is not None
             assert least <= reference + 1e-9
             assert least >= reference - 1e-9 or reference <= -0.029
-        assert clearance.least(X, time)[0] == min(
-            clearance.least(X, time, among=among)[0] for among in ("obstacles", "members")
-        )
+        to_obstacles, to_members = (clearance.least(X, time, among=a)[0] for a in ("obstacles", "members"))
+        assert clearance.least(X, time)[0] == min(to_obstacles, to_members)
+        for floor, self_floor in ((0.02, 0.3), (0.3, 0.02), (0.0, 0.0)):
+            expected_answer = to_obstacles >= floor and to_members >= self_floor
+            assert clearance.keeps(X, time, floor, self_floor) == expected_answer
         X = X + (rng.choice([0.02, 0.2]) if not round_numbers else 0.25) * np.round(
             rng.normal(size=X.shape), 0
         )

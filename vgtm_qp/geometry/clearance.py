@@ -122,12 +122,15 @@ class Clearance:
                 second = first[contacts.two()[first] & (contacts.distance_second[first] < limit)]
                 part = self._pairs(group, rows, contacts, first, second)
                 parts.append(self._distinct(part) if group.shape == "triangle" else part)
+        self._tire(candidates, X, time, wasted)
+        return self._with_enclosed(join(parts, self.names), X, time)
+
+    def _tire(self, candidates: Candidates, X: Array, time: float, wasted: int) -> None:
+        """Renew the reference once the pairs evaluated for nothing have cost as much as that does."""
         self._wasted += wasted
         if self._wasted > sum(map(len, candidates.groups)):
-            # The pairs evaluated for nothing since the last time have cost as much as a new reference does.
             candidates.refresh(X, time)
             self._wasted = 0
-        return self._with_enclosed(join(parts, self.names), X, time)
 
     def _contacts(
         self, group: Group, X: Array, time: float, rows: Index, limit: float, use_fcl: bool
@@ -189,21 +192,22 @@ class Clearance:
             k = int(np.argmin(enclosed.distance))
             best, pair = float(enclosed.distance[k]), enclosed.pair(k)
         reach = self_reach = 0.0
+        wasted = 0
         while True:
             candidates, motion = self._covering(X, time, reach, self_reach)
             for group in candidates.groups:
                 if group.is_self in wanted:
-                    distance, row = _least_of(group, motion, X, time, best)
+                    distance, row, count = _least_of(group, motion, X, time, best)
+                    wasted += count
                     if row >= 0:
-                        best, pair = (
-                            distance,
-                            Pair(int(group.member[row]), int(group.other[row]), group.is_self),
-                        )
+                        best = distance
+                        pair = Pair(int(group.member[row]), int(group.other[row]), group.is_self)
             far, far_self = candidates.beyond(motion)
             extent = self._extent(X, time) if best > min(far, far_self) else 0.0
             search = False in wanted and len(self.pieces) > 0 and far < min(best, extent)
             search_self = True in wanted and far_self < min(best, extent)
             if not (search or search_self):
+                self._tire(candidates, X, time, wasted)
                 return best, pair
             reach = 2.0 * max(far, self.influence) if search else reach
             self_reach = 2.0 * max(far_self, self.self_influence) if search_self else self_reach
@@ -379,19 +383,20 @@ class Clearance:
         return candidates, candidates.motion(X, time, end, end_time)
 
 
-def _least_of(group: Group, motion: Motion, X: Array, time: float, best: float) -> tuple[float, int]:
-    """Return the least distance below `best` and its row, or (best, -1), evaluating what the bounds leave."""
+def _least_of(group: Group, motion: Motion, X: Array, time: float, best: float) -> tuple[float, int, int]:
+    """Return the least distance below `best`, its row, and how many pairs the bounds left beside the first.
+
+    The row is -1 where none is below.
+    """
     # The nearest pairs at the reference are likely to be so still; they make `best` small for the others.
     rows, row = np.arange(min(len(group), _FIRST)), -1
-    distance = group.contacts(X, time, rows).distance
-    k = int(np.argmin(distance))
-    if distance[k] < best:
-        best, row = float(distance[k]), k
-    rows = np.flatnonzero(group.lower(motion, best)[0] < best)
-    rows = rows[rows >= _FIRST]
-    if len(rows):
-        distance = group.contacts(X, time, rows).distance
-        k = int(np.argmin(distance))
-        if distance[k] < best:
-            best, row = float(distance[k]), int(rows[k])
-    return best, row
+    for first in (True, False):
+        if len(rows):
+            distance = group.contacts(X, time, rows).distance
+            k = int(np.argmin(distance))
+            if distance[k] < best:
+                best, row = float(distance[k]), int(rows[k])
+        if first:
+            rows = np.flatnonzero(group.lower(motion, best)[0] < best)
+            rows = rows[rows >= _FIRST]
+    return best, row, len(rows)
