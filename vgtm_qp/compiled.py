@@ -119,6 +119,13 @@ class Kernel:
         self.inputs[index] = array
         self._buffer.set_arg(index, memoryview(array.reshape(-1)))
 
+    def bind_output(self, index: int, array: Array) -> None:
+        """Let result `index` be written to `array` (C-contiguous float64, of the same size), which the kernel keeps."""
+        if array.size != self.outputs[index].size or not array.flags.c_contiguous or array.dtype != np.float64:
+            raise ValueError(f"result {index} gives {self.outputs[index].size} contiguous float64 numbers")
+        self.outputs[index] = array
+        self._buffer.set_res(index, memoryview(array.reshape(-1)))
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Refuse to pickle: a kernel holds addresses; build it in the worker."""
         raise TypeError("a Kernel holds addresses and cannot be pickled; build it where it is used")

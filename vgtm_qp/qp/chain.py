@@ -1,0 +1,202 @@
+"""A truss as a chain of equal periods, each hung on the one before: what makes a step's cost linear in the bays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from vgtm_qp.qp.layout import Layout
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_LONGEST_PERIOD = 6
+_MOST_LOCKED = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Periods of p stages; every member and tracked face of a period uses nodes of it and of the period before only.
+
+    Within a period the w nodes of the one before that it uses come first, then its own m nodes in stage order.
+
+    Attributes
+    ----------
+    layout : Layout
+    nodes : (n, m) int
+        The nodes of each period in stage order.
+    members : (n, 3m) int
+        The members of each period by the stage they belong to.
+    stage_sizes : tuple of int
+        Nodes of each of the p stages.
+    carried : (w,) int
+        Which of a period's nodes the next period uses.
+    pattern : (3m, w + m) bool
+        Which nodes a member's length depends on, in any of the periods.
+    soft : (3m,) bool
+        The places of actuated members.
+    faces : (n, f) int
+        Positions in ``layout.tracked`` of the faces that each period completes.
+    face_places : (f, 3) int
+        Places of those faces' nodes.
+    face_weights : (f, 3)
+    locked : (l,) int
+        Fixed members that stand where other periods have an actuated one.
+    """
+
+    layout: Layout
+    nodes: Index
+    members: Index
+    stage_sizes: tuple[int, ...]
+    carried: Index
+    pattern: Mask
+    soft: Mask
+    faces: Index
+    face_places: Index
+    face_weights: Array
+    locked: Index
+
+    @property
+    def periods(self) -> int:
+        """Number of periods n."""
+        return len(self.nodes)
+
+    @property
+    def own(self) -> int:
+        """Number of displacement coordinates of a period's own nodes, 3m."""
+        return 3 * self.nodes.shape[1]
+
+    @property
+    def before(self) -> int:
+        """Number of displacement coordinates that a period takes over from the one before, 3w."""
+        return 3 * len(self.carried)
+
+    @cached_property
+    def node_period(self) -> Index:
+        """(N,) the period of each node; -1 for base nodes."""
+        period = np.full(self.layout.truss.node_count, -1, dtype=np.int64)
+        period[self.nodes] = np.arange(self.periods)[:, None]
+        return period
+
+    @cached_property
+    def node_place(self) -> Index:
+        """(N,) the place of each node within its period, 0 to m - 1."""
+        place = np.zeros(self.layout.truss.node_count, dtype=np.int64)
+        place[self.nodes] = np.arange(self.nodes.shape[1])
+        return place
+
+    @cached_property
+    def coordinate_pattern(self) -> Mask:
+        """(3m, 3w + 3m) the pattern of a period's rows of the length Jacobian."""
+        return np.repeat(self.pattern, 3, axis=1)
+
+    @cached_property
+    def gather(self) -> sparse.csr_matrix:
+        """The matrix that takes all members' gradients to the Jacobian's nonzeros, period by period, column by column."""
+        layout, pattern = self.layout, self.coordinate_pattern
+        number = np.full(pattern.shape, -1, dtype=np.int64)
+        number.T[pattern.T] = np.arange(int(pattern.sum()))
+        member, flat, column = layout.length_scatter
+        row = np.empty(layout.truss.member_count, dtype=np.int64)
+        period = np.empty_like(row)
+        row[self.members] = np.arange(self.members.shape[1])
+        period[self.members] = np.arange(self.periods)[:, None]
+        node = layout.truss.free[column // 3]
+        place = _places(self.node_period[node], self.node_place[node], period[member], self.carried)
+        entry = period[member] * int(pattern.sum()) + number[row[member], 3 * place + column % 3]
+        shape = (self.periods * int(pattern.sum()), layout.truss.member_count * layout.member_nodes.shape[1] * 3)
+        return sparse.csr_matrix((np.ones(len(entry)), (entry, flat)), shape=shape)
+
+    @property
+    def is_square(self) -> bool:
+        """Whether a period's fixed members and its faces' positions determine its nodes, given the curve."""
+        return self.faces.shape[1] > 0 and int(self.soft.sum()) == 3 * self.faces.shape[1] and not len(self.locked)
+
+
+def find_chain(layout: Layout) -> Chain | None:
+    """Return the chain of `layout`, with the shortest period; None where the truss is none."""
+    truss = layout.truss
+    stages = int(truss.stage.max(initial=-1)) + 1
+    found = [
+        chain
+        for length in range(1, min(stages, _LONGEST_PERIOD) + 1)
+        if stages % length == 0 and (chain := _chain(layout, stages, length)) is not None
+    ]
+    return min(found, key=lambda chain: (len(chain.locked), len(chain.stage_sizes)), default=None)
+
+
+def _places(period: Index, place: Index, here: Index, carried: Index) -> Index:
+    """Return the places of nodes among a period's w + m; -1 for nodes that are neither its own nor carried."""
+    position = np.full(max(int(place.max(initial=0)), int(carried.max(initial=0))) + 1, -1, dtype=np.int64)
+    position[carried] = np.arange(len(carried))
+    return np.where(period == here, len(carried) + place, np.where(period == here - 1, position[place], -1))
+
+
+def _repeats(counts: Index, length: int) -> bool:
+    """Whether `counts` per stage repeat after `length` stages and none is zero."""
+    return bool(counts.min() > 0 and (counts.reshape(-1, length) == counts[:length]).all())
+
+
+def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
+    truss = layout.truss
+    periods = stages // length
+    node_counts = np.bincount(truss.stage[truss.free], minlength=stages)
+    member_stage = truss.stage[layout.member_nodes].max(axis=1)
+    if not len(member_stage) or member_stage.min() < 0 or not _repeats(node_counts, length):
+        return None
+    if (np.bincount(member_stage, minlength=stages) != 3 * node_counts).any():
+        return None
+    nodes = truss.free.reshape(periods, -1)
+    members = np.argsort(member_stage, kind="stable").reshape(periods, -1)
+
+    period = np.full(truss.node_count, -2, dtype=np.int64)
+    place = np.zeros(truss.node_count, dtype=np.int64)
+    period[nodes], place[nodes] = np.arange(periods)[:, None], np.arange(nodes.shape[1])
+    here = np.arange(periods)[:, None, None]
+    used = layout.member_nodes[members]
+    face_used, faces = np.zeros((periods, 0, 3), dtype=np.int64), np.zeros((periods, 0), dtype=np.int64)
+    if len(layout.tracked):
+        face_nodes = truss.faces[layout.tracked]
+        completed = period[face_nodes].max(axis=1)
+        order = np.argsort(completed, kind="stable")
+        if len(order) % periods or (completed[order] != np.repeat(np.arange(periods), len(order) // periods)).any():
+            return None
+        faces = order.reshape(periods, -1)
+        face_used = face_nodes[faces]
+    for nodes_used in (used, face_used):
+        if ((period[nodes_used] >= 0) & (period[nodes_used] < here - 1)).any():
+            return None
+    carried = np.unique(
+        np.concatenate([place[nodes_used][period[nodes_used] == here - 1] for nodes_used in (used, face_used)])
+    )
+    face_places = _places(period[face_used], place[face_used], here, carried)
+    weights = truss.face_weights[layout.tracked[faces]]
+    if (face_places != face_places[:1]).any() or (face_places < 0).any() or np.ptp(weights, axis=0).max(initial=0.0) > 0:
+        return None
+    places = _places(period[used], place[used], here, carried)
+    pattern = np.zeros((members.shape[1], len(carried) + nodes.shape[1]), dtype=bool)
+    _, row, slot = np.nonzero(places >= 0)
+    pattern[row, places[places >= 0]] = True
+    actuated = truss.actuated[members]
+    soft = actuated.mean(axis=0) > 0.5
+    locked = members[~actuated & soft]
+    if (actuated & ~soft).any() or len(locked) > _MOST_LOCKED:
+        return None
+    return Chain(
+        layout=layout,
+        nodes=nodes,
+        members=members,
+        stage_sizes=tuple(node_counts[:length].tolist()),
+        carried=carried,
+        pattern=pattern,
+        soft=soft,
+        faces=faces,
+        face_places=face_places[0],
+        face_weights=weights[0],
+        locked=locked,
+    )

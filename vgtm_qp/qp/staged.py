@@ -1,0 +1,186 @@
+"""The step's QP of a long arm, exactly and at a cost linear in its bays (elastic tracking or none).
+
+A Riccati recursion from the tip to the base eliminates the free motions of every bay; the curve's coordinates are
+global unknowns beside them; rows with bounds meet in a small dense QP of their own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.chain import Chain
+from vgtm_qp.qp.chain_data import ChainData
+from vgtm_qp.qp.elimination import Elimination, Sweep
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
+
+Array = NDArray[np.float64]
+
+_BLOCK = 8
+_RESIDUAL = 1e-8
+_SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
+
+
+class StagedSolver:
+    """Solves the QP of a step by elimination along a chain.
+
+    Parameters
+    ----------
+    chain : Chain
+        Of a layout without hard tracking.
+    """
+
+    def __init__(self, chain: Chain) -> None:
+        self.layout, self.chain = chain.layout, chain
+        elimination = Elimination(chain)
+        periods = chain.periods
+        self._freedom, self._curve = periods * elimination.freedom, elimination.curve
+        self._numbers = ChainData(chain, elimination.inputs.sizes)
+        self._reversed = np.zeros_like(self._numbers.data)
+        self._factor = Sweep(elimination.factor(), periods)
+        self._columns = Sweep(elimination.columns(_BLOCK), periods)
+        self._forward = Sweep(elimination.forward(), periods)
+        self._balance = Sweep(elimination.balance(), periods)
+        gains = self._factor.outputs[1]
+        for sweep in (self._factor, self._columns, self._balance):
+            sweep.bind_input(1, self._reversed)
+        for sweep in (self._columns, self._balance):
+            sweep.bind_input(2, gains)
+        self._forward.bind_input(1, self._numbers.data)
+        self._gains = gains.reshape(periods, -1)
+        self._forward_gains = self._forward.inputs[2].reshape(periods, -1)
+        self._motions = self._forward.inputs[3].reshape(periods, -1)
+        self._rows = self._columns.inputs[3].reshape(periods, _BLOCK, -1, 3)
+        self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
+        self._active: set[tuple[object, ...]] = set()
+
+    def solve(self, numbers: StepNumbers) -> StepSolution:
+        """Solve one QP.
+
+        Raises
+        ------
+        InfeasibleStepError
+            The hard rows contradict one another.
+        SolverError
+            The QP is singular, or the answer failed the residual check.
+        """
+        self._eliminate(numbers)
+        table = RowTable.of(self.layout, numbers, self.chain.locked)
+        size = self._freedom + self._curve + 1
+        point, multipliers, iterations = solve_rows(self, size, table, table.remembered(self._active), _BLOCK)
+        self._check(table, point, multipliers)
+        self._active = {table.key(k) for k in np.flatnonzero(multipliers).tolist() if k >= table.equal}
+        return solution(table, point, multipliers, iterations)
+
+    def columns(self, table: RowTable, rows: list[int]) -> Array:
+        """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
+        chain, rest = self.chain, slice(self._freedom, self._freedom + self._curve)
+        columns = np.zeros((self._freedom + self._curve + 1, len(rows)))
+        for start in range(0, len(rows), _BLOCK):
+            block = rows[start : start + _BLOCK]
+            self._rows[:] = 0.0
+            for k, row in enumerate(block):
+                nodes, coefficients, progress = table.coefficients(row)
+                free = chain.node_period[nodes] >= 0
+                period, place = chain.periods - 1 - chain.node_period[nodes[free]], chain.node_place[nodes[free]]
+                np.add.at(self._rows[:, k], (period, place), coefficients[free])
+                columns[-1, start + k] = progress * self._progress_scale
+            self._columns()
+            columns[: self._freedom, start : start + len(block)] = self._columns.outputs[1].reshape(
+                self._freedom, _BLOCK
+            )[:, : len(block)]
+        if self._curve:
+            through = self._outer[:, :-1].T @ columns[: self._freedom]
+            columns[rest] = -solve_triangular(self._curve_factor, through, lower=True, check_finite=False)
+        return columns
+
+    def point(self, table: RowTable, combined: Array) -> Point:
+        """Return the point that minimises the Lagrangian, `combined` (size,) being the columns times multipliers."""
+        chain, truss = self.chain, self.layout.truss
+        freedom, curve = self._freedom, self._curve
+        free = np.zeros(0)
+        if curve:
+            known = self._curve_rhs + combined[freedom : freedom + curve]
+            free = -solve_triangular(self._curve_factor, known, lower=True, trans=1, check_finite=False)
+        progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
+        motions = self._outer[:, -1] + self._outer[:, :-1] @ free + combined[:freedom]
+        self._motions[:] = motions.reshape(chain.periods, -1)[::-1]
+        self._forward()
+        _, moved, changed, _ = self._forward.outputs
+        nodes, lengths = np.zeros((truss.node_count, 3)), np.empty(truss.member_count)
+        nodes[chain.nodes] = moved.reshape(*chain.nodes.shape, 3)
+        lengths[chain.members] = changed.reshape(chain.members.shape)
+        values = table.values(nodes, lengths, progress)
+        return Point(nodes, lengths, self._numbers.vertices(free), progress, values)
+
+    def _eliminate(self, numbers: StepNumbers) -> None:
+        """Run the recursion and factorise what is left, in the curve's coordinates."""
+        data = self._numbers
+        data.fill(numbers)
+        self._reversed[:] = data.data[::-1]
+        self._factor()
+        if not np.all(np.isfinite(self._outer[-1])) or not numbers.progress_curvature > 0.0:
+            raise SolverError(_SINGULAR)
+        self._forward_gains[:] = self._gains[::-1]
+        self._progress_scale = 1.0 / np.sqrt(numbers.progress_curvature)
+        self._progress_rhs = self._progress_scale * numbers.progress_gradient
+        if self._curve:
+            hessian, gradient = data.curve_terms()
+            outer = self._outer[:, :-1]
+            try:
+                self._curve_factor = np.linalg.cholesky(hessian - outer.T @ outer)
+            except np.linalg.LinAlgError as error:
+                raise SolverError(_SINGULAR) from error
+            gradient += self._factor.carry[-1, -self._curve :]
+            self._curve_rhs = solve_triangular(self._curve_factor, gradient, lower=True, check_finite=False)
+
+    def _check(self, table: RowTable, point: Point, multipliers: Array) -> None:
+        """Refuse an answer whose primal or dual residual is too large."""
+        chain, numbers, weights = self.chain, table.numbers, self.layout.weights
+        truss = self.layout.truss
+        nodal, force, face = self._balance.inputs[3:]
+        gradient = weights.node_rate * point.nodes
+        for row in np.flatnonzero(multipliers).tolist():
+            if row < len(numbers.tip_rhs) or row >= table.clearance.start:
+                nodes, coefficients, _ = table.coefficients(row)
+                np.add.at(gradient, nodes, multipliers[row] * coefficients)
+        actuator = np.zeros(truss.member_count)
+        actuator[truss.actuators] = (
+            (weights.actuator_rate + weights.stroke_centring) * point.values[table.actuators]
+            + numbers.actuator_gradient
+            + multipliers[table.actuators]
+        )
+        actuator[chain.locked] = multipliers[len(numbers.tip_rhs) : table.equal]
+        nodal[:] = gradient[chain.nodes[::-1]].reshape(-1)
+        force[:] = actuator[chain.members[::-1][:, chain.soft]].reshape(-1)
+        residual = 0.0
+        if self._curve:
+            gap, tilt = self._numbers.misfit(point.vertices, self._forward.outputs[3].reshape(-1, 5))
+            pulled = np.hstack([weights.tracking * gap, weights.tangent * tilt])
+            face[:] = pulled.reshape(chain.periods, -1)[::-1].reshape(-1)
+            residual = float(np.max(np.abs(self._numbers.curve_gradient(point.vertices, gap, tilt))))
+        self._balance()
+        residual = max(residual, float(np.max(np.abs(self._balance.outputs[1]))))
+        scale = 1.0 + float(np.max(np.abs(force), initial=0.0)) + float(np.max(np.abs(multipliers)))
+        fixed = point.lengths[self.layout.fixed]
+        primal = max(float(np.max(table.violation(point.values))), float(np.max(np.abs(fixed), initial=0.0)))
+        if not (primal <= _RESIDUAL and residual <= _RESIDUAL * scale):
+            raise SolverError(
+                f"the elimination left a primal residual of {primal:.1e} m and a dual residual of {residual / scale:.1e}"
+            )
+
+
+def solution(table: RowTable, point: Point, multipliers: Array, iterations: int) -> StepSolution:
+    """Return the solution in the arm's terms."""
+    return StepSolution(
+        nodes=point.nodes,
+        actuators=point.values[table.actuators].copy(),
+        vertices=point.vertices,
+        progress=point.progress,
+        actuator_multipliers=multipliers[table.actuators].copy(),
+        clearance_multipliers=-multipliers[table.clearance],
+        iterations=iterations,
+    )

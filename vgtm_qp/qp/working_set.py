@@ -1,0 +1,246 @@
+"""The inequality part of a long arm's QP: few rows are near their bounds, so those alone meet in a small dense QP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpstrf
+
+from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.condensed import FEASIBILITY, UNBOUNDED, InfeasibleStepError
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.numbers import StepNumbers
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_NO_ROW = 1e-11
+_DEPENDENT = 1e-14
+_VIOLATED = 1e-10
+_REFINEMENTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class RowTable:
+    """All rows with bounds of one QP: tip, locked members, progress, actuators, clearance, in this order.
+
+    Attributes
+    ----------
+    layout : Layout
+    numbers : StepNumbers
+    locked : (l,) int
+        Fixed members that are held by a row of their own.
+    lower, upper : (total,)
+    """
+
+    layout: Layout
+    numbers: StepNumbers
+    locked: Index
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, layout: Layout, numbers: StepNumbers, locked: Index) -> RowTable:
+        """Return the table of `numbers`."""
+        held = np.zeros(len(locked))
+        clearance = numbers.clearance.lower
+        lower = [numbers.tip_rhs, held, [numbers.progress_lower], numbers.lower, clearance]
+        upper = [numbers.tip_rhs, held, [numbers.progress_upper], numbers.upper, np.full(len(clearance), UNBOUNDED)]
+        return cls(layout, numbers, locked, np.concatenate(lower), np.concatenate(upper))
+
+    @property
+    def equal(self) -> int:
+        """Number of equalities, which come first."""
+        return len(self.numbers.tip_rhs) + len(self.locked)
+
+    @property
+    def actuators(self) -> slice:
+        """Where the actuators' bounds are."""
+        return slice(self.equal + 1, self.equal + 1 + len(self.numbers.lower))
+
+    @property
+    def clearance(self) -> slice:
+        """Where the clearance rows are."""
+        return slice(self.actuators.stop, len(self.lower))
+
+    def values(self, nodes: Array, lengths: Array, progress: float) -> Array:
+        """Return (total,) row values at displacements of the nodes (N, 3) and changes of the lengths (M,)."""
+        numbers, truss, clearance = self.numbers, self.layout.truss, self.numbers.clearance
+        return np.concatenate(
+            [
+                numbers.tip_jacobian @ nodes[truss.tip].reshape(-1) - numbers.tip_rate * progress,
+                lengths[self.locked],
+                [progress],
+                lengths[truss.actuators],
+                np.einsum("rsc,rsc->r", clearance.coefficients, nodes[clearance.nodes]),
+            ]
+        )
+
+    def violation(self, values: Array) -> Array:
+        """Return (total,) how far the values are out of their bounds; not positive where they are not."""
+        return np.maximum(self.lower - values, values - self.upper)
+
+    def coefficients(self, row: int) -> tuple[Index, Array, float]:
+        """Return nodes (Q,), their coefficients (Q, 3) and that of the progress."""
+        numbers, truss = self.numbers, self.layout.truss
+        tip = len(numbers.tip_rhs)
+        if row < tip:
+            return truss.tip, numbers.tip_jacobian[row].reshape(-1, 3), -float(numbers.tip_rate[row])
+        if row == self.equal:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0
+        if row >= self.clearance.start:
+            k = row - self.clearance.start
+            return numbers.clearance.nodes[k], numbers.clearance.coefficients[k], 0.0
+        member = self.locked[row - tip] if row < self.equal else truss.actuators[row - self.actuators.start]
+        return self.layout.member_nodes[member], numbers.gradient[member], 0.0
+
+    def key(self, row: int) -> tuple[object, ...]:
+        """Return what names the row in the next QP, where clearance rows may be others."""
+        if row < self.clearance.start:
+            return (row,)
+        return ("clearance", self.numbers.clearance.nodes[row - self.clearance.start].tobytes())
+
+    def remembered(self, keys: set[tuple[object, ...]]) -> list[int]:
+        """Return the inequality rows that `keys` name."""
+        found = [key[0] for key in keys if len(key) == 1]
+        rows = [row for row in found if isinstance(row, int) and self.equal <= row < self.clearance.start]
+        if len(found) < len(keys):
+            rows += [k for k in range(self.clearance.start, len(self.lower)) if self.key(k) in keys]
+        return sorted(rows)
+
+
+def dual_solution(gram: Array, values: Array, lower: Array, upper: Array, equal: Array) -> tuple[Array, int]:
+    """Return the multipliers that bring `values` - `gram` multipliers into the bounds at least cost.
+
+    Multipliers are positive at upper and negative at lower bounds. `gram` (R, R) is A H^-1 A' of rows A.
+
+    Raises
+    ------
+    InfeasibleStepError
+        The rows contradict one another.
+    SolverError
+        The dual QP was not solved.
+    """
+    norm = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    multipliers = np.zeros(len(norm))
+    if not np.all(np.isfinite(norm)):
+        raise SolverError("the QP is singular: the truss is in a singular pose, or all weights are zero")
+    empty = norm < _NO_ROW
+    if empty.any():
+        outside = np.maximum(lower - values, values - upper)[empty]
+        if outside.max() > 1e-9:
+            raise InfeasibleStepError("a hard row cannot be moved by any actuator")
+    kept = np.flatnonzero(~empty)
+    if not len(kept):
+        return multipliers, 0
+    scale = 1.0 / norm[kept]
+    scaled = gram[np.ix_(kept, kept)] * scale[:, None] * scale
+    factor, pivot, rank, _ = dpstrf(scaled, tol=_DEPENDENT * len(kept), lower=1)
+    rows = np.zeros((len(kept), rank))
+    rows[pivot - 1] = np.tril(factor)[:, :rank]
+    bounds = []
+    for bound in (lower, upper):
+        value = bound[kept]
+        free = np.abs(value) >= UNBOUNDED
+        bounds.append(np.where(free, value, (value - values[kept]) * scale))
+    sense = np.where(equal[kept], 5, 0).astype(np.int32)
+    _, _, flag, info = daqp.solve(
+        np.eye(rank), np.zeros(rank), rows, bounds[1], bounds[0], sense, primal_tol=FEASIBILITY, eps_prox=0.0
+    )
+    if flag == -1:
+        raise InfeasibleStepError("the hard rows of the step contradict one another")
+    if flag < 1:
+        raise SolverError(f"daqp ended with exit flag {flag}")
+    multipliers[kept] = np.asarray(info["lam"]) * scale
+    return multipliers, int(info["iterations"])
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A primal point of the QP and its row values.
+
+    Attributes
+    ----------
+    nodes : (N, 3)
+    lengths : (M,)
+        Changes of the lengths beyond ``length_rhs``: d_a of actuated members, the residual of fixed ones, m.
+    vertices : (V, 3)
+    progress : float
+    values : (total,)
+    """
+
+    nodes: Array
+    lengths: Array
+    vertices: Array
+    progress: float
+    values: Array
+
+
+class Eliminated(Protocol):
+    """A QP whose unknowns are eliminated: H = L L' for some L that only it knows."""
+
+    def columns(self, table: RowTable, rows: list[int]) -> Array:
+        """Return (size, len(rows)) L^-1 A' of the given rows A."""
+        ...
+
+    def point(self, table: RowTable, combined: Array) -> Point:
+        """Return the point that minimises the Lagrangian, `combined` (size,) being the columns times multipliers."""
+        ...
+
+
+def solve_rows(
+    problem: Eliminated, size: int, table: RowTable, remembered: list[int], block: int = 8
+) -> tuple[Point, Array, int]:
+    """Return the solution, the multipliers of all rows (total,), and the iterations of the dual QPs.
+
+    Rows enter the dual QP when they are violated, the worst first, and stay: so it ends.
+
+    Raises
+    ------
+    InfeasibleStepError
+        The rows contradict one another.
+    SolverError
+        A dual QP was not solved, or rounding kept a row out of its bounds.
+    """
+    rows: list[int] = []
+    columns = np.zeros((size, 0))
+    gram = np.zeros((0, 0))
+    multipliers = np.zeros(0)
+    iterations, refined = 0, 0
+    new = [*range(table.equal), *remembered]
+    point = problem.point(table, np.zeros(size))
+    while True:
+        violation = table.violation(point.values)
+        violated = np.flatnonzero(violation > _VIOLATED)
+        outside = np.setdiff1d(violated, [*rows, *new])
+        room = block * max(1, len(outside) // (4 * block))
+        if not rows:
+            room = max(0, -len(new) % block)
+        new += outside[np.argsort(-violation[outside])][:room].tolist()
+        if not new:
+            if not len(violated):
+                break
+            refined += 1
+            if refined > _REFINEMENTS:
+                raise SolverError(f"rounding left a row {violation.max():.1e} m or rad out of its bounds")
+        else:
+            added = problem.columns(table, new)
+            across = columns.T @ added
+            gram = np.block([[gram, across], [across.T, added.T @ added]])
+            columns = np.hstack([columns, added])
+            rows += new
+            multipliers = np.concatenate([multipliers, np.zeros(len(new))])
+            new = []
+        index = np.array(rows, dtype=np.int64)
+        multipliers, count = dual_solution(
+            gram, point.values[index] + gram @ multipliers, table.lower[index], table.upper[index], index < table.equal
+        )
+        iterations += count
+        point = problem.point(table, columns @ multipliers)
+    every = np.zeros(len(table.lower))
+    every[rows] = multipliers
+    return point, every, iterations
