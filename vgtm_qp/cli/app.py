@@ -19,7 +19,8 @@ from vgtm_qp.errors import ProblemError, VgtmError
 
 _EPILOGUE = (
     "Exit codes: 0 solved and verified; 1 internal error; 2 wrong usage or problem file; 3 blocked or "
-    "infeasible, the partial result is written; 4 verification failed; 130 interrupted, what was solved is on disk."
+    "infeasible, the partial result is written; 4 verification failed; 130 interrupted, what was solved is on "
+    "disk."
 )
 
 

@@ -116,13 +116,14 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     scratch = path.with_name(f".{path.name}.{secrets.token_hex(8)}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with mpl.rc_context(_STYLE):
-            figure.savefig(scratch, dpi=220)
-        scratch.replace(path)
+        try:
+            with mpl.rc_context(_STYLE):
+                figure.savefig(scratch, dpi=220)
+            scratch.replace(path)
+        finally:
+            scratch.unlink(missing_ok=True)
     except OSError as error:
         raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        scratch.unlink(missing_ok=True)
     return path
 
 

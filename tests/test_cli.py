@@ -1,0 +1,297 @@
+"""The command line as a person or a script meets it: what is printed where, and every exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+import vgtm_qp as vq
+from vgtm_qp.cli import main
+from vgtm_qp.cli.solve import MethodName
+
+ROOT = Path(__file__).resolve().parents[1]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+COMMAND = [sys.executable, "-c", "import sys; from vgtm_qp.cli import main; sys.exit(main())"]
+
+FREE = """
+schema_version = 1
+name = "free"
+[truss]
+module = "octahedral"
+bays = 2
+stroke = [0.6, 1.5]
+[maneuver]
+steps = 3
+[[maneuver.waypoint]]
+time = 3.0
+position = {position}
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "free.toml").write_text(FREE.format(position="[0.1, 0.0, 1.6]"), encoding="utf-8")
+    (tmp_path / "far.toml").write_text(FREE.format(position="[9.0, 0.0, 1.6]"), encoding="utf-8")
+    return tmp_path
+
+
+def run(capsys: pytest.CaptureFixture[str], *tokens: str) -> tuple[int, str, str]:
+    code = main(tokens)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_solve_writes_a_verified_result_and_prints_a_table(capsys, folder):
+    code, out, err = run(capsys, "solve", "free.toml")
+    assert (code, err) == (0, "")
+    assert out.startswith("free: solved, verified\n")
+    assert "result: free.npz" in out
+    assert vq.load_result(folder / "free.npz").certificate.ok
+
+
+def test_solve_as_json_is_one_document_with_the_keys_of_the_contract(capsys):
+    code, out, err = run(capsys, "solve", "free.toml", "--json", "-o", "a/b.npz")
+    summary = json.loads(out)
+    assert (code, err) == (0, "")
+    assert set(summary) >= {
+        "name", "status", "reached", "steps", "bays", "method", "solver", "min_clearance", "max_member_error",
+        "max_stroke_violation", "max_rate_violation", "max_tip_error", "step_time", "setup_time",
+        "blocked_by", "result",
+    }  # fmt: skip
+    assert set(summary["step_time"]) >= {"median", "p95", "p99", "phases"}
+    assert (summary["status"], summary["result"]) == ("solved", "a/b.npz")
+    assert Path("a/b.npz").is_file()
+
+
+def test_options_stand_in_for_those_of_the_problem(capsys):
+    code, out, _ = run(
+        capsys, "solve", "free.toml", "--steps", "2", "--solver", "osqp", "--method", "qp", "--json"
+    )
+    summary = json.loads(out)
+    assert code == 0
+    assert (summary["steps"], summary["solver"]) == (2, "osqp")
+
+
+def test_a_figure_is_drawn(capsys, folder):
+    code, out, _ = run(capsys, "solve", "free.toml", "--figure", "frames.png")
+    assert code == 0
+    assert "figure: frames.png" in out
+    assert (folder / "frames.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
+    code, out, _ = run(capsys, "solve", "five_bay_blocked_by_wall", "--json")
+    summary = json.loads(out)
+    assert code == 3
+    assert summary["status"] == "blocked"
+    assert summary["blocked_by"]
+    assert 0.0 < summary["reached"] < 1.0
+    assert run(capsys, "verify", summary["result"])[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("tokens", "words"),
+    [
+        (["slove", "free.toml"], ['"solve"', "solve, verify, check, list, schema, doctor"]),
+        (["solve"], ["PROBLEM"]),
+        (["solve", "free.toml", "extra"], ["extra"]),
+        (["solve", "free.toml", "--bogus"], ["--bogus", "--solver", "--figure"]),
+        (["solve", "free.toml", "--steps", "many"], ["--steps", "many"]),
+        (["solve", "free.toml", "--steps", "0"], ["--steps", "found 0", "integer"]),
+        (["solve", "free.toml", "--method", "magic"], ["magic", '"qp"', '"pseudoinverse"']),
+        (["solve", "free.toml", "--solver", "magic"], ["magic", "daqp", "osqp"]),
+        (["solve", "free.toml", "-o", "result.txt"], ["--output", ".npz"]),
+        (["solve", "free.toml", "-o", "/proc/none/result.npz"], ["--output", "/proc"]),
+        (["solve", "free.toml", "--figure", "frames.gif"], ["--figure", ".pdf"]),
+        (["solve", "none.toml"], ["none.toml", "five_bay_two_cubes"]),
+        (["solve", "far.toml"], ["far.toml", "maneuver.waypoint[0].position", "out of any reach"]),
+        (["check", "far.toml"], ["far.toml", "maneuver.waypoint[0].position", "out of any reach"]),
+        (["verify"], ["RESULT"]),
+        (["verify", "free.toml"], ["free.toml"]),
+        (["verify", "none.npz"], ["none.npz"]),
+    ],
+)
+@pytest.mark.parametrize("as_json", [False, True])
+def test_wrong_usage_gives_2_and_names_the_choices(capsys, folder, tokens, words, as_json):
+    code, out, err = run(capsys, *tokens, *["--json"] * as_json)
+    assert code == 2
+    assert "Traceback" not in err
+    assert all(word in err for word in words)
+    if as_json:
+        document = json.loads(out)
+        said = json.dumps(document, ensure_ascii=False).replace('\\"', '"')
+        assert all(word in said for word in words)
+    else:
+        assert out == ""
+    assert not list(folder.glob("*.npz"))
+
+
+def test_mistakes_of_a_file_are_listed_one_a_line_and_as_data(capsys, folder):
+    text = FREE.format(position="[nan, 0.0, 1.6]").replace("bays = 2", "bayz = 2")
+    (folder / "wrong.toml").write_text(text, encoding="utf-8")
+    code, out, err = run(capsys, "check", "wrong.toml", "--json")
+    mistakes = json.loads(out)["mistakes"]
+    assert code == 2
+    assert {mistake["key"] for mistake in mistakes} == {
+        "truss.bays",
+        "truss.bayz",
+        "maneuver.waypoint[0].position[0]",
+    }
+    assert err.splitlines() == [
+        f"{m['file']}: {m['key']}: found {m['value']}; expected {m['expected']}" for m in mistakes
+    ]
+
+
+def test_check_describes_the_truss(capsys):
+    code, out, _ = run(capsys, "check", "free.toml")
+    assert code == 0
+    assert "statically determinate: 18 members, 18 coordinates, rank 18" in out
+    data = json.loads(run(capsys, "check", "free.toml", "--json")[1])
+    assert data["valid"]
+    assert data["warnings"] == []
+    assert data["truss"]["determinacy"]["rank"] == 18
+    assert data["truss"]["trackable"] == ["position"]
+
+
+def test_an_altered_result_gives_4(capsys, folder):
+    assert main(["solve", "free.toml"]) == 0
+    with np.load("free.npz") as file:
+        arrays = dict(file)
+    arrays["nodes"][2, 5, 0] += 1e-3
+    np.savez_compressed("altered.npz", **arrays)
+    code, _, err = run(capsys, "verify", "altered.npz")
+    assert code == 4
+    assert "altered.npz" in err
+
+
+def test_a_maneuver_outside_its_tolerances_gives_4(capsys):
+    assert run(capsys, "solve", "free.toml")[0] == 0
+    maneuver = vq.load_result("free.npz")
+    problem = {
+        **maneuver.manifest["problem"],
+        "truss": {**maneuver.manifest["problem"]["truss"], "rate": 1e-6},
+    }
+    record = {**maneuver.manifest["arm"], "rate": [1e-6] * len(maneuver.members)}
+    replace(maneuver, manifest={**maneuver.manifest, "problem": problem, "arm": record}).save("fast.npz")
+    code, out, _ = run(capsys, "verify", "free.npz", "fast.npz", "--json")
+    document = json.loads(out)
+    assert code == 4
+    assert [entry["verified"] for entry in document["results"]] == [True, False]
+    assert not document["verified"]
+
+
+def test_list_and_schema_and_doctor(capsys):
+    bundled = vq.bundled_problems()
+    assert [entry["name"] for entry in json.loads(run(capsys, "list", "--json")[1])["problems"]] == list(
+        bundled
+    )
+    assert all(name in run(capsys, "list")[1] for name in bundled)
+    assert json.loads(run(capsys, "schema")[1]) == vq.problem_schema()
+    code, out, _ = run(capsys, "doctor", "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert found["ok"]
+    assert "daqp" in found["solvers"]["says"]
+    assert set(found["extras"]) == {"view", "export", "mujoco", "cluster", "test"}
+
+
+def test_doctor_says_what_fails(capsys, monkeypatch):
+    fcl = pytest.importorskip("fcl")
+    monkeypatch.setattr(fcl, "distance", lambda *_: 0.7)
+    monkeypatch.setenv("VGTM_CC", "none")
+    code, out, _ = run(capsys, "doctor")
+    assert code == 1
+    assert "not in order: fcl" in out
+    assert "no C compiler" in out
+
+
+def test_the_methods_of_the_command_line_are_those_of_the_problem_file():
+    names = vq.problem_schema()["$defs"]["Method"]["properties"]["name"]["enum"]
+    assert list(get_args(MethodName)) == names
+
+
+def test_an_internal_error_gives_1_and_one_document(capsys, monkeypatch):
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("by design")
+
+    monkeypatch.setattr("vgtm_qp.problem.load_problem", broken)
+    code, out, err = run(capsys, "solve", "free.toml", "--json")
+    assert code == 1
+    assert "Traceback" in err
+    assert "by design" in json.loads(out)["error"]
+
+
+def test_an_interrupt_between_steps_gives_130_and_keeps_them(capsys, monkeypatch):
+    from vgtm_qp.step.resolver import Resolver
+
+    follow, calls = Resolver.follow, []
+
+    def interrupted(self, *args, **options):
+        calls.append(None)
+        if len(calls) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return follow(self, *args, **options)
+
+    monkeypatch.setattr(Resolver, "follow", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    code, out, err = run(capsys, "solve", "free.toml", "--steps", "8", "--json")
+    assert code == 130
+    assert "free.npz" in err
+    assert json.loads(out)["blocked_by"] == ["interrupted"]
+    assert vq.load_result("free.npz").steps == 3
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_from_outside_gives_130_whatever_it_hits():
+    program = (
+        "import os, signal, sys, threading; from vgtm_qp.cli import main; "
+        "threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start(); sys.exit(main())"
+    )
+    command = [sys.executable, "-c", program, "solve", "free.toml", "--steps", "500000", "-o", "long.npz"]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 130, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "interrupted" in done.stderr
+
+
+def test_a_reader_that_goes_away_is_no_error():
+    process = subprocess.Popen(
+        [*COMMAND, "schema"], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    process.stdout.close()
+    err = process.stderr.read()
+    process.stderr.close()
+    assert (process.wait(timeout=60), err) == (0, b"")
+
+
+def test_help_imports_nothing_heavy():
+    heavy = ["casadi", "fcl", "matplotlib", "numpy", "pydantic", "scipy", "trimesh", "vgtm_qp.problem"]
+    code = (
+        "import sys; from vgtm_qp.cli import main; main(['--help']); "
+        f"print([name for name in {heavy} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True
+    )
+    assert done.stderr.strip() == "[]"
+    assert "solve" in done.stdout
+
+
+def test_the_package_gives_its_names_and_keeps_the_function_verify():
+    from vgtm_qp.verify.check import verify
+
+    assert vq.verify is verify
+    assert set(vq.__all__) <= set(dir(vq))
+    assert all(getattr(vq, name) is not None for name in vq.__all__)
+    with pytest.raises(AttributeError, match="load_problem"):
+        vq.no_such_name  # noqa: B018
