@@ -58,7 +58,7 @@ class Replay:
     ----------
     kinematic, physics : Following
     tip_error_per_millimetre : float
-        mm at the tip for actuator errors whose squares sum to 1 mm^2, by pushing each actuator in the simulation.
+        mm at the tip for actuator errors whose squares sum to 1 mm^2, found by pushing each actuator.
     probed_state : int
         The state at which that was measured: the one where it is greatest.
     certified_tip_error_per_millimetre : float
@@ -103,8 +103,8 @@ class Replay:
 def replay(maneuver: Maneuver) -> Replay:
     """Replay a maneuver in MuJoCo, as it was solved and under gravity.
 
-    The physics replay drives the length of every member through equality constraints, in straight lines between
-    the states; gravity pulls at the nodes. The nodes' masses are `vgtm_qp.export.mjcf.node_masses`.
+    The physics replay drives the length of every member through equality constraints, in straight lines
+    between the states; gravity pulls at the nodes. The nodes' masses are `vgtm_qp.export.mjcf.node_masses`.
 
     Raises
     ------
@@ -174,7 +174,7 @@ class _Simulation:
         return self._following(nodes, lengths, contacts)
 
     def most_sensitive_state(self) -> tuple[int, float]:
-        """Return the state where actuator errors move the tip furthest, and how far, mm/mm, by the Jacobian."""
+        """Return the state where actuator errors move the tip most, and how far by the Jacobian, mm/mm."""
         states = np.unique(np.linspace(0, len(self._tip) - 1, _PROBED_STATES).round().astype(int))
         values = [
             found[2] if (found := self._arm.singular_values(self._maneuver.nodes[k])) else 0.0 for k in states
@@ -185,8 +185,8 @@ class _Simulation:
     def measured_sensitivity(self, state: int, expected: float) -> float:
         """Return the same by lengthening one actuator after another and waiting for the tip.
 
-        Without gravity, whose sag takes a nearly singular pose away from its singularity, and each by so little that
-        the tip should move by a tenth of a millimetre: near a singularity it soon moves less than in proportion.
+        Without gravity, whose sag takes a nearly singular pose away from its singularity, and each by so little
+        that the tip should move by a tenth of a millimetre: there it soon moves less than in proportion.
         """
         data, probe = self._data, _PROBED_TIP_MOTION / max(expected, 1.0)
         gravity = self._model.opt.gravity.copy()

@@ -205,7 +205,7 @@ class ArmScene:
 
 
 def _placement(ends: Array) -> tuple[Array, Array, Array]:
-    """Return middles (K, 3), quaternions (K, 4) that turn z along, and spans (K,) of segments (K, 2, 3), m."""
+    """Return middles (K, 3), quaternions (K, 4) that turn z along, spans (K,), of segments (K, 2, 3), m."""
     along = ends[:, 1] - ends[:, 0]
     span = np.linalg.norm(along, axis=1)
     direction = along / np.maximum(span, 1e-12)[:, None]

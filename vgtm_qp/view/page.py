@@ -1,0 +1,291 @@
+"""A live page: play a maneuver back, drag tip or control vertices, see what the arm does and what stops it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
+from threading import Event
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import VgtmError
+from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.maneuver.solve import solve
+from vgtm_qp.problem import Problem
+from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled
+from vgtm_qp.view.read_out import read_out
+from vgtm_qp.view.scene import ArmScene, viser_server
+from vgtm_qp.view.session import METHODS, Session
+
+Array = NDArray[np.float64]
+
+_PERIOD = 1.0 / 30.0
+_READ_OUT_PERIOD = 0.1
+_LEAST_EXPONENT = -4.0
+_TARGET_COLOUR = (214, 39, 40)
+_SLIDERS = (
+    "node_rate",
+    "actuator_rate",
+    "stroke_centring",
+    "curve_rate",
+    "tracking",
+    "tangent",
+    "smoothness",
+)
+
+
+def view(
+    shown: Problem | Maneuver,
+    *,
+    port: int = 8080,
+    ready: Callable[[str], None] | None = None,
+    stop: Event | None = None,
+) -> None:
+    """Serve the live page of a problem or a result, to this machine alone, until interrupted.
+
+    Parameters
+    ----------
+    shown
+        A problem, or a maneuver to play back first.
+    port
+        The next free one from here on; 0 for any.
+    ready
+        Called with the page's address once it can be opened.
+    stop
+        Ends the page when set.
+
+    Raises
+    ------
+    MissingExtraError
+        viser is not installed.
+    ProblemError
+        The problem cannot be set up.
+    """
+    maneuver = shown if isinstance(shown, Maneuver) else None
+    problem = Problem.from_dict(maneuver.manifest["problem"]) if maneuver else shown
+    assert isinstance(problem, Problem)
+    with viser_server(port) as server:
+        page = _Page(server, Session(problem), maneuver)
+        if ready is not None:
+            ready(f"http://127.0.0.1:{server.get_port()}")
+        page.run(stop or Event())
+
+
+class _Page:
+    """The widgets and the loop. Callbacks only leave notes in the inbox; the loop alone touches the session."""
+
+    def __init__(self, server: Any, session: Session, maneuver: Maneuver | None) -> None:
+        self._server, self._session, self._maneuver = server, session, maneuver
+        self._inbox: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._settings: dict[str, Any] = {}
+        self._playing, self._moment, self._message = False, 0.0, ""
+        state = session.state
+        self._scene = ArmScene(server, session.drawing, state.nodes, state.control_vertices)
+        path = make_plan(session.problem, *session.pose()).path.positions
+        self._scene.add_path("/path", path)
+        nodes = maneuver.nodes if maneuver else state.nodes[None]
+        self._scene.look(camera_for(session.drawing, nodes, path))
+        self._target = self._add_handle("/tip target", session.target, 0.085, _TARGET_COLOUR, self._drag_tip)
+        colour = tuple(round(255 * channel) for channel in CURVE_COLOUR)
+        self._vertices = [
+            self._add_handle(f"/control vertex {i}", point, 0.06, colour, self._drag_vertex(i))
+            for i, point in enumerate(state.control_vertices)
+            if session.vertices_can_be_wanted and i > 0
+        ]
+        self._add_widgets()
+        if maneuver:
+            self._show(maneuver)
+
+    def run(self, stop: Event) -> None:
+        """Step, draw and wait for the rest of the frame, until `stop` is set."""
+        read_at = 0.0
+        self._draw()
+        while not stop.is_set():
+            started = perf_counter()
+            changed = self._read_inbox()
+            if self._playing:
+                self._play(_PERIOD)
+            elif self._session.advance(_PERIOD) or changed:
+                self._draw()
+            if started - read_at > _READ_OUT_PERIOD:
+                self._read_out.content = read_out(self._session, self._message)
+                read_at = started
+            stop.wait(max(0.0, _PERIOD - (perf_counter() - started)))
+
+    def _read_inbox(self) -> bool:
+        found = False
+        while True:
+            try:
+                note = self._inbox.get_nowait()
+            except Empty:
+                break
+            note()
+            found = True
+        if self._settings:
+            settings, self._settings = self._settings, {}
+            self._try(lambda: self._session.change(settings))
+        return found
+
+    def _try(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except VgtmError as error:
+            self._message = str(error)
+        else:
+            self._message = ""
+
+    def _draw(self) -> None:
+        session = self._session
+        self._scene.move(session.state.nodes, session.state.control_vertices, session.state.time)
+        self._target.position = session.target
+        for i, handle in enumerate(self._vertices, start=1):
+            handle.position = session.vertex_goals.get(i, session.state.control_vertices[i])
+
+    def _add_handle(self, name: str, position: Array, radius: float, colour: Any, moved: Any) -> Any:
+        handle = self._server.scene.add_icosphere(name, radius=radius, color=colour, position=position)
+
+        @handle.on_drag("left")  # type: ignore[untyped-decorator]
+        async def _(event: Any) -> None:
+            place = np.array(event.end_position)
+            self._inbox.put(lambda: moved(place, event.phase == "end"))
+
+        return handle
+
+    def _drag_tip(self, position: Array, _: bool) -> None:
+        self._pause()
+        self._session.want_tip(position)
+
+    def _drag_vertex(self, index: int) -> Callable[[Array, bool], None]:
+        def moved(position: Array, released: bool) -> None:
+            self._pause()
+            self._session.want_vertex(index, None if released else position)
+
+        return moved
+
+    def _add_widgets(self) -> None:
+        gui, session = self._server.gui, self._session
+        gui.configure_theme(
+            control_layout="collapsible", control_width="large", show_logo=False, show_share_button=False
+        )
+        gui.set_panel_label(session.drawing.name or "vgtm")
+        self._read_out = gui.add_html(read_out(session, ""))
+        with gui.add_folder("Maneuver"):
+            self._play_button = gui.add_button("Play")
+            self._slider = gui.add_slider(
+                "time [s]", min=0.0, max=1.0, step=0.01, initial_value=0.0, disabled=True
+            )
+            again = gui.add_button("Solve and play", hint="from home, with the method and weights set below")
+        with gui.add_folder("By hand"):
+            gui.add_markdown("Drag the red ball: the tip follows. Press *Home* to start again.")
+            home = gui.add_button("Home")
+            method = gui.add_dropdown("method", METHODS, initial_value=session.problem.method.name)
+            safe = gui.add_slider(
+                "safe [m]",
+                min=0.0,
+                max=0.3,
+                step=0.005,
+                initial_value=min(0.3, session.problem.clearance.safe),
+            )
+        with gui.add_folder("Weights, powers of ten", expand_by_default=False):
+            for name in _SLIDERS:
+                self._add_weight(name)
+        self._on(self._play_button.on_click, lambda _: self._toggle())
+        self._on(self._slider.on_update, lambda event: self._scrub(event))
+        self._on(again.on_click, lambda _: self._solve())
+        self._on(home.on_click, lambda _: self._go_home())
+        self._on(method.on_update, lambda _: self._settings.update({"method.name": method.value}))
+        self._on(safe.on_update, lambda _: self._settings.update({"clearance.safe": float(safe.value)}))
+
+    def _add_weight(self, name: str) -> None:
+        weights = self._session.problem.method.weights
+        value = float(getattr(weights, name))
+        slider = self._server.gui.add_slider(
+            name.replace("_", " "),
+            min=_LEAST_EXPONENT,
+            max=2.0,
+            step=0.1,
+            initial_value=round(max(_LEAST_EXPONENT, np.log10(max(value, 1e-12))), 1),
+            hint=f"{type(weights).model_fields[name].description}; the least value switches it off",
+        )
+
+        def changed(_: Any) -> None:
+            exponent = float(slider.value)
+            weight = 0.0 if exponent <= _LEAST_EXPONENT else float(10.0**exponent)
+            self._settings[f"method.weights.{name}"] = weight
+
+        self._on(slider.on_update, changed)
+
+    def _on(self, register: Any, act: Callable[[Any], Any]) -> None:
+        """Let `act` run in the loop whenever the event comes."""
+
+        async def callback(event: Any) -> None:
+            self._inbox.put(lambda: act(event))
+
+        register(callback)
+
+    def _show(self, maneuver: Maneuver) -> None:
+        """Make `maneuver` the one that is played back."""
+        self._maneuver, self._moment = maneuver, 0.0
+        self._slider.max, self._slider.disabled = max(float(maneuver.time[-1]), 0.01), False
+        if len(maneuver.time) > 1:
+            self._scene.add_path("/tip path", maneuver.tip_position, thickness=0.02)
+
+    def _solve(self) -> None:
+        self._pause()
+        self._message = "solving ..."
+        self._read_out.content = read_out(self._session, self._message)
+
+        def run() -> None:
+            self._show(solve(self._session.problem))
+            self._toggle()
+
+        self._try(run)
+        if self._maneuver is not None and self._maneuver.status != "solved":
+            self._message = f"{self._maneuver.status} at {100 * self._maneuver.reached:.0f} % of the path"
+
+    def _toggle(self) -> None:
+        if self._playing:
+            self._pause()
+        elif self._maneuver is not None:
+            if self._moment >= self._maneuver.time[-1]:
+                self._moment = 0.0
+            self._playing, self._play_button.label = True, "Pause"
+        else:
+            self._message = "nothing to play yet: press Solve and play"
+
+    def _go_home(self) -> None:
+        self._pause()
+        self._session.go_home()
+
+    def _pause(self) -> None:
+        self._playing, self._play_button.label = False, "Play"
+
+    def _play(self, duration: float) -> None:
+        assert self._maneuver is not None
+        self._moment = min(self._moment + duration, float(self._maneuver.time[-1]))
+        self._put(self._moment)
+        self._slider.value = round(self._moment, 2)
+        if self._moment >= self._maneuver.time[-1]:
+            self._pause()
+
+    def _scrub(self, event: Any) -> None:
+        """Follow the hand on the slider; what the page itself sets there has no client."""
+        if event.client is None or self._maneuver is None:
+            return
+        self._pause()
+        self._moment = float(self._slider.value)
+        self._put(self._moment)
+
+    def _put(self, moment: float) -> None:
+        """Show the arm at `moment` on its straight way between two states, and leave it to the hand there."""
+        maneuver = self._maneuver
+        assert maneuver is not None
+        at = np.array([moment])
+        nodes = resampled(maneuver.time, maneuver.nodes, at)[0]
+        vertices = resampled(maneuver.time, maneuver.control_vertices, at)[0]
+        self._session.put_at(moment, nodes, vertices)
+        self._draw()

@@ -1,0 +1,204 @@
+"""An arm that follows a hand: where its tip and control vertices are wanted, and steps towards that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.maneuver.manifest import arm_record
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.path import Path
+from vgtm_qp.step.resolver import Resolver, Step, StepStatus
+from vgtm_qp.step.state import State, frozen
+from vgtm_qp.view.drawing import Drawing, drawing_of_problem
+
+Array = NDArray[np.float64]
+
+METHODS = ("qp", "pseudoinverse", "curve-pseudoinverse")
+
+_REACHED = 1e-4
+_STRIDE = 0.06
+_RETRY_AFTER = 10
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the instruments show.
+
+    Attributes
+    ----------
+    outcome : str
+        ``"at rest"``, ``"moving"``, ``"slowed"`` or ``"blocked"``.
+    stopped_by : tuple of str
+        The obstacles, members and limits that hold the arm back, most decisive first.
+    active : tuple of str
+        Names of all active rows of the last QP.
+    clearance, self_clearance : float
+        Least distance to obstacles, and between members that share no node, m.
+    nearest : str
+        The pair at that distance to an obstacle.
+    step_time : float
+        Computing time of the last step, s.
+    """
+
+    outcome: str
+    stopped_by: tuple[str, ...]
+    active: tuple[str, ...]
+    clearance: float
+    self_clearance: float
+    nearest: str
+    step_time: float
+
+
+class Session:
+    """One arm, its resolver, and what is wanted of it. Not to be shared by threads."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self._resolver = _make_resolver(problem)
+        truss = self._resolver.arm.truss
+        self.drawing: Drawing = drawing_of_problem(
+            problem, arm_record(truss), truss.members, len(self.state.control_vertices)
+        )
+        self.target: Array = self.tip
+        self.vertex_goals: dict[int, Array] = {}
+        self._waiting = 0
+        self._step_time = 0.0
+        self._held_by: tuple[str, ...] = ()
+        self._last: Step | None = None
+
+    @property
+    def state(self) -> State:
+        """Where the arm is."""
+        state: State = self._resolver.state
+        return state
+
+    @property
+    def tip(self) -> Array:
+        """(3,) position of the tip, m."""
+        return self.pose()[0]
+
+    def pose(self) -> tuple[Array, Array]:
+        """Return position (3,), m, and rotation (3, 3) of the tip."""
+        position, rotation = self._resolver.tip()
+        return position, rotation
+
+    @property
+    def vertices_can_be_wanted(self) -> bool:
+        """True where the method follows goals of control vertices."""
+        return hasattr(self._resolver, "control_vertex_goals") and bool(len(self.state.control_vertices))
+
+    def want_tip(self, position: Array) -> None:
+        """Ask for the tip at `position` (3,), m."""
+        self.target = np.array(position, dtype=float)
+        self._waiting = 0
+
+    def want_vertex(self, index: int, position: Array | None) -> None:
+        """Ask for control vertex `index` at `position` (3,), m; None lets it go."""
+        if position is None:
+            self.vertex_goals.pop(index, None)
+        else:
+            self.vertex_goals[index] = np.array(position, dtype=float)
+        self._waiting = 0
+
+    def go_home(self) -> None:
+        """Put the arm into its home pose, at rest, and want nothing else."""
+        self._put(self._resolver.arm.home_state())
+
+    def put_at(self, time: float, nodes: Array, control_vertices: Array) -> None:
+        """Put the arm at rest at `nodes` (N, 3) and `control_vertices` (V, 3), m; want nothing else."""
+        home: State = self._resolver.arm.home_state()
+        self._put(
+            replace(
+                home,
+                time=float(time),
+                nodes=frozen(nodes),
+                control_vertices=frozen(control_vertices),
+                lengths=frozen(self.drawing.arm.lengths(nodes)),
+            )
+        )
+
+    def _put(self, state: State) -> None:
+        self._resolver.state = state
+        self.target, self.vertex_goals = self.tip, {}
+        self._waiting, self._held_by, self._last = 0, (), None
+
+    def change(self, settings: Mapping[str, Any]) -> None:
+        """Change values of the problem, by key path, and go on from the same state.
+
+        Raises
+        ------
+        VgtmError
+            A value is wrong, or the method cannot serve this problem; nothing has changed.
+        """
+        problem = self.problem.replace(settings)
+        resolver = _make_resolver(problem)
+        resolver.state = self.state
+        self.problem, self._resolver = problem, resolver
+        self._waiting, self._held_by = 0, ()
+
+    def advance(self, dt: float) -> bool:
+        """Make one step of duration `dt`, s, towards what is wanted; return whether the arm moved.
+
+        A blocked arm tries again after a moment, so that obstacles that move away let it go.
+        """
+        away = self.target - self.tip
+        distance = float(np.linalg.norm(away))
+        if distance <= _REACHED and not self.vertex_goals:
+            self._last, self._held_by = None, ()
+            return False
+        if self._waiting > 0:
+            self._waiting -= 1
+            return False
+        if self.vertices_can_be_wanted:
+            self._resolver.control_vertex_goals = dict(self.vertex_goals)
+        position, rotation = self._resolver.tip()
+        stride = away * min(1.0, _STRIDE / max(distance, _REACHED))
+        path = Path(
+            np.array([0.0, 1.0]), np.stack([position, position + stride]), np.stack([rotation, rotation])
+        )
+        started, before = perf_counter(), self.state.nodes
+        step: Step = self._resolver.follow(path, 0.0, 1.0, dt=dt)
+        self._step_time = perf_counter() - started
+        self._last = step
+        if step.status is StepStatus.REACHED:
+            self._held_by = ()
+        elif step.active or not self._held_by:
+            self._held_by = step.blocked_by
+        if step.status is StepStatus.BLOCKED:
+            self._waiting = _RETRY_AFTER
+            return False
+        moved = float(np.max(np.abs(self.state.nodes - before)))
+        return moved > 1e-9
+
+    def reading(self) -> Reading:
+        """Return what the instruments show now."""
+        monitor, state = self._resolver.arm.monitor, self.state
+        clearance, pair = monitor.least(state.nodes, state.time, among="obstacles")
+        last = self._last
+        outcome = "at rest"
+        if last is not None:
+            words = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatus.BLOCKED: "blocked"}
+            outcome = words[last.status]
+        return Reading(
+            outcome=outcome,
+            stopped_by=self._held_by,
+            active=last.active if last is not None else (),
+            clearance=clearance,
+            self_clearance=monitor.least(state.nodes, state.time, among="members")[0],
+            nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),
+            step_time=self._step_time,
+        )
+
+
+def _make_resolver(problem: Problem) -> Any:
+    if problem.method.name == "qp":
+        return Resolver(problem)
+    from vgtm_qp.methods import make_resolver
+
+    return make_resolver(problem)
