@@ -114,9 +114,10 @@ def arm_problem(
     waypoint: dict[str, Any] | None = None,
     **more: Any,
 ) -> Problem:
-    """An octahedral arm that goes straight to a target; other tables by keyword."""
+    """An octahedral arm that goes straight to a target; other tables by keyword, less what is None."""
     spec = {"module": "octahedral", "bays": bays, "stroke": [0.6, 1.5], **(truss or {})}
     point = {"time": time, "position": [float(x) for x in target], **(waypoint or {})}
+    spec, point = ({k: v for k, v in table.items() if v is not None} for table in (spec, point))
     return Problem.from_dict(
         {"schema_version": 1, "truss": spec, "maneuver": {"steps": steps, "waypoint": [point]}, **more}
     )

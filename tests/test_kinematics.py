@@ -1,4 +1,4 @@
-"""Lengths, face frames, tip pose and every row of their Jacobians against finite differences, for every module."""
+"""Lengths, face frames, tip pose and every row of their Jacobians against differences, for every module."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stroke, rate and acceleration as one box: it never contradicts itself and whatever stays in it stays allowed."""
+"""Stroke, rate and acceleration as one box: no contradictions, and what stays in it stays allowed."""
 
 from __future__ import annotations
 

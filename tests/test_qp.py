@@ -1,4 +1,4 @@
-"""The QP of a step: full and condensed forms agree, every answer satisfies KKT, and wrong answers are refused."""
+"""The QP of a step: full and condensed forms agree, answers satisfy KKT, wrong answers are refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CASES = [(name, curve) for name in TRUSSES for curve in CURVES if curve != "hard
 
 
 def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
-    """A layout and random numbers of its QP, feasible by construction, with bounds and clearance rows near active."""
+    """A layout and random numbers of its QP: feasible, with bounds and clearance rows near active."""
     rng = np.random.default_rng(seed)
     truss = TRUSSES[name](joint_offset=joint_offset)
     kinematics = Kinematics(truss, compiled=False)
@@ -130,7 +130,7 @@ def full_point(builder, numbers, solution):
 
 
 def stationarity(builder, qp, z, solution):
-    """What is left of the gradient by the solution's multipliers and the best ones of rows that it does not report."""
+    """What is left of the gradient by the solution's multipliers and the best ones for the other rows."""
     clearance = len(solution.clearance_multipliers)
     known = np.zeros(len(z))
     known[builder.column["actuators"]] = solution.actuator_multipliers
@@ -148,7 +148,7 @@ def stationarity(builder, qp, z, solution):
 
 
 def exact_point(qp, z):
-    """The minimiser over the rows and bounds that are active at `z`: what a solver's answer is off by is removed."""
+    """The minimiser over the rows and bounds that are active at `z`, free of a solver's tolerance."""
     value = qp.A @ z
     rows = (value - qp.row_lower < 1e-6) | (qp.row_upper - value < 1e-6)
     columns = (z - qp.column_lower < 1e-6) | (qp.column_upper - z < 1e-6)
@@ -306,7 +306,7 @@ def test_every_solver_on_the_list_solves():
 
 
 def good_answer(layout, numbers):
-    """The exact answer with all its multipliers, from one solver run through the public surface of the full QP."""
+    """The answer with all its multipliers, caught on its way into the residual check."""
     kept = {}
     from vgtm_qp.qp.solvers import _Piqp
 

@@ -10,9 +10,11 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
 
 from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
-from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.settle import MULTIPLIER, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.step.linearise import Linearisation, Target
 from vgtm_qp.step.path import PathPoint
@@ -39,6 +41,10 @@ class Engine(Protocol):
         """Return the QP's answer at `X` (N, 3) with Jacobians at `Y`; raise ``SolverError`` instead of a wrong one."""
         ...
 
+    def gain(self) -> Array | None:
+        """Return what settles the tip after the last QP, (N, 3, n_e); None where only another QP does."""
+        ...
+
     def close(self, X: Array, target: Target, tolerance: float) -> Closed:
         """Return the configuration near `X` whose members have their lengths."""
         ...
@@ -52,6 +58,7 @@ class PlainEngine:
         self._solver = solver
         layout = linearisation.layout
         self._jacobian = np.zeros((layout.node_columns, layout.node_columns))
+        self._last: tuple[StepNumbers, StepSolution] | None = None
 
     def solve(
         self,
@@ -68,7 +75,32 @@ class PlainEngine:
         """See :class:`Engine`."""
         at = None if Y is X else Y
         numbers = self._linearisation.numbers(X, vertices, target, progress, rows, motion=motion, at=at)
-        return self._solver.solve(numbers)
+        solution = self._solver.solve(numbers)
+        self._last = numbers, solution
+        return solution
+
+    def gain(self) -> Array | None:
+        """See :class:`Engine`."""
+        layout = self._linearisation.layout
+        truss, weights = layout.truss, layout.weights
+        if layout.hard_tracking or self._last is None:
+            return None
+        numbers, solution = self._last
+        layout.length_jacobian(numbers.gradient, self._jacobian)
+        _, _, response, failed = dgesv(self._jacobian, np.eye(truss.member_count)[:, truss.actuators])
+        if failed:
+            return None
+        every = np.zeros((truss.node_count, 3, response.shape[1]))
+        every[truss.free] = response.reshape(-1, 3, response.shape[1])
+        tip = numbers.tip_jacobian @ every[truss.tip].reshape(-1, response.shape[1])
+        pressing = solution.clearance_multipliers > MULTIPLIER
+        rows = numbers.clearance
+        active = np.einsum("rsc,rscn->rn", rows.coefficients[pressing], every[rows.nodes[pressing]])
+        free = np.abs(solution.actuator_multipliers) <= MULTIPLIER
+        gain = settling_gain(
+            response, tip, active, free, weights.node_rate, weights.actuator_rate + weights.stroke_centring
+        )
+        return None if gain is None else every @ gain
 
     def close(self, X: Array, target: Target, tolerance: float) -> Closed:
         """See :class:`Engine`."""
@@ -81,10 +113,15 @@ class PlainEngine:
             wanted[actuators] = np.clip(kinematics.lengths[actuators], target.lower, target.upper)
             error = wanted - kinematics.lengths
             worst = float(np.max(np.abs(error)))
-            if worst <= tolerance or not worst < 1e-2:
+            # Divided by a short step's duration, once or twice, an error of `tolerance` is a rate that counts.
+            if worst <= 1e-3 * tolerance or not worst < 1e-2:
                 break
             layout.length_jacobian(kinematics.gradient, self._jacobian)
-            X[free] += np.linalg.solve(self._jacobian, error).reshape(-1, 3)
+            _, _, step, info = dgesv(self._jacobian, error)
+            if info != 0:
+                worst = np.inf
+                break
+            X[free] += step.reshape(-1, 3)
         return Closed(X, kinematics.lengths.copy(), worst, kinematics.tip_position(X), kinematics.tip_rotation.copy())
 
 
@@ -114,6 +151,10 @@ class FusedEngine:
         )
         error, rate, across = self._task.residual(solver.tip_position, solver.tip_rotation, goal)
         return solver.solve(TipGoal(rate * (target.end - target.start), error, across), progress, rows)
+
+    def gain(self) -> Array | None:
+        """See :class:`Engine`."""
+        return self._solver.gain()
 
     def close(self, X: Array, target: Target, tolerance: float) -> Closed:
         """See :class:`Engine`."""
