@@ -34,6 +34,7 @@ class ChainData:
         }
         self._faces = chain.faces.reshape(-1)
         self._weights, self._slopes = layout.curve_weights[self._faces], layout.curve_slopes[self._faces]
+        self._slope_products = (self._slopes[:, :, None] * self._slopes[:, None, :]).reshape(len(self._faces), layout.vertices**2)
         self._actuator = np.zeros(layout.truss.member_count)
         self._soft = chain.members[:, chain.soft]
         self.offset, self.normal = np.zeros((layout.vertices, 3)), np.zeros(3)
@@ -52,6 +53,7 @@ class ChainData:
         part["rhs"][:] = numbers.length_rhs[chain.members]
         self._actuator[chain.layout.truss.actuators] = numbers.actuator_gradient
         part["actuator_gradient"][:] = self._actuator[self._soft]
+        self.actuator_gradient = part["actuator_gradient"].reshape(-1)
         if not chain.layout.vertices:
             return
         self.offset[0] = numbers.base_displacement
@@ -85,14 +87,22 @@ class ChainData:
         first = np.einsum("c...,c->...", gradient[1], self.normal)
         return np.concatenate([first[None], gradient[2:].reshape(-1, *gradient.shape[2:])])
 
+    def polygon_terms(self) -> tuple[Array, Array]:
+        """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the control polygon alone."""
+        hessian = np.kron(self._polygon, np.eye(3)).reshape(*self._polygon.shape[:1], 3, *self._polygon.shape[1:], 3)
+        reduced = self._reduced(self._reduced(hessian).transpose(1, 2, 0))
+        return reduced, self.polygon_gradient(self.offset)
+
+    def polygon_gradient(self, vertices: Array) -> Array:
+        """Return (3V - 5,) the gradient of those terms where the vertices are displaced so."""
+        return self._reduced(self._polygon @ vertices + self._vertex_gradient)
+
     def curve_terms(self) -> tuple[Array, Array]:
-        """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the curve's coordinates alone."""
+        """Return Hessian and gradient of all terms in the curve's coordinates, with the faces where they are."""
         count = len(self.offset)
-        if not count:
-            return np.zeros((0, 0)), np.zeros(0)
-        turned = np.einsum("kac,kv->kavc", self._tangent_curve, self._slopes).reshape(-1, 3 * count)
-        hessian = self.chain.layout.weights.tangent * (turned.T @ turned)
-        hessian = hessian.reshape(count, 3, count, 3)
+        turned = self._tangent_curve[..., None] * self._tangent_curve[:, :, None]
+        hessian = self.chain.layout.weights.tangent * (self._slope_products.T @ turned.sum(axis=1).reshape(-1, 9))
+        hessian = hessian.reshape(count, count, 3, 3).transpose(0, 2, 1, 3)
         axis = np.arange(3)
         hessian[:, axis, :, axis] += self._hessian
         reduced = self._reduced(self._reduced(hessian).transpose(1, 2, 0))
@@ -103,6 +113,15 @@ class ChainData:
         gradient = self._polygon @ vertices + self._vertex_gradient - self._tracking * self._weights.T @ gap
         angles = np.einsum("kac,ka->kc", self._tangent_curve, tilt)
         return self._reduced(gradient + self.chain.layout.weights.tangent * self._slopes.T @ angles)
+
+    def face_parts(self, nodes: Array, numbers: StepNumbers) -> Array:
+        """Return (K, 5) what displacements of the nodes (N, 3) do to gaps and angles."""
+        truss = self.chain.layout.truss
+        faces = self.chain.layout.tracked[self._faces]
+        moved = nodes[truss.faces[faces]]
+        centres = np.einsum("kf,kfc->kc", truss.face_weights[faces], moved)
+        angles = np.einsum("kaf,kf->ka", numbers.tangent_face[self._faces], moved.reshape(-1, 9))
+        return np.hstack([centres, angles])
 
     def misfit(self, vertices: Array, faces: Array) -> tuple[Array, Array]:
         """Return gap (K, 3) and tilt (K, 2) for displaced vertices and the faces' own parts (K, 5)."""

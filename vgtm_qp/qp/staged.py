@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtrs
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.chain import Chain
@@ -20,8 +20,8 @@ from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
 Array = NDArray[np.float64]
 
 _BLOCK = 8
-_RESIDUAL = 1e-8
-_SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
+RESIDUAL = 1e-8
+SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
 
 
 class StagedSolver:
@@ -53,7 +53,17 @@ class StagedSolver:
         self._gains = gains.reshape(periods, -1)
         self._forward_gains = self._forward.inputs[2].reshape(periods, -1)
         self._motions = self._forward.inputs[3].reshape(periods, -1)
-        self._rows = self._columns.inputs[3].reshape(periods, _BLOCK, -1, 3)
+        own = chain.nodes.shape[1]
+        self._own_nodes = own
+        # Rows of base nodes, which answer to no displacement, go to places behind the last one that is read.
+        rows = np.zeros((periods * _BLOCK * own + _BLOCK * own, 3))
+        self._columns.bind_input(3, rows.reshape(-1)[: self._columns.inputs[3].size])
+        self._rows = rows
+        self._place = np.where(
+            chain.node_period >= 0,
+            (periods - 1 - chain.node_period) * _BLOCK * own + chain.node_place,
+            periods * _BLOCK * own,
+        )
         self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
         self._active: set[tuple[object, ...]] = set()
 
@@ -77,24 +87,24 @@ class StagedSolver:
 
     def columns(self, table: RowTable, rows: list[int]) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
-        chain, rest = self.chain, slice(self._freedom, self._freedom + self._curve)
+        rest = slice(self._freedom, self._freedom + self._curve)
         columns = np.zeros((self._freedom + self._curve + 1, len(rows)))
+        passed = self._columns.outputs[1].reshape(self._freedom, _BLOCK)
         for start in range(0, len(rows), _BLOCK):
             block = rows[start : start + _BLOCK]
-            self._rows[:] = 0.0
+            filled = []
             for k, row in enumerate(block):
                 nodes, coefficients, progress = table.coefficients(row)
-                free = chain.node_period[nodes] >= 0
-                period, place = chain.periods - 1 - chain.node_period[nodes[free]], chain.node_place[nodes[free]]
-                np.add.at(self._rows[:, k], (period, place), coefficients[free])
+                place = self._place[nodes] + k * self._own_nodes
+                np.add.at(self._rows, place, coefficients)
+                filled.append(place)
                 columns[-1, start + k] = progress * self._progress_scale
             self._columns()
-            columns[: self._freedom, start : start + len(block)] = self._columns.outputs[1].reshape(
-                self._freedom, _BLOCK
-            )[:, : len(block)]
+            columns[: self._freedom, start : start + len(block)] = passed[:, : len(block)]
+            self._rows[np.concatenate(filled)] = 0.0
         if self._curve:
             through = self._outer[:, :-1].T @ columns[: self._freedom]
-            columns[rest] = -solve_triangular(self._curve_factor, through, lower=True, check_finite=False)
+            columns[rest] = -dtrtrs(self._curve_factor, through, lower=1)[0]
         return columns
 
     def point(self, table: RowTable, combined: Array) -> Point:
@@ -104,7 +114,7 @@ class StagedSolver:
         free = np.zeros(0)
         if curve:
             known = self._curve_rhs + combined[freedom : freedom + curve]
-            free = -solve_triangular(self._curve_factor, known, lower=True, trans=1, check_finite=False)
+            free = -dtrtrs(self._curve_factor, known, lower=1, trans=1)[0]
         progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
         motions = self._outer[:, -1] + self._outer[:, :-1] @ free + combined[:freedom]
         self._motions[:] = motions.reshape(chain.periods, -1)[::-1]
@@ -123,7 +133,7 @@ class StagedSolver:
         self._reversed[:] = data.data[::-1]
         self._factor()
         if not np.all(np.isfinite(self._outer[-1])) or not numbers.progress_curvature > 0.0:
-            raise SolverError(_SINGULAR)
+            raise SolverError(SINGULAR)
         self._forward_gains[:] = self._gains[::-1]
         self._progress_scale = 1.0 / np.sqrt(numbers.progress_curvature)
         self._progress_rhs = self._progress_scale * numbers.progress_gradient
@@ -133,20 +143,16 @@ class StagedSolver:
             try:
                 self._curve_factor = np.linalg.cholesky(hessian - outer.T @ outer)
             except np.linalg.LinAlgError as error:
-                raise SolverError(_SINGULAR) from error
+                raise SolverError(SINGULAR) from error
             gradient += self._factor.carry[-1, -self._curve :]
-            self._curve_rhs = solve_triangular(self._curve_factor, gradient, lower=True, check_finite=False)
+            self._curve_rhs = dtrtrs(self._curve_factor, gradient, lower=1)[0]
 
     def _check(self, table: RowTable, point: Point, multipliers: Array) -> None:
         """Refuse an answer whose primal or dual residual is too large."""
         chain, numbers, weights = self.chain, table.numbers, self.layout.weights
         truss = self.layout.truss
         nodal, force, face = self._balance.inputs[3:]
-        gradient = weights.node_rate * point.nodes
-        for row in np.flatnonzero(multipliers).tolist():
-            if row < len(numbers.tip_rhs) or row >= table.clearance.start:
-                nodes, coefficients, _ = table.coefficients(row)
-                np.add.at(gradient, nodes, multipliers[row] * coefficients)
+        gradient = weights.node_rate * point.nodes + table.nodal_forces(multipliers)
         actuator = np.zeros(truss.member_count)
         actuator[truss.actuators] = (
             (weights.actuator_rate + weights.stroke_centring) * point.values[table.actuators]
@@ -167,7 +173,7 @@ class StagedSolver:
         scale = 1.0 + float(np.max(np.abs(force), initial=0.0)) + float(np.max(np.abs(multipliers)))
         fixed = point.lengths[self.layout.fixed]
         primal = max(float(np.max(table.violation(point.values))), float(np.max(np.abs(fixed), initial=0.0)))
-        if not (primal <= _RESIDUAL and residual <= _RESIDUAL * scale):
+        if not (primal <= RESIDUAL and residual <= RESIDUAL * scale):
             raise SolverError(
                 f"the elimination left a primal residual of {primal:.1e} m and a dual residual of {residual / scale:.1e}"
             )

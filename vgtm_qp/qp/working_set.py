@@ -98,6 +98,17 @@ class RowTable:
         member = self.locked[row - tip] if row < self.equal else truss.actuators[row - self.actuators.start]
         return self.layout.member_nodes[member], numbers.gradient[member], 0.0
 
+    def nodal_forces(self, multipliers: Array) -> Array:
+        """Return (N, 3) the tip's and clearance rows' multipliers (total,) times their coefficients."""
+        numbers, truss = self.numbers, self.layout.truss
+        forces = np.zeros((truss.node_count, 3))
+        tip = multipliers[: len(numbers.tip_rhs)] @ numbers.tip_jacobian
+        np.add.at(forces, truss.tip, tip.reshape(-1, 3))
+        active = np.flatnonzero(multipliers[self.clearance])
+        pressing = multipliers[self.clearance][active, None, None] * numbers.clearance.coefficients[active]
+        np.add.at(forces, numbers.clearance.nodes[active], pressing)
+        return forces
+
     def key(self, row: int) -> tuple[object, ...]:
         """Return what names the row in the next QP, where clearance rows may be others."""
         if row < self.clearance.start:
@@ -216,7 +227,8 @@ def solve_rows(
     while True:
         violation = table.violation(point.values)
         violated = np.flatnonzero(violation > _VIOLATED)
-        outside = np.setdiff1d(violated, [*rows, *new])
+        known = {*rows, *new}
+        outside = np.array([k for k in violated.tolist() if k not in known], dtype=np.int64)
         room = block * max(1, len(outside) // (4 * block))
         if not rows:
             room = max(0, -len(new) % block)

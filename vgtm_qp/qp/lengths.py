@@ -1,0 +1,105 @@
+"""Newton's step on the member lengths: node displacements for given changes of all lengths, at linear cost."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.chain import Chain, find_chain
+from vgtm_qp.qp.elimination import Sweep, range_and_null
+from vgtm_qp.qp.layout import Layout
+
+Array = NDArray[np.float64]
+
+_DENSE = 150
+"""Up to so many node coordinates LAPACK is faster than any use of the structure."""
+
+_SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
+
+
+class LengthSolver:
+    """Solves J d_rho = error with the length Jacobian J: dense, along the chain of bays, or by sparse elimination."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        chain = find_chain(layout) if layout.node_columns > _DENSE else None
+        self._chain = None if chain is None else _ChainSubstitution(chain)
+        self._jacobian = np.zeros((layout.node_columns,) * 2 if layout.node_columns <= _DENSE else (0, 0))
+
+    def solve(self, gradient: Array, error: Array) -> Array:
+        """Return the displacements of the free nodes (N - N_c, 3), m, that change the lengths (M,) by `error`, m.
+
+        Parameters
+        ----------
+        gradient : (M, Q, 3)
+            d length / d (positions of ``layout.member_nodes``).
+
+        Raises
+        ------
+        SolverError
+            The truss is in a singular pose.
+        """
+        if self._chain is not None:
+            step = self._chain.solve(gradient, error)
+        elif len(self._jacobian):
+            step = self._dense(gradient, error)
+        else:
+            step = self._sparse(gradient, error)
+        if not np.all(np.isfinite(step)):
+            raise SolverError(_SINGULAR)
+        return step.reshape(-1, 3)
+
+    def _dense(self, gradient: Array, error: Array) -> Array:
+        try:
+            return np.asarray(np.linalg.solve(self._layout.length_jacobian(gradient, self._jacobian), error))
+        except np.linalg.LinAlgError as reason:
+            raise SolverError(_SINGULAR) from reason
+
+    def _sparse(self, gradient: Array, error: Array) -> Array:
+        member, flat, column = self._layout.length_scatter
+        shape = (self._layout.truss.member_count, self._layout.node_columns)
+        jacobian = sparse.csc_matrix((gradient.reshape(-1)[flat], (member, column)), shape=shape)
+        try:
+            return np.asarray(splu(jacobian).solve(error))
+        except RuntimeError as reason:
+            raise SolverError(_SINGULAR) from reason
+
+
+class _ChainSubstitution:
+    """Bay after bay: each stage's members place its nodes on those before."""
+
+    def __init__(self, chain: Chain) -> None:
+        self._chain = chain
+        self._sweep = Sweep(_substitution(chain), chain.periods)
+
+    def solve(self, gradient: Array, error: Array) -> Array:
+        chain, sweep = self._chain, self._sweep
+        sweep.inputs[1][:] = chain.gather @ gradient.reshape(-1)
+        sweep.inputs[2][:] = error[chain.members].reshape(-1)
+        sweep()
+        return sweep.outputs[1].copy()
+
+
+def _substitution(chain: Chain) -> ca.Function:
+    """Return (carry, Jacobian's nonzeros, error) -> (carry, displacements) of one period."""
+    pattern = chain.coordinate_pattern
+    rows, columns = np.nonzero(pattern)
+    sparsity = ca.Sparsity.triplet(*pattern.shape, rows.tolist(), columns.tolist())
+    carry, values = ca.SX.sym("carry", chain.before), ca.SX.sym("values", sparsity.nnz())
+    error = ca.SX.sym("error", chain.own)
+    jacobian, u, done = ca.SX(sparsity, values), carry, 0
+    for count in chain.stage_sizes:
+        own = list(range(done, done + 3 * count))
+        columns_before = chain.before + done
+        block = jacobian[own, list(range(columns_before, columns_before + 3 * count))]
+        inverse, _ = range_and_null(block)
+        u = ca.vertcat(u, inverse @ (error[own] - jacobian[own, list(range(columns_before))] @ u))
+        done += 3 * count
+    live = [chain.before + 3 * place + axis for place in chain.carried.tolist() for axis in range(3)]
+    return ca.Function(
+        "lengths", [carry, values, error], [ca.densify(u[live]), ca.densify(u[chain.before :])]
+    )
