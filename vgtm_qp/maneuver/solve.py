@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,10 @@ from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.checks import check_problem
-from vgtm_qp.step.resolver import Resolver, Step, StepStatus
+from vgtm_qp.step.resolver import Step, StepStatus
+
+if TYPE_CHECKING:
+    from vgtm_qp.methods import AnyResolver
 
 Array = NDArray[np.float64]
 
@@ -42,7 +45,7 @@ class _Record:
 
 
 def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = True) -> Maneuver:
-    """Solve a problem and return the maneuver, certified unless `verify` is False.
+    """Solve a problem by its method and return the maneuver, certified unless `verify` is False.
 
     Parameters
     ----------
@@ -59,8 +62,10 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     ProblemError, TrussError, SolverError
         The problem cannot be set up; no step was taken.
     """
+    from vgtm_qp.methods import make_resolver
+
     started = perf_counter()
-    resolver = Resolver(problem)
+    resolver = make_resolver(problem)
     mistakes = check_problem(problem, resolver.arm)
     if mistakes:
         raise ProblemError(str(problem.source or problem.name), mistakes)
@@ -85,7 +90,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     return maneuver.with_certificate(check(maneuver))
 
 
-def _run(resolver: Resolver, plan: Plan, record: _Record, progress: Progress | None) -> Step | None:
+def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress | None) -> Step | None:
     """Step along the plan; return the step at which the arm stopped for good, or None where it came through."""
     value, start, end = plan.path.start, plan.path.start, plan.path.end
     stalled = 0
@@ -113,9 +118,9 @@ def _run(resolver: Resolver, plan: Plan, record: _Record, progress: Progress | N
 
 
 def _add_state(
-    record: _Record, resolver: Resolver, plan: Plan, value: float, seconds: float, phases: dict[str, float]
+    record: _Record, resolver: AnyResolver, plan: Plan, value: float, seconds: float, phases: dict[str, float]
 ) -> None:
-    state, monitor = resolver.state, resolver.arm.monitor
+    state, arm = resolver.state, resolver.arm
     position, rotation = resolver.tip()
     target = plan.path.at(value)
     record.add(
@@ -127,8 +132,8 @@ def _add_state(
         tip_rotation=rotation,
         tip_target_position=target.position,
         tip_target_rotation=target.rotation,
-        clearance=monitor.least(state.nodes, state.time, among="obstacles")[0],
-        self_clearance=monitor.least(state.nodes, state.time, among="members")[0],
+        clearance=arm.least_clearance(state.nodes, state.time, "obstacles"),
+        self_clearance=arm.least_clearance(state.nodes, state.time, "members"),
         progress=(value - plan.path.start) / (plan.path.end - plan.path.start),
         step_time=seconds,
         phase_time=list(phases.values()),
@@ -137,7 +142,7 @@ def _add_state(
 
 def _assemble(
     problem: Problem,
-    resolver: Resolver,
+    resolver: AnyResolver,
     record: _Record,
     status: str,
     blocked_by: tuple[str, ...],

@@ -1,0 +1,131 @@
+"""The paper's method, section 4: the curve first, then the truss tracks it; and its form with a QP for the curve."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.curve import Curve
+from vgtm_qp.errors import CurveError, SolverError
+from vgtm_qp.methods.condensation import rotation_vectors
+from vgtm_qp.methods.curve_motion import CurveMotion
+from vgtm_qp.methods.resolver import MethodResolver
+from vgtm_qp.methods.segments import make_segments
+from vgtm_qp.methods.tracking import Tracker
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.limits import length_box
+from vgtm_qp.step.path import Path
+
+Array = NDArray[np.float64]
+
+_SMALLEST = 1 / 64
+_SLACK = 1e-10
+_BETWEEN = 5e-5
+
+
+class CurveFirstResolver(MethodResolver):
+    """Moves the curve by itself, then the truss after it, recursively or in parallel.
+
+    With the method ``curve-pseudoinverse`` the curve moves by eqs. (37)-(38) and nothing else is looked at. With
+    ``qp`` it moves by a QP that knows the clearances, the truss tracks it exactly, and a step that breaks a limit
+    or a clearance is halved.
+
+    Raises
+    ------
+    CurveError, ProblemError, TrussError
+        The arm cannot be built, or cannot track a curve.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        method = problem.method
+        changes = {"method.tracking": "coupled", "method.solver": "piqp"}
+        super().__init__(build_arm(problem.replace(changes)), method.step_limit)
+        arm = self.arm
+        if arm.base_motion is not None:
+            raise CurveError(
+                'a moving base takes tracking = "coupled" or "none", or the method pseudoinverse'
+            )
+        self.motion = CurveMotion(problem, arm)
+        self.curve: Curve = self.motion.home
+        segments = make_segments(arm.layout, arm.task.turns)
+        self.tracker = Tracker(
+            arm.layout, arm.kinematics, segments, arm.home_lengths, parallel=method.tracking == "parallel"
+        )
+        self._faces = np.array([segment.face for segment in segments])
+        self._frames = any(segment.tracks != "position" for segment in segments)
+        self._correct, self._is_qp = method.correct, method.name == "qp"
+
+    def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+        if self._is_qp:
+            return self._move_safely(path, start, end, dt)
+        state, faces = self.state, self._faces
+        curve = self.motion.follow(
+            self.curve, path.at(start), path.at(end), state.time, state.nodes, correct=self._correct
+        )
+        nodes = self.motion.nodes(curve, faces, frames=self._frames)
+        self.spend("solve")
+        if self._correct:
+            X = self.tracker.track(state.nodes, nodes)
+        else:
+            before = self.motion.nodes(self.curve, faces, frames=self._frames)
+            turned = rotation_vectors(nodes.frame @ np.swapaxes(before.frame, 1, 2))
+            X = self.tracker.rates(state.nodes, nodes.position - before.position, turned)
+        self.spend("correction")
+        self.curve = curve
+        return X, curve.control_vertices, 1.0
+
+    def _move_safely(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+        """Move by the curve's QP; halve the piece of path until the tracking truss keeps every limit."""
+        state, share, reason = self.state, 1.0, ""
+        while share >= _SMALLEST:
+            goal = start + share * (end - start)
+            try:
+                curve, progress, active = self.motion.follow_qp(
+                    self.curve, path.at(start), path.at(goal), state.time, state.nodes
+                )
+                here = start + progress * (goal - start)
+                curve = self.motion.corrected(curve, path.at(here))
+                self.spend("solve")
+                X = self.tracker.track(
+                    state.nodes, self.motion.nodes(curve, self._faces, frames=self._frames)
+                )
+                self.spend("correction")
+                broken = self._broken(X, dt)
+                self.spend("acceptance")
+            except SolverError as error:
+                broken, active, progress = str(error), (), 0.0
+            if not broken and share * progress >= 1e-3:
+                self.curve = curve
+                return X, curve.control_vertices, share * progress
+            reason = broken or ", ".join(active) or "no progress along the path"
+            share /= 2.0
+        raise SolverError(reason)
+
+    def _broken(self, X: Array, dt: float) -> str:
+        """Return which limit the step to node positions `X` would break, empty if none."""
+        arm, state = self.arm, self.state
+        truss, monitor = arm.truss, arm.monitor
+        actuators = truss.actuators
+        lower, upper = length_box(
+            state.lengths[actuators],
+            state.length_rates[actuators],
+            truss.stroke[actuators],
+            truss.rate[actuators],
+            truss.acceleration[actuators],
+            dt,
+            state.duration or None,
+        )
+        arm.kinematics.evaluate(X)
+        lengths = arm.kinematics.lengths[actuators]
+        beyond = np.maximum(lower - lengths, lengths - upper)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > _SLACK:
+            return f"stroke or rate: {truss.member_names[actuators[worst]]}, {beyond[worst]:.2g} m beyond"
+        time = state.time + dt
+        if not monitor.keeps(X, time, arm.safe - _SLACK, arm.self_safe - _SLACK):
+            return "clearance at the end of the step"
+        floors = arm.safe - _BETWEEN, max(arm.self_safe - _BETWEEN, 0.0)
+        if not monitor.between(state.nodes, X, state.time, time, *floors).certified:
+            return "clearance between the states"
+        return ""

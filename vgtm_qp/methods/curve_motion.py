@@ -1,0 +1,256 @@
+"""The curve on its own, section 4.4: eqs. (37)-(38) with base conditions, or the same terms as a QP with clearance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.curve import Curve, degree_of_redundancy, make_family
+from vgtm_qp.curve.redundancy import BASE_ROWS
+from vgtm_qp.errors import CurveError, SolverError
+from vgtm_qp.methods.condensation import CurveNodes
+from vgtm_qp.methods.objectives import potential_slope
+from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
+from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE, pose_displacement
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import Arm
+from vgtm_qp.step.path import PathPoint, turn_between, vector_from_rotation
+
+Array = NDArray[np.float64]
+
+DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
+
+_SAMPLES = 400
+_UNBOUNDED = 1e30
+_PROGRESS = 1e3
+
+
+class CurveMotion:
+    """Moves a reference curve so that its end follows the path.
+
+    Attributes
+    ----------
+    s : (F,)
+        Parameters of the curve nodes, one a face, that of the base included.
+
+    Raises
+    ------
+    CurveError
+        The curve has too few control vertices for its base and the end effector.
+    """
+
+    def __init__(self, problem: Problem, arm: Arm) -> None:
+        method, spec, truss = problem.method, problem.curve, arm.truss
+        if spec is None or not len(truss.faces):
+            raise CurveError("this method needs a reference curve and a truss with faces")
+        options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
+        family = make_family(spec.family, spec.control_vertices, **options)
+        self._arm, self._task = arm, arm.task
+        spare = degree_of_redundancy(spec.control_vertices, len(arm.task.row_names), spec.torsion_vertices)
+        if spare < 0:
+            raise CurveError(
+                f"{spec.control_vertices} control vertices are {-spare} coordinates too few for base and tip"
+            )
+        if arm.task.turns == "orientation" and not spec.torsion_vertices:
+            raise CurveError("orientation at the tip takes curve.torsion_vertices of 1 or more")
+        centres = np.einsum("fk,fkc->fc", truss.face_weights, truss.home[truss.faces])
+        steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+        self.s = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
+        self.home = Curve(family, arm.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0])
+        names = DEFAULT_TERMS if method.null_space is None else method.null_space
+        gains = method.gains
+        self._terms = {name: float(getattr(gains, name)) for name in names}
+        self._weights = family.weights(self.s)
+        self._spacing = np.linalg.norm(np.diff(self._weights @ arm.control_vertices, axis=0), axis=1)
+        vertices = spec.control_vertices
+        second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
+        self._bending = np.kron(second.T @ second, np.eye(3))
+        self._across = truss.face_frames[0][:, :2].T
+        self._node_s = _nearest_parameters(self.home, truss.home)
+
+    def nodes(self, curve: Curve, faces: Array, *, frames: bool) -> CurveNodes:
+        """Return the curve nodes of `faces` (S,); their frames are identities where they are not asked for."""
+        s = self.s[faces]
+        frame = curve.frame(s) if frames else np.broadcast_to(np.eye(3), (len(s), 3, 3))
+        return CurveNodes(curve.position(s), frame)
+
+    def follow(
+        self, curve: Curve, here: PathPoint, goal: PathPoint, time: float, X: Array, *, correct: bool
+    ) -> Curve:
+        """Return the curve after a step by eq. (38), from the pose `here` on the path to `goal`.
+
+        Without `correct` the end moves by the path's own displacement, as in the paper; with it the step ends at
+        the goal exactly. `X` (N, 3) are the truss's nodes, for the obstacle potential alone.
+
+        Raises
+        ------
+        SolverError
+            The tip's and base's rows are dependent, or the correction does not converge.
+        """
+        J = self._rows(curve)
+        moved, turned = pose_displacement(here, goal)
+        x = self._error(curve, goal) if correct else self._tip_vector(curve, moved, turned)
+        x = np.concatenate([x, np.zeros(BASE_ROWS)])
+        inverse = moore_penrose(J)
+        if inverse.rank < len(J):
+            raise SolverError(f"the {len(J)} rows of the curve's tip and base have rank {inverse.rank}")
+        dp = inverse.matrix @ x
+        if self._terms:
+            N = projector(inverse, J)
+            dp = dp + N @ null_space_vector(N, dp, self.objective(curve, X, time))
+        curve = displaced(curve, dp)
+        return self.corrected(curve, goal) if correct else curve
+
+    def corrected(self, curve: Curve, goal: PathPoint) -> Curve:
+        """Return the curve that ends at `goal`, by Newton's method and least displacements.
+
+        Raises
+        ------
+        SolverError
+            It does not converge.
+        """
+        for _ in range(MAX_CORRECTIONS):
+            error = self._error(curve, goal)
+            if float(np.max(np.abs(error), initial=0.0)) <= TIP_TOLERANCE:
+                return curve
+            x = np.concatenate([error, np.zeros(BASE_ROWS)])
+            curve = displaced(curve, moore_penrose(self._rows(curve)).matrix @ x)
+        raise SolverError("Newton's method on the curve's tip does not converge")
+
+    def objective(self, curve: Curve, X: Array, time: float) -> Objective:
+        """Return the null-space terms as a quadratic cost of the displacements (D,) of the curve's coordinates."""
+        p = curve.control_vertices
+        vertices, size = p.size, curve.coordinates
+        hessian, gradient = np.zeros((size, size)), np.zeros(size)
+        rate = self._terms.get("curve_rate", 0.0)
+        hessian[np.diag_indices_from(hessian)] += rate or (
+            1.0 if set(self._terms) <= {"obstacle_potential"} else 1e-9
+        )
+        legs = np.diff(self._weights @ p, axis=0)
+        lengths = np.linalg.norm(legs, axis=1)
+        if gain := self._terms.get("spacing"):
+            rows = np.einsum("kv,kc->kvc", np.diff(self._weights, axis=0), legs / lengths[:, None])
+            rows = rows.reshape(len(legs), vertices)
+            hessian[:vertices, :vertices] += gain * rows.T @ rows
+            gradient[:vertices] += gain * rows.T @ (lengths - self._spacing)
+        if gain := self._terms.get("smoothness"):
+            hessian[:vertices, :vertices] += gain * self._bending
+            gradient[:vertices] += gain * self._bending @ p.ravel()
+        if gain := self._terms.get("obstacle_potential"):
+            rows, distance, _ = self._near(curve, X, time)
+            gradient[:vertices] += gain * potential_slope(distance, self._arm.influence) @ rows
+        return Objective(hessian, gradient)
+
+    def follow_qp(
+        self, curve: Curve, here: PathPoint, goal: PathPoint, time: float, X: Array
+    ) -> tuple[Curve, float, tuple[str, ...]]:
+        """Return the curve after one QP: the terms of :meth:`objective`, with clearance; progress; active rows.
+
+        A member near an obstacle moves, to first order, with the curve where it stands: that is all a curve can
+        know of the truss. The end slows down along the path where the rows do not let it go on.
+
+        Raises
+        ------
+        SolverError
+            The QP has no solution.
+        """
+        objective = self.objective(curve, X, time)
+        moved, turned = pose_displacement(here, goal)
+        rate = self._tip_vector(curve, moved, turned)
+        behind = self._error(curve, here)
+        near, distance, names = self._near(curve, X, time)
+        size, tips = curve.coordinates, len(rate)
+        J = self._rows(curve)
+        A = np.zeros((len(J) + len(near), size + 1))
+        A[: len(J), :size] = J
+        A[:tips, -1] = -rate
+        A[len(J) :, : near.shape[1]] = near
+        curvature = _PROGRESS * max(float(rate @ rate), 1e-12)
+        H = np.zeros((size + 1, size + 1))
+        H[:size, :size] = objective.hessian
+        H[-1, -1] = curvature
+        f = np.append(objective.gradient, -2.0 * curvature)
+        equal = np.concatenate([behind, np.zeros(BASE_ROWS)])
+        room = np.minimum(self._arm.safe + 1e-6 - distance, 0.0)
+        lower = np.concatenate([np.full(size, -_UNBOUNDED), [0.0], equal, room])
+        upper = np.concatenate([np.full(size, _UNBOUNDED), [1.0], equal, np.full(len(near), _UNBOUNDED)])
+        sense = np.zeros(len(lower), dtype=np.int32)
+        sense[size + 1 : size + 1 + len(J)] = 5
+        x, _, flag, info = daqp.solve(H, f, A, upper, lower, sense)
+        if flag < 1:
+            raise SolverError("the QP of the curve has no solution")
+        pressing = np.asarray(info["lam"])[size + 1 + len(J) :] < -1e-9
+        active = tuple(names[k] for k in np.flatnonzero(pressing))
+        return displaced(curve, x[:size]), min(max(float(x[-1]), 0.0), 1.0), active
+
+    def _rows(self, curve: Curve) -> Array:
+        """Return the rows of eq. (37) at the tip, then those that hold the base: (n_e + 5, D)."""
+        task, size = self._task, curve.coordinates
+        rows = [curve.position_jacobian(1.0)[task.axes]]
+        if task.turns:
+            turning = curve.orientation_jacobian(1.0)
+            rows.append(turning if task.turns == "orientation" else curve.frame(1.0)[:, :2].T @ turning)
+        base = np.zeros((BASE_ROWS, size))
+        base[:3, :3] = np.eye(3)
+        base[3:, 3:6] = self._across
+        return np.concatenate([*rows, base])
+
+    def _tip_vector(self, curve: Curve, moved: Array, turned: Array) -> Array:
+        task = self._task
+        if not task.turns:
+            return moved[task.axes]
+        turn = turned if task.turns == "orientation" else curve.frame(1.0)[:, :2].T @ turned
+        return np.concatenate([moved[task.axes], turn])
+
+    def _error(self, curve: Curve, goal: PathPoint) -> Array:
+        turned = np.zeros(3)
+        if self._task.turns:
+            frame = curve.frame(1.0)
+            turned = (
+                vector_from_rotation(goal.rotation @ frame.T)
+                if self._task.turns == "orientation"
+                else turn_between(frame[:, 2], goal.rotation[:, 2])
+            )
+        return self._tip_vector(curve, goal.position - curve.position(1.0), turned)
+
+    def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array, list[str]]:
+        """Return rows (R, 3 V) of d distance / d p, distances (R,), m, and names of the members near obstacles."""
+        arm = self._arm
+        pairs = arm.monitor.near(X, time, arm.influence)
+        with_obstacle = np.flatnonzero(~pairs.is_self)
+        members = arm.monitor.members[pairs.member[with_obstacle]]
+        t, normal = pairs.t[with_obstacle], pairs.normal[with_obstacle]
+        s = np.clip((1.0 - t) * self._node_s[members[:, 0]] + t * self._node_s[members[:, 1]], 0.0, 1.0)
+        witness = (1.0 - t)[:, None] * X[members[:, 0]] + t[:, None] * X[members[:, 1]]
+        first = curve.derivative(s)
+        tangent = first / np.linalg.norm(first, axis=1, keepdims=True)
+        # A witness point off the axis turns with the tangent: d q = d r + (t x d t) x (q - r).
+        lever = np.cross(witness - curve.position(s), normal)
+        turning = np.cross(lever, tangent)
+        table, slope = curve.family.weights(s), curve.family.weights(s, 1)
+        across = (turning - np.einsum("rc,rc->r", turning, tangent)[:, None] * tangent) / np.linalg.norm(
+            first, axis=1, keepdims=True
+        )
+        rows = np.einsum("rv,rc->rvc", table, normal) + np.einsum("rv,rc->rvc", slope, across)
+        names = [pairs.name(int(k)) for k in with_obstacle]
+        return rows.reshape(len(s), 3 * table.shape[1]), pairs.distance[with_obstacle], names
+
+
+def displaced(curve: Curve, d: Array) -> Curve:
+    """Return the curve after a displacement `d` (D,) of its coordinates."""
+    size = curve.control_vertices.size
+    return replace(
+        curve,
+        control_vertices=curve.control_vertices + d[:size].reshape(-1, 3),
+        torsion=curve.torsion + d[size:],
+    )
+
+
+def _nearest_parameters(curve: Curve, points: Array) -> Array:
+    """Return (N,) parameters of the points of the curve that are nearest to `points`, to a few thousandths."""
+    s = np.linspace(0.0, 1.0, _SAMPLES + 1)
+    squares = ((curve.position(s)[None] - points[:, None]) ** 2).sum(axis=2)
+    return np.asarray(s[np.argmin(squares, axis=1)])

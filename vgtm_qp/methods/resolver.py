@@ -1,0 +1,102 @@
+"""What the resolvers of all other methods share: a state, a clock, and an end with a reason."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import CurveError, SolverError
+from vgtm_qp.step.arm import Arm
+from vgtm_qp.step.path import Path, PathPoint, vector_from_rotation
+from vgtm_qp.step.resolver import Step, StepStatus
+from vgtm_qp.step.state import State, frozen
+
+Array = NDArray[np.float64]
+
+_COLLAPSED = 1e-3
+LENGTH_TOLERANCE = 1e-11
+TIP_TOLERANCE = 1e-10
+MAX_CORRECTIONS = 30
+
+
+class MethodResolver(ABC):
+    """Moves an arm step by step, as :class:`vgtm_qp.step.resolver.Resolver` does, by one of the other methods."""
+
+    def __init__(self, arm: Arm, step_limit: float | None) -> None:
+        self.arm = arm
+        self.state = arm.home_state()
+        self.phases = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
+        self.rank: int | None = None
+        """Rank of the Jacobian in the last step, None where the method does not reveal it."""
+        self._limit = step_limit
+        self._steps = 0
+        self._mark = 0.0
+
+    def tip(self) -> tuple[Array, Array]:
+        """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
+        kinematics = self.arm.kinematics
+        kinematics.evaluate(self.state.nodes)
+        return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
+
+    def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
+        """Move along `path` from its value `start` to `end` in one step, or say why that is the end."""
+        dt = self.arm.dt if dt is None else dt
+        self._steps += 1
+        self._mark = perf_counter()
+        try:
+            nodes, vertices, progress = self._move(path, start, end, dt)
+            self._refuse_breakdown(nodes, path, start, end)
+        except (SolverError, CurveError, np.linalg.LinAlgError) as error:
+            reason = f"step {self._steps}: {error}"
+            return _step(StepStatus.BLOCKED, 0.0, self.state, reason)
+        kinematics = self.arm.kinematics
+        kinematics.evaluate(nodes)
+        lengths = frozen(kinematics.lengths)
+        before = self.state
+        self.state = State(
+            time=before.time + dt,
+            nodes=frozen(nodes),
+            control_vertices=frozen(vertices),
+            lengths=lengths,
+            length_rates=frozen((lengths - before.lengths) / dt),
+            motion=frozen(nodes - before.nodes),
+            duration=dt,
+        )
+        self.spend("kinematics")
+        status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
+        return _step(status, progress, self.state, "")
+
+    def spend(self, phase: str) -> None:
+        """Give the time since the last call to `phase`."""
+        now = perf_counter()
+        self.phases[phase] += now - self._mark
+        self._mark = now
+
+    @abstractmethod
+    def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+        """Return node positions, control vertices and progress after the step, or raise SolverError."""
+
+    def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
+        truss, lengths = self.arm.truss, self.arm.home_lengths
+        asked = float(np.linalg.norm(path.at(end).position - path.at(start).position))
+        limit = self._limit or 0.5 * float(lengths.min()) + 3.0 * asked
+        moved = float(np.max(np.abs(nodes - self.state.nodes)))
+        if not moved <= limit:
+            raise SolverError(
+                f"a node would move by {moved:.3g} m, more than {limit:.3g} m: the pose is nearly singular"
+            )
+        ratio = np.linalg.norm(nodes[truss.members[:, 0]] - nodes[truss.members[:, 1]], axis=1) / lengths
+        if float(ratio.min()) < _COLLAPSED:
+            raise SolverError(f"member {truss.member_names[int(np.argmin(ratio))]} collapsed to a point")
+
+
+def pose_displacement(start: PathPoint, end: PathPoint) -> tuple[Array, Array]:
+    """Return the displacement (3,), m, and the rotation vector (3,), rad, from one pose to another."""
+    return end.position - start.position, vector_from_rotation(end.rotation @ start.rotation.T)
+
+
+def _step(status: StepStatus, progress: float, state: State, reason: str) -> Step:
+    return Step(status=status, progress=progress, state=state, reason=reason, qps=0, _members=())
