@@ -253,6 +253,6 @@ class FusedSolver:
         spread = self._spread[:near]
         spread[:] = 0.0
         place, index = self._place[clearance.nodes], np.arange(near)
-        for slot in (3, 2, 1, 0):
-            spread[index, place[:, slot]] = clearance.coefficients[:, slot]
+        for slot in range(place.shape[1]):
+            spread[index, place[:, slot]] += clearance.coefficients[:, slot]
         return spread[:, :-1].reshape(near, -1)

@@ -149,7 +149,9 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
         curve_weights = constants.add("curve_weights", layout.curve_weights)
         curve_slopes = constants.add("curve_slopes", layout.curve_slopes)
         centre = (X + moved)[:, truss.faces[0].tolist()] @ ca.DM(truss.face_weights[0])
-        axes, normal = rotations[:, :2], rotations[:, 2]
+        base_face = Frames(truss.home[truss.faces[:1]], truss.face_frames[:1], truss.faces[:1], constants, "base")
+        base_rotation, _ = base_face.at(X + moved)
+        axes, normal = base_rotation[:, :2], base_rotation[:, 2]
         offset = ca.MX.zeros(3, layout.vertices)
         offset[:, 0] = centre - vertices[:, 0]
         offset[:, 1] = offset[:, 0] - axes @ (axes.T @ (vertices[:, 1] - vertices[:, 0]))

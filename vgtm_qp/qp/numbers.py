@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,11 @@ class ClearanceRows:
 
     def __len__(self) -> int:
         return len(self.lower)
+
+    def after(self, displacement: Array) -> ClearanceRows:
+        """Return the rows with a known displacement (N, 3), m, of some nodes taken out of them."""
+        known = np.einsum("rsc,rsc->r", self.coefficients, displacement[self.nodes])
+        return replace(self, lower=self.lower - known)
 
     def joined(self, other: ClearanceRows) -> ClearanceRows:
         """Return these rows followed by `other`'s."""

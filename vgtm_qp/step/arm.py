@@ -17,6 +17,7 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, make_solver
+from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.engine import Engine, FusedEngine, PlainEngine
 from vgtm_qp.step.linearise import Linearisation
 from vgtm_qp.step.path import rotation_from_vector
@@ -46,6 +47,8 @@ class Arm:
         Least clearance to obstacles and between members, and the distance from which pairs enter the QP, m.
     dt : float
         Duration of a step, s.
+    base_motion : BaseMotion or None
+        None where the base rests.
     """
 
     truss: Truss
@@ -60,6 +63,7 @@ class Arm:
     self_safe: float
     influence: float
     dt: float
+    base_motion: BaseMotion | None = None
 
     def home_state(self) -> State:
         """Return the arm at rest in its home pose at time 0."""
@@ -84,7 +88,8 @@ def build_arm(problem: Problem) -> Arm:
         The truss is not statically determinate.
     """
     _check_supported(problem)
-    truss = build_truss(problem.truss)
+    spec = problem.truss
+    truss = build_truss(spec)
     kinematics = Kinematics(truss)
     kinematics.evaluate(truss.home)
     task = TipTask(problem.end_effector.track, kinematics)
@@ -112,6 +117,7 @@ def build_arm(problem: Problem) -> Arm:
         self_safe=clearance.between_members,
         influence=clearance.influence,
         dt=step_duration(problem.maneuver),
+        base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
     )
 
 

@@ -141,6 +141,8 @@ class Attempt:
         for count in range(1, self.max_qps + 1):
             motion = count == 1
             rows = self._rows(state, X, state.time if motion else target.time, stations, reach, motion=motion)
+            if motion and target.base is not None:
+                rows = rows.after(np.where(self.task.base[:, None], target.base - X, 0.0))
             phases.add("distance")
             goal = target.path.at(target.start + progress * span)
             try:
@@ -197,7 +199,7 @@ class Attempt:
     def _expected(self, target: Target, guess: Array) -> float:
         """Return about how far a node moves in the step, m; anything where the arm was at rest."""
         last = float(np.abs(guess).max())
-        if last == 0.0:
+        if last == 0.0 or target.base is not None:
             return self.influence
         way = target.path.at(target.end).position - target.path.at(target.start).position
         return max(last, float(np.abs(way).max()))

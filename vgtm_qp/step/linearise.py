@@ -60,6 +60,11 @@ class Linearisation:
         """Return the largest error of a fixed member at the configuration evaluated last, m."""
         return float(np.max(np.abs(self.kinematics.lengths[self.layout.fixed] - self._fixed_lengths), initial=0.0))
 
+    def _base_rotation(self, X: Array) -> Array:
+        """Return (3, 3) the frame of the base face at node positions `X` (N, 3); the kinematics is evaluated there."""
+        self.kinematics.evaluate(X)
+        return np.array(self.kinematics.face_rotation[0])
+
     def numbers(
         self,
         X: Array,
@@ -91,6 +96,11 @@ class Linearisation:
             gradient, face_spin, tip_spin = gradient.copy(), face_spin.copy(), tip_spin.copy()
             kinematics.evaluate(X)
         actuators, tracked = layout.truss.actuators, layout.tracked
+
+        base_rotation = kinematics.face_rotation[0] if layout.vertices else np.eye(3)
+        if target.base is not None and layout.vertices:
+            base_rotation = self._base_rotation(np.where(layout.truss.base[:, None], target.base, X))
+            kinematics.evaluate(X)
 
         length_rhs = np.zeros(layout.truss.member_count)
         length_rhs[layout.fixed] = self._fixed_lengths - kinematics.lengths[layout.fixed]
@@ -126,7 +136,7 @@ class Linearisation:
             if motion:
                 tangent_rhs = along
                 vertex_gradient = self._polygon @ vertices
-            base_axes = kinematics.face_rotation[0][:, :2].T
+            base_axes = base_rotation[:, :2].T
             shift = centres[0] - vertices[0]
             if target.base is not None:
                 face = layout.truss.faces[0]

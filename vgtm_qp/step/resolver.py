@@ -181,9 +181,10 @@ class Resolver:
         lower, upper = length_box(
             state.lengths[actuators], state.length_rates[actuators], *self._limits, dt, state.duration or None
         )
+        base = None if self.arm.base_motion is None else self.arm.base_motion.nodes(state.time + dt)
         share, outcome = 1.0, None
         while share >= smallest:
-            target = Target(path, start, start + share * (end - start), lower, upper, state.time + dt)
+            target = Target(path, start, start + share * (end - start), lower, upper, state.time + dt, base)
             outcome = self._attempt.run(state, target, share)
             if outcome.accepted:
                 break
