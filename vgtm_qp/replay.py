@@ -49,6 +49,18 @@ class Following:
     clearance: Array
     contacts: int
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the worst values as strict JSON data, m; no clearance is None."""
+        clearance = float(self.clearance.min())
+        return {
+            "max_length_error": float(self.length_error.max()),
+            "max_tip_error": float(self.tip_error.max()),
+            "last_tip_error": float(self.tip_error[-1]),
+            "max_actuator_error": float(self.actuator_error.max()),
+            "min_clearance": clearance if np.isfinite(clearance) else None,
+            "contacts": self.contacts,
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class Replay:
@@ -98,6 +110,16 @@ class Replay:
                 f"{self.tip_error_per_millimetre:.4g}",
             ),
         ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the same as strict JSON data; lengths in m."""
+        return {
+            "tip_error_per_millimetre": self.tip_error_per_millimetre,
+            "certified_tip_error_per_millimetre": self.certified_tip_error_per_millimetre,
+            "probed_state": self.probed_state,
+            "kinematic": self.kinematic.to_dict(),
+            "physics": self.physics.to_dict(),
+        }
 
 
 def replay(maneuver: Maneuver) -> Replay:
@@ -185,8 +207,8 @@ class _Simulation:
     def measured_sensitivity(self, state: int, expected: float) -> float:
         """Return the same by lengthening one actuator after another and waiting for the tip.
 
-        Without gravity, whose sag takes a nearly singular pose away from its singularity, and each by so little
-        that the tip should move by a tenth of a millimetre: there it soon moves less than in proportion.
+        Without gravity, whose sag takes a nearly singular pose away from its singularity, and each by so
+        little that the tip should move a tenth of a millimetre: there it soon moves less than in proportion.
         """
         data, probe = self._data, _PROBED_TIP_MOTION / max(expected, 1.0)
         gravity = self._model.opt.gravity.copy()

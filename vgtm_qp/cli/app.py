@@ -6,21 +6,24 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 
-from cyclopts import App, CycloptsError, UnknownOptionError
+from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError
 
 from vgtm_qp.cli.check import check
 from vgtm_qp.cli.doctor import doctor
+from vgtm_qp.cli.export import export
 from vgtm_qp.cli.list import list_problems
 from vgtm_qp.cli.output import ExitCode, document, note
+from vgtm_qp.cli.replay import replay
 from vgtm_qp.cli.schema import schema
 from vgtm_qp.cli.solve import solve
 from vgtm_qp.cli.verify import verify
-from vgtm_qp.errors import ProblemError, VgtmError
+from vgtm_qp.cli.view import view
+from vgtm_qp.errors import ProblemError, VgtmError, nearest
 
 _EPILOGUE = (
-    "Exit codes: 0 solved and verified; 1 internal error; 2 wrong usage or problem file; 3 blocked or "
-    "infeasible, the partial result is written; 4 verification failed; 130 interrupted, what was solved is on "
-    "disk."
+    "Exit codes: 0 solved and verified; 1 internal error; 2 wrong usage or problem file; "
+    "3 blocked or infeasible, the partial result is written; 4 verification failed; "
+    "130 interrupted, what was solved is on disk."
 )
 
 
@@ -46,6 +49,9 @@ _COMMANDS: dict[str, Callable[..., int | None]] = {
     "verify": verify,
     "check": check,
     "list": list_problems,
+    "view": view,
+    "export": export,
+    "replay": replay,
     "schema": schema,
     "doctor": doctor,
 }
@@ -61,7 +67,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
         return ExitCode.SOLVED if code is None else int(code)
     except CycloptsError as error:
-        return _failed(f"{error}{_hint(error)}", ExitCode.USAGE, as_json)
+        return _failed(_explained(error), ExitCode.USAGE, as_json)
     except ProblemError as error:
         return _failed(str(error), ExitCode.USAGE, as_json, mistakes=_mistakes(error))
     except VgtmError as error:
@@ -86,15 +92,18 @@ def _failed(
     return code
 
 
-def _hint(error: CycloptsError) -> str:
-    """Return the options there are, for an unknown one, and where to read more."""
+def _explained(error: CycloptsError) -> str:
+    """Return what was wrong with the command line, with all the choices there were."""
     command = " ".join(("vgtm", *(error.command_chain or ())))
-    choices = ""
-    if isinstance(error, UnknownOptionError):
+    said = str(error)
+    if isinstance(error, UnknownCommandError) and error.unused_tokens:
+        name = error.unused_tokens[0]
+        said = f'unknown command "{name}"{nearest(name, _COMMANDS) or "."} Commands: {", ".join(_COMMANDS)}.'
+    elif isinstance(error, UnknownOptionError):
         names = [name for argument in error.argument_collection for name in argument.names]
         options = [name for name in names if name.startswith("-")]
-        choices = f" Options: {', '.join(options)}." if options else ""
-    return f"{choices} See {command} --help."
+        said += f" Options: {', '.join(options)}." if options else ""
+    return f"{said} See {command} --help."
 
 
 def _mistakes(error: ProblemError) -> list[dict[str, str]]:

@@ -32,6 +32,9 @@ def solve(
     figure: Annotated[
         Path | None, Parameter(help="draw frames of the maneuver too: .pdf, .png or .svg")
     ] = None,
+    html: Annotated[
+        Path | None, Parameter(help="write one offline page with the maneuver in three dimensions too")
+    ] = None,
     json: Json = False,
 ) -> int:
     """Solve a problem, verify the maneuver, write the result and print a short table.
@@ -50,6 +53,8 @@ def solve(
     check_writable(result, "--output", (".npz",))
     if figure is not None:
         check_writable(figure, "--figure", (".pdf", ".png", ".svg"))
+    if html is not None:
+        check_writable(html, "--html", (".html",))
 
     from vgtm_qp.maneuver.solve import solve as run
     from vgtm_qp.verify import verify as certify
@@ -64,13 +69,19 @@ def solve(
         from vgtm_qp.view.figure import plot_frames, save_figure
 
         save_figure(plot_frames(maneuver), figure)
+    if html is not None:
+        from vgtm_qp.export import export_maneuver
+
+        export_maneuver(maneuver, html, to="html")
 
     summary = maneuver.summary(result)
+    files = {"figure": figure, "html": html}
+    written = {name: str(path) for name, path in files.items() if path is not None}
     if json:
-        document(summary | ({"figure": str(figure)} if figure else {}))
+        document(summary | written)
     else:
         say(_report(summary))
-        say(f"result: {result}" + (f"\nfigure: {figure}" if figure else ""))
+        say("\n".join(f"{name}: {path}" for name, path in {"result": str(result), **written}.items()))
     if "interrupted" in maneuver.blocked_by:
         note(f"vgtm: interrupted; what was solved is in {result}")
         return ExitCode.INTERRUPTED

@@ -46,7 +46,7 @@ def mjcf(maneuver: Maneuver) -> str:
     Free nodes are bodies with three slide joints, so ``qpos`` is their displacement from the home pose; base
     nodes and moving obstacles are mocap bodies. Each member is a tendon called by its name with an equality
     constraint of the same name; those of actuated members are off, since position actuators drive them:
-    ``ctrl`` is a length, m. Members have mass but do not collide; nodes collide with obstacles. Meshes collide
+    ``ctrl`` is a length, m. Members have mass but do not collide; nodes collide with obstacles, meshes
     as their convex hulls.
 
     Raises

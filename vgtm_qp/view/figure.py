@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,31 @@ def plot_frames(
             axes.set_title(title, fontsize=8.0, pad=3.0)
         _draw_legend(figure, drawing, bool(len(surfaces)))
     return figure
+
+
+def each_frame(
+    maneuver: Maneuver, rows: Sequence[int], *, azimuth: float | None = None, elevation: float = 0.21
+) -> Iterator[Figure]:
+    """Yield one figure for each of the states `rows`, all in the view that holds the whole maneuver.
+
+    Raises
+    ------
+    VgtmError
+        There is no such state.
+    """
+    drawing = drawing_of_maneuver(maneuver)
+    projection = Projection.looking(_across(maneuver) if azimuth is None else azimuth, elevation)
+    surfaces = [Surface(mesh, projection) for mesh in drawing.obstacles]
+    view = _view(maneuver, drawing, list(range(len(maneuver.time))), projection, surfaces)
+    for row in _rows(maneuver, rows):
+        with mpl.rc_context(_STYLE):
+            figure, panels, scale = _panels(view, 1, 1)
+            _draw_floor(panels[0], view, projection, scale, ruler=True, labels=True)
+            _draw_state(panels[0], maneuver, drawing, row, projection, surfaces, scale)
+            _draw_tip(panels[0], maneuver, row, projection)
+            panels[0].set_title(f"{maneuver.time[row]:.2f} s", fontsize=8.0, pad=3.0)
+            _draw_legend(figure, drawing, bool(len(surfaces)))
+        yield figure
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:

@@ -1,4 +1,4 @@
-"""A live page: play a maneuver back, drag tip or control vertices, see what the arm does and what stops it."""
+"""A live page: play a maneuver back, drag tip or control vertices, and see what holds it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def view(
 
 
 class _Page:
-    """The widgets and the loop. Callbacks only leave notes in the inbox; the loop alone touches the session."""
+    """Widgets and loop. Callbacks only leave notes in the inbox; the loop alone touches the session."""
 
     def __init__(self, server: Any, session: Session, maneuver: Maneuver | None) -> None:
         self._server, self._session, self._maneuver = server, session, maneuver
