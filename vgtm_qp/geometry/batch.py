@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.compiled import Kernel
+from vgtm_qp.compiled import Kernel, compile_function
 
 Array = NDArray[np.float64]
 
@@ -20,15 +20,16 @@ class Batch:
     """
 
     def __init__(self, function: ca.Function) -> None:
-        arguments = function.sx_in()
-        outputs = ca.cse(ca.vertcat(*function.call(arguments)))
-        self._function = ca.Function(function.name(), arguments, [outputs])
+        self._function = function
         self._kernels: dict[int, tuple[Kernel, list[Array], Array]] = {}
+
+    def prepare(self, count: int) -> None:
+        """Compile what `count` rows need, so that no step has to wait for it."""
+        self._kernel(_capacity(count))
 
     def _kernel(self, capacity: int) -> tuple[Kernel, list[Array], Array]:
         if capacity not in self._kernels:
-            name = f"{self._function.name()}_{capacity}"
-            kernel = Kernel(self._function.map(name, "serial", capacity, [], []))
+            kernel = Kernel(_mapped(self._function, capacity), compiled=False)
             inputs = [x.reshape(capacity, -1) for x in kernel.inputs]
             self._kernels[capacity] = kernel, inputs, kernel.outputs[0].reshape(capacity, -1)
         return self._kernels[capacity]
@@ -54,6 +55,19 @@ class Batch:
             target[:size] = source[start:stop]
         kernel()
         return output[:size].copy()
+
+
+_functions: dict[tuple[str, int], ca.Function] = {}
+
+
+def _mapped(function: ca.Function, capacity: int) -> ca.Function:
+    """Return `function` with its outputs in one column, mapped and compiled; once for all batches of a process."""
+    key = (function.name(), capacity)
+    if key not in _functions:
+        arguments = function.sx_in()
+        packed = ca.Function(function.name(), arguments, [ca.cse(ca.vertcat(*function.call(arguments)))])
+        _functions[key] = compile_function(packed.map(f"{key[0]}_{capacity}", "serial", capacity, [], []))
+    return _functions[key]
 
 
 def _capacity(count: int) -> int:

@@ -96,7 +96,7 @@ def _near_pieces(
 
 def _near_members(middle: Array, half: Array, members: Members, horizon: float) -> tuple[Index, Index]:
     """Return pairs of members without a common node that the plane between them does not keep apart."""
-    nodes, radius = members.nodes, members.radius
+    nodes, radius = members.joined, members.radius
     longest = float(np.max(np.linalg.norm(half, axis=1) + radius))
     pairs = cKDTree(middle).query_pairs(2.0 * longest + horizon, output_type="ndarray").astype(np.int64)
     first, second = pairs[:, 0], pairs[:, 1]

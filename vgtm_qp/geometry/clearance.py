@@ -25,13 +25,16 @@ _AMONG = {"all": (False, True), "obstacles": (False,), "members": (True,)}
 _FIRST = 16
 
 
+_FEW_PAIRS = 20_000
+
+
 class Clearance:
     """Keeps the candidate pairs of an arm; one thread at a time.
 
     Parameters
     ----------
     members : (M, 2) int
-        Nodes of each member.
+        Nodes of each member, or other points whose positions are given.
     radius : (M,)
         Capsule radii, m.
     obstacles
@@ -47,6 +50,8 @@ class Clearance:
         together.
     fcl_reach : float or None
         Pairs nearer than this are asked of FCL too; by default 2.5 `safe`.
+    joined : (M, 2) int or None
+        Nodes that each member is joined to, where `members` are other points; members that share one may touch.
     """
 
     def __init__(
@@ -61,6 +66,7 @@ class Clearance:
         member_names: Sequence[str] | None = None,
         self_influence: float | None = None,
         fcl_reach: float | None = None,
+        joined: ArrayLike | None = None,
     ) -> None:
         self.members = np.asarray(members, dtype=np.int64).reshape(-1, 2)
         self.radius = np.broadcast_to(np.asarray(radius, dtype=float), len(self.members)).copy()
@@ -73,8 +79,10 @@ class Clearance:
         names = tuple(member_names) if member_names is not None else tuple(map(str, range(len(self.members))))
         self.names = Names(names, tuple(o.name for o in self.obstacles), tuple(self.pieces.obstacle.tolist()))
         self.fcl = FclQueries(self.pieces)
-        self._members = Members(self.members, self.radius)
+        nodes = self.members if joined is None else np.asarray(joined, dtype=np.int64).reshape(-1, 2)
+        self._members = Members(self.members, self.radius, nodes)
         self._kernels = Kernels()
+        self._kernels.prepare({*self.pieces.shape.tolist()} | ({"segment"} if self_collision else set()))
         self._candidates: Candidates | None = None
         self._wasted = 0
         self._solids = {
@@ -370,6 +378,9 @@ class Clearance:
         drift = 0.0 if end_time is None else self.pieces.fastest * abs(end_time - time)
         horizon = max(reach, self.influence) + self.influence + travel + drift
         self_horizon = max(self_reach, self.self_influence) + self.self_influence + 2.0 * travel
+        if len(self.members) * (len(self.members) + len(self.pieces)) <= _FEW_PAIRS:
+            # A list of all pairs never needs another broad phase, which would cost more than its tail does.
+            horizon = self_horizon = 2.0 * self._extent(X, time) + horizon + self_horizon
         self._candidates = candidates = Candidates(
             self._members,
             self.pieces,

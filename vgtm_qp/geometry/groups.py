@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,10 +30,14 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Members:
-    """The arm as capsules: ``nodes`` (M, 2) int and ``radius`` (M,)."""
+    """The arm as capsules: ``nodes`` (M, 2) int, ``radius`` (M,) and ``joined`` (M, 2) int.
+
+    Members that have an entry of ``joined`` in common may touch; it is ``nodes`` where joints have no extent.
+    """
 
     nodes: Index
     radius: Array
+    joined: Index
 
     def moved(self, X: Array, reference: Array) -> Array:
         """Return how far any point of each member is from where it was, at most, (M,)."""
@@ -67,6 +72,13 @@ class Kernels:
     def __init__(self) -> None:
         self._distance: dict[str, Batch] = {}
         self._sweep: dict[str, Batch] = {}
+
+    def prepare(self, shapes: Iterable[str]) -> None:
+        """Compile the kernels of `shapes` for few and for many pairs."""
+        for shape in shapes:
+            for count in (1, 64):
+                self.distance(shape).prepare(count)
+                self.sweep(shape).prepare(count)
 
     def distance(self, shape: str) -> Batch:
         """Return the batch of ``distance_function(shape)``."""

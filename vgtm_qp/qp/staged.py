@@ -18,6 +18,7 @@ from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 _BLOCK = 8
 RESIDUAL = 1e-8
@@ -54,11 +55,9 @@ class StagedSolver:
         self._forward_gains = self._forward.inputs[2].reshape(periods, -1)
         self._motions = self._forward.inputs[3].reshape(periods, -1)
         own = chain.nodes.shape[1]
-        self._own_nodes = own
         # Rows of base nodes, which answer to no displacement, go to places behind the last one that is read.
-        rows = np.zeros((periods * _BLOCK * own + _BLOCK * own, 3))
-        self._columns.bind_input(3, rows.reshape(-1)[: self._columns.inputs[3].size])
-        self._rows = rows
+        self._rows = np.zeros(((periods + 1) * _BLOCK * own, 3))
+        self._columns.bind_input(3, self._rows.reshape(-1)[: self._columns.inputs[3].size])
         self._place = np.where(
             chain.node_period >= 0,
             (periods - 1 - chain.node_period) * _BLOCK * own + chain.node_place,
@@ -85,23 +84,21 @@ class StagedSolver:
         self._active = {table.key(k) for k in np.flatnonzero(multipliers).tolist() if k >= table.equal}
         return solution(table, point, multipliers, iterations)
 
-    def columns(self, table: RowTable, rows: list[int]) -> Array:
+    def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
         rest = slice(self._freedom, self._freedom + self._curve)
         columns = np.zeros((self._freedom + self._curve + 1, len(rows)))
+        nodes, coefficients, progress = table.coefficients(rows)
+        columns[-1] = progress * self._progress_scale
         passed = self._columns.outputs[1].reshape(self._freedom, _BLOCK)
         for start in range(0, len(rows), _BLOCK):
-            block = rows[start : start + _BLOCK]
-            filled = []
-            for k, row in enumerate(block):
-                nodes, coefficients, progress = table.coefficients(row)
-                place = self._place[nodes] + k * self._own_nodes
-                np.add.at(self._rows, place, coefficients)
-                filled.append(place)
-                columns[-1, start + k] = progress * self._progress_scale
+            block = slice(start, start + _BLOCK)
+            count = len(progress[block])
+            place = self._place[nodes[block]] + (np.arange(count) * self.chain.nodes.shape[1])[:, None]
+            np.add.at(self._rows, place, coefficients[block])
             self._columns()
-            columns[: self._freedom, start : start + len(block)] = passed[:, : len(block)]
-            self._rows[np.concatenate(filled)] = 0.0
+            columns[: self._freedom, block] = passed[:, :count]
+            self._rows[place] = 0.0
         if self._curve:
             through = self._outer[:, :-1].T @ columns[: self._freedom]
             columns[rest] = -dtrtrs(self._curve_factor, through, lower=1)[0]

@@ -20,6 +20,7 @@ from vgtm_qp.qp.staged import RESIDUAL, SINGULAR, solution
 from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 
 def following(elimination: Elimination) -> ca.Function:
@@ -98,16 +99,14 @@ class TrackedSolver:
         self._active = {table.key(k) for k in np.flatnonzero(multipliers).tolist() if k >= table.equal}
         return solution(table, point, multipliers, iterations)
 
-    def columns(self, table: RowTable, rows: list[int]) -> Array:
+    def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
-        moved = self._moved.reshape(-1, 3, self._curve + 1)
-        columns = np.zeros((self._curve + 1, len(rows)))
-        for k, row in enumerate(rows):
-            nodes, coefficients, progress = table.coefficients(row)
-            free = self.chain.node_period[nodes] >= 0
-            response = np.tensordot(coefficients[free], moved[self._place[nodes[free]], :, :-1], axes=2)
-            columns[:-1, k] = response
-            columns[-1, k] = progress * self._progress_scale
+        nodes, coefficients, progress = table.coefficients(rows)
+        coefficients[self.chain.node_period[nodes] < 0] = 0.0
+        moved = self._moved.reshape(-1, 3, self._curve + 1)[self._place[nodes]]
+        columns = np.empty((self._curve + 1, len(rows)))
+        columns[:-1] = np.einsum("rqc,rqcn->nr", coefficients, moved[..., :-1])
+        columns[-1] = progress * self._progress_scale
         columns[:-1] = dtrtrs(self._factor, columns[:-1], lower=1)[0]
         return columns
 

@@ -35,6 +35,10 @@ class RowTable:
     locked : (l,) int
         Fixed members that are held by a row of their own.
     lower, upper : (total,)
+    equal : int
+        Number of equalities, which come first.
+    actuators, clearance : slice
+        Where the actuators' bounds and the clearance rows are.
     """
 
     layout: Layout
@@ -42,6 +46,9 @@ class RowTable:
     locked: Index
     lower: Array
     upper: Array
+    equal: int
+    actuators: slice
+    clearance: slice
 
     @classmethod
     def of(cls, layout: Layout, numbers: StepNumbers, locked: Index) -> RowTable:
@@ -50,22 +57,18 @@ class RowTable:
         clearance = numbers.clearance.lower
         lower = [numbers.tip_rhs, held, [numbers.progress_lower], numbers.lower, clearance]
         upper = [numbers.tip_rhs, held, [numbers.progress_upper], numbers.upper, np.full(len(clearance), UNBOUNDED)]
-        return cls(layout, numbers, locked, np.concatenate(lower), np.concatenate(upper))
-
-    @property
-    def equal(self) -> int:
-        """Number of equalities, which come first."""
-        return len(self.numbers.tip_rhs) + len(self.locked)
-
-    @property
-    def actuators(self) -> slice:
-        """Where the actuators' bounds are."""
-        return slice(self.equal + 1, self.equal + 1 + len(self.numbers.lower))
-
-    @property
-    def clearance(self) -> slice:
-        """Where the clearance rows are."""
-        return slice(self.actuators.stop, len(self.lower))
+        equal = len(numbers.tip_rhs) + len(locked)
+        first_clearance = equal + 1 + len(numbers.lower)
+        return cls(
+            layout,
+            numbers,
+            locked,
+            np.concatenate(lower),
+            np.concatenate(upper),
+            equal,
+            slice(equal + 1, first_clearance),
+            slice(first_clearance, first_clearance + len(clearance)),
+        )
 
     def values(self, nodes: Array, lengths: Array, progress: float) -> Array:
         """Return (total,) row values at displacements of the nodes (N, 3) and changes of the lengths (M,)."""
@@ -84,19 +87,32 @@ class RowTable:
         """Return (total,) how far the values are out of their bounds; not positive where they are not."""
         return np.maximum(self.lower - values, values - self.upper)
 
-    def coefficients(self, row: int) -> tuple[Index, Array, float]:
-        """Return nodes (Q,), their coefficients (Q, 3) and that of the progress."""
-        numbers, truss = self.numbers, self.layout.truss
+    def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
+        """Return nodes (R, Q), their coefficients (R, Q, 3) and those of the progress (R,); spare ones are zero."""
+        numbers, truss, members = self.numbers, self.layout.truss, self.layout.member_nodes
+        width = max(len(truss.tip), 4, members.shape[1])
+        nodes, coefficients = np.zeros((len(rows), width), dtype=np.int64), np.zeros((len(rows), width, 3))
+        progress = np.zeros(len(rows))
+
+        def put(where: Index, named: Index, values: Array) -> None:
+            nodes[where, : named.shape[-1]] = named
+            coefficients[where, : named.shape[-1]] = values
+
         tip = len(numbers.tip_rhs)
-        if row < tip:
-            return truss.tip, numbers.tip_jacobian[row].reshape(-1, 3), -float(numbers.tip_rate[row])
-        if row == self.equal:
-            return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0
-        if row >= self.clearance.start:
-            k = row - self.clearance.start
-            return numbers.clearance.nodes[k], numbers.clearance.coefficients[k], 0.0
-        member = self.locked[row - tip] if row < self.equal else truss.actuators[row - self.actuators.start]
-        return self.layout.member_nodes[member], numbers.gradient[member], 0.0
+        where = np.flatnonzero(rows < tip)
+        put(where, truss.tip, numbers.tip_jacobian[rows[where]].reshape(len(where), -1, 3))
+        progress[where] = -numbers.tip_rate[rows[where]]
+        progress[rows == self.equal] = 1.0
+        where = np.flatnonzero((rows >= self.actuators.start) & (rows < self.clearance.start))
+        strokes = truss.actuators[rows[where] - self.actuators.start]
+        put(where, members[strokes], numbers.gradient[strokes])
+        where = np.flatnonzero((rows >= tip) & (rows < self.equal))
+        held = self.locked[rows[where] - tip]
+        put(where, members[held], numbers.gradient[held])
+        where = np.flatnonzero(rows >= self.clearance.start)
+        near = rows[where] - self.clearance.start
+        put(where, numbers.clearance.nodes[near], numbers.clearance.coefficients[near])
+        return nodes, coefficients, progress
 
     def nodal_forces(self, multipliers: Array) -> Array:
         """Return (N, 3) the tip's and clearance rows' multipliers (total,) times their coefficients."""
@@ -194,7 +210,7 @@ class Point:
 class Eliminated(Protocol):
     """A QP whose unknowns are eliminated: H = L L' for some L that only it knows."""
 
-    def columns(self, table: RowTable, rows: list[int]) -> Array:
+    def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A."""
         ...
 
@@ -240,10 +256,13 @@ def solve_rows(
             if refined > _REFINEMENTS:
                 raise SolverError(f"rounding left a row {violation.max():.1e} m or rad out of its bounds")
         else:
-            added = problem.columns(table, new)
-            across = columns.T @ added
-            gram = np.block([[gram, across], [across.T, added.T @ added]])
+            added = problem.columns(table, np.array(new, dtype=np.int64))
             columns = np.hstack([columns, added])
+            grown = np.empty((columns.shape[1],) * 2)
+            grown[: len(gram), : len(gram)] = gram
+            grown[:, len(gram) :] = columns.T @ added
+            grown[len(gram) :] = grown[:, len(gram) :].T
+            gram = grown
             rows += new
             multipliers = np.concatenate([multipliers, np.zeros(len(new))])
             new = []

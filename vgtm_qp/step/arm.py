@@ -24,7 +24,7 @@ from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
 from vgtm_qp.truss.build import build_truss
-from vgtm_qp.truss.kinematics import Kinematics
+from vgtm_qp.truss.kinematics import Kinematics, member_ends
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
@@ -49,6 +49,9 @@ class Arm:
         Duration of a step, s.
     base_motion : BaseMotion or None
         None where the base rests.
+    measure : Clearance or None
+        The clearance of members between the ends that offset joints give them; None where the ends are the nodes.
+        The monitor sees them from node to node, wider by the offset: it may call safe unsafe, never the other way.
     """
 
     truss: Truss
@@ -64,6 +67,13 @@ class Arm:
     influence: float
     dt: float
     base_motion: BaseMotion | None = None
+    measure: Clearance | None = None
+
+    def least_clearance(self, X: Array, time: float, among: str = "all") -> float:
+        """Return the exact least surface distance at node positions `X` (N, 3), m; see ``Clearance.least``."""
+        if self.measure is None:
+            return self.monitor.least(X, time, among=among)[0]
+        return self.measure.least(member_ends(self.truss, X).reshape(-1, 3), time, among=among)[0]
 
     def home_state(self) -> State:
         """Return the arm at rest in its home pose at time 0."""
@@ -95,15 +105,16 @@ def build_arm(problem: Problem) -> Arm:
     task = TipTask(problem.end_effector.track, kinematics)
     layout, control_vertices = _layout(problem, truss, task)
     clearance = problem.clearance
+    options: dict[str, Any] = {
+        "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
+        "safe": clearance.safe,
+        "influence": clearance.influence,
+        "member_names": truss.member_names,
+    }
     monitor = Clearance(
-        truss.members,
-        truss.radius,
-        [make_obstacle(obstacle) for obstacle in problem.obstacle],
-        safe=clearance.safe,
-        influence=clearance.influence,
-        self_collision=clearance.self_collision,
-        member_names=truss.member_names,
+        truss.members, truss.radius + _widest_offset(truss), self_collision=clearance.self_collision, **options
     )
+    ends = np.arange(2 * truss.member_count).reshape(-1, 2)
     return Arm(
         truss=truss,
         kinematics=kinematics,
@@ -118,7 +129,15 @@ def build_arm(problem: Problem) -> Arm:
         influence=clearance.influence,
         dt=step_duration(problem.maneuver),
         base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
+        measure=None if truss.joints is None else Clearance(ends, truss.radius, joined=truss.members, **options),
     )
+
+
+def _widest_offset(truss: Truss) -> Array:
+    """Return (M,) how far a point of a member between its ends can be from the line between its nodes, m."""
+    if truss.joints is None:
+        return np.zeros(truss.member_count)
+    return np.asarray(np.linalg.norm(truss.joints.offset, axis=2).max(axis=1))
 
 
 def make_engine(solver: str, layout: Layout, kinematics: Kinematics, task: TipTask) -> Engine:

@@ -14,6 +14,7 @@ from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.linearise import Target, clearance_rows
+from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.state import State
 from vgtm_qp.step.task import TipTask
 
@@ -24,12 +25,16 @@ _MOTION_MARGIN = 3.0
 """A member may move by so many times what is expected of it before a pair that matters can be missed."""
 
 
+_SETTLING_STEPS = 4
+
+
 @dataclass(frozen=True)
 class Tolerances:
     """What an accepted state is held against: lengths and tip in m (rad), clearance in m below `safe`.
 
-    They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. After a
-    first QP that moves a node by more than `first`, m, a correction is always due.
+    They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. The QP
+    keeps `margin` over the least clearance, m, for what is not linear in its step. A tip that is further off than
+    `settling` after a QP calls for another one.
     """
 
     member: float = 1e-10
@@ -37,8 +42,8 @@ class Tolerances:
     tip: float = 1e-8
     clearance: float = 1e-10
     between: float = 5e-5
-    margin: float = 1e-8
-    first: float = 1e-3
+    margin: float = 2e-5
+    settling: float = 1e-3
 
 
 @dataclass
@@ -166,15 +171,11 @@ class Attempt:
             if not moved < np.inf:
                 return outcome("singular pose", count)
             reach = moved
-            if motion and moved > tolerance.first:
-                continue
-            closed = self.engine.close(X, target, tolerance.member)
-            X = closed.X
-            goal = target.path.at(target.start + progress * span)
-            error = self.task.residual(closed.tip_position, closed.tip_rotation, goal)[0]
+            settled = self._settle(X, target, target.path.at(target.start + progress * span))
             phases.add("correction")
-            if closed.error > tolerance.member or float(np.abs(error).max()) > tolerance.tip:
+            if settled is None:
                 continue
+            closed, X = settled, settled.X
             if not self.monitor.keeps(
                 X, target.time, self.safe - tolerance.clearance, self.self_safe - tolerance.clearance
             ):
@@ -195,6 +196,23 @@ class Attempt:
             if len(stations) > 8:
                 return outcome("clearance between the states", count)
         return outcome("no convergence", self.max_qps)
+
+    def _settle(self, X: Array, target: Target, goal: PathPoint) -> Closed | None:
+        """Return the configuration near `X` with its lengths closed and the tip at `goal`; None where another QP is due."""
+        tolerance, gain = self.tolerances, None
+        for _ in range(_SETTLING_STEPS):
+            closed = self.engine.close(X, target, tolerance.member)
+            error = self.task.residual(closed.tip_position, closed.tip_rotation, goal)[0]
+            off = float(np.abs(error).max())
+            if not (closed.error <= tolerance.member and off <= tolerance.settling):
+                return None
+            if off <= tolerance.tip:
+                return closed
+            gain = self.engine.gain() if gain is None else gain
+            if gain is None:
+                return None
+            X = closed.X + gain @ error
+        return None
 
     def _expected(self, target: Target, guess: Array) -> float:
         """Return about how far a node moves in the step, m; anything where the arm was at rest."""
@@ -223,7 +241,8 @@ class Attempt:
         )
         rows = clearance_rows(self.monitor, near, *safe)
         if motion:
-            np.minimum(rows.lower, 0.0, out=rows.lower)
+            # A zero step is always allowed, but for the margin that the step before may have used up.
+            np.minimum(rows.lower, 2.0 * margin, out=rows.lower)
         for s in stations:
             between = state.nodes + s * (X - state.nodes)
             pairs = self.monitor.near(between, state.time + s * (time - state.time), 1.5 * self.safe)

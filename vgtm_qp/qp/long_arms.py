@@ -1,0 +1,29 @@
+"""Which arms are long enough, and regular enough, for a solver whose cost is linear in the bays."""
+
+from __future__ import annotations
+
+from vgtm_qp.qp.chain import find_chain
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.staged import StagedSolver
+from vgtm_qp.qp.tracked import TrackedSolver
+
+STAGED_ACTUATORS = 45
+"""From so many actuators on, elimination along the chain is faster than condensing onto the actuators."""
+
+
+def chain_solver(layout: Layout) -> StagedSolver | TrackedSolver | None:
+    """Return the solver along the chain of `layout`; None where it is no chain or does not fit hard tracking."""
+    chain = find_chain(layout)
+    if chain is None:
+        return None
+    if not layout.hard_tracking:
+        return StagedSolver(chain)
+    return TrackedSolver(chain) if chain.is_square else None
+
+
+def prefers_staged(layout: Layout) -> bool:
+    """Whether `chain_solver` is there for `layout` and faster than the condensed QP."""
+    if len(layout.truss.actuators) < STAGED_ACTUATORS:
+        return False
+    chain = find_chain(layout)
+    return chain is not None and (not layout.hard_tracking or chain.is_square)
