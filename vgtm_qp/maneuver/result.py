@@ -20,6 +20,7 @@ from vgtm_qp.maneuver.certificate import Certificate
 from vgtm_qp.maneuver.manifest import check_manifest, dump_manifest, parse_manifest
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
@@ -246,6 +247,30 @@ class Maneuver:
         from vgtm_qp.view.figure import plot_frames
 
         return plot_frames(self, **options)
+
+    def plot_clearance(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the least distances to obstacles and between members over time."""
+        from vgtm_qp.view.plots import plot_clearance
+
+        return plot_clearance(self, axes=axes)
+
+    def plot_strokes(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the lengths of the actuated members over time, between their limits."""
+        from vgtm_qp.view.plots import plot_strokes
+
+        return plot_strokes(self, axes=axes)
+
+    def plot_tip_error(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the distance of the tip from its target over time."""
+        from vgtm_qp.view.plots import plot_tip_error
+
+        return plot_tip_error(self, axes=axes)
+
+    def plot_step_time(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the computing time of each step by phase."""
+        from vgtm_qp.view.plots import plot_step_time
+
+        return plot_step_time(self, axes=axes)
 
     @classmethod
     def load(cls, path: str | Path) -> Maneuver:
