@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
-from vgtm_qp.methods.condensation import rotation_vectors
+from vgtm_qp.methods.condensation import CurveNodes, rotation_vectors
 from vgtm_qp.methods.curve_motion import CurveMotion
 from vgtm_qp.methods.resolver import MethodResolver
 from vgtm_qp.methods.segments import make_segments
@@ -20,6 +20,8 @@ from vgtm_qp.step.path import Path
 Array = NDArray[np.float64]
 
 _SMALLEST = 1 / 64
+_MAX_QPS = 5
+_LEAST_PROGRESS = 1 / 64
 _SLACK = 1e-10
 _BETWEEN = 5e-5
 
@@ -59,16 +61,16 @@ class CurveFirstResolver(MethodResolver):
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
         if self._is_qp:
             return self._move_safely(path, start, end, dt)
-        state, faces = self.state, self._faces
+        state = self.state
         curve = self.motion.follow(
             self.curve, path.at(start), path.at(end), state.time, state.nodes, correct=self._correct
         )
-        nodes = self.motion.nodes(curve, faces, frames=self._frames)
+        nodes = self._nodes(curve)
         self.spend("solve")
         if self._correct:
             X = self.tracker.track(state.nodes, nodes)
         else:
-            before = self.motion.nodes(self.curve, faces, frames=self._frames)
+            before = self._nodes(self.curve)
             turned = rotation_vectors(nodes.frame @ np.swapaxes(before.frame, 1, 2))
             X = self.tracker.rates(state.nodes, nodes.position - before.position, turned)
         self.spend("correction")
@@ -80,27 +82,34 @@ class CurveFirstResolver(MethodResolver):
         state, share, reason = self.state, 1.0, ""
         while share >= _SMALLEST:
             goal = start + share * (end - start)
-            try:
-                curve, progress, active = self.motion.follow_qp(
-                    self.curve, path.at(start), path.at(goal), state.time, state.nodes
-                )
-                here = start + progress * (goal - start)
-                curve = self.motion.corrected(curve, path.at(here))
-                self.spend("solve")
-                X = self.tracker.track(
-                    state.nodes, self.motion.nodes(curve, self._faces, frames=self._frames)
-                )
+            piece = path.at(start), path.at(goal)
+            curve, X, progress, time = self.curve, np.array(state.nodes), 0.0, state.time
+            for _ in range(_MAX_QPS):
+                try:
+                    now = path.at(start + progress * (goal - start))
+                    curve, change, active = self.motion.follow_qp(curve, piece, now, progress, time, X)
+                    progress = min(max(progress + change, 0.0), 1.0)
+                    curve = self.motion.corrected(curve, path.at(start + progress * (goal - start)))
+                    self.spend("solve")
+                    X = self.tracker.track(state.nodes, self._nodes(curve))
+                except SolverError as error:
+                    reason = str(error)
+                    break
                 self.spend("correction")
-                broken = self._broken(X, dt)
+                time = state.time + dt
+                reason = self._broken(X, dt)
                 self.spend("acceptance")
-            except SolverError as error:
-                broken, active, progress = str(error), (), 0.0
-            if not broken and share * progress >= 1e-3:
-                self.curve = curve
-                return X, curve.control_vertices, share * progress
-            reason = broken or ", ".join(active) or "no progress along the path"
+                if not reason and share * progress >= _LEAST_PROGRESS:
+                    self.curve = curve
+                    return X, curve.control_vertices, share * progress
+                if not reason or progress < _LEAST_PROGRESS or reason.startswith("stroke"):
+                    reason = reason or ", ".join(active) or "no progress along the path"
+                    break
             share /= 2.0
         raise SolverError(reason)
+
+    def _nodes(self, curve: Curve) -> CurveNodes:
+        return self.motion.nodes(curve, self._faces, frames=self._frames)
 
     def _broken(self, X: Array, dt: float) -> str:
         """Return which limit the step to node positions `X` would break, empty if none."""

@@ -26,6 +26,7 @@ DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 _SAMPLES = 400
 _UNBOUNDED = 1e30
 _PROGRESS = 1e3
+_MARGIN = 1e-5
 
 
 class CurveMotion:
@@ -145,12 +146,24 @@ class CurveMotion:
         return Objective(hessian, gradient)
 
     def follow_qp(
-        self, curve: Curve, here: PathPoint, goal: PathPoint, time: float, X: Array
+        self, curve: Curve, piece: tuple[PathPoint, PathPoint], now: PathPoint, progress: float, time: float, X: Array
     ) -> tuple[Curve, float, tuple[str, ...]]:
-        """Return the curve after one QP: the terms of :meth:`objective`, with clearance; progress; active rows.
+        """Return the curve after one QP with clearance, the change of progress, and the active rows.
 
-        A member near an obstacle moves, to first order, with the curve where it stands: that is all a curve can
-        know of the truss. The end slows down along the path where the rows do not let it go on.
+        From `progress` 0 it is the step's motion, with the terms of :meth:`objective`. From another it corrects what
+        the first one, linear as it is, left over: without gradients, and back along the path if need be. A member
+        near an obstacle moves with the curve where it stands: that is all a curve can know of the truss.
+
+        Parameters
+        ----------
+        piece
+            Start and end of the piece of path.
+        now
+            The pose on it at `progress`, 0 to 1.
+        time
+            At which the obstacles are met, s.
+        X : (N, 3)
+            Node positions, m.
 
         Raises
         ------
@@ -158,9 +171,8 @@ class CurveMotion:
             The QP has no solution.
         """
         objective = self.objective(curve, X, time)
-        moved, turned = pose_displacement(here, goal)
+        moved, turned = pose_displacement(*piece)
         rate = self._tip_vector(curve, moved, turned)
-        behind = self._error(curve, here)
         near, distance, names = self._near(curve, X, time)
         size, tips = curve.coordinates, len(rate)
         J = self._rows(curve)
@@ -172,11 +184,15 @@ class CurveMotion:
         H = np.zeros((size + 1, size + 1))
         H[:size, :size] = objective.hessian
         H[-1, -1] = curvature
-        f = np.append(objective.gradient, -2.0 * curvature)
-        equal = np.concatenate([behind, np.zeros(BASE_ROWS)])
-        room = np.minimum(self._arm.safe + 1e-6 - distance, 0.0)
-        lower = np.concatenate([np.full(size, -_UNBOUNDED), [0.0], equal, room])
-        upper = np.concatenate([np.full(size, _UNBOUNDED), [1.0], equal, np.full(len(near), _UNBOUNDED)])
+        f, room = np.zeros(size + 1), self._arm.safe + _MARGIN - distance
+        bounds = -progress, 0.0
+        if progress == 0.0:
+            f, bounds = np.append(objective.gradient, -2.0 * curvature), (0.0, 1.0)
+            room = np.minimum(room, 0.0)
+        equal = np.concatenate([self._error(curve, now), np.zeros(BASE_ROWS)])
+        free = np.full(size, _UNBOUNDED)
+        lower = np.concatenate([-free, bounds[:1], equal, room])
+        upper = np.concatenate([free, bounds[1:], equal, np.full(len(near), _UNBOUNDED)])
         sense = np.zeros(len(lower), dtype=np.int32)
         sense[size + 1 : size + 1 + len(J)] = 5
         x, _, flag, info = daqp.solve(H, f, A, upper, lower, sense)
@@ -184,7 +200,7 @@ class CurveMotion:
             raise SolverError("the QP of the curve has no solution")
         pressing = np.asarray(info["lam"])[size + 1 + len(J) :] < -1e-9
         active = tuple(names[k] for k in np.flatnonzero(pressing))
-        return displaced(curve, x[:size]), min(max(float(x[-1]), 0.0), 1.0), active
+        return displaced(curve, x[:size]), float(x[-1]), active
 
     def _rows(self, curve: Curve) -> Array:
         """Return the rows of eq. (37) at the tip, then those that hold the base: (n_e + 5, D)."""

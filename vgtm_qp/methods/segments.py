@@ -14,6 +14,9 @@ Index = NDArray[np.int64]
 
 _ROWS = {"position": 3, "pointing": 5, "orientation": 6}
 
+_JOINED = 3
+"""One or two straight octahedral bays cannot turn their end face without moving it; three can, but for roll."""
+
 
 @dataclass(frozen=True, eq=False)
 class Segment:
@@ -83,12 +86,9 @@ def make_segments(layout: Layout, turns: str | None) -> tuple[Segment, ...]:
     if (faces - 1) % stride:
         partition = [(face, "position") for face in range(1, ends[0] + 1)] + partition[1:]
     if turns and _ROWS[turns] > _ROWS[most]:
-        joined = 2 if turns == "pointing" else 3
-        if faces - 1 < joined:
-            raise CurveError(
-                f'"{turns}" at the tip takes {joined} bays of this module; the arm has {faces - 1}'
-            )
-        partition = [*partition[: max(len(partition) - joined, 0)], (faces - 1, turns)]
+        if faces - 1 < _JOINED:
+            raise CurveError(f'"{turns}" at the tip takes {_JOINED} bays of this module; it has {faces - 1}')
+        partition = [*partition[: max(len(partition) - _JOINED, 0)], (faces - 1, turns)]
     return tuple(_segments(layout, partition))
 
 

@@ -1,0 +1,283 @@
+"""The methods of the paper against one another, against the QP, and against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from method_problems import MODULES, free_problem, run
+
+import vgtm_qp as vq
+from vgtm_qp.errors import CurveError
+from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.methods import make_resolver
+from vgtm_qp.methods.conventional import ConventionalResolver
+from vgtm_qp.methods.curve_first import CurveFirstResolver
+from vgtm_qp.methods.objectives import potential_gradient, potential_slope
+from vgtm_qp.methods.segments import make_segments
+from vgtm_qp.problem import Problem
+from vgtm_qp.qp.condensed import CondensedSolver
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.linearise import Linearisation, Target
+
+ALL_TERMS = ["node_rate", "actuator_rate", "stroke_centring"]
+
+
+@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("algebra", ["dense", "sparse"])
+@pytest.mark.parametrize("variant", ["moore-penrose", "weighted"])
+def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra: str, variant: str) -> None:
+    """Equal objective, no obstacle, no limit: one step of eq. (28) is one QP, to 1e-9."""
+    corrected = free_problem(module, name="pseudoinverse", correct=True)
+    there = make_resolver(corrected)
+    run(there, corrected, 12)
+
+    problem = corrected.replace(
+        {
+            "method.correct": False,
+            "method.algebra": algebra,
+            "method.variant": variant,
+            "method.null_space": ALL_TERMS,
+        }
+    )
+    resolver = ConventionalResolver(problem)
+    arm = resolver.arm
+    plan = make_plan(problem, *resolver.tip())
+    resolver.state = there.state
+    start, end = float(plan.marks[11]), float(plan.marks[12])
+    step = resolver.follow(plan.path, start, end)
+    assert step.progress == 1.0, step.reason
+
+    unlimited = np.full(len(arm.truss.actuators), 1e9)
+    target = Target(plan.path, start, end, -unlimited, unlimited, there.state.time + 0.05)
+    linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
+    numbers = linearisation.numbers(
+        np.array(there.state.nodes), np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True
+    )
+    answer = CondensedSolver(arm.layout).solve(numbers)
+    assert answer.progress == pytest.approx(1.0, abs=1e-12)
+    moved = resolver.state.nodes - there.state.nodes
+    assert np.abs(moved).max() > 1e-3
+    np.testing.assert_allclose(moved, answer.nodes, atol=1e-9)
+
+
+@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("correct", [False, True])
+def test_parallel_tracking_is_recursive_tracking(module: str, correct: bool) -> None:
+    options = {"name": "curve-pseudoinverse", "correct": correct}
+    problem = free_problem(module, tracking="recursive", **options)
+    recursive = run(CurveFirstResolver(problem), problem)
+    problem = free_problem(module, tracking="parallel", **options)
+    parallel = run(CurveFirstResolver(problem), problem)
+    np.testing.assert_allclose(parallel, recursive, atol=1e-9)
+
+
+@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("name", ["pseudoinverse", "curve-pseudoinverse"])
+def test_corrected_methods_keep_lengths_and_tip(module: str, name: str) -> None:
+    problem = free_problem(module, name=name, tracking="recursive", correct=True)
+    resolver = make_resolver(problem)
+    run(resolver, problem)
+    arm = resolver.arm
+    fixed = arm.layout.fixed
+    np.testing.assert_allclose(resolver.state.lengths[fixed], arm.home_lengths[fixed], atol=1e-10)
+    np.testing.assert_allclose(resolver.tip()[0], problem.maneuver.waypoint[0].position, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["pseudoinverse", "curve-pseudoinverse"])
+def test_faithful_methods_drift_by_the_square_of_the_step(name: str) -> None:
+    drift = []
+    for steps in (20, 40):
+        problem = free_problem("octahedral", steps=steps, name=name, tracking="recursive")
+        resolver = make_resolver(problem)
+        run(resolver, problem)
+        fixed = resolver.arm.layout.fixed
+        drift.append(np.abs(resolver.state.lengths - resolver.arm.home_lengths)[fixed].max())
+    # Squares of half the displacement, twice as often.
+    assert drift[0] / drift[1] == pytest.approx(2.0, abs=0.2)
+
+
+@pytest.mark.parametrize("module", ["octahedral", "octahedral with offset joints", "longeron"])
+def test_dense_and_sparse_algebra_give_one_maneuver(module: str) -> None:
+    for variant in ("moore-penrose", "damped"):
+        options = {"name": "pseudoinverse", "variant": variant, "null_space": ["node_rate", "actuator_rate"]}
+        ways = []
+        for algebra in ("dense", "sparse"):
+            problem = free_problem(module, algebra=algebra, **options)
+            ways.append(run(make_resolver(problem), problem))
+        np.testing.assert_allclose(ways[0], ways[1], atol=1e-9)
+
+
+def test_damping_and_truncation_change_the_answer_and_the_rank() -> None:
+    def resolver(**options: object) -> ConventionalResolver:
+        problem = free_problem("octahedral", name="pseudoinverse", **options)
+        found = ConventionalResolver(problem)
+        run(found, problem, 3)
+        return found
+
+    plain = resolver()
+    rows = len(plain.arm.layout.fixed) + 3
+    assert plain.rank == rows
+    damped = resolver(variant="damped", damping=0.3)
+    assert np.abs(damped.state.nodes - plain.state.nodes).max() > 1e-4
+    truncated = resolver(variant="truncated", truncation=0.3)
+    assert truncated.rank is not None
+    assert truncated.rank < rows
+
+
+def test_segments_are_of_the_right_size() -> None:
+    def partition(module: str, turns: str | None = None, **truss: object) -> list[tuple[int, str, bool]]:
+        problem = free_problem(module).replace({f"truss.{key}": value for key, value in truss.items()})
+        layout = build_arm(problem.replace({"method.solver": "piqp"})).layout
+        return [(s.face, s.tracks, s.is_square) for s in make_segments(layout, turns)]
+
+    assert partition("octahedral") == [(k, "position", True) for k in range(1, 6)]
+    assert partition("hexapod") == [(k, "orientation", True) for k in range(1, 5)]
+    assert partition("longeron") == [
+        (1, "position", True),
+        (3, "orientation", True),
+        (5, "orientation", True),
+    ]
+    assert partition("longeron", bays=4) == [(2, "orientation", True), (4, "orientation", True)]
+    assert partition("tetrahedral") == [(k, "orientation", False) for k in range(1, 5)]
+    assert partition("tetrahedral, two actuated") == [(k, "orientation", True) for k in range(1, 5)]
+    assert partition("octahedral", "pointing")[-2:] == [(2, "position", True), (5, "pointing", False)]
+
+
+def test_pointing_is_tracked_by_three_octahedral_bays_together() -> None:
+    problem = free_problem("octahedral", name="curve-pseudoinverse", tracking="recursive", correct=True)
+    data = problem.to_dict()
+    data["end_effector"] = {"track": ["position", "pointing"]}
+    data["maneuver"]["waypoint"][0]["pointing"] = [0.2, 0.1, 1.0]
+    states = []
+    for tracking in ("recursive", "parallel"):
+        data["method"]["tracking"] = tracking
+        pointed = Problem.from_dict(data)
+        resolver = make_resolver(pointed)
+        states.append(run(resolver, pointed))
+        direction = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
+        np.testing.assert_allclose(resolver.tip()[1][:, 2], direction, atol=1e-9)
+    np.testing.assert_allclose(states[0], states[1], atol=1e-9)
+
+
+def test_the_curve_keeps_its_base_and_its_null_space_vector_does_not_move_the_tip() -> None:
+    ends = []
+    for terms in ([], ["curve_rate", "spacing", "smoothness"]):
+        problem = free_problem("hexapod", name="curve-pseudoinverse", tracking="parallel", null_space=terms)
+        resolver = CurveFirstResolver(problem)
+        home = resolver.curve
+        run(resolver, problem)
+        p = resolver.curve.control_vertices
+        np.testing.assert_allclose(p[0], home.control_vertices[0], atol=1e-12)
+        np.testing.assert_allclose(p[1, :2], 0.0, atol=1e-12)
+        ends.append(p)
+    np.testing.assert_allclose(ends[0][-1], ends[1][-1], atol=1e-12)
+    assert np.abs(ends[0] - ends[1]).max() > 1e-3
+
+
+def test_torsion_coordinates_let_the_curve_steer_roll() -> None:
+    problem = free_problem("hexapod", name="curve-pseudoinverse", tracking="recursive", correct=True)
+    data = problem.to_dict()
+    data["end_effector"] = {"track": ["position", "orientation"]}
+    data["maneuver"]["waypoint"][0]["rotation_vector"] = [0.1, 0.05, 0.3]
+    with pytest.raises(CurveError, match="torsion_vertices"):
+        make_resolver(Problem.from_dict(data))
+    data["curve"] |= {"torsion_vertices": 2, "control_vertices": 6}
+    rolled = Problem.from_dict(data)
+    resolver = make_resolver(rolled)
+    run(resolver, rolled)
+    np.testing.assert_allclose(resolver.arm.truss.tip_frame, np.eye(3))
+    expected = make_plan(rolled, *resolver.tip()).path.at(1e9).rotation
+    np.testing.assert_allclose(resolver.tip()[1], expected, atol=1e-9)
+
+
+def test_a_breakdown_ends_the_maneuver_with_step_and_reason() -> None:
+    problem = vq.load_problem("five_bay_free").replace(
+        {"method.name": "curve-pseudoinverse", "method.null_space": [], "method.correct": True}
+    )
+    goal = {"time": 10.0, "position": [1.84, 0.0, 2.86]}
+    maneuver = vq.solve(problem.replace({"maneuver.waypoint": [goal]}))
+    assert maneuver.status == "blocked"
+    assert 10 <= maneuver.steps < 50
+    assert maneuver.blocked_by[0].startswith(f"step {maneuver.steps + 1}: ")
+
+
+def test_a_faithful_run_is_solved_but_not_verified() -> None:
+    problem = vq.load_problem("five_bay_free").replace({"method.name": "pseudoinverse"})
+    maneuver = vq.solve(problem)
+    assert maneuver.status == "solved"
+    assert maneuver.certificate is not None
+    assert any("member error" in line for line in maneuver.certificate.failures())
+    corrected = vq.solve(problem.replace({"method.correct": True}))
+    assert corrected.certificate is not None
+    assert not any("member error" in line for line in corrected.certificate.failures())
+
+
+@pytest.mark.parametrize("tracking", ["recursive", "parallel"])
+def test_the_curve_qp_keeps_every_limit_up_to_where_it_stops(tracking: str) -> None:
+    problem = vq.load_problem("ten_bay_round_a_cube").replace({"method.tracking": tracking})
+    maneuver = vq.solve(problem)
+    assert maneuver.status == "solved"
+    assert maneuver.certificate is not None
+    assert maneuver.certificate.ok, str(maneuver.certificate)
+
+
+def test_the_potential_gradient_is_that_of_the_potential() -> None:
+    problem = vq.load_problem("five_bay_two_cubes").replace({"method.solver": "piqp"})
+    arm = build_arm(problem)
+    random = np.random.default_rng(0)
+    X = arm.truss.home + random.normal(scale=0.02, size=arm.truss.home.shape)
+
+    def potential(nodes: np.ndarray) -> float:
+        distance = arm.monitor.near(nodes, 0.0, arm.influence).distance
+        return float(np.sum(0.5 * (arm.influence / distance - 1.0) ** 2))
+
+    gradient = potential_gradient(arm.monitor, X, 0.0, arm.influence)
+    assert np.abs(gradient).max() > 0.1
+    for _ in range(5):
+        direction = random.normal(size=X.shape)
+        h = 1e-6
+        slope = (potential(X + h * direction) - potential(X - h * direction)) / (2 * h)
+        assert slope == pytest.approx(float(np.sum(gradient * direction)), rel=1e-4, abs=1e-4)
+
+
+def test_the_potential_ends_at_the_influence_distance_and_stays_finite() -> None:
+    slopes = potential_slope(np.array([-0.1, 1e-12, 0.1, 0.5, 0.7]), 0.5)
+    assert np.all(np.isfinite(slopes))
+    assert slopes[0] == slopes[1] < slopes[2] < 0.0
+    np.testing.assert_array_equal(slopes[3:], 0.0)
+
+
+def test_the_obstacle_potential_keeps_the_conventional_arm_further_away() -> None:
+    problem = vq.load_problem("five_bay_two_cubes").replace(
+        {"method.name": "pseudoinverse", "method.correct": True, "maneuver.steps": 20}
+    )
+    plain = vq.solve(problem, verify=False)
+    pushed = vq.solve(
+        problem.replace(
+            {
+                "method.null_space": ["actuator_rate", "obstacle_potential"],
+                "method.weights.obstacle_potential": 1e-4,
+            }
+        ),
+        verify=False,
+    )
+    assert min(pushed.clearance) > min(plain.clearance) + 0.01
+
+
+def test_a_moving_base_enters_the_conventional_solution() -> None:
+    problem = free_problem("octahedral", name="pseudoinverse", correct=True)
+    data = problem.to_dict()
+    data["truss"]["base_motion"] = [{"time": 1.0, "position": [0.1, 0.0, 0.05]}]
+    moving = Problem.from_dict(data)
+    resolver = make_resolver(moving)
+    states = run(resolver, moving)
+    base = resolver.arm.truss.base
+    np.testing.assert_allclose(states[-1][base] - states[0][base], [[0.095, 0.0, 0.0475]] * 3, atol=2e-3)
+    fixed = resolver.arm.layout.fixed
+    np.testing.assert_allclose(
+        resolver.state.lengths[fixed], resolver.arm.home_lengths[fixed], atol=1e-10
+    )
+    data["method"] |= {"name": "curve-pseudoinverse", "tracking": "recursive"}
+    with pytest.raises(CurveError, match="moving base"):
+        make_resolver(Problem.from_dict(data))
