@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dgesv, dposv
 
 Array = NDArray[np.float64]
 
-MULTIPLIER = 1e-9
+MULTIPLIER = 1e-6
 """Rows and bounds whose multiplier is not greater than this count as inactive."""
 
 
