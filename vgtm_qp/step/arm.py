@@ -47,6 +47,8 @@ class Arm:
         Least clearance to obstacles and between members, and the distance from which pairs enter the QP, m.
     dt : float
         Duration of a step, s.
+    jams : tuple of (str, float)
+        Actuated members that lock later than at the start, and the times, s.
     base_motion : BaseMotion or None
         None where the base rests.
     measure : Clearance or None
@@ -67,6 +69,7 @@ class Arm:
     influence: float
     dt: float
     base_motion: BaseMotion | None = None
+    jams: tuple[tuple[str, float], ...] = ()
     measure: Clearance | None = None
 
     def least_clearance(self, X: Array, time: float, among: str = "all") -> float:
@@ -129,6 +132,7 @@ def build_arm(problem: Problem) -> Arm:
         influence=clearance.influence,
         dt=step_duration(problem.maneuver),
         base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
+        jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
         measure=None if truss.joints is None else Clearance(ends, truss.radius, joined=truss.members, **options),
     )
 

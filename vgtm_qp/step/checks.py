@@ -16,6 +16,8 @@ from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.problem.table import Place, shown
 from vgtm_qp.step.arm import Arm
+from vgtm_qp.step.path import PathPoint
+from vgtm_qp.truss.mobility import RANK_TOLERANCE, actuator_response, describe
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
@@ -31,7 +33,36 @@ def check_problem(problem: Problem, arm: Arm) -> list[Mistake]:
     the members can be long; a target so deep inside an obstacle that no tip can be there.
     """
     mistakes = [mistake for distance, mistake in _at_home(problem, arm) if distance <= 0.0]
-    return [*mistakes, *_out_of_reach(problem, arm), *_inside_obstacles(problem, arm, _hollow(arm.truss))]
+    return [
+        *unreachable_tip(problem, arm),
+        *mistakes,
+        *_out_of_reach(problem, arm),
+        *_inside_obstacles(problem, arm, _hollow(arm.truss)),
+    ]
+
+
+def unreachable_tip(problem: Problem, arm: Arm) -> Iterator[Mistake]:
+    """Yield the tracked coordinates of the end effector if the actuators cannot change them all, each on its own.
+
+    To first order at the home pose: eq. (6) holds at full row rank only. A straight octahedral arm cannot roll.
+    """
+    truss, task = arm.truss, arm.task
+    goal = PathPoint(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    arm.kinematics.evaluate(truss.home)
+    jacobian = task.rows(truss.home, goal).jacobian
+    rows = np.zeros((len(jacobian), truss.node_count, 3))
+    rows[:, truss.tip] = jacobian.reshape(len(jacobian), -1, 3)
+    response = actuator_response(truss, rows)
+    response[len(task.axes) :] *= truss.height
+    values = np.linalg.svd(response, compute_uv=False)
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
+    if rank < len(jacobian):
+        reasons = "; ".join(describe(truss).unreachable)
+        found = f"this arm at home has rank {rank} of {len(jacobian)} in these"
+        why = f" and cannot start: {reasons}" if reasons else ""
+        yield problem.mistake(
+            ("end_effector", "track"), f"coordinates that the actuators can change one by one; {found}{why}"
+        )
 
 
 def find_warnings(problem: Problem, arm: Arm) -> list[Mistake]:

@@ -9,10 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vgtm_qp.errors import GoalError
+from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.arm import Arm, build_arm
+from vgtm_qp.step.checks import unreachable_tip
 from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.limits import length_box
 from vgtm_qp.step.linearise import Target
@@ -20,6 +21,10 @@ from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
 from vgtm_qp.step.state import State, frozen
 
 Array = NDArray[np.float64]
+
+
+_INSTANT = 1e-9
+"""Times that differ by less are the same, s."""
 
 
 class StepStatus(StrEnum):
@@ -54,7 +59,7 @@ class Step:
     state: State
     reason: str
     qps: int
-    _members: tuple[str, ...] = field(repr=False)
+    _actuators: tuple[str, ...] = field(repr=False)
     _solution: StepSolution | None = field(default=None, repr=False)
     _rows: ClearanceRows | None = field(default=None, repr=False)
 
@@ -70,7 +75,7 @@ class Step:
             found[name] = max(found.get(name, 0.0), float(pressing[k]))
         strokes = np.abs(self._solution.actuator_multipliers)
         for k in np.flatnonzero(strokes > 1e-9):
-            found[f"stroke: {self._members[k]}"] = float(strokes[k])
+            found[self._actuators[k]] = float(strokes[k])
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     @property
@@ -85,10 +90,20 @@ class Step:
 
 
 class Resolver:
-    """Moves one arm step by step. Not to be shared by threads: use one per thread."""
+    """Moves one arm step by step. Not to be shared by threads: use one per thread.
+
+    Raises
+    ------
+    ProblemError
+        The end effector is asked for coordinates that no actuator can start to change.
+    """
 
     def __init__(self, problem: Problem | Arm) -> None:
         self.arm = arm = problem if isinstance(problem, Arm) else build_arm(problem)
+        if isinstance(problem, Problem):
+            mistakes = list(unreachable_tip(problem, arm))
+            if mistakes:
+                raise ProblemError(str(problem.source or problem.name), mistakes)
         self._attempt = Attempt(
             arm.engine, arm.task, arm.monitor, arm.safe, arm.self_safe, arm.influence
         )
@@ -100,11 +115,47 @@ class Resolver:
             truss.rate[truss.actuators],
             truss.acceleration[truss.actuators],
         )
+        self._row_names = [f"stroke: {name}" for name in self._actuator_names]
+        self._locked: set[str] = set()
+        self._jams = sorted(arm.jams, key=lambda jam: -jam[1])
 
     @property
     def phases(self) -> dict[str, float]:
         """Seconds spent so far in each phase."""
         return self._attempt.phases.seconds
+
+    @property
+    def locked(self) -> frozenset[str]:
+        """Names of the actuated members that are stuck by now; those stuck from the start are fixed members."""
+        return frozenset(self._locked)
+
+    def lock(self, name: str) -> None:
+        """Hold an actuated member at its present length from now on.
+
+        The QP keeps its shape: an actuator whose least and greatest lengths are one is a fixed member.
+
+        Raises
+        ------
+        GoalError
+            No actuated member has that name.
+        """
+        if name not in self._actuator_names:
+            what = "has a fixed length" if name in self.arm.truss.member_names else "is no member"
+            names = ", ".join(self._actuator_names[:6]) + (", ..." if len(self._actuator_names) > 6 else "")
+            raise GoalError(
+                f'cannot lock "{name}", which {what}; actuated members are {names}{nearest(name, self._actuator_names)}'
+            )
+        k = self._actuator_names.index(name)
+        self._limits[0][k] = self.state.lengths[self.arm.truss.actuators[k]]
+        self._row_names[k] = f"locked: {name}"
+        self._locked.add(name)
+
+    def _until_jam(self, dt: float) -> float:
+        """Lock what jams by now; return the part of a step of `dt` that ends at the next jam, 1 where none is due."""
+        while self._jams and self._jams[-1][1] <= self.state.time + _INSTANT:
+            self.lock(self._jams.pop()[0])
+        left = self._jams[-1][1] - self.state.time if self._jams else np.inf
+        return left / dt if left < dt - _INSTANT else 1.0
 
     def step(
         self,
@@ -169,6 +220,8 @@ class Resolver:
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None, smallest: float = 1 / 64) -> Step:
         """Move along `path` from its value `start` towards `end` in one step; pieces are halved until one is safe.
 
+        A step in which an actuator of the problem jams ends at that time, with the part of the way until then.
+
         Raises
         ------
         GoalError
@@ -177,6 +230,8 @@ class Resolver:
         dt = self.arm.dt if dt is None else dt
         if not (np.isfinite(dt) and dt > 0.0):
             raise GoalError(f"dt must be a positive number of seconds, not {dt!r}; the state of the arm is unchanged")
+        whole = self._until_jam(dt)
+        dt *= whole
         state, actuators = self.state, self.arm.truss.actuators
         lower, upper = length_box(
             state.lengths[actuators], state.length_rates[actuators], *self._limits, dt, state.duration or None
@@ -184,16 +239,17 @@ class Resolver:
         base = None if self.arm.base_motion is None else self.arm.base_motion.nodes(state.time + dt)
         share, outcome = 1.0, None
         while share >= smallest:
-            target = Target(path, start, start + share * (end - start), lower, upper, state.time + dt, base)
+            reach = start + share * whole * (end - start)
+            target = Target(path, start, reach, lower, upper, state.time + dt, base)
             outcome = self._attempt.run(state, target, share)
             if outcome.accepted:
                 break
             share /= 2
         assert outcome is not None
-        told = (self._actuator_names, outcome.solution, outcome.rows)
+        told = (tuple(self._row_names), outcome.solution, outcome.rows)
         if not outcome.accepted:
             return Step(StepStatus.BLOCKED, 0.0, state, outcome.reason, outcome.iterations, *told)
-        progress = share * outcome.progress
+        progress = share * whole * outcome.progress
         closed = outcome.closed
         assert closed is not None
         self.state = State(

@@ -38,6 +38,8 @@ _SAFE = 0.05
 """What a problem that does not say keeps from its obstacles, m."""
 _SELF_SHARE = 0.25
 """What it keeps between members, as a share of that."""
+_INSTANT = 1e-9
+"""Times that differ by less are the same, s."""
 _MANY_UNKNOWNS = 2000
 _FEW_STATES = 21
 
@@ -105,7 +107,14 @@ def verify(maneuver: Maneuver) -> Certificate:
         stroke_violation=_worst(_beyond_stroke(arm, lengths), "m", LIMIT_TOLERANCE, names),
         rate_violation=_worst(_beyond_rate(arm, maneuver.time, lengths), "m/s", LIMIT_TOLERANCE, names),
         acceleration_violation=_worst(
-            _beyond_acceleration(arm, maneuver.time, lengths), "m/s^2", LIMIT_TOLERANCE, names
+            np.where(
+                _locking_rows(arm, problem, maneuver.time),
+                0.0,
+                _beyond_acceleration(arm, maneuver.time, lengths),
+            ),
+            "m/s^2",
+            LIMIT_TOLERANCE,
+            names,
         ),
         clearance=_least(at, safe - CLEARANCE_TOLERANCE),
         clearance_between=_least(between, safe - BETWEEN_TOLERANCE),
@@ -127,6 +136,7 @@ def verify(maneuver: Maneuver) -> Certificate:
             *wrong,
             *path.contradictions,
             *_record_contradictions(maneuver, arm),
+            *_jams_between_rows(maneuver, problem),
             *_outcome_contradictions(maneuver),
         ),
         notes=(*notes, *path.notes),
@@ -169,10 +179,30 @@ def _held(arm: Arm, problem: Mapping[str, Any], time: Array, lengths: Array) -> 
         if name not in arm.member_names:
             continue
         k = arm.member_names.index(name)
-        rows = np.flatnonzero(time >= since)
+        rows = np.flatnonzero(time >= since - _INSTANT)
         if len(rows):
             errors[rows, k] = np.maximum(errors[rows, k], np.abs(lengths[rows, k] - lengths[rows[0], k]))
     return errors
+
+
+def _jams_between_rows(maneuver: Maneuver, problem: Mapping[str, Any]) -> list[str]:
+    """Return the members that lock at a time which no row has: nothing says what length they stuck at."""
+    found = []
+    for entry in (problem.get("truss") or {}).get("locked") or ():
+        since = 0.0 if isinstance(entry, str) else float(entry.get("time", 0.0))
+        if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > _INSTANT:
+            found.append(f"{entry['member']} locks at {since:g} s, where there is no state")
+    return found
+
+
+def _locking_rows(arm: Arm, problem: Mapping[str, Any], time: Array) -> Array:
+    """Return (T - 2, M) whether an acceleration is that of a member which stops because it locks."""
+    middle = np.zeros((max(len(time) - 2, 0), len(arm.member_names)), dtype=bool)
+    for entry in (problem.get("truss") or {}).get("locked") or ():
+        if not isinstance(entry, str) and entry["member"] in arm.member_names:
+            since = float(entry.get("time", 0.0))
+            middle[:, arm.member_names.index(entry["member"])] = np.abs(time[1:-1] - since) <= _INSTANT
+    return middle
 
 
 def _base_error(arm: Arm, maneuver: Maneuver, problem: Mapping[str, Any]) -> Array:
