@@ -109,13 +109,20 @@ class Chain:
         node = layout.truss.free[column // 3]
         place = _places(self.node_period[node], self.node_place[node], period[member], self.carried)
         entry = period[member] * int(pattern.sum()) + number[row[member], 3 * place + column % 3]
-        shape = (self.periods * int(pattern.sum()), layout.truss.member_count * layout.member_nodes.shape[1] * 3)
+        shape = (
+            self.periods * int(pattern.sum()),
+            layout.truss.member_count * layout.member_nodes.shape[1] * 3,
+        )
         return sparse.csr_matrix((np.ones(len(entry)), (entry, flat)), shape=shape)
 
     @property
     def is_square(self) -> bool:
         """Whether a period's fixed members and its faces' positions determine its nodes, given the curve."""
-        return self.faces.shape[1] > 0 and int(self.soft.sum()) == 3 * self.faces.shape[1] and not len(self.locked)
+        return (
+            self.faces.shape[1] > 0
+            and int(self.soft.sum()) == 3 * self.faces.shape[1]
+            and not len(self.locked)
+        )
 
 
 def find_chain(layout: Layout) -> Chain | None:
@@ -164,7 +171,10 @@ def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
         face_nodes = truss.faces[layout.tracked]
         completed = period[face_nodes].max(axis=1)
         order = np.argsort(completed, kind="stable")
-        if len(order) % periods or (completed[order] != np.repeat(np.arange(periods), len(order) // periods)).any():
+        if (
+            len(order) % periods
+            or (completed[order] != np.repeat(np.arange(periods), len(order) // periods)).any()
+        ):
             return None
         faces = order.reshape(periods, -1)
         face_used = face_nodes[faces]
@@ -172,11 +182,17 @@ def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
         if ((period[nodes_used] >= 0) & (period[nodes_used] < here - 1)).any():
             return None
     carried = np.unique(
-        np.concatenate([place[nodes_used][period[nodes_used] == here - 1] for nodes_used in (used, face_used)])
+        np.concatenate(
+            [place[nodes_used][period[nodes_used] == here - 1] for nodes_used in (used, face_used)]
+        )
     )
     face_places = _places(period[face_used], place[face_used], here, carried)
     weights = truss.face_weights[layout.tracked[faces]]
-    if (face_places != face_places[:1]).any() or (face_places < 0).any() or np.ptp(weights, axis=0).max(initial=0.0) > 0:
+    if (
+        (face_places != face_places[:1]).any()
+        or (face_places < 0).any()
+        or np.ptp(weights, axis=0).max(initial=0.0) > 0
+    ):
         return None
     places = _places(period[used], place[used], here, carried)
     pattern = np.zeros((members.shape[1], len(carried) + nodes.shape[1]), dtype=bool)

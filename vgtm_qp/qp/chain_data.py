@@ -30,11 +30,14 @@ class ChainData:
         ends = np.cumsum(list(sizes.values())).tolist()
         self.data: Array = np.zeros((periods, ends[-1]))
         self._part = {
-            name: self.data[:, end - size : end] for (name, size), end in zip(sizes.items(), ends, strict=True)
+            name: self.data[:, end - size : end]
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
         }
         self._faces = chain.faces.reshape(-1)
         self._weights, self._slopes = layout.curve_weights[self._faces], layout.curve_slopes[self._faces]
-        self._slope_products = (self._slopes[:, :, None] * self._slopes[:, None, :]).reshape(len(self._faces), layout.vertices**2)
+        self._slope_products = (self._slopes[:, :, None] * self._slopes[:, None, :]).reshape(
+            len(self._faces), layout.vertices**2
+        )
         self._actuator = np.zeros(layout.truss.member_count)
         self._soft = chain.members[:, chain.soft]
         self.offset, self.normal = np.zeros((layout.vertices, 3)), np.zeros(3)
@@ -42,7 +45,9 @@ class ChainData:
             self._part["weights"][:] = self._weights[:, 1:].reshape(periods, -1)
             self._part["slopes"][:] = self._slopes[:, 1:].reshape(periods, -1)
         weights = layout.weights
-        self._polygon = weights.curve_rate * np.eye(layout.vertices) + weights.smoothness * layout.polygon_bending
+        self._polygon = (
+            weights.curve_rate * np.eye(layout.vertices) + weights.smoothness * layout.polygon_bending
+        )
         self._tracking = 0.0 if layout.hard_tracking else weights.tracking
         self._hessian = self._polygon + self._tracking * self._weights.T @ self._weights
 
@@ -61,7 +66,10 @@ class ChainData:
         self.offset[2:] = 0.0
         self.normal = np.cross(numbers.base_axes[0], numbers.base_axes[1])
         self._tangent_curve = numbers.tangent_curve[self._faces]
-        self._position_rhs, self._tangent_rhs = numbers.position_rhs[self._faces], numbers.tangent_rhs[self._faces]
+        self._position_rhs, self._tangent_rhs = (
+            numbers.position_rhs[self._faces],
+            numbers.tangent_rhs[self._faces],
+        )
         self._vertex_gradient = numbers.vertex_gradient
         gap, tilt = self._misfit(self.offset)
         part["tangent_face"][:] = numbers.tangent_face[self._faces].reshape(periods, -1)
@@ -89,7 +97,9 @@ class ChainData:
 
     def polygon_terms(self) -> tuple[Array, Array]:
         """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the control polygon alone."""
-        hessian = np.kron(self._polygon, np.eye(3)).reshape(*self._polygon.shape[:1], 3, *self._polygon.shape[1:], 3)
+        hessian = np.kron(self._polygon, np.eye(3)).reshape(
+            *self._polygon.shape[:1], 3, *self._polygon.shape[1:], 3
+        )
         reduced = self._reduced(self._reduced(hessian).transpose(1, 2, 0))
         return reduced, self.polygon_gradient(self.offset)
 
@@ -101,7 +111,9 @@ class ChainData:
         """Return Hessian and gradient of all terms in the curve's coordinates, with the faces where they are."""
         count = len(self.offset)
         turned = self._tangent_curve[..., None] * self._tangent_curve[:, :, None]
-        hessian = self.chain.layout.weights.tangent * (self._slope_products.T @ turned.sum(axis=1).reshape(-1, 9))
+        hessian = self.chain.layout.weights.tangent * (
+            self._slope_products.T @ turned.sum(axis=1).reshape(-1, 9)
+        )
         hessian = hessian.reshape(count, count, 3, 3).transpose(0, 2, 1, 3)
         axis = np.arange(3)
         hessian[:, axis, :, axis] += self._hessian

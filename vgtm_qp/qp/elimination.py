@@ -149,10 +149,20 @@ class Inputs:
         self.data = ca.SX.sym("data", sum(self.sizes.values()))
         parts = dict(zip(self.sizes, ca.vertsplit(self.data, _offsets(self.sizes.values())), strict=True))
         self.jacobian = ca.SX(sparsity, parts["jacobian"])
-        self.rhs, self.actuator_gradient, self.normal = parts["rhs"], parts["actuator_gradient"], parts["normal"]
-        self.weights, self.slopes = (ca.reshape(parts[name], vertices, faces).T for name in ("weights", "slopes"))
-        self.tangent_face = [ca.reshape(parts["tangent_face"][18 * k : 18 * k + 18], 9, 2).T for k in range(faces)]
-        self.tangent_curve = [ca.reshape(parts["tangent_curve"][6 * k : 6 * k + 6], 3, 2).T for k in range(faces)]
+        self.rhs, self.actuator_gradient, self.normal = (
+            parts["rhs"],
+            parts["actuator_gradient"],
+            parts["normal"],
+        )
+        self.weights, self.slopes = (
+            ca.reshape(parts[name], vertices, faces).T for name in ("weights", "slopes")
+        )
+        self.tangent_face = [
+            ca.reshape(parts["tangent_face"][18 * k : 18 * k + 18], 9, 2).T for k in range(faces)
+        ]
+        self.tangent_curve = [
+            ca.reshape(parts["tangent_curve"][6 * k : 6 * k + 6], 3, 2).T for k in range(faces)
+        ]
         self.gap = ca.reshape(parts["gap"], 3, faces).T
         self.tilt = ca.reshape(parts["tilt"], 2, faces).T
 
@@ -206,7 +216,9 @@ class Elimination:
     def centre_row(self, k: int) -> ca.SX:
         """Return the constant (3, 3w + 3m) Jacobian of the centre of face `k`."""
         row = ca.SX(3, self.size)
-        for place, weight in zip(self.chain.face_places[k].tolist(), self.chain.face_weights[k].tolist(), strict=True):
+        for place, weight in zip(
+            self.chain.face_places[k].tolist(), self.chain.face_weights[k].tolist(), strict=True
+        ):
             for axis in range(3):
                 row[axis, 3 * place + axis] += weight
         return row
@@ -286,7 +298,11 @@ class Elimination:
         return ca.Function(
             "factor",
             [carry, inputs.data],
-            [ca.densify(handed), ca.vertcat(*[_nonzeros(part) for part in gains]), ca.densify(ca.vertcat(*outer).T)],
+            [
+                ca.densify(handed),
+                ca.vertcat(*[_nonzeros(part) for part in gains]),
+                ca.densify(ca.vertcat(*outer).T),
+            ],
         )
 
     def _gains(self) -> tuple[ca.SX, list[list[ca.SX]]]:
@@ -294,7 +310,9 @@ class Elimination:
         parts = self._gain_parts
         offsets = _offsets([part.nnz() for part in parts])
         vector = ca.SX.sym("gains", offsets[-1])
-        pieces = [ca.SX(part.sparsity(), v) for part, v in zip(parts, ca.vertsplit(vector, offsets), strict=True)]
+        pieces = [
+            ca.SX(part.sparsity(), v) for part, v in zip(parts, ca.vertsplit(vector, offsets), strict=True)
+        ]
         return vector, [pieces[4 * k : 4 * k + 4] for k in range(len(self.stages))]
 
     def columns(self, count: int) -> ca.Function:
@@ -325,8 +343,17 @@ class Elimination:
             motion = z[done : done + stage.freedom] + W @ followed + Wb @ u
             u = ca.vertcat(u, G @ (self.hard_rhs(stage) + followed) - free @ motion)
             done += stage.freedom
-        faces = [row(k) @ u for k in range(self.chain.faces.shape[1]) for row in (self.centre_row, self.tangent_row)]
-        outputs = [u[self.live], u[self.chain.before :], self.inputs.jacobian @ u - self.inputs.rhs, ca.vertcat(*faces)]
+        faces = [
+            row(k) @ u
+            for k in range(self.chain.faces.shape[1])
+            for row in (self.centre_row, self.tangent_row)
+        ]
+        outputs = [
+            u[self.live],
+            u[self.chain.before :],
+            self.inputs.jacobian @ u - self.inputs.rhs,
+            ca.vertcat(*faces),
+        ]
         return ca.Function("forward", [carry, self.inputs.data, vector, z], [ca.densify(x) for x in outputs])
 
     def balance(self) -> ca.Function:
@@ -342,7 +369,10 @@ class Elimination:
         V[self.live] += carry
         V += self.inputs.jacobian[self.soft, :].T @ actuator
         for k in range(faces):
-            V += self.centre_row(k).T @ face[5 * k : 5 * k + 3] + self.tangent_row(k).T @ face[5 * k + 3 : 5 * k + 5]
+            V += (
+                self.centre_row(k).T @ face[5 * k : 5 * k + 3]
+                + self.tangent_row(k).T @ face[5 * k + 3 : 5 * k + 5]
+            )
         outer: list[ca.SX] = []
         for stage, (free, G, _, _) in reversed(list(zip(self.stages, gains, strict=True))):
             Vu = V[stage.own]

@@ -1,4 +1,6 @@
-"""QP solvers by name: the condensed DAQP path, and PIQP, OSQP or anything else of qpsolvers on the full QP."""
+"""QP solvers by name: DAQP on the condensed QP, or along the chain of bays where the arm is long; PIQP, OSQP or
+anything else of qpsolvers on the full QP.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ from vgtm_qp.errors import SolverError, nearest
 from vgtm_qp.qp.condensed import CondensedSolver, InfeasibleStepError
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.long_arms import chain_solver, prefers_staged
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
@@ -51,7 +54,8 @@ def make_solver(name: str, layout: Layout) -> StepSolver:
         There is no such solver, or it is not installed; the message lists those that are.
     """
     if name == DEFAULT_SOLVER:
-        return CondensedSolver(layout)
+        solver = chain_solver(layout) if prefers_staged(layout) else None
+        return solver or CondensedSolver(layout)
     if name == "osqp":
         return FullSolver(layout, _Osqp())
     if name == "piqp":

@@ -15,12 +15,13 @@ from vgtm_qp.qp.chain import Chain
 from vgtm_qp.qp.chain_data import ChainData
 from vgtm_qp.qp.elimination import Elimination, Sweep
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
-from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
+from vgtm_qp.qp.working_set import Answer, Point, RowTable, solve_rows
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _BLOCK = 8
+_GREATEST_GAIN = 1e6
 RESIDUAL = 1e-8
 SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
 
@@ -65,6 +66,7 @@ class StagedSolver:
         )
         self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
         self._active: set[tuple[object, ...]] = set()
+        self._answer: Answer | None = None
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Solve one QP.
@@ -79,10 +81,35 @@ class StagedSolver:
         self._eliminate(numbers)
         table = RowTable.of(self.layout, numbers, self.chain.locked)
         size = self._freedom + self._curve + 1
-        point, multipliers, iterations = solve_rows(self, size, table, table.remembered(self._active), _BLOCK)
-        self._check(table, point, multipliers)
-        self._active = {table.key(k) for k in np.flatnonzero(multipliers).tolist() if k >= table.equal}
-        return solution(table, point, multipliers, iterations)
+        self._answer = answer = solve_rows(self, size, table, self._active, _BLOCK)
+        self._check(table, answer.point, answer.multipliers)
+        self._active = answer.active
+        return answer.solution()
+
+    def gain(self, least: float) -> Array | None:
+        """Return the least motions (N, 3, n_e) of the nodes that move the tip by one unit of each of its rows.
+
+        Rows of the last answer with multipliers above `least` stay as they are, and so does the progress. None where
+        the active rows leave no such motion.
+        """
+        answer = self._answer
+        if answer is None:
+            return None
+        table = answer.table
+        held = (answer.rows < table.equal) | (np.abs(answer.multipliers[answer.rows]) > least)
+        held &= answer.rows != table.equal
+        columns = answer.columns[:, held]
+        columns[-1] = 0.0
+        tip = len(table.numbers.tip_rhs)
+        try:
+            shares = np.linalg.solve(columns.T @ columns, np.eye(columns.shape[1])[:, :tip])
+        except np.linalg.LinAlgError:
+            return None
+        if not np.abs(columns @ shares).max(initial=0.0) < _GREATEST_GAIN:
+            return None
+        rest = self.point(table, np.zeros(len(columns))).nodes
+        moved = [self.point(table, -columns @ share).nodes - rest for share in shares.T]
+        return np.stack(moved, axis=-1)
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
@@ -174,16 +201,3 @@ class StagedSolver:
             raise SolverError(
                 f"the elimination left a primal residual of {primal:.1e} m and a dual residual of {residual / scale:.1e}"
             )
-
-
-def solution(table: RowTable, point: Point, multipliers: Array, iterations: int) -> StepSolution:
-    """Return the solution in the arm's terms."""
-    return StepSolution(
-        nodes=point.nodes,
-        actuators=point.values[table.actuators].copy(),
-        vertices=point.vertices,
-        progress=point.progress,
-        actuator_multipliers=multipliers[table.actuators].copy(),
-        clearance_multipliers=-multipliers[table.clearance],
-        iterations=iterations,
-    )

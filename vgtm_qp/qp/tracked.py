@@ -16,7 +16,7 @@ from vgtm_qp.qp.chain import Chain
 from vgtm_qp.qp.chain_data import ChainData
 from vgtm_qp.qp.elimination import Elimination, Sweep, range_and_null
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
-from vgtm_qp.qp.staged import RESIDUAL, SINGULAR, solution
+from vgtm_qp.qp.staged import RESIDUAL, SINGULAR
 from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
 
 Array = NDArray[np.float64]
@@ -94,10 +94,10 @@ class TrackedSolver:
         """
         self._eliminate(numbers)
         table = RowTable.of(self.layout, numbers, self.chain.locked)
-        point, multipliers, iterations = solve_rows(self, self._curve + 1, table, table.remembered(self._active))
-        self._check(table, point, multipliers)
-        self._active = {table.key(k) for k in np.flatnonzero(multipliers).tolist() if k >= table.equal}
-        return solution(table, point, multipliers, iterations)
+        answer = solve_rows(self, self._curve + 1, table, self._active)
+        self._check(table, answer.point, answer.multipliers)
+        self._active = answer.active
+        return answer.solution()
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
@@ -133,7 +133,9 @@ class TrackedSolver:
         weights = self.layout.weights
         hessian, gradient = self._numbers.polygon_terms()
         stiffness = weights.actuator_rate + weights.stroke_centring
-        whole = weights.node_rate * (self._moved.T @ self._moved) + stiffness * (self._strokes.T @ self._strokes)
+        whole = weights.node_rate * (self._moved.T @ self._moved) + stiffness * (
+            self._strokes.T @ self._strokes
+        )
         whole += weights.tangent * (self._angles.T @ self._angles)
         try:
             self._factor = np.linalg.cholesky(hessian + whole[:-1, :-1])
@@ -145,7 +147,9 @@ class TrackedSolver:
     def _check(self, table: RowTable, point: Point, multipliers: Array) -> None:
         """Refuse an answer whose primal or dual residual is too large."""
         numbers, weights, layout = table.numbers, self.layout.weights, self.layout
-        changed = np.einsum("mqc,mqc->m", numbers.gradient, point.nodes[layout.member_nodes]) - numbers.length_rhs
+        changed = (
+            np.einsum("mqc,mqc->m", numbers.gradient, point.nodes[layout.member_nodes]) - numbers.length_rhs
+        )
         gap, tilt = self._numbers.misfit(point.vertices, self._numbers.face_parts(point.nodes, numbers))
         primal = max(
             float(np.max(np.abs(changed - point.lengths))),

@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dpstrf
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.condensed import FEASIBILITY, UNBOUNDED, InfeasibleStepError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import StepNumbers
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -56,7 +56,13 @@ class RowTable:
         held = np.zeros(len(locked))
         clearance = numbers.clearance.lower
         lower = [numbers.tip_rhs, held, [numbers.progress_lower], numbers.lower, clearance]
-        upper = [numbers.tip_rhs, held, [numbers.progress_upper], numbers.upper, np.full(len(clearance), UNBOUNDED)]
+        upper = [
+            numbers.tip_rhs,
+            held,
+            [numbers.progress_upper],
+            numbers.upper,
+            np.full(len(clearance), UNBOUNDED),
+        ]
         equal = len(numbers.tip_rhs) + len(locked)
         first_clearance = equal + 1 + len(numbers.lower)
         return cls(
@@ -100,7 +106,7 @@ class RowTable:
 
         tip = len(numbers.tip_rhs)
         where = np.flatnonzero(rows < tip)
-        put(where, truss.tip, numbers.tip_jacobian[rows[where]].reshape(len(where), -1, 3))
+        put(where, truss.tip, numbers.tip_jacobian[rows[where]].reshape(len(where), len(truss.tip), 3))
         progress[where] = -numbers.tip_rate[rows[where]]
         progress[rows == self.equal] = 1.0
         where = np.flatnonzero((rows >= self.actuators.start) & (rows < self.clearance.start))
@@ -219,10 +225,54 @@ class Eliminated(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The primal and dual answer of the rows, and what it was found with.
+
+    Attributes
+    ----------
+    table : RowTable
+    point : Point
+    multipliers : (total,)
+        Positive at upper and negative at lower bounds.
+    rows : (R,) int
+        The rows that entered the dual QP.
+    columns : (size, R)
+        L^-1 A' of those rows.
+    iterations : int
+        Of the dual QPs.
+    """
+
+    table: RowTable
+    point: Point
+    multipliers: Array
+    rows: Index
+    columns: Array
+    iterations: int
+
+    @property
+    def active(self) -> set[tuple[object, ...]]:
+        """Keys of the active inequalities."""
+        return {self.table.key(k) for k in np.flatnonzero(self.multipliers).tolist() if k >= self.table.equal}
+
+    def solution(self) -> StepSolution:
+        """Return the answer in the arm's terms."""
+        table, point = self.table, self.point
+        return StepSolution(
+            nodes=point.nodes,
+            actuators=point.values[table.actuators].copy(),
+            vertices=point.vertices,
+            progress=point.progress,
+            actuator_multipliers=self.multipliers[table.actuators].copy(),
+            clearance_multipliers=-self.multipliers[table.clearance],
+            iterations=self.iterations,
+        )
+
+
 def solve_rows(
-    problem: Eliminated, size: int, table: RowTable, remembered: list[int], block: int = 8
-) -> tuple[Point, Array, int]:
-    """Return the solution, the multipliers of all rows (total,), and the iterations of the dual QPs.
+    problem: Eliminated, size: int, table: RowTable, remembered: set[tuple[object, ...]], block: int = 8
+) -> Answer:
+    """Return the answer of a QP with the rows of `table`; `remembered` are the keys of those that were active last.
 
     Rows enter the dual QP when they are violated, the worst first, and stay: so it ends.
 
@@ -238,7 +288,7 @@ def solve_rows(
     gram = np.zeros((0, 0))
     multipliers = np.zeros(0)
     iterations, refined = 0, 0
-    new = [*range(table.equal), *remembered]
+    new = [*range(table.equal), *table.remembered(remembered)]
     point = problem.point(table, np.zeros(size))
     while True:
         violation = table.violation(point.values)
@@ -268,10 +318,14 @@ def solve_rows(
             new = []
         index = np.array(rows, dtype=np.int64)
         multipliers, count = dual_solution(
-            gram, point.values[index] + gram @ multipliers, table.lower[index], table.upper[index], index < table.equal
+            gram,
+            point.values[index] + gram @ multipliers,
+            table.lower[index],
+            table.upper[index],
+            index < table.equal,
         )
         iterations += count
         point = problem.point(table, columns @ multipliers)
     every = np.zeros(len(table.lower))
     every[rows] = multipliers
-    return point, every, iterations
+    return Answer(table, point, every, np.array(rows, dtype=np.int64), columns, iterations)

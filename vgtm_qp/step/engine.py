@@ -12,10 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
+from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
+from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
 from vgtm_qp.qp.settle import MULTIPLIER, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
+from vgtm_qp.qp.staged import StagedSolver
 from vgtm_qp.step.linearise import Linearisation, Target
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.task import TipTask
@@ -56,8 +59,7 @@ class PlainEngine:
     def __init__(self, linearisation: Linearisation, solver: StepSolver) -> None:
         self._linearisation = linearisation
         self._solver = solver
-        layout = linearisation.layout
-        self._jacobian = np.zeros((layout.node_columns, layout.node_columns))
+        self._lengths = LengthSolver(linearisation.layout)
         self._last: tuple[StepNumbers, StepSolution] | None = None
 
     def solve(
@@ -86,8 +88,10 @@ class PlainEngine:
         if layout.hard_tracking or self._last is None:
             return None
         numbers, solution = self._last
-        layout.length_jacobian(numbers.gradient, self._jacobian)
-        _, _, response, failed = dgesv(self._jacobian, np.eye(truss.member_count)[:, truss.actuators])
+        if isinstance(self._solver, StagedSolver):
+            return self._solver.gain(MULTIPLIER)
+        jacobian = layout.length_jacobian(numbers.gradient)
+        _, _, response, failed = dgesv(jacobian, np.eye(truss.member_count)[:, truss.actuators])
         if failed:
             return None
         every = np.zeros((truss.node_count, 3, response.shape[1]))
@@ -116,12 +120,11 @@ class PlainEngine:
             # Divided by a short step's duration, once or twice, an error of `tolerance` is a rate that counts.
             if worst <= 1e-3 * tolerance or not worst < 1e-2:
                 break
-            layout.length_jacobian(kinematics.gradient, self._jacobian)
-            _, _, step, info = dgesv(self._jacobian, error)
-            if info != 0:
+            try:
+                X[free] += self._lengths.solve(kinematics.gradient, error)
+            except SolverError:
                 worst = np.inf
                 break
-            X[free] += step.reshape(-1, 3)
         return Closed(X, kinematics.lengths.copy(), worst, kinematics.tip_position(X), kinematics.tip_rotation.copy())
 
 
