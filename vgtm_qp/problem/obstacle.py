@@ -83,8 +83,8 @@ class Clearance(Table):
     safe: Distance = Field(default=0.05, description="least distance from an obstacle, m")
     influence: Length = Field(default=0.5, description="distance below which a pair is in the QP, m")
     margin: Distance = Field(
-        default=0.001,
-        description="distance that the QP keeps over the least one, so that the exact check passes, m",
+        default=0.0002,
+        description="distance that the QP keeps over the least one, so that the exact checks pass at once, m",
     )
     self_collision: Flag = Field(
         default=True, description="whether members that share no node keep apart too"

@@ -45,6 +45,8 @@ class Arm:
         The curve at home, m.
     safe, self_safe, influence : float
         Least clearance to obstacles and between members, and the distance from which pairs enter the QP, m.
+    margin : float
+        What the QP keeps over the least clearance, m.
     dt : float
         Duration of a step, s.
     jams : tuple of (str, float)
@@ -52,8 +54,9 @@ class Arm:
     base_motion : BaseMotion or None
         None where the base rests.
     measure : Clearance or None
-        The clearance of members between the ends that offset joints give them; None where the ends are the nodes.
-        The monitor sees them from node to node, wider by the offset: it may call safe unsafe, never the other way.
+        What the clearance of a state is measured with: members between the ends that offset joints give them, and
+        pairs of members whether they must keep apart or not. None where the monitor sees the same. It sees members
+        from node to node, wider by the offset of their joints: it may call safe unsafe, never the other way.
     """
 
     truss: Truss
@@ -67,6 +70,7 @@ class Arm:
     safe: float
     self_safe: float
     influence: float
+    margin: float
     dt: float
     base_motion: BaseMotion | None = None
     jams: tuple[tuple[str, float], ...] = ()
@@ -117,6 +121,7 @@ def build_arm(problem: Problem) -> Arm:
     monitor = Clearance(
         truss.members, truss.radius + _widest_offset(truss), self_collision=clearance.self_collision, **options
     )
+    apart = truss.joints is not None or not clearance.self_collision
     ends = np.arange(2 * truss.member_count).reshape(-1, 2)
     return Arm(
         truss=truss,
@@ -130,10 +135,11 @@ def build_arm(problem: Problem) -> Arm:
         safe=clearance.safe,
         self_safe=clearance.between_members,
         influence=clearance.influence,
+        margin=clearance.margin,
         dt=step_duration(problem.maneuver),
         base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
-        measure=None if truss.joints is None else Clearance(ends, truss.radius, joined=truss.members, **options),
+        measure=Clearance(ends, truss.radius, joined=truss.members, **options) if apart else None,
     )
 
 

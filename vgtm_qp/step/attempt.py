@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +42,8 @@ class Tolerances:
     stroke: float = 1e-10
     tip: float = 1e-8
     clearance: float = 1e-10
-    between: float = 5e-5
-    margin: float = 2e-5
+    between: float = 1e-10
+    margin: float = 2e-4
     settling: float = 1e-3
 
 
@@ -151,9 +152,7 @@ class Attempt:
             phases.add("distance")
             goal = target.path.at(target.start + progress * span)
             try:
-                solution = self.engine.solve(
-                    X, Y if motion else X, vertices, target, goal, progress, rows, motion=motion
-                )
+                solution = self._solve(X, Y if motion else X, vertices, target, goal, progress, rows, motion=motion)
             except InfeasibleStepError:
                 return outcome("infeasible", count)
             except SolverError as error:
@@ -196,6 +195,17 @@ class Attempt:
             if len(stations) > 8:
                 return outcome("clearance between the states", count)
         return outcome("no convergence", self.max_qps)
+
+    def _solve(self, *at: Any, motion: bool) -> StepSolution:
+        """Return the engine's answer; where even a zero step is forbidden by the margin, without the margin."""
+        rows = at[-1]
+        try:
+            return self.engine.solve(*at, motion=motion)
+        except InfeasibleStepError:
+            if not motion or not len(rows) or rows.lower.max() <= 0.0:
+                raise
+        np.minimum(rows.lower, 0.0, out=rows.lower)
+        return self.engine.solve(*at, motion=motion)
 
     def _settle(self, X: Array, target: Target, goal: PathPoint) -> Closed | None:
         """Return the configuration near `X` with its lengths closed and the tip at `goal`; None where another QP is due."""

@@ -14,7 +14,7 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.checks import unreachable_tip
-from vgtm_qp.step.attempt import Attempt
+from vgtm_qp.step.attempt import Attempt, Tolerances
 from vgtm_qp.step.limits import length_box
 from vgtm_qp.step.linearise import Target
 from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
@@ -105,7 +105,13 @@ class Resolver:
             if mistakes:
                 raise ProblemError(str(problem.source or problem.name), mistakes)
         self._attempt = Attempt(
-            arm.engine, arm.task, arm.monitor, arm.safe, arm.self_safe, arm.influence
+            arm.engine,
+            arm.task,
+            arm.monitor,
+            arm.safe,
+            arm.self_safe,
+            arm.influence,
+            tolerances=Tolerances(margin=arm.margin),
         )
         self.state = arm.home_state()
         truss = arm.truss
