@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vgtm_qp.errors import (
         CurveError,
+        ExportError,
         GoalError,
         MissingExtraError,
         Mistake,
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
         TrussError,
         VgtmError,
     )
+    from vgtm_qp.export import export_maneuver
     from vgtm_qp.maneuver.certificate import Certificate, Measure
     from vgtm_qp.maneuver.result import Maneuver, load_result
     from vgtm_qp.maneuver.solve import solve
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "vgtm_qp.errors": (
         "CurveError",
+        "ExportError",
         "GoalError",
         "MissingExtraError",
         "Mistake",
@@ -41,6 +44,7 @@ _HOMES = {
         "TrussError",
         "VgtmError",
     ),
+    "vgtm_qp.export": ("export_maneuver",),
     "vgtm_qp.maneuver.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.result": ("Maneuver", "load_result"),
     "vgtm_qp.maneuver.solve": ("solve",),
@@ -56,6 +60,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = [
     "Certificate",
     "CurveError",
+    "ExportError",
     "GoalError",
     "Maneuver",
     "Measure",
@@ -74,6 +79,7 @@ __all__ = [
     "build_truss",
     "bundled_problems",
     "describe",
+    "export_maneuver",
     "load_problem",
     "load_result",
     "problem_schema",

@@ -1,0 +1,36 @@
+"""Every example runs as it stands, in an empty folder, and does what its first line says."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
+
+SAYS = {
+    "first_maneuver": ("solved in 50 steps", "first_maneuver.html"),
+    "own_truss": ("6 free motions", "solved; verified: True"),
+    "control_loop": ("75 cycles at 25 Hz", "the tip is 0.000 mm from its goal"),
+    "compare_methods": ("curve-pseudoinverse", "pseudoinverse", "qp"),
+    "jammed_actuator": ("it moved by 0.000000000 m", "verified: True"),
+    "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
+}
+
+
+def test_there_are_six_and_each_is_tried():
+    assert {example.stem for example in EXAMPLES} == set(SAYS)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.stem)
+def test_an_example_runs(
+    example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(example), run_name="__main__")
+    printed = capsys.readouterr().out
+    for words in SAYS[example.stem]:
+        assert words in printed
+    for picture in tmp_path.glob("*.png"):
+        assert picture.stat().st_size > 5_000
