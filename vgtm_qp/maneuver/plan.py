@@ -66,7 +66,7 @@ def _through_waypoints(maneuver: WaypointManeuver, position: Array, rotation: Ar
         elif waypoint.rotation_vector is not None:
             turned = rotation_from_vector(waypoint.rotation_vector)
         rotations.append(turned)
-    marks = times[-1] * np.arange(1, maneuver.steps + 1) / maneuver.steps
+    marks = np.linspace(0.0, times[-1], maneuver.steps + 1)[1:]
     return Plan(Path(np.array(times), np.stack(positions), np.stack(rotations)), marks)
 
 

@@ -21,7 +21,7 @@ from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.qp.staged import StagedSolver
 from vgtm_qp.step.linearise import Linearisation, Target
 from vgtm_qp.step.path import PathPoint
-from vgtm_qp.step.task import TipTask
+from vgtm_qp.step.task import TipTask, worth_closing
 
 Array = NDArray[np.float64]
 
@@ -153,6 +153,8 @@ class FusedEngine:
             X, Y, X if target.base is None else target.base, vertices, target.lower, target.upper, motion=motion
         )
         error, rate, across = self._task.residual(solver.tip_position, solver.tip_rotation, goal)
+        if motion:
+            error = worth_closing(error)
         return solver.solve(TipGoal(rate * (target.end - target.start), error, across), progress, rows)
 
     def gain(self) -> Array | None:

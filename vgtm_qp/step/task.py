@@ -25,6 +25,18 @@ _ROWS = {
 }
 
 
+_CLOSED = 2e-8
+
+
+def worth_closing(error: Array) -> Array:
+    """Return a tip error (n_e,), or zeros where it is within what an accepted state may have, m or rad.
+
+    An arm that limits and clearances hold on all sides cannot close even that: its QP would have no solution, where
+    staying as it is has one whose multipliers tell what holds it.
+    """
+    return error if float(np.abs(error).max(initial=0.0)) > _CLOSED else np.zeros_like(error)
+
+
 @dataclass(frozen=True)
 class TipRows:
     """Jacobian (n_e, 3 K_tip) w.r.t. the tip's nodes, rate (n_e,) along the path, and error (n_e,) goal minus value."""

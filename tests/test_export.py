@@ -1,0 +1,279 @@
+"""Every export is read back by somebody else's reader, and holds what the result holds."""
+
+from __future__ import annotations
+
+import builtins
+import csv
+import re
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from synthetic import maneuver_of, place, tripod
+
+import vgtm_qp as vq
+from vgtm_qp.cli import main
+from vgtm_qp.cli.export import FormatName
+from vgtm_qp.export import FORMATS, export_maneuver
+from vgtm_qp.export.mjcf import mjcf, node_masses
+from vgtm_qp.export.trajectory import actuator_names, step_rates, through_rates
+from vgtm_qp.verify.arm import Arm
+
+MOVING = {
+    "name": "drone",
+    "shape": "sphere",
+    "center": [3.0, 0.0, 2.0],
+    "radius": 0.1,
+    "velocity": [-0.1, 0.0, 0.0],
+}
+
+
+@pytest.fixture(scope="module")
+def maneuver() -> vq.Maneuver:
+    """A tripod whose two actuators move at uneven times, beside obstacles of every kind."""
+    time = np.array([0.0, 0.4, 1.0, 1.3, 2.0])
+    first = 1.4 + 0.1 * np.sin(time)
+    last = 0.9 + 0.05 * time
+    nodes = np.array([place(np.array([a, 1.4, 1.4, 1.5, 1.5, b])) for a, b in zip(first, last, strict=True)])
+    obstacles = [
+        {"name": "mast", "shape": "cylinder", "center": [2.0, 0.0, 1.0], "radius": 0.2, "height": 2.0},
+        MOVING,
+        {
+            "name": "crate",
+            "shape": "box",
+            "center": [0, 2.5, 0.5],
+            "size": 0.4,
+            "rotation_vector": [0, 0, 0.5],
+        },
+    ]
+    return maneuver_of(nodes, time, tripod(), problem={"obstacle": obstacles})
+
+
+@pytest.fixture(scope="module")
+def arm_between_cubes() -> vq.Maneuver:
+    return vq.solve(vq.load_problem("five_bay_two_cubes").replace({"maneuver.steps": 12}))
+
+
+def test_the_command_line_names_the_formats_that_there_are():
+    assert set(FormatName.__args__) == set(FORMATS)
+
+
+def test_csv_holds_lengths_and_rates_to_the_last_digit(maneuver: vq.Maneuver, tmp_path: Path):
+    with export_maneuver(maneuver, tmp_path / "t.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    names = actuator_names(maneuver)
+    assert header == ["time [s]", *(f"{n} [m]" for n in names), *(f"d {n}/dt [m/s]" for n in names)]
+    table = np.array(rows, dtype=float)
+    lengths = maneuver.member_lengths[:, maneuver.member_actuated]
+    assert np.array_equal(table[:, 0], maneuver.time)
+    assert np.array_equal(table[:, 1 : 1 + len(names)], lengths)
+    steps = np.diff(maneuver.time)[:, None]
+    assert np.allclose(
+        lengths[0] + np.cumsum(table[1:, 1 + len(names) :] * steps, axis=0), lengths[1:], atol=1e-15
+    )
+
+
+def test_rates_through_the_states_lie_between_those_of_the_steps(maneuver: vq.Maneuver):
+    before, through = step_rates(maneuver), through_rates(maneuver)
+    assert not through[[0, -1]].any()
+    low, high = np.minimum(before[1:-1], before[2:]), np.maximum(before[1:-1], before[2:])
+    assert np.all(through[1:-1] >= low - 1e-12)
+    assert np.all(through[1:-1] <= high + 1e-12)
+
+
+def test_rates_through_the_states_are_exact_for_a_parabola():
+    time = np.array([0.0, 0.5, 0.8, 1.5])
+    lengths = 0.9 + 0.1 * time + 0.05 * time**2
+    nodes = np.array([place(np.array([1.4, 1.4, 1.4, 1.5, 1.5, value])) for value in lengths])
+    through = through_rates(maneuver_of(nodes, time, tripod()))
+    assert np.allclose(through[1:-1, 1], 0.1 + 0.1 * time[1:-1], atol=1e-12)
+
+
+def test_a_ros_trajectory_holds_the_lengths(maneuver: vq.Maneuver, tmp_path: Path):
+    message = yaml.safe_load(export_maneuver(maneuver, tmp_path / "t.yaml").read_text())
+    assert message["joint_names"] == actuator_names(maneuver)
+    times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
+    assert np.allclose(times, maneuver.time, atol=1e-9)
+    positions = [point["positions"] for point in message["points"]]
+    assert np.array_equal(positions, maneuver.member_lengths[:, maneuver.member_actuated])
+
+
+def test_a_bag_is_read_back_by_rosbags(maneuver: vq.Maneuver, tmp_path: Path):
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    path = export_maneuver(maneuver, tmp_path / "t.mcap")
+    states, trajectories = [], []
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        for connection, stamp, raw in reader.messages():
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            if connection.topic == "/joint_states":
+                assert connection.msgtype == "sensor_msgs/msg/JointState"
+                assert stamp == message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+                states.append((1e-9 * stamp, message))
+            else:
+                assert connection.msgtype == "trajectory_msgs/msg/JointTrajectory"
+                trajectories.append(message)
+    lengths = maneuver.member_lengths[:, maneuver.member_actuated]
+    assert np.allclose([stamp for stamp, _ in states], maneuver.time, atol=1e-9)
+    assert all(list(message.name) == actuator_names(maneuver) for _, message in states)
+    assert np.array_equal([message.position for _, message in states], lengths)
+    assert np.array_equal([message.velocity for _, message in states], through_rates(maneuver))
+    assert len(trajectories) == 1
+    assert list(trajectories[0].joint_names) == actuator_names(maneuver)
+    assert np.array_equal([point.positions for point in trajectories[0].points], lengths)
+
+
+def test_mujoco_reads_the_model_and_finds_the_lengths_at_every_keyframe(
+    maneuver: vq.Maneuver, tmp_path: Path
+):
+    import mujoco
+
+    model: Any = mujoco.MjModel.from_xml_path(str(export_maneuver(maneuver, tmp_path / "t.xml")))
+    data: Any = mujoco.MjData(model)
+    assert [model.tendon(k).name for k in range(model.ntendon)] == [
+        str(name) for name in maneuver.member_names
+    ]
+    assert model.nkey == len(maneuver.time)
+    drone = model.body("obstacle drone").mocapid[0]
+    for k in range(model.nkey):
+        mujoco.mj_resetDataKeyframe(model, data, k)
+        mujoco.mj_forward(model, data)
+        assert np.allclose(data.ten_length, maneuver.member_lengths[k], atol=1e-12)
+        assert np.allclose(data.site_xpos, maneuver.nodes[k], atol=1e-12)
+        assert np.allclose(data.ctrl, maneuver.member_lengths[k, maneuver.member_actuated], atol=1e-12)
+        center = np.array(MOVING["center"]) + maneuver.time[k] * np.array(MOVING["velocity"])
+        assert np.allclose(data.mocap_pos[drone], center, atol=1e-12)
+
+
+def test_mujoco_holds_the_truss_up_by_its_actuators(maneuver: vq.Maneuver):
+    import mujoco
+
+    model: Any = mujoco.MjModel.from_xml_string(mjcf(maneuver))
+    data: Any = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 2)
+    for _ in range(1500):
+        mujoco.mj_step(model, data)
+    assert np.allclose(data.ten_length, maneuver.member_lengths[2], atol=1e-3)
+    assert np.abs(data.qvel).max() < 1e-4
+
+
+def test_masses_add_up_to_those_of_the_members(maneuver: vq.Maneuver):
+    arm = Arm(maneuver.manifest["arm"], maneuver.members)
+    assert node_masses(arm).sum() == pytest.approx(arm.length.sum())
+    assert node_masses(arm)[4] == pytest.approx(0.5 * arm.length[3:].sum())
+
+
+def test_offset_joints_have_no_mujoco_model():
+    from vgtm_qp.truss.truss import Joints
+
+    joints = Joints(triangle=np.tile([0, 1, 2], (5, 1)), offset=np.zeros((6, 2, 3)))
+    nodes = place(np.array([1.4, 1.4, 1.4, 1.5, 1.5, 0.9]))[None]
+    with pytest.raises(vq.ExportError, match="pin joints"):
+        mjcf(maneuver_of(nodes, np.array([0.0]), tripod(joints)))
+
+
+def test_a_page_of_two_hundred_frames_stays_small_and_loads_nothing(
+    arm_between_cubes: vq.Maneuver, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = export_maneuver(arm_between_cubes, tmp_path / "arm.html")
+    assert path.stat().st_size <= 2_000_000
+    page = path.read_text(encoding="utf-8")
+    assert "<title>five-bay arm between two cubes (solved)</title>" in page
+    head = page[: page.index("<script")]
+    assert not re.search(r"(src|href)=[\"']https?://", head)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("suffix", "magic"), [(".gif", b"GIF89a"), (".pdf", b"%PDF"), (".png", b"\x89PNG")])
+def test_pictures_are_of_their_kind(
+    arm_between_cubes: vq.Maneuver, tmp_path: Path, suffix: str, magic: bytes
+):
+    few = _first_states(arm_between_cubes, 4)
+    path = export_maneuver(few, tmp_path / f"arm{suffix}")
+    assert path.read_bytes().startswith(magic)
+
+
+def test_an_animation_shows_every_state_and_moves(arm_between_cubes: vq.Maneuver, tmp_path: Path):
+    from PIL import Image
+
+    few = _first_states(arm_between_cubes, 4)
+    with Image.open(export_maneuver(few, tmp_path / "arm.gif")) as animation:
+        assert animation.n_frames == 4
+        pictures = []
+        for k in range(4):
+            animation.seek(k)
+            pictures.append(np.asarray(animation.convert("RGB")).copy())
+    assert tuple(pictures[0][0, 0]) == (255, 255, 255)
+    assert all((one != other).any() for one, other in pairwise(pictures))
+
+
+def test_a_video_has_a_frame_for_each_state(arm_between_cubes: vq.Maneuver, tmp_path: Path):
+    import imageio_ffmpeg
+
+    path = export_maneuver(_first_states(arm_between_cubes, 3), tmp_path / "arm.mp4")
+    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    assert frames == 3
+
+
+def test_a_missing_extra_is_named_with_the_pip_line(
+    maneuver: vq.Maneuver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    absent = {"viser", "mcap_ros2", "yaml", "PIL", "imageio_ffmpeg", "mujoco"}
+    import_module = builtins.__import__
+
+    def without(name: str, *arguments: Any, **options: Any) -> Any:
+        if name.split(".")[0] in absent:
+            raise ImportError(name)
+        return import_module(name, *arguments, **options)
+
+    still = _first_states(maneuver, 1)
+    monkeypatch.setattr(builtins, "__import__", without)
+    for name, extra in {
+        "html": "view",
+        "mcap": "export",
+        "ros": "export",
+        "gif": "export",
+        "mp4": "export",
+    }.items():
+        with pytest.raises(vq.MissingExtraError, match=re.escape(f"pip install 'vgtm-qp[{extra}]'")):
+            export_maneuver(still, tmp_path / f"x{FORMATS[name].suffix}")
+    from vgtm_qp.replay import replay
+
+    with pytest.raises(vq.MissingExtraError, match=re.escape("pip install 'vgtm-qp[mujoco]'")):
+        replay(still)
+
+
+def test_wrong_formats_and_places_are_named(maneuver: vq.Maneuver, tmp_path: Path):
+    with pytest.raises(vq.ExportError, match="choices: html, gif"):
+        export_maneuver(maneuver, tmp_path / "x.csv", to="cvs")
+    with pytest.raises(vq.ExportError, match=r"no format ends in \"\.doc\""):
+        export_maneuver(maneuver, tmp_path / "x.doc")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(vq.ExportError, match="cannot be written"):
+        export_maneuver(maneuver, tmp_path / "file" / "x.csv")
+
+
+def test_the_command_exports_beside_the_result(
+    maneuver: vq.Maneuver, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    result = maneuver.save(tmp_path / "tripod.npz")
+    assert main(["export", str(result), "--to", "csv"]) == 0
+    assert (tmp_path / "tripod.csv").is_file()
+    assert main(["export", str(result), "--to", "html", "-o", str(tmp_path / "page.htm")]) == 2
+    assert "--output" in capsys.readouterr().err
+    assert main(["export", str(tmp_path / "none.npz"), "--to", "csv"]) == 2
+
+
+def _first_states(maneuver: vq.Maneuver, count: int) -> vq.Maneuver:
+    rows = len(maneuver.time)
+    arrays = {
+        name: array[:count]
+        if array.shape[:1] == (rows,) and name not in ("members", "member_names")
+        else array
+        for name, array in maneuver.arrays.items()
+    }
+    return vq.Maneuver(**arrays, manifest=maneuver.manifest)
