@@ -17,7 +17,7 @@ from vgtm_qp.qp.fused_graph import Bound, length_function, row_function
 from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
-from vgtm_qp.qp.settle import MULTIPLIER, settling_gain
+from vgtm_qp.qp.settle import held, settling_gain
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ class FusedSolver:
         self._constant = np.zeros((self._size - 1, self._size - 1))
         self._tracked = 3 * len(layout.tracked)
         self._hard = self._tracked if layout.hard_tracking else 0
-        self._settling = (np.zeros((0, actuators)), np.zeros((0, actuators)), np.ones(actuators, dtype=bool))
+        self._settling = np.zeros((0, actuators)), np.ones(actuators, dtype=bool)
         self._reserve(self._size + 64)
         if self._hard:
             self._soft = np.ones(self._stack.shape[1])
@@ -174,9 +174,7 @@ class FusedSolver:
             raise InfeasibleStepError("the hard rows of the step contradict one another")
         multipliers = info["lam"]
         check_answer(x, multipliers, flag, hessian, gradient, constraint, lower, upper)
-        pressing = multipliers[size + tip + hard :] < -MULTIPLIER
-        free = np.abs(multipliers[:count]) <= MULTIPLIER
-        self._settling = (tip_rows[:, :-1], constraint[tip + hard :, :count][pressing], free)
+        self._settling = tip_rows[:, :-1], ~held(x[:count], self._box[0], self._box[1])
 
         truss = self.layout.truss
         nodes = np.zeros((truss.node_count, 3))
@@ -214,7 +212,7 @@ class FusedSolver:
         return Closed(out[0].reshape(-1, 3).copy(), out[1].copy(), error, out[3].copy(), out[4].reshape(3, 3).T.copy())
 
     def gain(self) -> Array | None:
-        """Return the node displacements (N, 3, n_e) per unit of tip error that leave the last QP's active rows alone.
+        """Return the node displacements (N, 3, n_e) per unit of tip error that leave actuators at their bounds.
 
         None where they cannot; see :mod:`vgtm_qp.qp.settle`.
         """

@@ -2,7 +2,7 @@
 
 The QP was linearised at the guessed middle of the step, so what is left after it is of third order. It is removed by
 Newton iterations whose Jacobian is kept: the least motion of the nodes, in the QP's metric, that moves the tip by the
-error while active actuators and active clearances stay where the QP put them.
+error while actuators at a bound stay there. Clearance rows need no part in it: their margin is larger than the motion.
 """
 
 from __future__ import annotations
@@ -13,14 +13,20 @@ from scipy.linalg.lapack import dgesv, dposv
 
 Array = NDArray[np.float64]
 
-MULTIPLIER = 1e-6
-"""Rows and bounds whose multiplier is not greater than this count as inactive."""
+_WORST_CONDITION = 1e8
+_AT_BOUND = 1e-6
+"""An actuator nearer than this to a bound counts as held there, m."""
+
+
+def held(displacement: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
+    """Return which actuators (n_a,) a QP left at a bound; by where they are, since multipliers may vanish there."""
+    return np.asarray((displacement < lower + _AT_BOUND) | (displacement > upper - _AT_BOUND))
 
 
 def settling_gain(
-    response: Array, tip: Array, active_rows: Array, free: NDArray[np.bool_], node_rate: float, actuator_rate: float
+    response: Array, tip: Array, free: NDArray[np.bool_], node_rate: float, actuator_rate: float
 ) -> Array | None:
-    """Return the actuator displacements (n_a, n_e) per unit of tip error; None where the active rows leave none.
+    """Return the actuator displacements (n_a, n_e) per unit of tip error; None where too few actuators are free.
 
     Parameters
     ----------
@@ -28,27 +34,22 @@ def settling_gain(
         Node displacements per actuator displacement.
     tip : (n_e, n_a)
         The tip's rows.
-    active_rows : (R, n_a)
-        Rows that stay as they are.
     free : (n_a,)
         Actuators that may move.
     node_rate, actuator_rate : float
         The QP's weights on node and actuator displacements.
     """
-    if np.count_nonzero(free) < len(tip) + len(active_rows):
+    if np.count_nonzero(free) < len(tip):
         return None
-    moving = response[:, free]
+    moving, rows = response[:, free], tip[:, free]
     hessian = node_rate * (moving.T @ moving)
     hessian.flat[:: len(hessian) + 1] += actuator_rate
-    rows = np.concatenate((tip, active_rows))[:, free]
     _, answer, failed = dposv(hessian, rows.T)
     if failed:
         return None
     normal = rows @ answer
-    wanted = np.zeros((len(rows), len(tip)))
-    wanted.flat[:: len(tip) + 1] = 1.0
-    _, _, shares, failed = dgesv(normal, wanted)
-    if failed or not np.abs(shares).max() < 1e8 / (1e-300 + np.abs(normal).max()):
+    _, _, shares, failed = dgesv(normal, np.eye(len(tip)))
+    if failed or not np.abs(shares).max() * np.abs(normal).max() < _WORST_CONDITION:
         return None
     gain = np.zeros((len(free), len(tip)))
     gain[free] = answer @ shares

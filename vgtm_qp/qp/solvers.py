@@ -183,6 +183,9 @@ class _Piqp:
             solver = piqp.SparseSolver()
             solver.settings.eps_abs = 1e-10
             solver.settings.eps_rel = 1e-12
+            # Complementarity, too, must be good enough to tell an active row from one that nearly is.
+            solver.settings.eps_duality_gap_abs = 1e-13
+            solver.settings.eps_duality_gap_rel = 1e-13
             solver.settings.verbose = False
             solver.setup(qp.P, **data)
             self._solver = solver

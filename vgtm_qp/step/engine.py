@@ -16,7 +16,7 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
 from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
-from vgtm_qp.qp.settle import MULTIPLIER, settling_gain
+from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.qp.staged import StagedSolver
 from vgtm_qp.step.linearise import Linearisation, Target
@@ -89,7 +89,7 @@ class PlainEngine:
             return None
         numbers, solution = self._last
         if isinstance(self._solver, StagedSolver):
-            return self._solver.gain(MULTIPLIER)
+            return self._solver.gain(1e-6)
         jacobian = layout.length_jacobian(numbers.gradient)
         _, _, response, failed = dgesv(jacobian, np.eye(truss.member_count)[:, truss.actuators])
         if failed:
@@ -97,12 +97,9 @@ class PlainEngine:
         every = np.zeros((truss.node_count, 3, response.shape[1]))
         every[truss.free] = response.reshape(-1, 3, response.shape[1])
         tip = numbers.tip_jacobian @ every[truss.tip].reshape(-1, response.shape[1])
-        pressing = solution.clearance_multipliers > MULTIPLIER
-        rows = numbers.clearance
-        active = np.einsum("rsc,rscn->rn", rows.coefficients[pressing], every[rows.nodes[pressing]])
-        free = np.abs(solution.actuator_multipliers) <= MULTIPLIER
+        free = ~held(solution.actuators, numbers.lower, numbers.upper)
         gain = settling_gain(
-            response, tip, active, free, weights.node_rate, weights.actuator_rate + weights.stroke_centring
+            response, tip, free, weights.node_rate, weights.actuator_rate + weights.stroke_centring
         )
         return None if gain is None else every @ gain
 
