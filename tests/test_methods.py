@@ -12,7 +12,7 @@ from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.methods.conventional import ConventionalResolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
-from vgtm_qp.methods.objectives import potential_gradient, potential_slope
+from vgtm_qp.methods.objectives import potential_curvature, potential_field, potential_slope
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.condensed import CondensedSolver
@@ -232,8 +232,9 @@ def test_the_potential_gradient_is_that_of_the_potential() -> None:
         distance = arm.monitor.near(nodes, 0.0, arm.influence).distance
         return float(np.sum(0.5 * (arm.influence / distance - 1.0) ** 2))
 
-    gradient = potential_gradient(arm.monitor, X, 0.0, arm.influence)
+    gradient, blocks = potential_field(arm.monitor, X, 0.0, arm.influence)
     assert np.abs(gradient).max() > 0.1
+    assert np.linalg.eigvalsh(blocks).min() > -1e-9
     for _ in range(5):
         direction = random.normal(size=X.shape)
         h = 1e-6
@@ -245,6 +246,9 @@ def test_the_potential_ends_at_the_influence_distance_and_stays_finite() -> None
     slopes = potential_slope(np.array([-0.1, 1e-12, 0.1, 0.5, 0.7]), 0.5)
     assert np.all(np.isfinite(slopes))
     assert slopes[0] == slopes[1] < slopes[2] < 0.0
+    h, d = 1e-6, np.array([0.1, 0.2, 0.4])
+    numeric = (potential_slope(d + h, 0.5) - potential_slope(d - h, 0.5)) / (2 * h)
+    np.testing.assert_allclose(potential_curvature(d, 0.5), numeric, rtol=1e-6)
     np.testing.assert_array_equal(slopes[3:], 0.0)
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from vgtm_qp.maneuver.certificate import Certificate, Measure
     from vgtm_qp.maneuver.result import Maneuver, load_result
     from vgtm_qp.maneuver.solve import solve
+    from vgtm_qp.methods.compare import Report, compare
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
     from vgtm_qp.step.resolver import Resolver, Step, StepStatus
     from vgtm_qp.truss.build import build_truss
@@ -48,6 +49,7 @@ _HOMES = {
     "vgtm_qp.maneuver.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.result": ("Maneuver", "load_result"),
     "vgtm_qp.maneuver.solve": ("solve",),
+    "vgtm_qp.methods.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
     "vgtm_qp.step.resolver": ("Resolver", "Step", "StepStatus"),
     "vgtm_qp.truss.build": ("build_truss",),
@@ -68,6 +70,7 @@ __all__ = [
     "Mistake",
     "Problem",
     "ProblemError",
+    "Report",
     "Resolver",
     "ResultError",
     "SolverError",
@@ -78,6 +81,7 @@ __all__ = [
     "VgtmError",
     "build_truss",
     "bundled_problems",
+    "compare",
     "describe",
     "export_maneuver",
     "load_problem",

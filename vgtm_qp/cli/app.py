@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError
 
 from vgtm_qp.cli.check import check
+from vgtm_qp.cli.compare import compare
 from vgtm_qp.cli.doctor import doctor
 from vgtm_qp.cli.export import export
 from vgtm_qp.cli.list import list_problems
@@ -47,6 +48,7 @@ app = App(
 _COMMANDS: dict[str, Callable[..., int | None]] = {
     "solve": solve,
     "verify": verify,
+    "compare": compare,
     "check": check,
     "list": list_problems,
     "view": view,

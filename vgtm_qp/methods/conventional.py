@@ -63,6 +63,10 @@ class DenseSolution:
         actuated = lengths[layout.truss.actuators]
         hessian = terms.actuator * actuated.T @ actuated
         hessian[np.diag_indices_from(hessian)] += terms.node
+        if terms.blocks is not None:
+            count = len(terms.blocks)
+            by_node = hessian.reshape(count, 3, count, 3)
+            by_node[np.arange(count), :, np.arange(count)] += terms.blocks
         objective = Objective(hessian, actuated.T @ terms.actuator_gradient + terms.node_gradient)
         inverse = self._inverse(J, objective)
         self.rank = inverse.rank
@@ -109,8 +113,12 @@ class SparseSolution:
         tip_column = np.tile(self._tip, tips)
         index = np.arange(actuators)
         diagonal = np.arange(self._parts[-1])
-        rows = [diagonal, y + member, column, a + index, y + truss.actuators, u + tip_row, tip_column]
-        columns = [diagonal, column, y + member, y + truss.actuators, a + index, tip_column, u + tip_row]
+        block = (3 * np.arange(nodes // 3)[:, None] + np.arange(3))[:, :, None]
+        block_row = np.broadcast_to(block, (nodes // 3, 3, 3)).ravel()
+        block_column = np.broadcast_to(np.swapaxes(block, 1, 2), (nodes // 3, 3, 3)).ravel()
+        self._no_blocks = np.zeros(3 * nodes)
+        rows = [block_row, diagonal, y + member, column, a + index, y + truss.actuators, u + tip_row, tip_column]
+        columns = [block_column, diagonal, column, y + member, y + truss.actuators, a + index, tip_column, u + tip_row]
         self._system = BandedSystem(np.concatenate(rows), np.concatenate(columns), int(self._parts[-1]))
         self._damped = np.zeros(members + tips)
         self._damped[layout.fixed] = self._damped[members:] = -self._damping
@@ -124,7 +132,8 @@ class SparseSolution:
         ends = tip[:, self._present].reshape(-1)
         ones = np.full(count, -1.0)
         diagonal = np.concatenate([np.full(nodes, terms.node), np.full(count, terms.actuator), self._damped])
-        values = np.concatenate([diagonal, lengths, lengths, ones, ones, ends, ends])
+        blocks = self._no_blocks if terms.blocks is None else terms.blocks.ravel()
+        values = np.concatenate([blocks, diagonal, lengths, lengths, ones, ones, ends, ends])
         rhs = np.zeros(u)
         rhs[:nodes], rhs[nodes:a] = -terms.node_gradient, -terms.actuator_gradient
         rhs[a + self._layout.fixed] = x[len(tip) :]

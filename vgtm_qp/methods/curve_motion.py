@@ -12,7 +12,7 @@ from vgtm_qp.curve import Curve, degree_of_redundancy, make_family
 from vgtm_qp.curve.redundancy import BASE_ROWS
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.condensation import CurveNodes
-from vgtm_qp.methods.objectives import potential_slope
+from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE, pose_displacement
 from vgtm_qp.problem import Problem
@@ -142,6 +142,8 @@ class CurveMotion:
             gradient[:vertices] += gain * self._bending @ p.ravel()
         if gain := self._terms.get("obstacle_potential"):
             rows, distance, _ = self._near(curve, X, time)
+            stiffness = gain * potential_curvature(distance, self._arm.influence)
+            hessian[:vertices, :vertices] += (rows.T * stiffness) @ rows
             gradient[:vertices] += gain * potential_slope(distance, self._arm.influence) @ rows
         return Objective(hessian, gradient)
 

@@ -23,12 +23,16 @@ _NEAREST = 0.05
 
 
 class Terms(NamedTuple):
-    """1/2 node |d|^2 + 1/2 actuator |a|^2 + actuator_gradient . a + node_gradient . d, a = J_a d."""
+    """1/2 node |d|^2 + 1/2 actuator |a|^2 + actuator_gradient . a + node_gradient . d + 1/2 d' blocks d, a = J_a d.
+
+    ``blocks`` (N - N_c, 3, 3) couple the coordinates of one node; None stands for zeros.
+    """
 
     node: float
     actuator: float
     actuator_gradient: Array
     node_gradient: Array
+    blocks: Array | None = None
 
 
 class TrussObjective:
@@ -62,11 +66,12 @@ class TrussObjective:
         arm = self._arm
         actuators = arm.truss.actuators
         centring = self._centring * (lengths[actuators] - arm.home_lengths[actuators])
-        gradient = np.zeros(arm.layout.node_columns)
-        if self._potential:
-            field = potential_gradient(arm.monitor, X, time, arm.influence)
-            gradient = self._potential * field[arm.truss.free].reshape(-1)
-        return Terms(self.node, self.actuator, centring, gradient)
+        if not self._potential:
+            return Terms(self.node, self.actuator, centring, np.zeros(arm.layout.node_columns))
+        field, blocks = potential_field(arm.monitor, X, time, arm.influence)
+        free = arm.truss.free
+        gradient = self._potential * field[free].reshape(-1)
+        return Terms(self.node, self.actuator, centring, gradient, self._potential * blocks[free])
 
 
 def potential_slope(distance: Array, influence: float) -> Array:
@@ -75,16 +80,33 @@ def potential_slope(distance: Array, influence: float) -> Array:
     return np.asarray(np.where(distance < influence, -(influence / d - 1.0) * influence / d**2, 0.0))
 
 
-def potential_gradient(monitor: Clearance, X: Array, time: float, influence: float) -> Array:
-    """Return (N, 3) the gradient of the potential of all near pairs with respect to the node positions, 1/m."""
+def potential_curvature(distance: Array, influence: float) -> Array:
+    """Return the second derivative of that potential, 1/m^2; 0 beyond `influence`."""
+    d = np.maximum(distance, _NEAREST * influence)
+    ratio = influence / d
+    return np.asarray(np.where(distance < influence, (3.0 * ratio - 2.0) * ratio / d**2, 0.0))
+
+
+def potential_field(monitor: Clearance, X: Array, time: float, influence: float) -> tuple[Array, Array]:
+    """Return the potential's gradient (N, 3), 1/m, by the node positions, and blocks (N, 3, 3), 1/m^2, above its Hessian.
+
+    The plain gradient asks for steps that grow without end as a distance shrinks. With the curvature along the
+    normals each pair asks for a part of its own distance. A block for each node is enough for a bound: the square of
+    a mean of two displacements is at most the mean of their squares, and that of a difference twice their sum.
+    """
     pairs = monitor.near(X, time, influence)
-    gradient = np.zeros_like(X)
-    force = potential_slope(pairs.distance, influence)[:, None] * pairs.normal
-    ends = monitor.members[pairs.member]
-    np.add.at(gradient, ends[:, 0], (1.0 - pairs.t)[:, None] * force)
-    np.add.at(gradient, ends[:, 1], pairs.t[:, None] * force)
+    gradient, blocks = np.zeros_like(X), np.zeros((len(X), 3, 3))
+    slope = potential_slope(pairs.distance, influence)
+    curvature = potential_curvature(pairs.distance, influence) * np.where(pairs.is_self, 2.0, 1.0)
+    outer = curvature[:, None, None] * pairs.normal[:, :, None] * pairs.normal[:, None, :]
+
+    def add(members: NDArray[np.int64], t: Array, force: Array, stiffness: Array) -> None:
+        for end, share in ((0, 1.0 - t), (1, t)):
+            np.add.at(gradient, members[:, end], share[:, None] * force)
+            np.add.at(blocks, members[:, end], share[:, None, None] * stiffness)
+
+    force = slope[:, None] * pairs.normal
+    add(monitor.members[pairs.member], pairs.t, force, outer)
     own = np.flatnonzero(pairs.is_self)
-    others = monitor.members[pairs.other[own]]
-    np.add.at(gradient, others[:, 0], -(1.0 - pairs.t_other[own])[:, None] * force[own])
-    np.add.at(gradient, others[:, 1], -pairs.t_other[own][:, None] * force[own])
-    return gradient
+    add(monitor.members[pairs.other[own]], pairs.t_other[own], -force[own], outer[own])
+    return gradient, blocks

@@ -99,4 +99,4 @@ def pose_displacement(start: PathPoint, end: PathPoint) -> tuple[Array, Array]:
 
 
 def _step(status: StepStatus, progress: float, state: State, reason: str) -> Step:
-    return Step(status=status, progress=progress, state=state, reason=reason, qps=0, _members=())
+    return Step(status, progress, state, reason, 0, ())

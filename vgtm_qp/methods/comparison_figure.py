@@ -1,0 +1,117 @@
+"""One figure for a comparison: where every method ends, and what it keeps on the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.methods.compare import Report, Row
+from vgtm_qp.view.drawing import obstacle_meshes
+
+Array = NDArray[np.float64]
+
+_COLUMNS = 5
+_FLOOR = 1e-16
+
+
+def plot_comparison(report: Report) -> Figure:
+    """Return the figure: one panel a maneuver with its start, middle and end; below, clearance and drift."""
+    keys = [(row.problem, row.method) for row in report.rows]
+    rows = dict(zip(keys, report.rows, strict=True))
+    lines = -(-len(keys) // _COLUMNS)
+    figure = Figure(figsize=(11.0, 3.1 * lines + 3.0), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=[3.1 * lines, 3.0])
+    panels = upper.subplots(lines, min(_COLUMNS, len(keys)), squeeze=False).ravel()
+    for axes in panels[len(keys) :]:
+        axes.set_axis_off()
+    limits = _limits(list(report.maneuvers.values()))
+    for axes, key in zip(panels, keys, strict=False):
+        _draw_maneuver(axes, rows[key], report.maneuvers.get(key), limits)
+    several = len({problem for problem, _ in keys}) > 1
+    _draw_curves(lower, report, several)
+    return figure
+
+
+def _draw_maneuver(axes: Axes, row: Row, maneuver: Maneuver | None, limits: tuple[Array, Array]) -> None:
+    verdict = "solved" if row.solved else "keeps all but drifts" if row.kept else "failed"
+    colour = {"solved": "tab:green", "failed": "tab:red"}.get(verdict, "tab:orange")
+    axes.set_title(f"{row.method}\n{verdict}, {100 * row.reached:.0f} % of the path", fontsize=7.5, color=colour)
+    axes.set_aspect("equal")
+    axes.set_xlim(limits[0][0], limits[1][0])
+    axes.set_ylim(limits[0][1], limits[1][1])
+    axes.tick_params(labelsize=6.5)
+    if maneuver is None:
+        axes.text(0.5, 0.5, _folded(row.reason), transform=axes.transAxes, ha="center", fontsize=6.5)
+        return
+    for outline in _outlines(maneuver):
+        axes.fill(*outline.T, color="0.75", zorder=0)
+    last = len(maneuver.time) - 1
+    for index, shade in ((0, 0.25), (last // 2, 0.45), (last, 1.0)):
+        ends = maneuver.nodes[index][maneuver.members][:, :, [0, 2]]
+        actuated = maneuver.member_actuated
+        axes.add_collection(LineCollection(list(ends[~actuated]), colors="0.35", linewidths=0.7, alpha=shade))
+        axes.add_collection(LineCollection(list(ends[actuated]), colors="tab:blue", linewidths=0.9, alpha=shade))
+    axes.plot(*maneuver.tip_position[:, [0, 2]].T, color="tab:red", linewidth=0.8)
+    if not row.solved:
+        axes.set_xlabel(_folded(row.reason), fontsize=6.0)
+
+
+def _draw_curves(area: Any, report: Report, several: bool) -> None:
+    clearance, drift = area.subplots(1, 2)
+    handles = []
+    for k, row in enumerate(report.rows):
+        maneuver = report.maneuvers.get((row.problem, row.method))
+        if maneuver is None:
+            continue
+        style: dict[str, Any] = {"color": f"C{k % 10}", "linestyle": ("-", "--", ":")[k // 10 % 3], "linewidth": 1.1}
+        fixed = ~maneuver.member_actuated
+        off = np.abs(maneuver.member_lengths - maneuver.member_lengths[0])[:, fixed].max(axis=1, initial=0.0)
+        near = np.where(np.isfinite(maneuver.clearance), maneuver.clearance, np.nan)
+        clearance.plot(maneuver.progress, near, **style)
+        drift.semilogy(maneuver.progress, np.maximum(off, _FLOOR), **style)
+        label = f"{row.problem}: {row.method}" if several else row.method
+        handles.append(Line2D([], [], label=label, **style))
+        safe = maneuver.manifest["problem"]["clearance"]["safe"]
+        clearance.axhline(safe, color="0.5", linewidth=0.6)
+    clearance.set_ylabel("least clearance [m]", fontsize=8)
+    drift.set_ylabel("worst fixed member [m]", fontsize=8)
+    for axes in (clearance, drift):
+        axes.set_xlabel("part of the path", fontsize=8)
+        axes.tick_params(labelsize=7)
+    area.legend(handles=handles, loc="outside right center", fontsize=7, frameon=False)
+
+
+def _outlines(maneuver: Maneuver) -> list[Array]:
+    """Return the outlines (K, 2) of the obstacles at the end, seen along y."""
+    entries = maneuver.manifest["problem"].get("obstacle", ())
+    outlines = []
+    for mesh in obstacle_meshes(entries, Path(maneuver.manifest["directory"])):
+        points = (mesh.vertices + mesh.position(float(maneuver.time[-1])))[:, [0, 2]]
+        outlines.append(points[ConvexHull(points).vertices])
+    return outlines
+
+
+def _limits(maneuvers: list[Maneuver]) -> tuple[Array, Array]:
+    points = [maneuver.nodes[:, :, [0, 2]].reshape(-1, 2) for maneuver in maneuvers]
+    stacked = np.concatenate(points) if points else np.zeros((1, 2))
+    # A method that breaks down may throw nodes far away; the view is that of nearly all of them.
+    low, high = np.percentile(stacked, (0.5, 99.5), axis=0)
+    for outline in (outline for maneuver in maneuvers for outline in _outlines(maneuver)):
+        low, high = np.minimum(low, outline.min(axis=0)), np.maximum(high, outline.max(axis=0))
+    margin = 0.08 * float(np.max(high - low)) + 1e-9
+    return low - margin, high + margin
+
+
+def _folded(text: str, width: int = 36) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(text, width)[:3])

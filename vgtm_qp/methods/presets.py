@@ -1,0 +1,92 @@
+"""Methods by name for comparisons: each is a set of changes to a problem's ``[method]`` table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Any
+
+from vgtm_qp.errors import GoalError, nearest
+from vgtm_qp.problem import Problem
+
+_OBSTACLES = {
+    "method.null_space": ["actuator_rate", "stroke_centring", "obstacle_potential"],
+    "method.weights.obstacle_potential": 1e-5,
+    "method.weights.stroke_centring": 2e-3,
+}
+_CURVE = {"method.name": "curve-pseudoinverse", "method.null_space": ["curve_rate", "spacing", "smoothness"]}
+_DENSE = {"method.name": "pseudoinverse", "method.algebra": "dense", "method.null_space": ["actuator_rate"]}
+_CORRECT = {"method.correct": True}
+_FAITHFUL = {"method.correct": False}
+
+PRESETS: MappingProxyType[str, dict[str, Any]] = MappingProxyType(
+    {
+        "qp": {"method.name": "qp", "method.tracking": "coupled"},
+        "qp-none": {"method.name": "qp", "method.tracking": "none", "method.hard_tracking": False},
+        "qp-recursive": {"method.name": "qp", "method.tracking": "recursive"},
+        "qp-parallel": {"method.name": "qp", "method.tracking": "parallel"},
+        "pseudoinverse": {**_DENSE, **_FAITHFUL},
+        "pseudoinverse-plain": {**_DENSE, **_FAITHFUL, "method.null_space": []},
+        "pseudoinverse-weighted": {**_DENSE, **_FAITHFUL, "method.variant": "weighted"},
+        "pseudoinverse-damped": {**_DENSE, **_FAITHFUL, "method.variant": "damped"},
+        "pseudoinverse-truncated": {**_DENSE, **_FAITHFUL, "method.variant": "truncated"},
+        "pseudoinverse-sparse": {**_DENSE, **_FAITHFUL, "method.algebra": "sparse"},
+        "pseudoinverse-corrected": {**_DENSE, **_CORRECT, "method.algebra": "sparse"},
+        "pseudoinverse-obstacles": {
+            **_DENSE,
+            **_CORRECT,
+            **_OBSTACLES,
+            "method.algebra": "sparse",
+        },
+        "curve-pseudoinverse": {**_CURVE, **_FAITHFUL, "method.tracking": "recursive"},
+        "curve-pseudoinverse-plain": {
+            **_CURVE,
+            **_FAITHFUL,
+            "method.tracking": "recursive",
+            "method.null_space": [],
+        },
+        "curve-pseudoinverse-parallel": {**_CURVE, **_FAITHFUL, "method.tracking": "parallel"},
+        "curve-pseudoinverse-corrected": {**_CURVE, **_CORRECT, "method.tracking": "recursive"},
+        "curve-pseudoinverse-obstacles": {
+            **_CURVE,
+            **_CORRECT,
+            "method.tracking": "parallel",
+            "method.null_space": ["curve_rate", "spacing", "smoothness", "obstacle_potential"],
+            "method.gains.obstacle_potential": 1e-4,
+        },
+    }
+)
+"""What each name changes. ``-plain`` has no null-space vector; ``-corrected`` and ``-obstacles`` correct the drift."""
+
+DEFAULT_METHODS = (
+    "qp",
+    "qp-none",
+    "qp-recursive",
+    "pseudoinverse",
+    "pseudoinverse-corrected",
+    "pseudoinverse-obstacles",
+    "curve-pseudoinverse",
+    "curve-pseudoinverse-corrected",
+    "curve-pseudoinverse-obstacles",
+)
+
+
+def with_method(problem: Problem, name: str) -> Problem:
+    """Return the problem with the method called `name`; its own weights, gains and solver stay.
+
+    Raises
+    ------
+    GoalError
+        There is no method of that name.
+    ProblemError
+        The problem contradicts it.
+    """
+    check_methods([name])
+    return problem.replace(PRESETS[name])
+
+
+def check_methods(names: Sequence[str]) -> None:
+    """Raise GoalError for the first name that is not a method's."""
+    for name in names:
+        if name not in PRESETS:
+            raise GoalError(f'no method "{name}"{nearest(name, PRESETS)}; choices: {", ".join(PRESETS)}')
