@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from vgtm_qp.geometry.clearance import Clearance, NearPairs
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers
-from vgtm_qp.qp.shape import turn_rows
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.task import TipTask, worth_closing
 from vgtm_qp.truss.kinematics import Kinematics
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 
@@ -34,10 +32,6 @@ class Target:
         Time at the end of the step, s.
     base : (N, 3) or None
         Positions of the base nodes at the end of the step (other rows are ignored), m.
-    base_rotation : (3, 3) or None
-        Rotation of the base frame there.
-    vertex_goals : (V, 3) or None
-        Where control vertices are drawn to, m; the rows in ``Layout.vertex_goals`` count.
     """
 
     path: Path
@@ -47,8 +41,6 @@ class Target:
     upper: Array
     time: float
     base: Array | None = None
-    base_rotation: Array | None = None
-    vertex_goals: Array | None = None
 
 
 class Linearisation:
@@ -83,7 +75,6 @@ class Linearisation:
         *,
         motion: bool,
         at: Array | None = None,
-        torsion: Array | None = None,
     ) -> StepNumbers:
         """Return the QP's numbers at node positions `X` (N, 3) and control vertices (V, 3).
 
@@ -96,8 +87,6 @@ class Linearisation:
             shortest way, without the gradients of the null-space objectives.
         at
             (N, 3) where the Jacobians are taken, m; `X` by default.
-        torsion
-            (T,) torsion coordinates of the curve, rad.
         """
         layout, kinematics, weights = self.layout, self.kinematics, self.layout.weights
         kinematics.evaluate(X if at is None else at)
@@ -132,25 +121,10 @@ class Linearisation:
         tangent_rhs = np.zeros((len(tracked), 2))
         base_axes, base_rhs = np.zeros((2, 3)), np.zeros(2)
         vertex_gradient = np.zeros_like(vertices)
-        curve = None
-        if layout.general is not None:
-            rows = layout.general.rows(
-                vertices, np.zeros(0) if torsion is None else torsion, base_frame(layout.truss, target)
-            )
-            turns = turn_rows(rows, kinematics.face_rotation[tracked], face_spin[tracked], layout.turns)
-            curve = CurveNumbers(
-                position=rows.position_rows,
-                turn_face=turns.face,
-                turn_curve=turns.curve,
-                turn_rhs=turns.residual if motion or layout.hard_turns else 0.0 * turns.residual,
-                spacing=rows.spacing_rows,
-                spacing_rhs=rows.spacing if motion else 0.0 * rows.spacing,
-            )
         if layout.vertices:
             centres = kinematics.face_centres(X)
             if motion or layout.hard_tracking:
-                nodes = layout.curve_weights @ vertices if layout.general is None else rows.position
-                position_rhs = centres[tracked] - nodes
+                position_rhs = centres[tracked] - layout.curve_weights @ vertices
             slopes = layout.curve_slopes @ vertices
             speed = np.linalg.norm(slopes, axis=1, keepdims=True)
             tangents = slopes / speed
@@ -159,10 +133,9 @@ class Linearisation:
             tangent_face = np.einsum("kac,kcf->kaf", turn, face_spin[tracked])
             along = np.einsum("kac,kc->ka", axes, tangents)
             tangent_curve = (axes - along[..., None] * tangents[:, None, :]) / speed[:, None]
-            if motion or layout.hard_turns:
-                tangent_rhs = along
             if motion:
-                vertex_gradient = self._polygon @ vertices + layout.goal_pull(vertices, target.vertex_goals)
+                tangent_rhs = along
+                vertex_gradient = self._polygon @ vertices
             base_axes = base_rotation[:, :2].T
             shift = centres[0] - vertices[0]
             if target.base is not None:
@@ -193,13 +166,7 @@ class Linearisation:
             base_axes=base_axes,
             base_rhs=base_rhs,
             clearance=clearance,
-            curve=curve,
         )
-
-
-def base_frame(truss: Truss, target: Target) -> Array:
-    """Return (3, 3) the frame of the base face at the end of the step."""
-    return truss.face_frames[0] if target.base_rotation is None else target.base_rotation @ truss.face_frames[0]
 
 
 def clearance_rows(
