@@ -14,6 +14,7 @@ from vgtm_qp.maneuver.result import Maneuver
 _MOST_FRAMES = 120
 _DOTS_PER_INCH = 100
 _LONGEST = 12.0
+_NEARLY_WHITE = 248
 
 
 def write_figure(maneuver: Maneuver, path: str | Path) -> Path:
@@ -72,7 +73,7 @@ def _write_gif(pictures: list[NDArray[np.uint8]], path: Path, duration: float) -
     middle = Image.fromarray(np.concatenate([pictures[0], pictures[len(pictures) // 2], pictures[-1]]))
     palette: Any = middle.quantize(colors=128, dither=Image.Dither.NONE)
     colours = np.array(palette.getpalette()).reshape(-1, 3)
-    colours[np.argmax(colours.sum(axis=1))] = 255
+    colours[colours.min(axis=1) >= _NEARLY_WHITE] = 255
     palette.putpalette(colours.ravel().tolist())
     frames = [
         Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
