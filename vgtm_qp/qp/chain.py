@@ -1,4 +1,4 @@
-"""A truss as a chain of equal periods, each hung on the one before: what makes a step's cost linear in the bays."""
+"""A truss as a chain of equal periods, each hung on the one before."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _MOST_LOCKED = 24
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Periods of p stages; every member and tracked face of a period uses nodes of it and of the period before only.
+    """Periods of p stages; its members and tracked faces use nodes of it and of the period before.
 
-    Within a period the w nodes of the one before that it uses come first, then its own m nodes in stage order.
+    Places within a period: first the w nodes that it uses of the one before, then its own m by stage.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Chain:
     @property
     def own(self) -> int:
         """Number of displacement coordinates of a period's own nodes, 3m."""
-        return 3 * self.nodes.shape[1]
+        return 3 * int(self.nodes.shape[1])
 
     @property
     def before(self) -> int:
@@ -97,7 +97,7 @@ class Chain:
 
     @cached_property
     def gather(self) -> sparse.csr_matrix:
-        """The matrix that takes all members' gradients to the Jacobian's nonzeros, period by period, column by column."""
+        """The matrix that takes all members' gradients to the Jacobian's nonzeros, period by period."""
         layout, pattern = self.layout, self.coordinate_pattern
         number = np.full(pattern.shape, -1, dtype=np.int64)
         number.T[pattern.T] = np.arange(int(pattern.sum()))
@@ -138,7 +138,7 @@ def find_chain(layout: Layout) -> Chain | None:
 
 
 def _places(period: Index, place: Index, here: Index, carried: Index) -> Index:
-    """Return the places of nodes among a period's w + m; -1 for nodes that are neither its own nor carried."""
+    """Return the places of nodes among a period's w + m; -1 if they are neither its own nor carried."""
     position = np.full(max(int(place.max(initial=0)), int(carried.max(initial=0))) + 1, -1, dtype=np.int64)
     position[carried] = np.arange(len(carried))
     return np.where(period == here, len(carried) + place, np.where(period == here - 1, position[place], -1))
@@ -196,7 +196,7 @@ def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
         return None
     places = _places(period[used], place[used], here, carried)
     pattern = np.zeros((members.shape[1], len(carried) + nodes.shape[1]), dtype=bool)
-    _, row, slot = np.nonzero(places >= 0)
+    _, row, _ = np.nonzero(places >= 0)
     pattern[row, places[places >= 0]] = True
     actuated = truss.actuated[members]
     soft = actuated.mean(axis=0) > 0.5

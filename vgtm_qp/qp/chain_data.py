@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class ChainData:
-    """Every period's numbers as rows of one array, filled from :class:`StepNumbers`; and the curve's own terms.
+    """The numbers of every period as rows of one array, and the curve's own terms.
 
     Attributes
     ----------
@@ -45,9 +45,7 @@ class ChainData:
             self._part["weights"][:] = self._weights[:, 1:].reshape(periods, -1)
             self._part["slopes"][:] = self._slopes[:, 1:].reshape(periods, -1)
         weights = layout.weights
-        self._polygon = (
-            weights.curve_rate * np.eye(layout.vertices) + weights.smoothness * layout.polygon_bending
-        )
+        self._polygon = layout.vertex_hessian
         self._tracking = 0.0 if layout.hard_tracking else weights.tracking
         self._hessian = self._polygon + self._tracking * self._weights.T @ self._weights
 
@@ -83,7 +81,7 @@ class ChainData:
         return gap, self._tangent_rhs + np.einsum("kac,kc->ka", self._tangent_curve, self._slopes @ vertices)
 
     def vertices(self, free: Array) -> Array:
-        """Return (V, 3) the displacements of the control vertices for the free curve coordinates (3V - 5,)."""
+        """Return (V, 3) the displacements of the control vertices for free coordinates (3V - 5,)."""
         vertices = self.offset.copy()
         if len(vertices):
             vertices[1] += free[0] * self.normal
@@ -96,10 +94,11 @@ class ChainData:
         return np.concatenate([first[None], gradient[2:].reshape(-1, *gradient.shape[2:])])
 
     def polygon_terms(self) -> tuple[Array, Array]:
-        """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the control polygon alone."""
-        hessian = np.kron(self._polygon, np.eye(3)).reshape(
-            *self._polygon.shape[:1], 3, *self._polygon.shape[1:], 3
-        )
+        """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the vertices alone."""
+        count = len(self.offset)
+        hessian = np.zeros((count, 3, count, 3))
+        axis = np.arange(3)
+        hessian[:, axis, :, axis] = self._polygon
         reduced = self._reduced(self._reduced(hessian).transpose(1, 2, 0))
         return reduced, self.polygon_gradient(self.offset)
 
@@ -108,10 +107,10 @@ class ChainData:
         return self._reduced(self._polygon @ vertices + self._vertex_gradient)
 
     def curve_terms(self) -> tuple[Array, Array]:
-        """Return Hessian and gradient of all terms in the curve's coordinates, with the faces where they are."""
+        """Return Hessian and gradient of all terms in the curve's coordinates while the faces stay."""
         count = len(self.offset)
         turned = self._tangent_curve[..., None] * self._tangent_curve[:, :, None]
-        hessian = self.chain.layout.weights.tangent * (
+        hessian: Array = self.chain.layout.weights.tangent * (
             self._slope_products.T @ turned.sum(axis=1).reshape(-1, 9)
         )
         hessian = hessian.reshape(count, count, 3, 3).transpose(0, 2, 1, 3)

@@ -1,110 +1,25 @@
-"""Elimination of one period of a chain, as CasADi graphs: the bay of a Riccati recursion from the tip to the base.
+"""Elimination of one period of a chain, as CasADi graphs: one bay of a Riccati recursion from tip to base.
 
-Each graph takes what it needs of the period and what the period after (or before) hands over, and hands over the same
-to the next; :func:`sweep` runs it along the chain. With J u_before and J u split into hard rows (fixed members) and
-soft ones (actuated), a stage's displacements are u = G (rhs + T u_before) + N t: G from the QR factors of the hard
-rows, N an orthonormal basis of their null space, t the stage's free motions, which are eliminated.
+Each graph takes the period's numbers and what the period after (or before) hands over, and hands over the
+same to the next; :class:`Sweep` runs it along the chain. A stage's displacements are u = G (rhs + T u_before)
++ N t: G from the QR factors of its fixed members' rows, N a basis of their null space, t the stage's free
+motions, which are eliminated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.chain import Chain
-
-Array = NDArray[np.float64]
-
-
-def range_and_null(A: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return G and N with A G = 1, A N = 0, G' N = 0, N' N = 1 for a wide `A`, by Householder reflections of A'.
-
-    The pivots follow the sparsity: a row reflects only the coordinates that it depends on.
-    """
-    rows, size = A.shape
-    pattern = np.zeros((size, rows), dtype=bool)
-    entry: dict[tuple[int, int], ca.SX] = {}
-    row_index, column_index = A.sparsity().get_triplet()
-    for i, j in zip(row_index, column_index, strict=True):
-        pattern[j, i], entry[j, i] = True, A[i, j]
-    Q = {(i, i): ca.SX(1.0) for i in range(size)}
-    free = list(range(size))
-    pivots: list[int] = []
-    for j in range(rows):
-        touched = [i for i in free if pattern[i, j]]
-        pivot = touched[0]
-        norm = ca.sqrt(sum(entry[i, j] ** 2 for i in touched))
-        signed = ca.copysign(norm, entry[pivot, j])
-        v = {i: entry[i, j] for i in touched}
-        v[pivot] = v[pivot] + signed
-        scale = 1.0 / (signed * v[pivot])
-        for k in range(j + 1, rows):
-            common = [i for i in touched if pattern[i, k]]
-            if common:
-                factor = scale * sum(v[i] * entry[i, k] for i in common)
-                for i in touched:
-                    entry[i, k] = entry[i, k] - factor * v[i] if pattern[i, k] else -factor * v[i]
-                    pattern[i, k] = True
-        for i in range(size):
-            common = [k for k in touched if (i, k) in Q]
-            if common:
-                factor = scale * sum(Q[i, k] * v[k] for k in common)
-                for k in touched:
-                    Q[i, k] = Q[i, k] - factor * v[k] if (i, k) in Q else -factor * v[k]
-        entry[pivot, j] = -signed
-        free.remove(pivot)
-        pivots.append(pivot)
-    G = ca.SX(size, rows)
-    for j in reversed(range(rows)):
-        column = _column(Q, size, pivots[j])
-        for k in range(j + 1, rows):
-            if pattern[pivots[j], k]:
-                column -= G[:, k] * entry[pivots[j], k]
-        G[:, j] = column / entry[pivots[j], j]
-    return ca.sparsify(G), ca.sparsify(ca.horzcat(ca.SX(size, 0), *[_column(Q, size, i) for i in free]))
-
-
-def _column(entries: dict[tuple[int, int], ca.SX], size: int, j: int) -> ca.SX:
-    column = ca.SX(size, 1)
-    for i in range(size):
-        if (i, j) in entries:
-            column[i] = entries[i, j]
-    return column
-
-
-def _nonzeros(A: ca.SX) -> ca.SX:
-    """Return the nonzeros of `A` as a column."""
-    return ca.vertcat(ca.SX(0, 1), *A.nonzeros())
-
-
-def _symmetric(A: ca.SX) -> ca.SX:
-    """Return `A`, known to be symmetric, with its lower half the very expressions of the upper one."""
-    return ca.triu2symm(ca.triu(A))
-
-
-def _inverse_factor(A: ca.SX) -> ca.SX:
-    """Return the upper triangular C^-T of A = C C'."""
-    n = A.shape[0]
-    C, inverse = ca.SX(n, n), ca.SX(n, n)
-    for j in range(n):
-        for i in range(j, n):
-            rest = A[i, j] - sum(C[i, k] * C[j, k] for k in range(j))
-            C[i, j] = ca.sqrt(rest) if i == j else rest / C[j, j]
-    for j in range(n):
-        inverse[j, j] = 1.0 / C[j, j]
-        for i in range(j):
-            inverse[i, j] = -sum(C[j, k] * inverse[i, k] for k in range(i, j)) / C[j, j]
-    return inverse
+from vgtm_qp.qp.sparse_symbols import inverse_factor, nonzeros, offsets, range_and_null, symbols_of, symmetric
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a period: its coordinates `own`, those before it, its hard rows, and the number of free motions."""
+    """One stage of a period: its own coordinates, those before, its fixed members' rows, its free motions."""
 
     own: list[int]
     before: list[int]
@@ -132,11 +47,9 @@ class Inputs:
     def __init__(self, chain: Chain) -> None:
         faces, vertices = chain.faces.shape[1], max(chain.layout.vertices - 1, 0)
         pattern = chain.coordinate_pattern
-        rows, columns = np.nonzero(pattern)
-        sparsity = ca.Sparsity.triplet(*pattern.shape, rows.tolist(), columns.tolist())
         self.sizes = {
-            "jacobian": sparsity.nnz(),
-            "rhs": pattern.shape[0],
+            "jacobian": int(pattern.sum()),
+            "rhs": chain.own,
             "actuator_gradient": int(chain.soft.sum()),
             "weights": faces * vertices,
             "slopes": faces * vertices,
@@ -147,8 +60,8 @@ class Inputs:
             "normal": 3,
         }
         self.data = ca.SX.sym("data", sum(self.sizes.values()))
-        parts = dict(zip(self.sizes, ca.vertsplit(self.data, _offsets(self.sizes.values())), strict=True))
-        self.jacobian = ca.SX(sparsity, parts["jacobian"])
+        parts = dict(zip(self.sizes, ca.vertsplit(self.data, offsets(self.sizes.values())), strict=True))
+        self.jacobian = symbols_of(pattern, parts["jacobian"])
         self.rhs, self.actuator_gradient, self.normal = (
             parts["rhs"],
             parts["actuator_gradient"],
@@ -165,10 +78,6 @@ class Inputs:
         ]
         self.gap = ca.reshape(parts["gap"], 3, faces).T
         self.tilt = ca.reshape(parts["tilt"], 2, faces).T
-
-
-def _offsets(sizes: Sequence[int]) -> list[int]:
-    return [0, *np.cumsum(list(sizes)).tolist()]
 
 
 class Elimination:
@@ -231,7 +140,7 @@ class Elimination:
         return row
 
     def curve_columns(self, values: ca.SX) -> ca.SX:
-        """Return the (3, 3V - 5) derivative of sum_i values_i p_i, i from 1, with respect to the free coordinates."""
+        """Return the (3, 3V - 5) derivative of sum_i values_i p_i, i from 1, by the free coordinates."""
         blocks = [values[i] * ca.SX.eye(3) for i in range(1, values.numel())]
         return ca.horzcat(values[0] * self.inputs.normal, *blocks)
 
@@ -246,8 +155,9 @@ class Elimination:
     def factor(self) -> ca.Function:
         """Return (carry, data) -> (carry, gains, Y): one period of the recursion.
 
-        The carry holds the upper half of the Hessian in the live coordinates, their linear terms for every curve
-        coordinate and for 1, and the gradient of the curve coordinates. Y (freedom, 3V - 5 + 1) is stored row by row.
+        The carry holds the upper half of the Hessian in the live coordinates, their linear terms for every
+        curve coordinate and for 1, and the gradient of the curve coordinates. Y (freedom, 3V - 5 + 1) is
+        stored row by row.
         """
         inputs, weights, columns = self.inputs, self.chain.layout.weights, self.curve + 1
         upper = ca.Sparsity.upper(len(self.live))
@@ -263,11 +173,11 @@ class Elimination:
         if self.soft:
             J = inputs.jacobian[self.soft, :]
             stiffness = weights.actuator_rate + weights.stroke_centring
-            H += _symmetric(stiffness * (J.T @ J))
+            H += symmetric(stiffness * (J.T @ J))
             V[:, -1] += J.T @ (inputs.actuator_gradient - stiffness * inputs.rhs[self.soft])
         for k in range(self.chain.faces.shape[1]):
             centre, tangent = self.centre_row(k), self.tangent_row(k)
-            H += _symmetric(weights.tracking * (centre.T @ centre) + weights.tangent * (tangent.T @ tangent))
+            H += symmetric(weights.tracking * (centre.T @ centre) + weights.tangent * (tangent.T @ tangent))
             V[:, :-1] -= weights.tracking * (centre.T @ self.curve_columns(inputs.weights[k, :]))
             turned = inputs.tangent_curve[k] @ self.curve_columns(inputs.slopes[k, :])
             V[:, :-1] += weights.tangent * (tangent.T @ turned)
@@ -282,41 +192,41 @@ class Elimination:
             Huu, Hub = ca.sparsify(H[u, u]), ca.sparsify(H[u, before])
             HG = Huu @ G
             total = ca.horzcat(V[u, :-1], V[u, -1] + Huu @ placed)
-            free = ca.sparsify(N @ _inverse_factor(_symmetric(N.T @ (Huu @ N))))
+            free = ca.sparsify(N @ inverse_factor(symmetric(N.T @ (Huu @ N))))
             W, Wb, Y = ca.sparsify(free.T @ HG), ca.sparsify(free.T @ Hub), free.T @ total
-            M = _symmetric(G.T @ HG - W.T @ W)
+            M = symmetric(G.T @ HG - W.T @ W)
             K = ca.sparsify(G.T @ Hub - W.T @ Wb)
             cross = T.T @ K
             rest = ca.horzcat(V[before, :-1], V[before, -1] + Hub.T @ placed)
             V = rest + T.T @ (G.T @ total - W.T @ Y) - Wb.T @ Y
-            H = ca.sparsify(_symmetric(H[before, before] + T.T @ (M @ T) + cross + cross.T - Wb.T @ Wb))
+            H = ca.sparsify(symmetric(H[before, before] + T.T @ (M @ T) + cross + cross.T - Wb.T @ Wb))
             curve_gradient += total[:, :-1].T @ placed - Y[:, :-1].T @ Y[:, -1]
             gains = [free, G, W, Wb, *gains]
             outer = [Y, *outer]
         self._gain_parts = gains
-        handed = ca.vertcat(_nonzeros(ca.project(H, upper)), ca.densify(ca.vec(V)), curve_gradient)
+        handed = ca.vertcat(nonzeros(ca.project(H, upper)), ca.densify(ca.vec(V)), curve_gradient)
         return ca.Function(
             "factor",
             [carry, inputs.data],
             [
                 ca.densify(handed),
-                ca.vertcat(*[_nonzeros(part) for part in gains]),
+                ca.vertcat(*[nonzeros(part) for part in gains]),
                 ca.densify(ca.vertcat(*outer).T),
             ],
         )
 
     def _gains(self) -> tuple[ca.SX, list[list[ca.SX]]]:
-        """Return the symbols of the gains and, per stage, (free, G, W, Wb) in their sparsity; `factor` comes first."""
+        """Return the symbols of the gains and, per stage, (free, G, W, Wb); `factor` fixes their sparsity."""
         parts = self._gain_parts
-        offsets = _offsets([part.nnz() for part in parts])
-        vector = ca.SX.sym("gains", offsets[-1])
+        ends = offsets(part.nnz() for part in parts)
+        vector = ca.SX.sym("gains", ends[-1])
         pieces = [
-            ca.SX(part.sparsity(), v) for part, v in zip(parts, ca.vertsplit(vector, offsets), strict=True)
+            ca.SX(part.sparsity(), v) for part, v in zip(parts, ca.vertsplit(vector, ends), strict=True)
         ]
         return vector, [pieces[4 * k : 4 * k + 4] for k in range(len(self.stages))]
 
     def columns(self, count: int) -> ca.Function:
-        """Return (carry, data, gains, rows (3m, count)) -> (carry, Z): rows of inequalities through the elimination."""
+        """Return (carry, data, gains, rows (3m, count)) -> (carry, Z): rows through the elimination."""
         vector, gains = self._gains()
         carry, rows = ca.SX.sym("carry", len(self.live), count), ca.SX.sym("rows", self.chain.own, count)
         V = ca.vertcat(ca.SX(self.chain.before, count), rows)
@@ -357,9 +267,9 @@ class Elimination:
         return ca.Function("forward", [carry, self.inputs.data, vector, z], [ca.densify(x) for x in outputs])
 
     def balance(self) -> ca.Function:
-        """Return (carry, data, gains, nodal (3m,), actuator (soft,), faces (5f,)) -> (carry, residual (freedom,)).
+        """Return (carry, data, gains, nodal (3m,), actuator (soft,), faces (5f,)) -> (carry, residual).
 
-        The costates of given gradients; the residual is what is left of stationarity in the free motions.
+        The costates of given gradients; the residual (freedom,) is what is left of stationarity.
         """
         vector, gains = self._gains()
         carry, nodal = ca.SX.sym("carry", len(self.live)), ca.SX.sym("nodal", self.chain.own)
@@ -383,23 +293,3 @@ class Elimination:
             [carry, self.inputs.data, vector, nodal, actuator, face],
             [ca.densify(V), ca.densify(ca.vertcat(*outer))],
         )
-
-
-class Sweep(Kernel):
-    """A period's function run along the chain: its first argument is its first result for the period before.
-
-    CasADi maps a function in order, and the two share memory shifted by one period, so the map is a recursion.
-
-    Attributes
-    ----------
-    carry : (n + 1, size)
-        What was handed over; row 0 is the start.
-    """
-
-    def __init__(self, function: ca.Function, periods: int) -> None:
-        super().__init__(function.map(periods))
-        size = function.nnz_in(0)
-        self.carry: Array = np.zeros((periods + 1, size))
-        flat = self.carry.reshape(-1)
-        self.bind_input(0, flat[: periods * size])
-        self.bind_output(0, flat[size:])

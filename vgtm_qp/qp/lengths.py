@@ -1,4 +1,4 @@
-"""Newton's step on the member lengths: node displacements for given changes of all lengths, at linear cost."""
+"""Newton's step on the member lengths: node displacements for given changes, at linear cost."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from scipy.sparse.linalg import splu
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.chain import Chain, find_chain
-from vgtm_qp.qp.elimination import Sweep, range_and_null
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.sparse_symbols import range_and_null, symbols_of
+from vgtm_qp.qp.sweep import Sweep
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,7 @@ _SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
 
 class LengthSolver:
-    """Solves J d_rho = error with the length Jacobian J: dense, along the chain of bays, or by sparse elimination."""
+    """Solves J d_rho = error with the length Jacobian J: dense, along the chain of bays, or sparse."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -31,7 +32,7 @@ class LengthSolver:
         self._jacobian = np.zeros((layout.node_columns,) * 2 if layout.node_columns <= _DENSE else (0, 0))
 
     def solve(self, gradient: Array, error: Array) -> Array:
-        """Return the displacements of the free nodes (N - N_c, 3), m, that change the lengths (M,) by `error`, m.
+        """Return displacements of the free nodes (N - N_c, 3), m, that change the lengths by `error` (M,), m.
 
         Parameters
         ----------
@@ -87,11 +88,9 @@ class _ChainSubstitution:
 def _substitution(chain: Chain) -> ca.Function:
     """Return (carry, Jacobian's nonzeros, error) -> (carry, displacements) of one period."""
     pattern = chain.coordinate_pattern
-    rows, columns = np.nonzero(pattern)
-    sparsity = ca.Sparsity.triplet(*pattern.shape, rows.tolist(), columns.tolist())
-    carry, values = ca.SX.sym("carry", chain.before), ca.SX.sym("values", sparsity.nnz())
+    carry, values = ca.SX.sym("carry", chain.before), ca.SX.sym("values", int(pattern.sum()))
     error = ca.SX.sym("error", chain.own)
-    jacobian, u, done = ca.SX(sparsity, values), carry, 0
+    jacobian, u, done = symbols_of(pattern, values), carry, 0
     for count in chain.stage_sizes:
         own = list(range(done, done + 3 * count))
         columns_before = chain.before + done

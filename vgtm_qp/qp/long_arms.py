@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vgtm_qp.qp.chain import find_chain
+from vgtm_qp.qp.chain import Chain, find_chain
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.staged import StagedSolver
 from vgtm_qp.qp.tracked import TrackedSolver
@@ -12,8 +12,8 @@ STAGED_ACTUATORS = 45
 
 
 def chain_solver(layout: Layout) -> StagedSolver | TrackedSolver | None:
-    """Return the solver along the chain of `layout`; None where it is no chain or does not fit hard tracking."""
-    chain = find_chain(layout)
+    """Return the solver along the chain of `layout`; None where it is none or cannot track hard."""
+    chain = _chain(layout)
     if chain is None:
         return None
     if not layout.hard_tracking:
@@ -25,5 +25,12 @@ def prefers_staged(layout: Layout) -> bool:
     """Whether `chain_solver` is there for `layout` and faster than the condensed QP."""
     if len(layout.truss.actuators) < STAGED_ACTUATORS:
         return False
-    chain = find_chain(layout)
+    chain = _chain(layout)
     return chain is not None and (not layout.hard_tracking or chain.is_square)
+
+
+def _chain(layout: Layout) -> Chain | None:
+    """Return the chain where the QP has only rows that the eliminations know: a curve of constant tables."""
+    if layout.general is not None or layout.hard_turns:
+        return None
+    return find_chain(layout)

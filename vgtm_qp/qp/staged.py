@@ -1,7 +1,7 @@
 """The step's QP of a long arm, exactly and at a cost linear in its bays (elastic tracking or none).
 
-A Riccati recursion from the tip to the base eliminates the free motions of every bay; the curve's coordinates are
-global unknowns beside them; rows with bounds meet in a small dense QP of their own.
+A Riccati recursion from the tip to the base eliminates the free motions of every bay; the curve's coordinates
+are global unknowns beside them; rows with bounds meet in a small dense QP of their own.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ from scipy.linalg.lapack import dtrtrs
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.chain import Chain
 from vgtm_qp.qp.chain_data import ChainData
-from vgtm_qp.qp.elimination import Elimination, Sweep
+from vgtm_qp.qp.elimination import Elimination
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
-from vgtm_qp.qp.working_set import Answer, Point, RowTable, solve_rows
+from vgtm_qp.qp.sweep import Sweep
+from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _BLOCK = 8
-_GREATEST_GAIN = 1e6
+_WORST_CONDITION = 1e8
 RESIDUAL = 1e-8
 SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
 
@@ -66,7 +67,7 @@ class StagedSolver:
         )
         self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
         self._active: set[tuple[object, ...]] = set()
-        self._answer: Answer | None = None
+        self._table: RowTable | None = None
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Solve one QP.
@@ -81,35 +82,34 @@ class StagedSolver:
         self._eliminate(numbers)
         table = RowTable.of(self.layout, numbers, self.chain.locked)
         size = self._freedom + self._curve + 1
-        self._answer = answer = solve_rows(self, size, table, self._active, _BLOCK)
+        self._table = table
+        answer = solve_rows(self, size, table, self._active, _BLOCK)
         self._check(table, answer.point, answer.multipliers)
         self._active = answer.active
         return answer.solution()
 
-    def gain(self, least: float) -> Array | None:
-        """Return the least motions (N, 3, n_e) of the nodes that move the tip by one unit of each of its rows.
+    def gain(self, held: NDArray[np.bool_]) -> Array | None:
+        """Return the least motions (N, 3, n_e) of the nodes that move the tip by one unit of each row.
 
-        Rows of the last answer with multipliers above `least` stay as they are, and so does the progress. None where
-        the active rows leave no such motion.
+        In the metric of the QP solved last; its progress and the `held` actuators (n_a,) stay as they are.
+        None where they leave no such motion.
         """
-        answer = self._answer
-        if answer is None:
+        table = self._table
+        if table is None:
             return None
-        table = answer.table
-        held = (answer.rows < table.equal) | (np.abs(answer.multipliers[answer.rows]) > least)
-        held &= answer.rows != table.equal
-        columns = answer.columns[:, held]
-        columns[-1] = 0.0
         tip = len(table.numbers.tip_rhs)
+        rows = np.concatenate([np.arange(table.equal), table.actuators.start + np.flatnonzero(held)])
+        columns = self.columns(table, rows)
+        columns[-1] = 0.0
+        gram = columns.T @ columns
         try:
-            shares = np.linalg.solve(columns.T @ columns, np.eye(columns.shape[1])[:, :tip])
+            shares = np.linalg.solve(gram, np.eye(len(rows))[:, :tip])
         except np.linalg.LinAlgError:
             return None
-        if not np.abs(columns @ shares).max(initial=0.0) < _GREATEST_GAIN:
+        if not np.abs(shares).max(initial=0.0) * np.abs(gram).max(initial=0.0) < _WORST_CONDITION:
             return None
         rest = self.point(table, np.zeros(len(columns))).nodes
-        moved = [self.point(table, -columns @ share).nodes - rest for share in shares.T]
-        return np.stack(moved, axis=-1)
+        return np.stack([self.point(table, -columns @ share).nodes - rest for share in shares.T], axis=-1)
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
@@ -132,7 +132,7 @@ class StagedSolver:
         return columns
 
     def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, `combined` (size,) being the columns times multipliers."""
+        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
         chain, truss = self.chain, self.layout.truss
         freedom, curve = self._freedom, self._curve
         free = np.zeros(0)
@@ -193,11 +193,12 @@ class StagedSolver:
             face[:] = pulled.reshape(chain.periods, -1)[::-1].reshape(-1)
             residual = float(np.max(np.abs(self._numbers.curve_gradient(point.vertices, gap, tilt))))
         self._balance()
-        residual = max(residual, float(np.max(np.abs(self._balance.outputs[1]))))
+        residual = max(residual, float(np.max(np.abs(self._balance.outputs[1]), initial=0.0)))
         scale = 1.0 + float(np.max(np.abs(force), initial=0.0)) + float(np.max(np.abs(multipliers)))
         fixed = point.lengths[self.layout.fixed]
         primal = max(float(np.max(table.violation(point.values))), float(np.max(np.abs(fixed), initial=0.0)))
-        if not (primal <= RESIDUAL and residual <= RESIDUAL * scale):
+        dual = residual / scale
+        if not (primal <= RESIDUAL and dual <= RESIDUAL):
             raise SolverError(
-                f"the elimination left a primal residual of {primal:.1e} m and a dual residual of {residual / scale:.1e}"
+                f"the elimination left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
             )

@@ -1,7 +1,7 @@
-"""The step's QP of a long arm whose faces stay on the curve exactly: the curve's coordinates are all that is free.
+"""The step's QP of a long arm whose faces stay on the curve exactly: only the curve's coordinates are free.
 
-Where a period's fixed members and its faces' positions are as many as its coordinates, one pass from the base to the
-tip gives all nodes as a linear function of the control vertices.
+Where a period's fixed members and its faces' positions are as many as its coordinates, one pass from the base
+to the tip gives all nodes as a linear function of the control vertices.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from scipy.linalg.lapack import dtrtrs
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.chain import Chain
 from vgtm_qp.qp.chain_data import ChainData
-from vgtm_qp.qp.elimination import Elimination, Sweep, range_and_null
+from vgtm_qp.qp.elimination import Elimination
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.sparse_symbols import range_and_null
 from vgtm_qp.qp.staged import RESIDUAL, SINGULAR
+from vgtm_qp.qp.sweep import Sweep
 from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
 
 Array = NDArray[np.float64]
@@ -24,9 +26,9 @@ Index = NDArray[np.int64]
 
 
 def following(elimination: Elimination) -> ca.Function:
-    """Return (carry, data) -> (carry, U, D, R): displacements, strokes and angles for unit curve coordinates and for 1.
+    """Return (carry, data) -> (carry, U, D, R): displacements, strokes and angles as functions of the curve.
 
-    U (3m, 3V - 5 + 1), D (soft, ...) and R (2f, ...) are stored row by row.
+    U (3m, 3V - 5 + 1), D (soft, ...) and R (2f, ...) are stored row by row; their last columns are constants.
     """
     inputs, chain = elimination.inputs, elimination.chain
     columns, faces = elimination.curve + 1, range(chain.faces.shape[1])
@@ -111,7 +113,7 @@ class TrackedSolver:
         return columns
 
     def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, `combined` (size,) being the columns times multipliers."""
+        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
         truss, chain = self.layout.truss, self.chain
         free = -dtrtrs(self._factor, self._rhs + combined[:-1], lower=1, trans=1)[0]
         progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))

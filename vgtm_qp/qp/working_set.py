@@ -1,4 +1,4 @@
-"""The inequality part of a long arm's QP: few rows are near their bounds, so those alone meet in a small dense QP."""
+"""The rows with bounds of a long arm's QP: the few that are near them meet in a small dense QP."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ class RowTable:
         """Return the table of `numbers`."""
         held = np.zeros(len(locked))
         clearance = numbers.clearance.lower
-        lower = [numbers.tip_rhs, held, [numbers.progress_lower], numbers.lower, clearance]
+        lower = [numbers.tip_rhs, held, np.array([numbers.progress_lower]), numbers.lower, clearance]
         upper = [
             numbers.tip_rhs,
             held,
-            [numbers.progress_upper],
+            np.array([numbers.progress_upper]),
             numbers.upper,
             np.full(len(clearance), UNBOUNDED),
         ]
@@ -94,7 +94,7 @@ class RowTable:
         return np.maximum(self.lower - values, values - self.upper)
 
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
-        """Return nodes (R, Q), their coefficients (R, Q, 3) and those of the progress (R,); spare ones are zero."""
+        """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
         numbers, truss, members = self.numbers, self.layout.truss, self.layout.member_nodes
         width = max(len(truss.tip), 4, members.shape[1])
         nodes, coefficients = np.zeros((len(rows), width), dtype=np.int64), np.zeros((len(rows), width, 3))
@@ -146,7 +146,9 @@ class RowTable:
         return sorted(rows)
 
 
-def dual_solution(gram: Array, values: Array, lower: Array, upper: Array, equal: Array) -> tuple[Array, int]:
+def dual_solution(
+    gram: Array, values: Array, lower: Array, upper: Array, equal: NDArray[np.bool_]
+) -> tuple[Array, int]:
     """Return the multipliers that bring `values` - `gram` multipliers into the bounds at least cost.
 
     Multipliers are positive at upper and negative at lower bounds. `gram` (R, R) is A H^-1 A' of rows A.
@@ -221,13 +223,13 @@ class Eliminated(Protocol):
         ...
 
     def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, `combined` (size,) being the columns times multipliers."""
+        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The primal and dual answer of the rows, and what it was found with.
+    """The primal and dual answer of a QP.
 
     Attributes
     ----------
@@ -235,10 +237,6 @@ class Answer:
     point : Point
     multipliers : (total,)
         Positive at upper and negative at lower bounds.
-    rows : (R,) int
-        The rows that entered the dual QP.
-    columns : (size, R)
-        L^-1 A' of those rows.
     iterations : int
         Of the dual QPs.
     """
@@ -246,8 +244,6 @@ class Answer:
     table: RowTable
     point: Point
     multipliers: Array
-    rows: Index
-    columns: Array
     iterations: int
 
     @property
@@ -272,7 +268,7 @@ class Answer:
 def solve_rows(
     problem: Eliminated, size: int, table: RowTable, remembered: set[tuple[object, ...]], block: int = 8
 ) -> Answer:
-    """Return the answer of a QP with the rows of `table`; `remembered` are the keys of those that were active last.
+    """Return the answer of a QP with the rows of `table`; `remembered` are keys of those active before.
 
     Rows enter the dual QP when they are violated, the worst first, and stay: so it ends.
 
@@ -328,4 +324,4 @@ def solve_rows(
         point = problem.point(table, columns @ multipliers)
     every = np.zeros(len(table.lower))
     every[rows] = multipliers
-    return Answer(table, point, every, np.array(rows, dtype=np.int64), columns, iterations)
+    return Answer(table, point, every, iterations)
