@@ -98,6 +98,7 @@ class Clearance:
         reach: float | None = None,
         use_fcl: bool = True,
         self_reach: float | None = None,
+        fcl_reach: float | None = None,
     ) -> NearPairs:
         """Return all pairs whose surfaces are nearer than `reach`, exact.
 
@@ -114,8 +115,11 @@ class Clearance:
             m; by default `influence` and the lesser of `reach` and `self_influence`.
         use_fcl : bool
             Ask python-fcl for the pairs nearer than `fcl_reach`; each answer is guarded.
+        fcl_reach : float or None
+            m; by default that of this object.
         """
         reach = self.influence if reach is None else reach
+        fcl_reach = (self.fcl_reach if fcl_reach is None else fcl_reach) if use_fcl else 0.0
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
         candidates, motion = self._covering(X, time, reach, self_reach)
         parts = []
@@ -124,7 +128,7 @@ class Clearance:
             limit = self_reach if group.is_self else reach
             rows = np.flatnonzero(group.lower(motion, limit)[0] < limit)
             if len(rows):
-                contacts = self._contacts(group, X, time, rows, limit, use_fcl)
+                contacts = self._contacts(group, X, time, rows, min(limit, fcl_reach))
                 first = np.flatnonzero(contacts.distance < limit)
                 wasted += len(rows) - len(first)
                 second = first[contacts.two()[first] & (contacts.distance_second[first] < limit)]
@@ -141,12 +145,12 @@ class Clearance:
             self._wasted = 0
 
     def _contacts(
-        self, group: Group, X: Array, time: float, rows: Index, limit: float, use_fcl: bool
+        self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float
     ) -> Contacts:
         segments, others = group.segments(X, rows), group.others(X, time, rows)
         contacts = group.contacts_of(segments, others, rows)
-        if use_fcl and group.shape in FclQueries.SHAPES:
-            asked = np.flatnonzero(contacts.distance < min(self.fcl_reach, limit))
+        if fcl_reach > 0.0 and group.shape in FclQueries.SHAPES:
+            asked = np.flatnonzero(contacts.distance < fcl_reach)
             radius = group.radius[rows]
             self.fcl.improve(group.shape, group.other[rows], radius, segments, others, contacts, asked)
         return contacts
@@ -251,6 +255,7 @@ class Clearance:
         end_time: float,
         floor: float,
         self_floor: float | None = None,
+        end_excess: float = 0.0,
     ) -> BetweenReport:
         """Prove that no surface distance falls below its floor while the nodes move on straight lines.
 
@@ -266,6 +271,8 @@ class Clearance:
             s; the obstacles move meanwhile.
         floor, self_floor : float
             For obstacles and, if it differs, between members, m; not negative.
+        end_excess : float
+            The end is held to floors higher by this, m; see ``BetweenReport.kept_at_end``.
 
         Raises
         ------
@@ -274,18 +281,23 @@ class Clearance:
         """
         floor = max(floor, 0.0)
         self_floor = floor if self_floor is None else max(self_floor, 0.0)
-        candidates, motion = self._covering(start, start_time, floor, self_floor, end, end_time)
+        candidates, motion = self._covering(
+            start, start_time, floor + end_excess, self_floor + end_excess, end, end_time
+        )
         proven = min(candidates.beyond(motion))
         found: list[tuple[Group, Found]] = []
+        kept_at_end = True
         for group in candidates.groups:
             least = self_floor if group.is_self else floor
-            lower, others = group.lower(motion, least)
-            open_ = ~(lower >= least)
+            at_end = least + end_excess
+            lower, others = group.lower(motion, at_end)
+            open_ = ~(lower >= at_end)
             proven = min(proven, others, float(lower[~open_].min(initial=np.inf)))
             rows = np.flatnonzero(open_)
             if len(rows):
                 result = sweep_group(group, rows, start, end, start_time, end_time, least)
                 proven = min(proven, result.proven)
+                kept_at_end &= result.at_end >= at_end
                 if len(result.rows):
                     found.append((group, result))
         parts = [self._failing(g, r, start, end, start_time, end_time) for g, r in found]
@@ -296,7 +308,7 @@ class Clearance:
             fractions.append(np.full(len(enclosed), 1.0 / 32.0))
         failing = join(parts, self.names)
         least = min([proven, float(failing.distance.min(initial=np.inf)), *(r.worst for _, r in found)])
-        return BetweenReport(not parts, least, np.concatenate([np.zeros(0), *fractions]), failing)
+        return BetweenReport(not parts, least, np.concatenate([np.zeros(0), *fractions]), failing, kept_at_end)
 
     def _failing(
         self, group: Group, found: Found, start: Array, end: Array, start_time: float, end_time: float
