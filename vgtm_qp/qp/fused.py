@@ -16,7 +16,7 @@ from vgtm_qp.qp.condensed import FEASIBILITY, UNBOUNDED, InfeasibleStepError, ch
 from vgtm_qp.qp.fused_graph import Bound, length_function, row_function
 from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows, StepSolution, progress_scale
 from vgtm_qp.qp.settle import held, settling_gain
 
 Array = NDArray[np.float64]
@@ -133,7 +133,7 @@ class FusedSolver:
         size, count, weights = self._size, self._actuators, self.layout.weights
         hessian, gradient = self._assemble()
         rate = goal.rate
-        curvature = weights.progress * max(float(rate @ rate), 1e-12)
+        curvature = weights.progress * progress_scale(rate)
         hessian[-1, -1] = curvature
         gradient[-1] = curvature * (progress - 2.0)
 

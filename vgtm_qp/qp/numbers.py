@@ -45,6 +45,29 @@ class ClearanceRows:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class CurveNumbers:
+    """Rows of a curve that is more than its tables, over its D = 3 V + T coordinates d_c::
+
+        gap     = C d_rho - position d_c + position_rhs           m
+        turn    = turn_face d_rho[face] + turn_curve d_c + turn_rhs   rad
+        stretch = spacing d_c + spacing_rhs                       m
+
+    Attributes
+    ----------
+    position : (K, 3, D)
+    turn_face, turn_curve, turn_rhs : (K, R, 9), (K, R, D), (K, R)
+    spacing, spacing_rhs : (S, D), (S,)
+    """
+
+    position: Array
+    turn_face: Array
+    turn_curve: Array
+    turn_rhs: Array
+    spacing: Array
+    spacing_rhs: Array
+
+
 @dataclass
 class StepNumbers:
     """Numbers of one QP at one configuration; displacements d over the step are the unknowns.
@@ -78,6 +101,8 @@ class StepNumbers:
     base_axes : (2, 3)
     base_rhs : (2,)
     clearance : ClearanceRows
+    curve : CurveNumbers or None
+        In the place of the curve's tables and the tangent rows, where ``Layout.general`` is given.
     """
 
     gradient: Array
@@ -101,6 +126,7 @@ class StepNumbers:
     base_axes: Array
     base_rhs: Array
     clearance: ClearanceRows
+    curve: CurveNumbers | None = None
 
 
 @dataclass(frozen=True)
@@ -115,6 +141,8 @@ class StepSolution:
         Changes of the actuated lengths, m.
     vertices : (V, 3)
         Displacements of the control vertices, m.
+    torsion : (T,)
+        Changes of the torsion coordinates, rad.
     progress : float
         Change of the path variable alpha.
     actuator_multipliers : (n_a,)
@@ -132,3 +160,13 @@ class StepSolution:
     actuator_multipliers: Array
     clearance_multipliers: Array
     iterations: int = 0
+    torsion: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def progress_scale(rate: Array) -> float:
+    """Return the square of the tip's rate (n_e,) along the path, by which its progress is weighted.
+
+    Where the path stands still progress costs nothing, and any positive number serves.
+    """
+    squared = float(rate @ rate)
+    return squared if squared > 1e-12 else 1.0

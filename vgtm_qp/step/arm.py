@@ -47,6 +47,8 @@ class Arm:
         Least clearance to obstacles and between members, and the distance from which pairs enter the QP, m.
     margin : float
         What the QP keeps over the least clearance, m.
+    minimum_angle : float
+        Least angle between members that share a node, rad.
     dt : float
         Duration of a step, s.
     jams : tuple of (str, float)
@@ -72,6 +74,7 @@ class Arm:
     influence: float
     margin: float
     dt: float
+    minimum_angle: float = 0.0
     base_motion: BaseMotion | None = None
     jams: tuple[tuple[str, float], ...] = ()
     measure: Clearance | None = None
@@ -137,6 +140,7 @@ def build_arm(problem: Problem) -> Arm:
         influence=clearance.influence,
         margin=clearance.margin,
         dt=step_duration(problem.maneuver),
+        minimum_angle=clearance.minimum_angle,
         base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
         measure=Clearance(ends, truss.radius, joined=truss.members, **options) if apart else None,

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from vgtm_qp.errors import SolverError
-from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.condensed import InfeasibleStepError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.engine import Engine
-from vgtm_qp.step.linearise import Target, clearance_rows
+from vgtm_qp.step.linearise import Target
+from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.state import State
 from vgtm_qp.step.task import TipTask
@@ -31,19 +31,15 @@ _SETTLING_STEPS = 4
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What an accepted state is held against: lengths and tip in m (rad), clearance in m below `safe`.
+    """What an accepted state is held against: lengths and tip in m (rad).
 
-    They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. The QP
-    keeps `margin` over the least clearance, m, for what is not linear in its step. A tip that is further off than
-    `settling` after a QP calls for another one.
+    They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. A tip
+    that is further off than `settling` after a QP calls for another one.
     """
 
     member: float = 1e-10
     stroke: float = 1e-10
     tip: float = 1e-8
-    clearance: float = 1e-10
-    between: float = 1e-10
-    margin: float = 2e-4
     settling: float = 1e-3
 
 
@@ -88,6 +84,8 @@ class Outcome:
         Its clearance rows.
     iterations : int
         QPs solved.
+    shortfall : Shortfall or None
+        What is still too near in the new configuration; None where that was not looked at.
     """
 
     accepted: bool
@@ -98,6 +96,7 @@ class Outcome:
     solution: StepSolution | None = None
     rows: ClearanceRows | None = None
     iterations: int = 0
+    shortfall: Shortfall | None = None
 
 
 class Attempt:
@@ -107,20 +106,14 @@ class Attempt:
         self,
         engine: Engine,
         task: TipTask,
-        monitor: Clearance,
-        safe: float,
-        self_safe: float,
-        influence: float,
+        separation: Separation,
         *,
         tolerances: Tolerances | None = None,
         max_qps: int = 8,
     ) -> None:
         self.engine = engine
         self.task = task
-        self.monitor = monitor
-        self.safe = safe
-        self.self_safe = self_safe
-        self.influence = influence
+        self.separation = separation
         self.tolerances = tolerances or Tolerances()
         self.max_qps = max_qps
         self.phases = Phases()
@@ -130,8 +123,20 @@ class Attempt:
 
         `share` is the length of the piece as a part of the step before: what the motion guessed from it is scaled by.
         """
-        tolerance, phases, span = self.tolerances, self.phases, target.end - target.start
-        phases.start()
+        self.phases.start()
+        short = state.shortfall
+        if short is None:
+            short = self.separation.shortfall(state.nodes, state.time)
+        if short:
+            outcome = self._run(state, target, share, short, self.separation.distances.recovery)
+            if outcome.accepted:
+                return outcome
+        return self._run(state, target, share, short, 0.0)
+
+    def _run(self, state: State, target: Target, share: float, short: Shortfall, gain: float) -> Outcome:
+        """Do it, with pairs that are too `short` of their clearance driven apart by `gain`, m."""
+        phases, span, separation = self.phases, target.end - target.start, self.separation
+        duration = target.time - state.time
         X, vertices, progress = state.nodes, state.control_vertices, 0.0
         guess = share * state.motion
         Y = X + 0.5 * guess
@@ -140,13 +145,19 @@ class Attempt:
         first: StepSolution | None = None
         first_rows: ClearanceRows | None = None
         closed: Closed | None = None
+        after: Shortfall | None = None
 
         def outcome(reason: str, count: int) -> Outcome:
-            return Outcome(not reason, closed, vertices, progress, reason, first, first_rows, count)
+            return Outcome(not reason, closed, vertices, progress, reason, first, first_rows, count, after)
 
         for count in range(1, self.max_qps + 1):
             motion = count == 1
-            rows = self._rows(state, X, state.time if motion else target.time, stations, reach, motion=motion)
+            if motion:
+                rows = separation.rows(X, state.time, duration, reach, short, gain)
+            else:
+                rows = separation.rows(X, target.time, 0.0, reach, short, gain)
+            for more in separation.rows_between(state.nodes, X, state.time, target.time, stations):
+                rows = rows.joined(more)
             if motion and target.base is not None:
                 rows = rows.after(np.where(self.task.base[:, None], target.base - X, 0.0))
             phases.add("distance")
@@ -175,19 +186,13 @@ class Attempt:
             if settled is None:
                 continue
             closed, X = settled, settled.X
-            if not self.monitor.keeps(
-                X, target.time, self.safe - tolerance.clearance, self.self_safe - tolerance.clearance
-            ):
+            after = separation.holds(X, target.time, short)
+            if after is None:
                 phases.add("acceptance")
                 continue
-            report = self.monitor.between(
-                state.nodes,
-                X,
-                state.time,
-                target.time,
-                self.safe - tolerance.between,
-                max(self.self_safe - tolerance.between, 0.0),
-            )
+            if separation.turns_too_far(state.nodes, X):
+                return outcome("an offset joint turns too far in one step", count)
+            report = separation.between(state.nodes, X, state.time, target.time, short)
             phases.add("acceptance")
             if report.certified:
                 return outcome("", count)
@@ -228,33 +233,6 @@ class Attempt:
         """Return about how far a node moves in the step, m; anything where the arm was at rest."""
         last = float(np.abs(guess).max())
         if last == 0.0 or target.base is not None:
-            return self.influence
+            return self.separation.distances.influence
         way = target.path.at(target.end).position - target.path.at(target.start).position
         return max(last, float(np.abs(way).max()))
-
-    def _rows(
-        self, state: State, X: Array, time: float, stations: list[float], reach: float, *, motion: bool
-    ) -> ClearanceRows:
-        """Return the clearance rows at `X` and, as the end state moves them too, at the `stations` on the way there.
-
-        Pairs that are further from their floor than `reach`, m, cannot become active in the QP. A pair that was
-        missed because a member moved further than expected is found by the check of the new state, and corrected.
-        """
-        margin = self.tolerances.margin
-        safe = (self.safe + margin, self.self_safe + margin)
-        near = self.monitor.near(
-            X,
-            time,
-            min(self.influence, self.safe + reach),
-            use_fcl=motion,
-            self_reach=min(self.influence, self.self_safe + 2.0 * reach),
-        )
-        rows = clearance_rows(self.monitor, near, *safe)
-        if motion:
-            # A zero step is always allowed, but for the margin that the step before may have used up.
-            np.minimum(rows.lower, 2.0 * margin, out=rows.lower)
-        for s in stations:
-            between = state.nodes + s * (X - state.nodes)
-            pairs = self.monitor.near(between, state.time + s * (time - state.time), 1.5 * self.safe)
-            rows = rows.joined(clearance_rows(self.monitor, pairs, *safe, s))
-        return rows

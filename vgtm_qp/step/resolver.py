@@ -14,9 +14,10 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.checks import unreachable_tip
-from vgtm_qp.step.attempt import Attempt, Tolerances
+from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.limits import length_box
 from vgtm_qp.step.linearise import Target
+from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
 from vgtm_qp.step.state import State, frozen
 
@@ -107,11 +108,11 @@ class Resolver:
         self._attempt = Attempt(
             arm.engine,
             arm.task,
-            arm.monitor,
-            arm.safe,
-            arm.self_safe,
-            arm.influence,
-            tolerances=Tolerances(margin=arm.margin),
+            Separation(
+                arm.truss,
+                arm.monitor,
+                Distances(arm.safe, arm.self_safe, arm.influence, arm.margin, arm.minimum_angle),
+            ),
         )
         self.state = arm.home_state()
         truss = arm.truss
@@ -266,6 +267,7 @@ class Resolver:
             length_rates=frozen((closed.lengths - state.lengths) / dt),
             motion=frozen(closed.X - state.nodes),
             duration=dt,
+            shortfall=outcome.shortfall,
         )
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return Step(status, progress, self.state, "", outcome.iterations, *told)

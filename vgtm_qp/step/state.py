@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vgtm_qp.geometry.clearance import Pair
 
 Array = NDArray[np.float64]
 
@@ -37,6 +40,8 @@ class State:
         Displacement of the nodes over that step, m: the guess for the next one, at whose middle it is linearised.
     duration : float
         Duration of that step, s; 0 at home, where the arm rests.
+    shortfall : mapping or None
+        Pairs that are nearer than they may be, with their distances, m; None where that is not known yet.
     """
 
     time: float
@@ -46,3 +51,4 @@ class State:
     length_rates: Array
     motion: Array
     duration: float = 0.0
+    shortfall: Mapping[Pair, float] | None = None

@@ -1,0 +1,208 @@
+"""What a step keeps apart: members and obstacles, members and members, and the angles between members that meet.
+
+A pair that is already nearer than it may be does not stop the arm: it may not come nearer, and is driven apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.geometry.clearance import BetweenReport, Clearance, Pair
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.linearise import clearance_rows
+from vgtm_qp.truss.kinematics import member_ends
+from vgtm_qp.truss.truss import Truss
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+Shortfall = Mapping[Pair, float]
+"""Pairs that are nearer than they may be, with their distances, m."""
+
+_NEAR_ANGLE = 0.3
+"""Members that meet at an angle larger than the least one by this, rad, are far from it."""
+
+_TURN = 0.3
+"""A joint's triangle may change by this share of itself in one step."""
+
+
+@dataclass(frozen=True)
+class Distances:
+    """What is kept: surface to surface from obstacles and between members, m, and angles between members, rad.
+
+    The QP keeps `margin` more, m, for what is not linear in its step; pairs further than `influence`, m, are not
+    in it. A pair that is too near at the start of a step is driven apart by up to `recovery`, m, in one step.
+    """
+
+    safe: float
+    self_safe: float
+    influence: float
+    margin: float = 2e-4
+    minimum_angle: float = 0.0
+    recovery: float = 0.01
+    rounding: float = 1e-10
+
+
+class Separation:
+    """Rows, checks and proofs of clearance for the steps of one arm."""
+
+    def __init__(self, truss: Truss, monitor: Clearance, distances: Distances) -> None:
+        self.monitor = monitor
+        self.distances = distances
+        self._truss = truss
+        self._corners = _corners(truss) if distances.minimum_angle > 0.0 else np.zeros((0, 2, 2), dtype=np.int64)
+
+    def shortfall(self, X: Array, time: float) -> Shortfall:
+        """Return the pairs that are too near at node positions `X` (N, 3); empty as a rule."""
+        kept = self.distances
+        floors = kept.safe - kept.rounding, kept.self_safe - kept.rounding
+        if self.monitor.keeps(X, time, *floors):
+            return {}
+        pairs = self.monitor.near(X, time, floors[0], use_fcl=False, self_reach=floors[1])
+        found: dict[Pair, float] = {}
+        for k in range(len(pairs)):
+            pair = pairs.pair(k)
+            found[pair] = min(found.get(pair, np.inf), float(pairs.distance[k]))
+        return found
+
+    def holds(self, X: Array, time: float, before: Shortfall) -> Shortfall | None:
+        """Return what is too near at `X`, or None where a pair is that was not `before`, or comes nearer."""
+        if not self._angles_hold(X):
+            return None
+        after = self.shortfall(X, time)
+        if all(distance >= before.get(pair, np.inf) - self.distances.rounding for pair, distance in after.items()):
+            return after
+        return None
+
+    def between(self, start: Array, end: Array, start_time: float, end_time: float, before: Shortfall) -> BetweenReport:
+        """Return the proof that no surfaces come nearer on the way than they may, or than the nearest are already."""
+        kept = self.distances
+        floor, self_floor = (
+            min([least, *(distance for pair, distance in before.items() if pair.is_self == is_self)])
+            for least, is_self in ((kept.safe, False), (kept.self_safe, True))
+        )
+        return self.monitor.between(
+            start, end, start_time, end_time, floor - kept.rounding, max(self_floor - kept.rounding, 0.0)
+        )
+
+    def turns_too_far(self, start: Array, end: Array) -> bool:
+        """Return whether an offset joint turns so far in a step that its members' ways have no useful bound."""
+        joints = self._truss.joints
+        if joints is None:
+            return False
+        before, after = (_joint_vectors(X[joints.triangle]) for X in (start, end))
+        change = np.linalg.norm(after - before, axis=-1)
+        return bool(np.any(change > _TURN * np.minimum(*(np.linalg.norm(v, axis=-1) for v in (before, after)))))
+
+    def rows(
+        self, X: Array, time: float, duration: float, reach: float, short: Shortfall, gain: float
+    ) -> ClearanceRows:
+        """Return the rows at `X`.
+
+        Parameters
+        ----------
+        duration
+            How long the obstacles move on until the end of the step, s; zero at the end. Where it is not, a zero
+            step is allowed as far as the obstacles rest, but for the margin that the step before may have used up
+            and for what is to be recovered.
+        reach
+            How far a node moves at most, m: a pair further from its floor than that cannot become active. One that
+            was missed because a member moved further is found by the check of the new state, and corrected.
+        short, gain
+            Pairs that were too near at the start of the step, and how far they are driven apart in it, m.
+        """
+        kept, motion = self.distances, duration > 0.0
+        reach += self.monitor.pieces.fastest * duration
+        pairs = self.monitor.near(
+            X,
+            time,
+            min(kept.influence, kept.safe + reach),
+            use_fcl=motion,
+            self_reach=min(kept.influence, kept.self_safe + 2.0 * reach),
+        )
+        rows = clearance_rows(self.monitor, pairs, kept.safe + kept.margin, kept.self_safe + kept.margin)
+        if motion:
+            np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
+        for k in np.flatnonzero(pairs.distance < np.where(pairs.is_self, kept.self_safe, kept.safe)) if short else ():
+            least = kept.self_safe if pairs.is_self[k] else kept.safe
+            before = short.get(pairs.pair(int(k)))
+            if before is not None:
+                rows.lower[k] = min(before + gain, least) - pairs.distance[k]
+        if motion and self.monitor.pieces.moving:
+            rows.lower += pairs.normal_speed * duration
+        return rows.joined(self._angle_rows(X, motion=motion)) if len(self._corners) else rows
+
+    def rows_between(
+        self, start: Array, X: Array, start_time: float, time: float, stations: list[float]
+    ) -> list[ClearanceRows]:
+        """Return the rows at the `stations`, 0 to 1, on the way from `start` to `X`: the end state moves them too."""
+        kept = self.distances
+        found = []
+        for s in stations:
+            pairs = self.monitor.near(start + s * (X - start), start_time + s * (time - start_time), 1.5 * kept.safe)
+            found.append(clearance_rows(self.monitor, pairs, kept.safe + kept.margin, kept.self_safe + kept.margin, s))
+        return found
+
+    def names(self, short: Shortfall) -> tuple[str, ...]:
+        """Return what is too near, nearest first."""
+        return tuple(self.monitor.names.clearance(pair) for pair, _ in sorted(short.items(), key=lambda item: item[1]))
+
+    def _angles(self, X: Array) -> tuple[Array, Array, Array]:
+        """Return angles (K,), rad, and the two members' vectors (K, 3) away from the node they share, m."""
+        ends = member_ends(self._truss, X)
+        along = ends[:, 1] - ends[:, 0]
+        first, second = (
+            np.where(self._corners[:, e, 1, None] == 0, 1.0, -1.0) * along[self._corners[:, e, 0]] for e in range(2)
+        )
+        sine = np.linalg.norm(np.cross(first, second), axis=1)
+        return np.arctan2(sine, np.einsum("kc,kc->k", first, second)), first, second
+
+    def _angles_hold(self, X: Array) -> bool:
+        if not len(self._corners):
+            return True
+        return bool(np.all(self._angles(X)[0] >= self.distances.minimum_angle - self.distances.rounding))
+
+    def _angle_rows(self, X: Array, *, motion: bool) -> ClearanceRows:
+        angles, first, second = self._angles(X)
+        chosen = np.flatnonzero(angles < self.distances.minimum_angle + _NEAR_ANGLE)
+        angle, u, v = angles[chosen], first[chosen], second[chosen]
+        lengths = [np.linalg.norm(w, axis=1, keepdims=True) for w in (u, v)]
+        u, v = u / lengths[0], v / lengths[1]
+        sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
+        turn_u = -(v - cosine * u) / (lengths[0] * np.maximum(sine, 1e-6))
+        turn_v = -(u - cosine * v) / (lengths[1] * np.maximum(sine, 1e-6))
+        corners, members = self._corners[chosen], self._truss.members
+        node = members[corners[:, 0, 0], corners[:, 0, 1]]
+        others = [members[corners[:, e, 0], 1 - corners[:, e, 1]] for e in range(2)]
+        nodes = np.stack([node, *others, others[1]], axis=1)
+        coefficients = np.stack([-turn_u - turn_v, turn_u, turn_v, np.zeros_like(turn_u)], axis=1)
+        lower = self.distances.minimum_angle + self.distances.margin - angle
+        names = self._truss.member_names
+        return ClearanceRows(
+            nodes,
+            coefficients,
+            np.minimum(lower, 2.0 * self.distances.margin) if motion else lower,
+            lambda k: f"angle: {names[corners[k, 0, 0]]} / {names[corners[k, 1, 0]]}",
+        )
+
+
+def _corners(truss: Truss) -> Index:
+    """Return (K, 2, 2): the two members that meet at a node, and which of their ends does."""
+    at: dict[int, list[tuple[int, int]]] = {}
+    for member, nodes in enumerate(truss.members.tolist()):
+        for end, node in enumerate(nodes):
+            at.setdefault(node, []).append((member, end))
+    found = [(a, b) for meeting in at.values() for k, a in enumerate(meeting) for b in meeting[k + 1 :]]
+    return np.array(found, dtype=np.int64).reshape(-1, 2, 2)
+
+
+def _joint_vectors(corner: Array) -> Array:
+    """Return (N, 4, 3) what a joint's frame is made of: the triangle's two sides, its bisector and its normal."""
+    first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    u = first / np.linalg.norm(first, axis=1, keepdims=True)
+    v = second / np.linalg.norm(second, axis=1, keepdims=True)
+    return np.stack([first, second, u + v, np.cross(first, second)], axis=1)
