@@ -16,6 +16,7 @@ Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _LONGEST_PERIOD = 6
+_MOST_NODES = 12
 _MOST_LOCKED = 24
 
 
@@ -127,14 +128,9 @@ class Chain:
 
 def find_chain(layout: Layout) -> Chain | None:
     """Return the chain of `layout`, with the shortest period; None where the truss is none."""
-    truss = layout.truss
-    stages = int(truss.stage.max(initial=-1)) + 1
-    found = [
-        chain
-        for length in range(1, min(stages, _LONGEST_PERIOD) + 1)
-        if stages % length == 0 and (chain := _chain(layout, stages, length)) is not None
-    ]
-    return min(found, key=lambda chain: (len(chain.locked), len(chain.stage_sizes)), default=None)
+    stages = int(layout.truss.stage.max(initial=-1)) + 1
+    lengths = (length for length in range(1, min(stages, _LONGEST_PERIOD) + 1) if stages % length == 0)
+    return next((chain for length in lengths if (chain := _chain(layout, stages, length)) is not None), None)
 
 
 def _places(period: Index, place: Index, here: Index, carried: Index) -> Index:
@@ -157,6 +153,8 @@ def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
     if not len(member_stage) or member_stage.min() < 0 or not _repeats(node_counts, length):
         return None
     if (np.bincount(member_stage, minlength=stages) != 3 * node_counts).any():
+        return None
+    if len(truss.free) > _MOST_NODES * periods:
         return None
     nodes = truss.free.reshape(periods, -1)
     members = np.argsort(member_stage, kind="stable").reshape(periods, -1)

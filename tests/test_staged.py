@@ -1,0 +1,443 @@
+"""Elimination along the bays against the dense condensed QP: one problem, one answer, multipliers included."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import make_layout, mast, random_pose
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vgtm_qp.errors import SolverError
+from vgtm_qp.problem.method import Weights
+from vgtm_qp.qp import lengths as lengths_module
+from vgtm_qp.qp import working_set
+from vgtm_qp.qp.chain import find_chain
+from vgtm_qp.qp.condensed import CondensedSolver, InfeasibleStepError
+from vgtm_qp.qp.lengths import LengthSolver
+from vgtm_qp.qp.long_arms import chain_solver, prefers_staged
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.qp.settle import held, settling_gain
+from vgtm_qp.qp.solvers import make_solver
+from vgtm_qp.qp.sparse_symbols import range_and_null
+from vgtm_qp.qp.staged import StagedSolver
+from vgtm_qp.qp.sweep import Sweep
+from vgtm_qp.qp.tracked import TrackedSolver
+from vgtm_qp.step.linearise import Linearisation, Target
+from vgtm_qp.step.path import Path, rotation_from_vector
+from vgtm_qp.truss import modules
+from vgtm_qp.truss.build import lock_members
+from vgtm_qp.truss.kinematics import Kinematics
+
+MODULES = {
+    "octahedral": lambda **kw: modules.octahedral(4, **kw),
+    "double-octahedral": lambda **kw: modules.double_octahedral(4, **kw),
+    "hexapod": lambda **kw: modules.hexapod(4, **kw),
+    "longeron": lambda **kw: modules.longeron(4, **kw),
+    "tetrahedral-1": lambda **kw: modules.tetrahedral(4, actuated=(1,), **kw),
+    "tetrahedral-23": lambda **kw: modules.tetrahedral(4, actuated=(2, 3), **kw),
+    "tetrahedral-123": lambda **kw: modules.tetrahedral(4, longeron=1.1, **kw),
+}
+SQUARE = ["octahedral", "double-octahedral", "longeron", "tetrahedral-1"]
+
+
+@pytest.fixture(autouse=True)
+def _without_compiler(monkeypatch):
+    """The virtual machine evaluates the same graphs; compiling a dozen of them would be most of the time."""
+    monkeypatch.setenv("VGTM_CC", "none")
+
+
+def make(truss, track=("position",), **options):
+    kinematics = Kinematics(truss)
+    layout, task = make_layout(truss, kinematics, track, **options)
+    return layout, kinematics, task
+
+
+def random_numbers(
+    layout,
+    kinematics,
+    task,
+    rng,
+    *,
+    off=0.02,
+    box=0.03,
+    push=0.1,
+    near=6,
+    slack=0.02,
+    base=False,
+    motion=True,
+):
+    """One QP at a random pose: members off their lengths, narrow strokes, clearance rows on two members each."""
+    truss = layout.truss
+    X = random_pose(truss, rng, off)
+    X[truss.base] = truss.home[truss.base]
+    kinematics.evaluate(X)
+    home = kinematics.lengths + 1e-4 * rng.normal(size=truss.member_count)
+    here, rotation = kinematics.tip_position(X), kinematics.tip_rotation.copy()
+    turn = rotation_from_vector(0.2 * push * rng.normal(size=3))
+    path = Path(
+        np.array([0.0, 1.0]),
+        np.stack([here, here + push * rng.normal(size=3)]),
+        np.stack([rotation, turn @ rotation]),
+    )
+    now = kinematics.lengths[truss.actuators]
+    room = box * rng.uniform(0.2, 1.0, size=(2, len(now)))
+    moved = truss.home @ rotation_from_vector([0.01, -0.02, 0.015]).T + [0.01, 0.0, 0.02] if base else None
+    target = Target(path, 0.0, 1.0, now - room[0], now + room[1], 0.0, moved)
+    vertices = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, truss.height]
+    vertices = vertices + off * rng.normal(size=vertices.shape)
+    nodes = truss.members[rng.integers(truss.member_count, size=(near, 2))].reshape(near, 4)
+    coefficients = rng.normal(size=(near, 4, 3)) * [[1.0], [1.0], [-1.0], [-1.0]]
+    rows = ClearanceRows(nodes, coefficients, -slack * rng.uniform(size=near))
+    linearisation = Linearisation(layout, kinematics, task, home)
+    return linearisation.numbers(X, vertices, target, 0.0 if motion else 0.6, rows, motion=motion)
+
+
+def outcome(solver, numbers):
+    try:
+        return solver.solve(numbers)
+    except InfeasibleStepError:
+        return "infeasible"
+
+
+def assert_same(found, wanted):
+    assert isinstance(found, str) == isinstance(wanted, str), (found, wanted)
+    if isinstance(wanted, str):
+        return
+    for name in (
+        "nodes",
+        "actuators",
+        "vertices",
+        "progress",
+        "actuator_multipliers",
+        "clearance_multipliers",
+    ):
+        one, other = np.asarray(getattr(found, name)), np.asarray(getattr(wanted, name))
+        np.testing.assert_allclose(one, other, atol=1e-9 * (1 + np.abs(other).max(initial=0.0)), err_msg=name)
+
+
+def assert_same_answers(layout, kinematics, task, solver, count, seed=0, **options):
+    """Compare over random QPs; return how many strokes and clearances were active in all, and how many had none."""
+    dense, rng = CondensedSolver(layout), np.random.default_rng(seed)
+    strokes = clearances = infeasible = 0
+    for k in range(count):
+        numbers = random_numbers(layout, kinematics, task, rng, motion=k % 3 < 2, **options)
+        wanted = outcome(dense, numbers)
+        assert_same(outcome(solver, numbers), wanted)
+        if isinstance(wanted, str):
+            infeasible += 1
+        else:
+            strokes += np.count_nonzero(wanted.actuator_multipliers)
+            clearances += np.count_nonzero(wanted.clearance_multipliers)
+    return strokes, clearances, infeasible
+
+
+@pytest.mark.parametrize("vertices", [5, 0])
+@pytest.mark.parametrize("name", MODULES)
+def test_elastic_answers_are_those_of_the_condensed_qp(name, vertices):
+    layout, kinematics, task = make(MODULES[name](), vertices=vertices)
+    solver = StagedSolver(find_chain(layout))
+    strokes, clearances, infeasible = assert_same_answers(layout, kinematics, task, solver, 9)
+    assert strokes > 20
+    assert clearances > 5
+    assert infeasible < 5
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("hexapod", {"track": ("position", "orientation")}),
+        ("octahedral", {"track": ("position", "pointing")}),
+        ("longeron", {"track": ("x", "pointing")}),
+    ],
+)
+@pytest.mark.parametrize("base", [False, True])
+def test_tip_directions_and_a_moving_base(name, options, base):
+    layout, kinematics, task = make(MODULES[name](), **options)
+    solver = StagedSolver(find_chain(layout))
+    found = assert_same_answers(layout, kinematics, task, solver, 6, base=base, push=0.03, box=0.06)
+    assert found[0] + found[1] > 0
+    assert found[2] < 6
+
+
+def test_offset_joints():
+    layout, kinematics, task = make(modules.octahedral(4, joint_offset=0.05))
+    solver = StagedSolver(find_chain(layout))
+    assert sum(assert_same_answers(layout, kinematics, task, solver, 5)) > 5
+
+
+def test_other_weights():
+    weights = Weights(node_rate=0.0, actuator_rate=1.0, stroke_centring=0.0, tracking=3.0, tangent=0.7)
+    layout, kinematics, task = make(MODULES["octahedral"](), weights=weights)
+    assert sum(assert_same_answers(layout, kinematics, task, StagedSolver(find_chain(layout)), 5)) > 5
+
+
+def test_locked_actuators_are_rows_of_their_own():
+    truss = lock_members(MODULES["octahedral"](), ["B2-1", "B4-3"])
+    layout, kinematics, task = make(truss)
+    chain = find_chain(layout)
+    assert [truss.member_names[k] for k in chain.locked] == ["B2-1", "B4-3"]
+    assert sum(assert_same_answers(layout, kinematics, task, StagedSolver(chain), 6)) > 5
+
+
+@pytest.mark.parametrize("track", [("position",), ("position", "pointing")])
+@pytest.mark.parametrize("name", SQUARE)
+def test_hard_tracking_follows_the_curve(name, track):
+    layout, kinematics, task = make(MODULES[name](), track, vertices=7, hard_tracking=True)
+    chain = find_chain(layout)
+    assert chain.is_square
+    options = {"off": 0.005, "push": 0.02, "box": 0.3}
+    _, clearances, infeasible = assert_same_answers(
+        layout, kinematics, task, TrackedSolver(chain), 8, **options
+    )
+    assert clearances > 0
+    assert infeasible < 4
+    strokes, *_ = assert_same_answers(
+        layout, kinematics, task, TrackedSolver(chain), 8, **{**options, "box": 0.06}, near=0
+    )
+    assert strokes > 0
+
+
+def test_a_long_arm_with_many_rows_at_once():
+    layout, kinematics, task = make(modules.octahedral(24), vertices=6)
+    solver = StagedSolver(find_chain(layout))
+    strokes, clearances, _ = assert_same_answers(
+        layout, kinematics, task, solver, 3, near=40, push=0.5, box=0.02
+    )
+    assert strokes > 60
+    assert clearances > 5
+
+
+@given(st.integers(0, 10**6), st.floats(0.005, 0.3), st.floats(0.0, 0.05), st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_any_qp_of_one_arm(shared, seed, box, slack, motion):
+    layout, kinematics, task, solver, dense = shared
+    rng = np.random.default_rng(seed)
+    numbers = random_numbers(layout, kinematics, task, rng, box=box, slack=slack, motion=motion, near=12)
+    assert_same(outcome(solver, numbers), outcome(dense, numbers))
+
+
+@pytest.fixture(scope="module")
+def shared():
+    layout, kinematics, task = make(MODULES["octahedral"]())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VGTM_CC", "none")
+        solver = StagedSolver(find_chain(layout))
+    return layout, kinematics, task, solver, CondensedSolver(layout)
+
+
+def test_compiled_and_interpreted_recursions_agree(shared, monkeypatch):
+    monkeypatch.delenv("VGTM_CC")
+    layout, kinematics, task, interpreted, _ = shared
+    compiled = StagedSolver(find_chain(layout))
+    numbers = random_numbers(layout, kinematics, task, np.random.default_rng(4))
+    assert_same(compiled.solve(numbers), interpreted.solve(numbers))
+
+
+def test_what_was_active_before_does_not_change_the_answer(shared):
+    layout, kinematics, task, solver, dense = shared
+    rng = np.random.default_rng(8)
+    several = [random_numbers(layout, kinematics, task, rng, near=9) for _ in range(3)]
+    for numbers in several + several[::-1]:
+        assert_same(outcome(solver, numbers), outcome(dense, numbers))
+
+
+def test_rows_that_contradict_one_another_are_infeasible(shared):
+    layout, kinematics, task, solver, _ = shared
+    numbers = random_numbers(layout, kinematics, task, np.random.default_rng(2), near=1)
+    rows = numbers.clearance
+    opposed = ClearanceRows(
+        np.repeat(rows.nodes, 2, axis=0),
+        np.concatenate([rows.coefficients, -rows.coefficients]),
+        np.full(2, 1e-3),
+    )
+    with pytest.raises(InfeasibleStepError):
+        solver.solve(replace(numbers, clearance=opposed))
+    base = np.flatnonzero(layout.truss.base)[:1]
+    unmovable = ClearanceRows(np.full((1, 4), base), rows.coefficients, np.array([1e-3]))
+    with pytest.raises(InfeasibleStepError):
+        solver.solve(replace(numbers, clearance=unmovable))
+    slack = replace(unmovable, lower=np.array([-1e-3]))
+    assert outcome(solver, replace(numbers, clearance=slack)) != "infeasible"
+
+
+@pytest.mark.parametrize("hard", [False, True])
+def test_a_singular_bay_is_an_error(hard):
+    layout, kinematics, task = make(MODULES["octahedral"](), vertices=7, hard_tracking=hard)
+    solver = chain_solver(layout)
+    numbers = random_numbers(
+        layout, kinematics, task, np.random.default_rng(2), off=0.001, push=0.01, box=0.3
+    )
+    gradient = numbers.gradient.copy()
+    gradient[layout.fixed[8]] = gradient[layout.fixed[9]] = 0.0
+    with pytest.raises(SolverError):
+        solver.solve(replace(numbers, gradient=gradient))
+    assert solver.solve(numbers).progress > 0.9
+
+
+def test_an_objective_without_terms_is_an_error():
+    weights = Weights(node_rate=0.0, actuator_rate=0.0, stroke_centring=0.0, tracking=0.0, tangent=0.0)
+    layout, kinematics, task = make(MODULES["octahedral"](), vertices=0, weights=weights)
+    numbers = random_numbers(layout, kinematics, task, np.random.default_rng(2))
+    with pytest.raises(SolverError, match="singular"):
+        StagedSolver(find_chain(layout)).solve(numbers)
+
+
+@pytest.mark.parametrize("hard", [False, True])
+def test_a_wrong_answer_is_refused(hard, monkeypatch):
+    layout, kinematics, task = make(MODULES["octahedral"](), vertices=7, hard_tracking=hard)
+    solver = chain_solver(layout)
+    numbers = random_numbers(
+        layout, kinematics, task, np.random.default_rng(2), off=0.001, push=0.01, box=0.3
+    )
+    solver.solve(numbers)
+    right = working_set.dual_solution
+    monkeypatch.setattr(working_set, "dual_solution", lambda *a: (right(*a)[0] * (1 + 1e-4), 1))
+    with pytest.raises(SolverError):
+        solver.solve(numbers)
+    monkeypatch.undo()
+    unchanged = type(solver).point
+    monkeypatch.setattr(
+        type(solver),
+        "point",
+        lambda self, table, combined: replace(
+            unchanged(self, table, combined), nodes=unchanged(self, table, combined).nodes * (1 + 1e-4)
+        ),
+    )
+    with pytest.raises(SolverError, match="residual"):
+        solver.solve(numbers)
+
+
+@pytest.mark.parametrize("joint_offset", [0.0, 0.04])
+@pytest.mark.parametrize("name", MODULES)
+def test_the_periods_hold_the_whole_length_jacobian(name, joint_offset):
+    layout, kinematics, _ = make(MODULES[name](joint_offset=joint_offset))
+    chain = find_chain(layout)
+    kinematics.evaluate(random_pose(layout.truss, np.random.default_rng(0)))
+    values = (chain.gather @ kinematics.gradient.reshape(-1)).reshape(chain.periods, -1)
+    pattern, rebuilt = chain.coordinate_pattern, np.zeros((layout.node_columns, layout.node_columns))
+    for period in range(chain.periods):
+        block = np.zeros(pattern.shape)
+        block.T[pattern.T] = values[period]
+        before = chain.nodes[period - 1][chain.carried] if period else np.zeros(0, dtype=np.int64)
+        columns = (
+            layout.node_column[np.concatenate([before, chain.nodes[period]])][:, None] + np.arange(3)
+        ).ravel()
+        rebuilt[np.ix_(chain.members[period], columns)] = block[:, block.shape[1] - len(columns) :]
+    np.testing.assert_allclose(rebuilt, layout.length_jacobian(kinematics.gradient), atol=1e-15)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=40, deadline=None)
+def test_range_and_null_space_of_sparse_rows(seed):
+    rng = np.random.default_rng(seed)
+    rows, size = sorted(rng.integers(1, 9, size=2))
+    pattern = rng.uniform(size=(rows, size)) < 0.4
+    pattern[np.arange(rows), rng.permutation(size)[:rows]] = True
+    values = np.where(
+        pattern, rng.uniform(0.5, 2.0, size=(rows, size)) * rng.choice([-1, 1], (rows, size)), 0.0
+    )
+    if np.linalg.cond(values) > 1e6:
+        return
+    symbols = ca.SX.sym("A", ca.DM(values).sparsity())
+    G, N = ca.Function("f", [symbols], [ca.densify(x) for x in range_and_null(symbols)])(ca.DM(values))
+    G, N = np.array(G), np.array(N).reshape(size, -1)
+    assert N.shape == (size, size - rows)
+    np.testing.assert_allclose(values @ G, np.eye(rows), atol=1e-9)
+    np.testing.assert_allclose(values @ N, 0.0, atol=1e-12)
+    np.testing.assert_allclose(G.T @ N, 0.0, atol=1e-8)
+    np.testing.assert_allclose(N.T @ N, np.eye(size - rows), atol=1e-12)
+
+
+def test_a_sweep_is_a_recursion():
+    carry, data = ca.SX.sym("carry", 2), ca.SX.sym("data", 1)
+    function = ca.Function(
+        "fibonacci", [carry, data], [ca.vertcat(carry[1], carry[0] + carry[1] + data), carry[0]]
+    )
+    sweep = Sweep(function, 8)
+    sweep.carry[0] = [0.0, 1.0]
+    for extra in (0.0, 1.0):
+        sweep.inputs[1][:] = extra
+        sweep()
+        a, b = 0.0, 1.0
+        for period in range(8):
+            assert sweep.outputs[1][period] == a
+            a, b = b, a + b + extra
+        assert sweep.carry[-1].tolist() == [a, b]
+    with pytest.raises(ValueError, match="16"):
+        sweep.bind_output(0, np.zeros(3))
+
+
+def test_memory_is_linear_in_the_bays():
+    def size(bays):
+        layout, *_ = make(modules.octahedral(bays))
+        solver = StagedSolver(find_chain(layout))
+        kernels = (solver._factor, solver._columns, solver._forward, solver._balance)
+        return sum(array.nbytes for kernel in kernels for array in (*kernel.inputs, *kernel.outputs))
+
+    assert size(60) < 3.1 * size(20)
+
+
+@pytest.mark.parametrize("path", ["chain", "sparse", "dense"])
+@pytest.mark.parametrize("name", [*MODULES, "graph"])
+def test_lengths_by_every_path(name, path, monkeypatch):
+    if path != "dense":
+        monkeypatch.setattr(lengths_module, "_DENSE", 0)
+    if path == "sparse":
+        monkeypatch.setattr(lengths_module, "find_chain", lambda _: None)
+    truss = mast() if name == "graph" else MODULES[name](joint_offset=0.02)
+    layout, kinematics, _ = make(truss, vertices=0)
+    rng = np.random.default_rng(1)
+    kinematics.evaluate(random_pose(truss, rng, 0.02))
+    error = rng.normal(size=truss.member_count)
+    solver = LengthSolver(layout)
+    step = solver.solve(kinematics.gradient, error)
+    np.testing.assert_allclose(layout.length_jacobian(kinematics.gradient) @ step.ravel(), error, atol=1e-10)
+    broken = kinematics.gradient.copy()
+    broken[0] = 0.0
+    with pytest.raises(SolverError, match="singular"):
+        solver.solve(broken, error)
+
+
+def test_the_gain_is_the_least_motion_of_the_tip():
+    layout, kinematics, task = make(MODULES["octahedral"](), vertices=0)
+    truss, weights = layout.truss, layout.weights
+    solver, rng = StagedSolver(find_chain(layout)), np.random.default_rng(3)
+    assert solver.gain(np.zeros(len(truss.actuators), dtype=bool)) is None
+    stopped = 0
+    for _ in range(4):
+        numbers = random_numbers(layout, kinematics, task, rng, box=0.1, push=0.05, near=0)
+        answer = solver.solve(numbers)
+        at_bound = held(answer.actuators, numbers.lower, numbers.upper)
+        stopped += at_bound.sum()
+        gain = solver.gain(at_bound)
+        response = np.linalg.inv(layout.length_jacobian(numbers.gradient))[:, truss.actuators]
+        tip = numbers.tip_jacobian @ response[(layout.node_column[truss.tip][:, None] + np.arange(3)).ravel()]
+        stiffness = weights.actuator_rate + weights.stroke_centring
+        wanted = response @ settling_gain(response, tip, ~at_bound, weights.node_rate, stiffness)
+        np.testing.assert_allclose(
+            gain[truss.free].reshape(wanted.shape), wanted, atol=1e-9 * np.abs(wanted).max()
+        )
+        assert not gain[truss.base].any()
+    assert stopped > 0
+    assert solver.gain(np.ones(len(truss.actuators), dtype=bool)) is None
+
+
+def test_long_regular_arms_are_solved_along_the_chain():
+    short, *_ = make(modules.octahedral(5))
+    assert not prefers_staged(short)
+    assert isinstance(make_solver("daqp", short), CondensedSolver)
+    long, *_ = make(modules.octahedral(20))
+    assert prefers_staged(long)
+    assert isinstance(make_solver("daqp", long), StagedSolver)
+    hard, *_ = make(modules.octahedral(20), hard_tracking=True)
+    assert isinstance(make_solver("daqp", hard), TrackedSolver)
+    legs, *_ = make(modules.hexapod(10), hard_tracking=True)
+    assert not prefers_staged(legs)
+    assert chain_solver(legs) is None
+    every, *_ = make(modules.octahedral(7))
+    irregular = replace(every, tracked=every.tracked[:3], curve_weights=every.curve_weights[:3])
+    assert chain_solver(irregular) is None
