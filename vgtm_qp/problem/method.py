@@ -19,6 +19,8 @@ NullSpaceTerm = Literal[
     "smoothness",
     "obstacle_potential",
 ]
+HardCoordinate = Literal["position", "pointing", "orientation"]
+HARD_COORDINATES = ("position", "pointing", "orientation")
 TRUSS_TERMS = ("node_rate", "actuator_rate", "stroke_centring", "obstacle_potential")
 CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 
@@ -38,6 +40,10 @@ class Weights(Table):
     )
     tangent: Weight = Field(
         default=0.05, description="angles between face normals and curve, rad^2; unit m^2/rad^2"
+    )
+    roll: Weight = Field(
+        default=0.05,
+        description="roll between faces and curve, rad^2, with torsion_vertices; unit m^2/rad^2",
     )
     spacing: Weight = Field(
         default=0.0, description="spacings of the curve nodes less those at home, m^2; unit 1"
@@ -94,6 +100,12 @@ class Method(Table):
     hard_tracking: Flag = Field(
         default=False, description="whether faces stay on the curve exactly; elastic otherwise"
     )
+    hard_coordinates: tuple[Annotated[HardCoordinate, Choice()], ...] = Field(
+        default=("position",),
+        min_length=1,
+        description="what of each face hard_tracking keeps on the curve: position; position and pointing; or "
+        "position, pointing and orientation, as far as the bays of the module have the motions",
+    )
     solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
     retries: Flag = Field(
         default=True, description="whether other ways out of a dead end are tried before giving up"
@@ -130,6 +142,9 @@ class Method(Table):
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.hard_tracking and self.tracking == "none":
             yield ("hard_tracking",), 'false, since tracking is "none"'
+        if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
+            choices = ", ".join(f'"{name}"' for name in HARD_COORDINATES)
+            yield ("hard_coordinates",), f"the first one, two or three of {choices}"
         if self.variant == "truncated" and self.algebra == "sparse":
             yield ("algebra",), '"dense", since the variant truncated needs the singular values'
         known = {"pseudoinverse": TRUSS_TERMS, "curve-pseudoinverse": CURVE_TERMS}.get(self.name)

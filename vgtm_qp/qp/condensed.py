@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import CurveNumbers, StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class CondensedSolver:
         truss, weights = layout.truss, layout.weights
         nodes, actuators, vertices = layout.node_columns, len(truss.actuators), layout.vertices
         curve_nodes = len(layout.tracked)
-        self._free_curve = 3 * vertices - 5 if vertices else 0
+        self._free_curve = layout.free_curve
         self._size = actuators + self._free_curve + 1
         self._jacobian = np.zeros((nodes, nodes))
         self._selection = np.zeros((nodes, actuators + 1))
@@ -50,21 +50,24 @@ class CondensedSolver:
                 if column >= 0:
                     self._centres[k, range(3), range(column, column + 3)] = weight
         self._face_columns = layout.node_column[truss.faces[layout.tracked]] if vertices else np.zeros((0, 3), int)
-        self._rows = np.zeros((nodes + 5 * curve_nodes, self._size))
-        self._rhs = np.zeros(nodes + 5 * curve_nodes)
+        count = nodes + (3 + layout.turns) * curve_nodes + layout.spacings
+        self._rows = np.zeros((count, self._size))
+        self._rhs = np.zeros(count)
         self._row_weight = np.concatenate(
             [
                 np.full(nodes, weights.node_rate),
                 np.full(3 * curve_nodes, weights.tracking),
-                np.full(2 * curve_nodes, weights.tangent),
+                layout.turn_weights,
+                np.full(layout.spacings, weights.spacing),
             ]
         )
-        if layout.hard_tracking:
-            self._row_weight[nodes : nodes + 3 * curve_nodes] = 0.0
+        self._row_weight[nodes : nodes + layout.hard_rows] = 0.0
         self._constant_hessian = np.zeros((self._size, self._size))
         index = np.arange(actuators)
         self._constant_hessian[index, index] = weights.actuator_rate + weights.stroke_centring
-        self._vertex_hessian = weights.curve_rate * np.eye(vertices) + weights.smoothness * layout.polygon_bending
+        coordinates = 3 * vertices + layout.torsion
+        self._curve_hessian = weights.curve_rate * np.eye(coordinates)
+        self._curve_hessian[: 3 * vertices, : 3 * vertices] = np.kron(layout.vertex_hessian, np.eye(3))
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Solve one QP.
@@ -98,10 +101,10 @@ class CondensedSolver:
         gradient[:count] += numbers.actuator_gradient
         if self._free_curve:
             block = slice(count, count + self._free_curve)
-            curve_hessian = np.einsum("ij,jcq->icq", self._vertex_hessian, curve)
-            hessian[block, block] += np.einsum("icp,icq->pq", curve, curve_hessian)
-            gradient[block] += np.einsum("icq,ic->q", curve_hessian, curve_offset)
-            gradient[block] += np.einsum("icq,ic->q", curve, numbers.vertex_gradient)
+            curve_hessian = self._curve_hessian @ curve
+            hessian[block, block] += curve.T @ curve_hessian
+            gradient[block] += curve_offset @ curve_hessian
+            gradient[block] += numbers.vertex_gradient.reshape(-1) @ curve[: numbers.vertex_gradient.size]
         hessian[-1, -1] += numbers.progress_curvature
         gradient[-1] += numbers.progress_gradient
 
@@ -116,7 +119,8 @@ class CondensedSolver:
 
         displacement = np.zeros((truss.node_count, 3))
         displacement[truss.free] = (response @ x[:count] + particular).reshape(-1, 3)
-        vertices = np.einsum("icq,q->ic", curve, x[count:-1]) + curve_offset
+        moved = curve @ x[count:-1] + curve_offset
+        vertices = moved[: 3 * layout.vertices].reshape(-1, 3)
         clearance = len(numbers.clearance)
         return StepSolution(
             nodes=displacement,
@@ -126,20 +130,18 @@ class CondensedSolver:
             actuator_multipliers=multipliers[:count].copy(),
             clearance_multipliers=-multipliers[len(multipliers) - clearance :],
             iterations=int(info["iterations"]),
+            torsion=moved[3 * layout.vertices :],
         )
 
     def _curve_basis(self, numbers: StepNumbers) -> tuple[Array, Array]:
-        """Return the basis (V, 3, q) of the free control vertex displacements and the offset (V, 3)."""
-        vertices, free = self.layout.vertices, self._free_curve
-        basis, offset = np.zeros((vertices, 3, free)), np.zeros((vertices, 3))
-        if vertices:
-            normal = np.cross(numbers.base_axes[0], numbers.base_axes[1])
-            basis[1, :, 0] = normal
-            axes = np.arange(3)
-            for i in range(2, vertices):
-                basis[i, axes, 1 + 3 * (i - 2) + axes] = 1.0
-            offset[0] = numbers.base_displacement
-            offset[1] = numbers.base_displacement + numbers.base_rhs @ numbers.base_axes
+        """Return the basis (D, q) of the free displacements of the curve's coordinates, and the offset (D,)."""
+        coordinates, free = 3 * self.layout.vertices + self.layout.torsion, self._free_curve
+        basis, offset = np.zeros((coordinates, free)), np.zeros(coordinates)
+        if coordinates:
+            basis[3:6, 0] = np.cross(numbers.base_axes[0], numbers.base_axes[1])
+            basis[6:, 1:] = np.eye(free - 1)
+            offset[:3] = numbers.base_displacement
+            offset[3:6] = numbers.base_displacement + numbers.base_rhs @ numbers.base_axes
         return basis, offset
 
     def _fill_tracking(
@@ -149,35 +151,51 @@ class CondensedSolver:
         tracked, count, nodes = len(layout.tracked), response.shape[1], layout.node_columns
         if not tracked:
             return
-        gap = slice(nodes, nodes + 3 * tracked)
+        rows = numbers.curve or self._tabled(numbers)
+        turns, spacings = layout.turns * tracked, layout.spacings
+        gap, turn = slice(nodes, nodes + 3 * tracked), slice(nodes + 3 * tracked, nodes + 3 * tracked + turns)
         centres = self._centres.reshape(3 * tracked, nodes)
+        position = rows.position.reshape(3 * tracked, -1)
         self._rows[gap, :count] = centres @ response
-        self._rows[gap, count:-1] = -np.einsum("kv,vcq->kcq", layout.curve_weights, curve).reshape(3 * tracked, -1)
-        self._rhs[gap] = (
-            numbers.position_rhs.reshape(-1)
-            + centres @ particular
-            - (layout.curve_weights @ curve_offset).reshape(-1)
-        )
-        tangent = slice(nodes + 3 * tracked, nodes + 5 * tracked)
+        self._rows[gap, count:-1] = -position @ curve
+        self._rhs[gap] = numbers.position_rhs.reshape(-1) + centres @ particular - position @ curve_offset
         columns = self._face_columns
         present = np.repeat(columns >= 0, 3, axis=1)[:, None, :]
         flat = (np.maximum(columns, 0)[:, :, None] + np.arange(3)).reshape(tracked, 9)
-        face = numbers.tangent_face * present
-        self._rows[tangent, :count] = np.einsum("kaf,kfn->kan", face, response[flat]).reshape(2 * tracked, count)
-        slope = np.einsum("kv,vcq->kcq", layout.curve_slopes, curve)
-        self._rows[tangent, count:-1] = np.einsum("kac,kcq->kaq", numbers.tangent_curve, slope).reshape(2 * tracked, -1)
-        self._rhs[tangent] = (
-            numbers.tangent_rhs
-            + np.einsum("kaf,kf->ka", face, particular[flat])
-            + np.einsum("kac,kc->ka", numbers.tangent_curve, layout.curve_slopes @ curve_offset)
-        ).reshape(-1)
+        face = rows.turn_face * present
+        turned = rows.turn_curve.reshape(turns, -1)
+        self._rows[turn, :count] = np.einsum("kaf,kfn->kan", face, response[flat]).reshape(turns, count)
+        self._rows[turn, count:-1] = turned @ curve
+        self._rhs[turn] = (
+            rows.turn_rhs.reshape(-1)
+            + np.einsum("kaf,kf->ka", face, particular[flat]).reshape(-1)
+            + turned @ curve_offset
+        )
+        if spacings:
+            self._rows[-spacings:, count:-1] = rows.spacing @ curve
+            self._rhs[-spacings:] = rows.spacing_rhs + rows.spacing @ curve_offset
+
+    def _tabled(self, numbers: StepNumbers) -> CurveNumbers:
+        """Return the rows of a curve that is no more than its tables of weights."""
+        layout = self.layout
+        size = 3 * layout.vertices
+        position = layout.curve_weights[:, None, :, None] * np.eye(3)[:, None, :]
+        turn = numbers.tangent_curve[:, :, None, :] * layout.curve_slopes[:, None, :, None]
+        return CurveNumbers(
+            position=position.reshape(-1, 3, size),
+            turn_face=numbers.tangent_face,
+            turn_curve=turn.reshape(-1, 2, size),
+            turn_rhs=numbers.tangent_rhs,
+            spacing=np.zeros((0, size)),
+            spacing_rhs=np.zeros(0),
+        )
 
     def _constraints(
         self, numbers: StepNumbers, response: Array, particular: Array
     ) -> tuple[Array, Array, Array, NDArray[np.int32]]:
         layout, count, size = self.layout, response.shape[1], self._size
         tip, clearance = len(numbers.tip_rhs), numbers.clearance
-        hard = 3 * len(layout.tracked) if layout.hard_tracking else 0
+        hard = layout.hard_rows
         total = tip + hard + len(clearance)
         constraint = np.zeros((total, size))
         lower, upper = np.full(size + total, -UNBOUNDED), np.full(size + total, UNBOUNDED)

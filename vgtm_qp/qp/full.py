@@ -121,15 +121,15 @@ class FullBuilder:
             "nodes": layout.node_columns,
             "actuators": len(truss.actuators),
             "vertices": 3 * vertices,
+            "torsion": layout.torsion,
             "position": 3 * tracked,
-            "tangent": 2 * tracked,
+            "tangent": layout.turns * tracked,
+            "spacing": layout.spacings,
             "progress": 1,
         }
         ends = np.cumsum(list(sizes.values()))
         self.column = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
         self.size = int(ends[-1])
-        second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
-        curve = weights.curve_rate * np.eye(vertices) + weights.smoothness * second.T @ second
         diagonal = [
             np.full(sizes["nodes"], weights.node_rate),
             np.full(sizes["actuators"], weights.actuator_rate + weights.stroke_centring),
@@ -137,9 +137,11 @@ class FullBuilder:
         self._hessian = sparse.block_diag(
             [
                 sparse.diags(np.concatenate(diagonal)),
-                np.kron(curve, np.eye(3)),
+                np.kron(layout.vertex_hessian, np.eye(3)),
+                weights.curve_rate * np.eye(layout.torsion),
                 sparse.diags(np.full(sizes["position"], 0.0 if layout.hard_tracking else weights.tracking)),
-                sparse.diags(np.full(sizes["tangent"], weights.tangent)),
+                sparse.diags(0.0 * layout.turn_weights if layout.hard_turns else layout.turn_weights),
+                sparse.diags(np.full(sizes["spacing"], weights.spacing)),
                 np.ones((1, 1)),
             ],
             format="csc",
@@ -151,6 +153,11 @@ class FullBuilder:
         self._order: Index = np.zeros(0, dtype=np.int64)
         self._labels: tuple[Label, ...] = ()
         self._keep: Index = np.zeros(0, dtype=np.int64)
+
+    @property
+    def _turns(self) -> str:
+        """Axes of the turns between a face and the curve: x and y tilt it, z rolls it."""
+        return "xyz"[: self.layout.turns]
 
     @property
     def structure(self) -> object:
@@ -195,6 +202,8 @@ class FullBuilder:
         column_lower[-1], column_upper[-1] = numbers.progress_lower, numbers.progress_upper
         if layout.hard_tracking:
             column_lower[self.column["position"]] = column_upper[self.column["position"]] = 0.0
+        if layout.hard_turns:
+            column_lower[self.column["tangent"]] = column_upper[self.column["tangent"]] = 0.0
         equal = np.concatenate(
             [
                 numbers.length_rhs,
@@ -202,7 +211,8 @@ class FullBuilder:
                 numbers.base_displacement if layout.vertices else np.zeros(0),
                 numbers.base_rhs if layout.vertices else np.zeros(0),
                 -numbers.position_rhs.reshape(-1),
-                -numbers.tangent_rhs.reshape(-1),
+                -(numbers.tangent_rhs if numbers.curve is None else numbers.curve.turn_rhs).reshape(-1),
+                np.zeros(0) if numbers.curve is None else -numbers.curve.spacing_rhs,
             ]
         )
         return StepQP(
@@ -230,6 +240,7 @@ class FullBuilder:
             actuator_multipliers=column_multipliers[self.column["actuators"]].copy(),
             clearance_multipliers=-row_multipliers[len(self._row_labels) :],
             iterations=iterations,
+            torsion=z[self.column["torsion"]].copy(),
         )
 
     def _columns(self) -> tuple[Label, ...]:
@@ -242,8 +253,10 @@ class FullBuilder:
             for i in range(layout.vertices)
             for a in axes
         ]
+        labels += [Label(f"torsion {j + 1}", "torsion", "rad") for j in range(layout.torsion)]
         labels += [Label(f"gap: face {k} {a}", "tracking gap", "m") for k in layout.tracked for a in axes]
-        labels += [Label(f"tilt: face {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in "xy"]
+        labels += [Label(f"tilt: face {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in self._turns]
+        labels += [Label(f"stretch: piece {k}", "spacing gap", "m") for k in range(layout.spacings)]
         return (*labels, Label("progress along the path", "progress", "1"))
 
     def _fixed_pattern(self) -> tuple[Index, Index, tuple[Label, ...]]:
@@ -287,24 +300,37 @@ class FullBuilder:
         k, slot = np.nonzero(faces >= 0)
         axis = np.arange(3)
         add(3 * k[:, None] + axis, faces[k, slot][:, None] + axis)
-        i, v = np.nonzero(layout.curve_weights)
-        add(3 * i[:, None] + axis, vertex + 3 * v[:, None] + axis)
+        if layout.general is None:
+            i, v = np.nonzero(layout.curve_weights)
+            add(3 * i[:, None] + axis, vertex + 3 * v[:, None] + axis)
+        else:
+            curve = np.arange(vertex, column["torsion"].stop)
+            add(*(grid.reshape(-1) for grid in np.meshgrid(np.arange(3 * tracked), curve, indexing="ij")))
         add(np.arange(3 * tracked), column["position"].start + np.arange(3 * tracked))
         labels += [Label(f"track: face {f} {a}", "tracking", "m") for f in layout.tracked for a in "xyz"]
 
-        shape = (len(k), 2, 3)
+        turns = layout.turns
+        shape = (len(k), turns, 3)
         add(
-            np.broadcast_to((2 * k[:, None] + np.arange(2))[..., None], shape),
+            np.broadcast_to((turns * k[:, None] + np.arange(turns))[..., None], shape),
             np.broadcast_to((faces[k, slot][:, None] + axis)[:, None, :], shape),
         )
-        i, v = np.nonzero(layout.curve_slopes)
-        shape = (len(i), 2, 3)
-        add(
-            np.broadcast_to((2 * i[:, None] + np.arange(2))[..., None], shape),
-            np.broadcast_to((vertex + 3 * v[:, None] + axis)[:, None, :], shape),
-        )
-        add(np.arange(2 * tracked), column["tangent"].start + np.arange(2 * tracked))
-        labels += [Label(f"tilt: face {f} {a}", "tangent", "rad") for f in layout.tracked for a in "xy"]
+        if layout.general is None:
+            i, v = np.nonzero(layout.curve_slopes)
+            shape = (len(i), 2, 3)
+            add(
+                np.broadcast_to((2 * i[:, None] + np.arange(2))[..., None], shape),
+                np.broadcast_to((vertex + 3 * v[:, None] + axis)[:, None, :], shape),
+            )
+        else:
+            add(*(grid.reshape(-1) for grid in np.meshgrid(np.arange(turns * tracked), curve, indexing="ij")))
+        add(np.arange(turns * tracked), column["tangent"].start + np.arange(turns * tracked))
+        labels += [Label(f"tilt: face {f} {a}", "tangent", "rad") for f in layout.tracked for a in self._turns]
+        if layout.spacings:
+            pieces = np.arange(layout.spacings)
+            add(*(grid.reshape(-1) for grid in np.meshgrid(pieces, curve, indexing="ij")))
+            add(pieces, column["spacing"].start + pieces)
+            labels += [Label(f"spacing: piece {k}", "spacing", "m") for k in pieces]
         return np.concatenate(rows), np.concatenate(cols), tuple(labels)
 
     def _fixed_values(self, numbers: StepNumbers) -> Array:
@@ -321,19 +347,27 @@ class FullBuilder:
             faces = truss.faces[layout.tracked]
             k, slot = np.nonzero(layout.node_column[faces] >= 0)
             weights = truss.face_weights[layout.tracked][k, slot]
-            i, v = np.nonzero(layout.curve_weights)
-            tangent = numbers.tangent_face.reshape(-1, 2, 3, 3)[k, :, slot]
-            ii, vv = np.nonzero(layout.curve_slopes)
-            slope = numbers.tangent_curve[ii] * layout.curve_slopes[ii, vv][:, None, None]
+            given = numbers.curve
+            turned = numbers.tangent_face if given is None else given.turn_face
+            tangent = turned.reshape(-1, layout.turns, 3, 3)[k, :, slot]
+            if given is None:
+                i, v = np.nonzero(layout.curve_weights)
+                position = np.repeat(-layout.curve_weights[i, v], 3)
+                ii, vv = np.nonzero(layout.curve_slopes)
+                slope = numbers.tangent_curve[ii] * layout.curve_slopes[ii, vv][:, None, None]
+            else:
+                position, slope = -given.position, given.turn_curve
             base = np.concatenate([-numbers.base_axes, numbers.base_axes], axis=1)
             values += [
                 np.ones(3),
                 base.reshape(-1),
                 np.repeat(weights, 3),
-                np.repeat(-layout.curve_weights[i, v], 3),
+                position.reshape(-1),
                 np.full(3 * len(layout.tracked), -1.0),
                 tangent.reshape(-1),
                 slope.reshape(-1),
-                np.full(2 * len(layout.tracked), -1.0),
+                np.full(layout.turns * len(layout.tracked), -1.0),
             ]
+            if layout.spacings and given is not None:
+                values += [given.spacing.reshape(-1), np.full(layout.spacings, -1.0)]
         return np.concatenate(values)

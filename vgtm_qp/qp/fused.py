@@ -17,6 +17,7 @@ from vgtm_qp.qp.fused_graph import Bound, length_function, row_function
 from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution, progress_scale
+from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.qp.settle import held, settling_gain
 
 Array = NDArray[np.float64]
@@ -83,8 +84,9 @@ class FusedSolver:
         self._position_axes = position_axes
         nodes, actuators = layout.node_columns, len(truss.actuators)
         self._actuators = actuators
-        self._free_curve = 3 * layout.vertices - 5 if layout.vertices else 0
+        self._free_curve = layout.free_curve
         self._size = actuators + self._free_curve + 1
+        self._torsion = self._size - 1 - layout.torsion
         out = self._rows.outputs
         self._stack = out[0].reshape(self._size, -1)
         self._response = self._stack[:, :nodes]
@@ -100,8 +102,9 @@ class FusedSolver:
         self._place = np.where(truss.base, len(truss.free), layout.node_column // 3)
         self._constant_normal = np.full(3, np.nan)
         self._constant = np.zeros((self._size - 1, self._size - 1))
-        self._tracked = 3 * len(layout.tracked)
-        self._hard = self._tracked if layout.hard_tracking else 0
+        self._hard = layout.hard_rows
+        self._goal_pull = np.zeros((layout.vertices, 3))
+        self._goal_weight = np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
         self._settling = np.zeros((0, actuators)), np.ones(actuators, dtype=bool)
         self._reserve(self._size + 64)
         if self._hard:
@@ -109,9 +112,22 @@ class FusedSolver:
             self._soft[nodes : nodes + self._hard] = 0.0
 
     def load(
-        self, X: Array, Y: Array, base: Array, vertices: Array, lower: Array, upper: Array, *, motion: bool
+        self,
+        X: Array,
+        Y: Array,
+        base: Array,
+        vertices: Array,
+        lower: Array,
+        upper: Array,
+        *,
+        motion: bool,
+        curve: CurveRows | None = None,
+        goals: Array | None = None,
     ) -> None:
-        """Linearise: residuals at `X` (N, 3), Jacobians at `Y`; see `row_function`. Sets tip_position and tip_rotation."""
+        """Linearise: residuals at `X` (N, 3), Jacobians at `Y`; see `row_function`. Sets tip_position and tip_rotation.
+
+        `curve` are the rows of a curve that is more than its tables, `goals` (V, 3) those of the control vertices.
+        """
         inputs = self._rows.inputs
         inputs[0][:] = X.reshape(-1)
         inputs[1][:] = Y.reshape(-1)
@@ -120,7 +136,13 @@ class FusedSolver:
         inputs[4][:] = lower
         inputs[5][:] = upper
         inputs[6][0] = 1.0 if motion else 0.0
+        for k, table in enumerate(curve or (), start=7):
+            inputs[k][:] = table.reshape(-1)
         self._rows()
+        if self.layout.vertex_goals:
+            self._goal_pull = self._goal_weight[:, None] * self._offset
+            if motion:
+                self._goal_pull += self.layout.goal_pull(vertices, goals)
 
     def solve(self, goal: TipGoal, progress: float, clearance: ClearanceRows) -> StepSolution:
         """Solve the QP at the configuration loaded last.
@@ -184,7 +206,7 @@ class FusedSolver:
         vertices = np.array(self._offset)
         if self._free_curve:
             vertices[1] += self._normal * x[count]
-            vertices[2:] += x[count + 1 : -1].reshape(-1, 3)
+            vertices[2:] += x[count + 1 : self._torsion].reshape(-1, 3)
         return StepSolution(
             nodes=nodes,
             actuators=x[:count],
@@ -193,6 +215,7 @@ class FusedSolver:
             actuator_multipliers=multipliers[:count],
             clearance_multipliers=-multipliers[len(multipliers) - near :],
             iterations=int(info["iterations"]),
+            torsion=x[self._torsion : -1],
         )
 
     def close(self, X: Array, lower: Array, upper: Array, tolerance: float, attempts: int = 3) -> Closed:
@@ -250,6 +273,9 @@ class FusedSolver:
         gradient[:-1] = self._gram[-1, :-1]
         gradient[:count] += self._box[2]
         gradient[count:-1] += self._curve_gradient
+        if self.layout.vertex_goals:
+            gradient[count] += self._goal_pull[1] @ self._normal
+            gradient[count + 1 : self._torsion] += self._goal_pull[2:].reshape(-1)
         return hessian, gradient
 
     def _constant_hessian(self) -> Array:
@@ -259,11 +285,12 @@ class FusedSolver:
         index = np.arange(count)
         constant[index, index] = weights.actuator_rate + weights.stroke_centring
         if self._free_curve:
-            bending = weights.curve_rate * np.eye(self.layout.vertices) + weights.smoothness * self.layout.polygon_bending
+            bending, end = self.layout.vertex_hessian, self._torsion
             constant[count, count] = bending[1, 1]
-            constant[count, count + 1 :] = np.kron(bending[1, 2:], self._normal)
+            constant[count, count + 1 : end] = np.kron(bending[1, 2:], self._normal)
             constant[count + 1 :, count] = constant[count, count + 1 :]
-            constant[count + 1 :, count + 1 :] = np.kron(bending[2:, 2:], np.eye(3))
+            constant[count + 1 : end, count + 1 : end] = np.kron(bending[2:, 2:], np.eye(3))
+            constant[end:, end:] = weights.curve_rate * np.eye(self.layout.torsion)
         return constant
 
     def _spread_rows(self, clearance: ClearanceRows) -> Array:

@@ -76,6 +76,9 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
     Results: R (3 (N - N_c) + 5 K, n_a + q + 1), whose Gram matrix is the objective's; tip spin and position rows
     (6, n_a + 1); actuator box and gradient (n_a, 3); tip position (3); tip rotation (3, 3); gradient of the curve's
     own objectives (q); offsets (3, V) of the control vertices; base normal (3).
+
+    Where the curve is more than its tables, ``CurveRows`` are arguments too, after `motion`, transposed as CasADi reads
+    them; then there are R rows of turns for each of the K faces and S rows of spacing.
     """
     symbols, truss = _Symbols(layout), layout.truss
     constants = symbols.constants
@@ -84,7 +87,7 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
     base, motion = ca.MX.sym("base", 3, truss.node_count), ca.MX.sym("motion")
     vertices = ca.MX.sym("p", 3, layout.vertices)
     weights = layout.weights
-    node_rate, centring, tracking, tangent, curve_rate, smoothness = ca.vertsplit(
+    node_rate, centring, tracking, tangent, roll, curve_rate, smoothness, spacing = ca.vertsplit(
         constants.add(
             "weights",
             np.array(
@@ -92,9 +95,11 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
                     weights.node_rate,
                     weights.stroke_centring,
                     1.0 if layout.hard_tracking else weights.tracking,
-                    weights.tangent,
+                    1.0 if layout.hard_turns else weights.tangent,
+                    1.0 if layout.hard_turns else weights.roll,
                     weights.curve_rate,
                     weights.smoothness,
+                    weights.spacing,
                 ]
             ),
         )
@@ -142,12 +147,11 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
     curve_gradient, offset, normal = ca.MX.zeros(0, 1), ca.MX.zeros(3, 0), ca.MX.zeros(3)
     gaps: list[ca.MX] = []
     tilts: list[ca.MX] = []
+    given: list[ca.MX] = []
     if layout.vertices:
         faces = Frames(truss.home[truss.faces], truss.face_frames, truss.faces, constants, "face")
         rotations, _ = faces.at(X)
         _, spins = faces.at(Y)
-        curve_weights = constants.add("curve_weights", layout.curve_weights)
-        curve_slopes = constants.add("curve_slopes", layout.curve_slopes)
         centre = (X + moved)[:, truss.faces[0].tolist()] @ ca.DM(truss.face_weights[0])
         base_face = Frames(truss.home[truss.faces[:1]], truss.face_frames[:1], truss.faces[:1], constants, "base")
         base_rotation, _ = base_face.at(X + moved)
@@ -155,31 +159,42 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
         offset = ca.MX.zeros(3, layout.vertices)
         offset[:, 0] = centre - vertices[:, 0]
         offset[:, 1] = offset[:, 0] - axes @ (axes.T @ (vertices[:, 1] - vertices[:, 0]))
-        curve_node = _curve_node(layout, len(actuators))
-        residual = 1.0 if layout.hard_tracking else motion
+        if layout.general is None:
+            curve_weights = constants.add("curve_weights", layout.curve_weights)
+            curve_slopes = constants.add("curve_slopes", layout.curve_slopes)
+            curve_node = _curve_node(layout, len(actuators))
+        else:
+            given = _given_curve(layout)
+            every = ca.vertcat(ca.vec(offset), ca.MX.zeros(layout.torsion))
+            curve_node = _given_curve_node(layout, len(actuators))
+        turn_scale = ca.sqrt(ca.vertcat(tangent, tangent, roll)[: layout.turns])
+        gap_on = 1.0 if layout.hard_tracking else motion
+        turn_on = 1.0 if layout.hard_turns else motion
         for k, face in enumerate(layout.tracked.tolist()):
-            nodes = truss.faces[face].tolist()
-            gap, tilt = curve_node(
+            nodes, block = truss.faces[face].tolist(), slice(3 * k, 3 * k + 3)
+            arguments = [
                 X[:, nodes],
                 displacement(nodes),
                 rotations[:, 3 * face : 3 * face + 3],
                 spins[:, 9 * face : 9 * face + 9],
-                vertices,
-                offset,
-                normal,
-                curve_weights[:, k],
-                curve_slopes[:, k],
-                truss.face_weights[face],
-                residual,
-                motion,
-            )
+            ]
+            if layout.general is None:
+                arguments += [vertices, offset, normal, curve_weights[:, k], curve_slopes[:, k]]
+            else:
+                position, rows, frame, spin = given[0][:, k], *(table[:, block] for table in given[1:4])
+                arguments += [position, rows, frame, spin, every, normal]
+            gap, tilt = curve_node(*arguments, truss.face_weights[face], gap_on, turn_on)
             gaps.append(ca.sqrt(tracking) * gap)
-            tilts.append(ca.sqrt(tangent) * tilt)
-        top = ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, 3 * layout.vertices - 5), top[:, -1])
+            tilts.append(ca.repmat(turn_scale, 1, gap.shape[1]) * tilt)
+        if layout.spacings:
+            stretch = ca.horzcat(_free_columns(given[5], normal), motion * given[4] + given[5].T @ every)
+            fixed = ca.MX.zeros(layout.spacings, len(actuators))
+            tilts.append(ca.sqrt(spacing) * ca.horzcat(fixed, stretch))
+        top = ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, layout.free_curve), top[:, -1])
         bend = ca.DM(layout.polygon_bending)
         pull = curve_rate * offset + smoothness * ((offset + motion * vertices) @ bend)
-        curve_gradient = ca.vertcat(ca.dot(pull[:, 1], normal), ca.vec(pull[:, 2:]))
-    inputs = [X, Y, base, vertices, symbols.lower, symbols.upper, motion, *constants.symbols]
+        curve_gradient = ca.vertcat(ca.dot(pull[:, 1], normal), ca.vec(pull[:, 2:]), ca.MX.zeros(layout.torsion))
+    inputs = [X, Y, base, vertices, symbols.lower, symbols.upper, motion, *given, *constants.symbols]
     results = [
         ca.vertcat(top, *gaps, *tilts),
         tip_rows,
@@ -196,6 +211,54 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
 def _tip_frames(layout: Layout, constants: Constants) -> Frames:
     truss = layout.truss
     return Frames(truss.home[truss.tip][None], truss.tip_frame[None], truss.tip[None], constants, "tip")
+
+
+def _given_curve(layout: Layout) -> list[ca.MX]:
+    """Return the arguments that ``CurveRows`` are given as: each array's last axis is the row index."""
+    count, size, pieces = len(layout.tracked), 3 * layout.vertices + layout.torsion, layout.spacings
+    shapes = {
+        "position": (3, count),
+        "position_rows": (size, 3 * count),
+        "frame": (3, 3 * count),
+        "spin_rows": (size, 3 * count),
+        "stretch": (pieces, 1),
+        "stretch_rows": (size, pieces),
+    }
+    return [ca.MX.sym(name, *shape) for name, shape in shapes.items()]
+
+
+def _free_columns(rows: ca.SX, normal: ca.SX) -> ca.SX:
+    """Return (R, q) rows over what the base leaves free of the curve's coordinates, from (D, R)."""
+    return ca.horzcat(rows[3:6, :].T @ normal, rows[6:, :].T)
+
+
+def _given_curve_node(layout: Layout, actuators: int) -> ca.Function:
+    """Return the rows of one curve node as `_curve_node` does, from its ``CurveRows``; R turns."""
+    size = 3 * layout.vertices + layout.torsion
+    nodes, motion_rows = ca.SX.sym("nodes", 3, 3), ca.SX.sym("rows", 9, actuators + 1)
+    rotation, spin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("spin", 3, 9)
+    position, position_rows = ca.SX.sym("position", 3), ca.SX.sym("position_rows", size, 3)
+    frame, spin_rows = ca.SX.sym("frame", 3, 3), ca.SX.sym("spin_rows", size, 3)
+    offset, normal, face = ca.SX.sym("offset", size), ca.SX.sym("normal", 3), ca.SX.sym("face", 3)
+    gap_on, turn_on = ca.SX.sym("gap_on"), ca.SX.sym("turn_on")
+
+    centre = ca.kron(face.T, ca.SX.eye(3)) @ motion_rows
+    gap = gap_on * (nodes @ face - position) + centre[:, -1] - position_rows.T @ offset
+    gap_rows = ca.horzcat(centre[:, :-1], -_free_columns(position_rows, normal), gap)
+
+    first, second, tangent = (frame[c, :].T for c in range(3))
+    x, y = rotation[:, 0], rotation[:, 1]
+    residuals, combined = [ca.dot(x, tangent), ca.dot(y, tangent)], [ca.cross(x, tangent), ca.cross(y, tangent)]
+    if layout.turns == 3:
+        residuals.append((ca.dot(x, second) - ca.dot(y, first)) / 2)
+        combined.append((ca.cross(x, second) - ca.cross(y, first)) / 2)
+    c = ca.horzcat(*combined).T
+    turned = c @ spin @ motion_rows
+    constant = turn_on * ca.vertcat(*residuals) + turned[:, -1] - c @ (spin_rows.T @ offset)
+    turn_rows = ca.horzcat(turned[:, :-1], -c @ _free_columns(spin_rows, normal), constant)
+    inputs = [nodes, motion_rows, rotation, spin, position, position_rows, frame, spin_rows, offset, normal, face]
+    outputs = [ca.densify(gap_rows), ca.densify(turn_rows)]
+    return ca.Function("curve_node", [*inputs, gap_on, turn_on], outputs)
 
 
 def _curve_node(layout: Layout, actuators: int) -> ca.Function:

@@ -9,11 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.problem.method import Weights
+from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.truss.kinematics import member_nodes
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+
+_GOAL_REACH = 0.01
+"""Greatest part of the arm's length that a control vertex is drawn towards its goal in one step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +39,12 @@ class Layout:
     elastic_tip : bool
         The end effector's rows may give way at an exact penalty.
     weights : Weights
+    hard_turns : bool
+        The faces' turns as equalities too, beside their positions.
+    shape : CurveShape or None
+        How the curve's nodes are placed; None for a curve that is no more than its tables.
+    vertex_goals : tuple of int
+        Control vertices that are drawn to goals.
     """
 
     truss: Truss
@@ -44,6 +55,9 @@ class Layout:
     weights: Weights
     hard_tracking: bool = False
     elastic_tip: bool = False
+    hard_turns: bool = False
+    shape: CurveShape | None = None
+    vertex_goals: tuple[int, ...] = ()
 
     @cached_property
     def node_column(self) -> Index:
@@ -66,6 +80,70 @@ class Layout:
     def member_nodes(self) -> Index:
         """(M, Q) nodes that each member's length depends on."""
         return member_nodes(self.truss)
+
+    @property
+    def general(self) -> CurveShape | None:
+        """The curve's shape where its rows have to be computed anew for each QP; None where tables do."""
+        return None if self.shape is None or self.shape.is_plain else self.shape
+
+    @property
+    def is_tabled(self) -> bool:
+        """Whether the QP has no more rows and objectives than a curve of constant tables needs."""
+        return self.general is None and not self.hard_turns and not self.vertex_goals
+
+    @property
+    def torsion(self) -> int:
+        """Number of torsion coordinates T."""
+        return 0 if self.general is None else self.general.torsion
+
+    @property
+    def turns(self) -> int:
+        """Turns R of each face that are tracked."""
+        return 2 if self.general is None else self.general.turns
+
+    @property
+    def hard_rows(self) -> int:
+        """Number of tracking rows that are equalities: the positions of the faces, then their turns."""
+        tracked = len(self.tracked) if self.hard_tracking else 0
+        return (3 + self.turns) * tracked if self.hard_turns else 3 * tracked
+
+    @property
+    def spacings(self) -> int:
+        """Number S of spacings between curve nodes that are rows."""
+        return 0 if self.general is None else self.general.spacings
+
+    @property
+    def free_curve(self) -> int:
+        """Number of coordinates of the curve that its base leaves free: 3 V - 5 + T."""
+        return 3 * self.vertices - 5 + self.torsion if self.vertices else 0
+
+    @cached_property
+    def turn_weights(self) -> Array:
+        """(R K,) weights of the faces' turns; ones where they are hard."""
+        weights = [self.weights.tangent, self.weights.tangent, self.weights.roll][: self.turns]
+        return np.ones(self.turns * len(self.tracked)) if self.hard_turns else np.tile(weights, len(self.tracked))
+
+    @cached_property
+    def vertex_hessian(self) -> Array:
+        """(V, V) of the objectives that are the curve's own, for each axis."""
+        drawn = np.isin(np.arange(self.vertices), self.vertex_goals) * self.weights.vertex_goal
+        rate = self.weights.curve_rate * np.eye(self.vertices)
+        return np.asarray(rate + self.weights.smoothness * self.polygon_bending + np.diag(drawn))
+
+    def goal_pull(self, vertices: Array, goals: Array | None) -> Array:
+        """Return (V, 3) the gradient of the control vertices' goals (V, 3), m; NaN where a vertex has none.
+
+        A step draws a vertex no further than by a share of the arm's length: a goal far away must not outweigh the
+        progress of the tip.
+        """
+        pull = np.zeros_like(vertices)
+        drawn = list(self.vertex_goals)
+        if drawn and goals is not None:
+            gap = vertices[drawn] - goals[drawn]
+            apart = np.linalg.norm(gap, axis=1, keepdims=True)
+            reach = _GOAL_REACH * self.truss.height
+            pull[drawn] = self.weights.vertex_goal * gap * np.minimum(1.0, reach / np.maximum(apart, 1e-300))
+        return pull
 
     @property
     def has_tip_frame(self) -> bool:

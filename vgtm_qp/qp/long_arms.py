@@ -23,7 +23,7 @@ def chain_solver(layout: Layout) -> StagedSolver | TrackedSolver | None:
 
 def prefers_staged(layout: Layout) -> bool:
     """Whether `chain_solver` is there for `layout` and faster than the condensed QP."""
-    if len(layout.truss.actuators) < STAGED_ACTUATORS:
+    if len(layout.truss.actuators) < STAGED_ACTUATORS or not layout.is_tabled:
         return False
     chain = _chain(layout)
     return chain is not None and (not layout.hard_tracking or chain.is_square)

@@ -163,10 +163,15 @@ class StepSolution:
     torsion: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def progress_scale(rate: Array) -> float:
-    """Return the square of the tip's rate (n_e,) along the path, by which its progress is weighted.
+_SHORT_WAY = 0.01
 
-    Where the path stands still progress costs nothing, and any positive number serves.
+
+def progress_scale(rate: Array) -> float:
+    """Return what the progress along the path is weighted by, m^2: the square of the tip's way (n_e,) in the step.
+
+    A way shorter than 10 mm counts more. The other objectives pull with forces that do not shrink with the way, so
+    that by its square alone the last micrometres would never be covered. Where the path stands still progress costs
+    nothing, and any positive number serves.
     """
-    squared = float(rate @ rate)
-    return squared if squared > 1e-12 else 1.0
+    way = float(np.sqrt(rate @ rate))
+    return way * max(way, _SHORT_WAY) if way > 1e-6 else 1.0

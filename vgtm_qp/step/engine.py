@@ -19,7 +19,7 @@ from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
 from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.qp.staged import StagedSolver
-from vgtm_qp.step.linearise import Linearisation, Target
+from vgtm_qp.step.linearise import Linearisation, Target, base_frame
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.task import TipTask, worth_closing
 
@@ -40,6 +40,7 @@ class Engine(Protocol):
         rows: ClearanceRows,
         *,
         motion: bool,
+        torsion: Array | None = None,
     ) -> StepSolution:
         """Return the QP's answer at `X` (N, 3) with Jacobians at `Y`; raise ``SolverError`` instead of a wrong one."""
         ...
@@ -73,10 +74,13 @@ class PlainEngine:
         rows: ClearanceRows,
         *,
         motion: bool,
+        torsion: Array | None = None,
     ) -> StepSolution:
         """See :class:`Engine`."""
         at = None if Y is X else Y
-        numbers = self._linearisation.numbers(X, vertices, target, progress, rows, motion=motion, at=at)
+        numbers = self._linearisation.numbers(
+            X, vertices, target, progress, rows, motion=motion, at=at, torsion=torsion
+        )
         solution = self._solver.solve(numbers)
         self._last = numbers, solution
         return solution
@@ -89,7 +93,7 @@ class PlainEngine:
             return None
         numbers, solution = self._last
         if isinstance(self._solver, StagedSolver):
-            return self._solver.gain(1e-6)
+            return self._solver.gain(held(solution.actuators, numbers.lower, numbers.upper))
         jacobian = layout.length_jacobian(numbers.gradient)
         _, _, response, failed = dgesv(jacobian, np.eye(truss.member_count)[:, truss.actuators])
         if failed:
@@ -143,11 +147,24 @@ class FusedEngine:
         rows: ClearanceRows,
         *,
         motion: bool,
+        torsion: Array | None = None,
     ) -> StepSolution:
         """See :class:`Engine`."""
-        solver = self._solver
+        solver, shape = self._solver, self._solver.layout.general
+        curve = None
+        if shape is not None:
+            frame = base_frame(solver.layout.truss, target)
+            curve = shape.rows(vertices, np.zeros(0) if torsion is None else torsion, frame)
         solver.load(
-            X, Y, X if target.base is None else target.base, vertices, target.lower, target.upper, motion=motion
+            X,
+            Y,
+            X if target.base is None else target.base,
+            vertices,
+            target.lower,
+            target.upper,
+            motion=motion,
+            curve=curve,
+            goals=target.vertex_goals,
         )
         error, rate, across = self._task.residual(solver.tip_position, solver.tip_rotation, goal)
         if motion:

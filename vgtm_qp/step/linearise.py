@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from vgtm_qp.geometry.clearance import Clearance, NearPairs
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
+from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers, progress_scale
+from vgtm_qp.qp.shape import turn_rows
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.task import TipTask, worth_closing
 from vgtm_qp.truss.kinematics import Kinematics
+from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 
@@ -32,6 +34,10 @@ class Target:
         Time at the end of the step, s.
     base : (N, 3) or None
         Positions of the base nodes at the end of the step (other rows are ignored), m.
+    base_rotation : (3, 3) or None
+        Rotation of the base frame there.
+    vertex_goals : (V, 3) or None
+        Where control vertices are drawn to, m; the rows in ``Layout.vertex_goals`` count.
     """
 
     path: Path
@@ -41,6 +47,8 @@ class Target:
     upper: Array
     time: float
     base: Array | None = None
+    base_rotation: Array | None = None
+    vertex_goals: Array | None = None
 
 
 class Linearisation:
@@ -75,6 +83,7 @@ class Linearisation:
         *,
         motion: bool,
         at: Array | None = None,
+        torsion: Array | None = None,
     ) -> StepNumbers:
         """Return the QP's numbers at node positions `X` (N, 3) and control vertices (V, 3).
 
@@ -87,6 +96,8 @@ class Linearisation:
             shortest way, without the gradients of the null-space objectives.
         at
             (N, 3) where the Jacobians are taken, m; `X` by default.
+        torsion
+            (T,) torsion coordinates of the curve, rad.
         """
         layout, kinematics, weights = self.layout, self.kinematics, self.layout.weights
         kinematics.evaluate(X if at is None else at)
@@ -114,17 +125,32 @@ class Linearisation:
         goal = target.path.at(target.start + progress * span)
         tip = self.task.rows(X, goal, tip_spin)
         rate = tip.rate * span
-        curvature = weights.progress * max(float(rate @ rate), 1e-12)
+        curvature = weights.progress * progress_scale(rate)
 
         position_rhs = np.zeros((len(tracked), 3))
         tangent_face, tangent_curve = np.zeros((len(tracked), 2, 9)), np.zeros((len(tracked), 2, 3))
         tangent_rhs = np.zeros((len(tracked), 2))
         base_axes, base_rhs = np.zeros((2, 3)), np.zeros(2)
         vertex_gradient = np.zeros_like(vertices)
+        curve = None
+        if layout.general is not None:
+            rows = layout.general.rows(
+                vertices, np.zeros(0) if torsion is None else torsion, base_frame(layout.truss, target)
+            )
+            turns = turn_rows(rows, kinematics.face_rotation[tracked], face_spin[tracked], layout.turns)
+            curve = CurveNumbers(
+                position=rows.position_rows,
+                turn_face=turns.face,
+                turn_curve=turns.curve,
+                turn_rhs=turns.residual if motion or layout.hard_turns else 0.0 * turns.residual,
+                spacing=rows.spacing_rows,
+                spacing_rhs=rows.spacing if motion else 0.0 * rows.spacing,
+            )
         if layout.vertices:
             centres = kinematics.face_centres(X)
             if motion or layout.hard_tracking:
-                position_rhs = centres[tracked] - layout.curve_weights @ vertices
+                nodes = layout.curve_weights @ vertices if layout.general is None else rows.position
+                position_rhs = centres[tracked] - nodes
             slopes = layout.curve_slopes @ vertices
             speed = np.linalg.norm(slopes, axis=1, keepdims=True)
             tangents = slopes / speed
@@ -133,9 +159,10 @@ class Linearisation:
             tangent_face = np.einsum("kac,kcf->kaf", turn, face_spin[tracked])
             along = np.einsum("kac,kc->ka", axes, tangents)
             tangent_curve = (axes - along[..., None] * tangents[:, None, :]) / speed[:, None]
-            if motion:
+            if motion or layout.hard_turns:
                 tangent_rhs = along
-                vertex_gradient = self._polygon @ vertices
+            if motion:
+                vertex_gradient = self._polygon @ vertices + layout.goal_pull(vertices, target.vertex_goals)
             base_axes = base_rotation[:, :2].T
             shift = centres[0] - vertices[0]
             if target.base is not None:
@@ -166,7 +193,13 @@ class Linearisation:
             base_axes=base_axes,
             base_rhs=base_rhs,
             clearance=clearance,
+            curve=curve,
         )
+
+
+def base_frame(truss: Truss, target: Target) -> Array:
+    """Return (3, 3) the frame of the base face at the end of the step."""
+    return truss.face_frames[0] if target.base_rotation is None else target.base_rotation @ truss.face_frames[0]
 
 
 def clearance_rows(

@@ -1,0 +1,152 @@
+"""Rows of a curve that are more than constant tables: nodes by arc length, torsion, spacing (sections 4.3-4.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.curve.curve import Curve
+from vgtm_qp.curve.families import CurveFamily
+
+Array = NDArray[np.float64]
+
+
+class CurveRows(NamedTuple):
+    """A curve at its K nodes and the rows over its D = 3 V + T coordinates, eqs. (32)-(36).
+
+    Attributes
+    ----------
+    position, position_rows : (K, 3), (K, 3, D)
+        r(s_k), m.
+    frame, spin_rows : (K, 3, 3), (K, 3, D)
+        F(s_k), its third column the tangent, and its angular velocity.
+    spacing, spacing_rows : (S,), (S, D)
+        Distances of successive nodes less those at home, m, from the base on; S = 0 where nobody asks.
+    """
+
+    position: Array
+    position_rows: Array
+    frame: Array
+    spin_rows: Array
+    spacing: Array
+    spacing_rows: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CurveShape:
+    """How a curve's nodes are placed on it and what of its frame the faces track.
+
+    Attributes
+    ----------
+    family : CurveFamily
+    nodes : (K,)
+        Parameters s_k, or fractions of the arc length where `by_arc_length`.
+    by_arc_length : bool
+        Nodes keep their fractions of the arc length; s_k moves with the curve.
+    torsion : int
+        Number T of torsion coordinates.
+    roll : (K,)
+        Angle about the tangent from the curve's frame to the face at home, rad; kept where faces track roll.
+    tracks_roll : bool
+        Whether the third turn of a face is a row of the QP.
+    spacing : (S,)
+        Distances of successive nodes at home, the base first, m; S = K, or 0 without that objective.
+    """
+
+    family: CurveFamily
+    nodes: Array
+    by_arc_length: bool = False
+    torsion: int = 0
+    roll: Array | None = None
+    tracks_roll: bool = False
+    spacing: Array | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether constant tables of weights at the nodes say all there is."""
+        return not (self.by_arc_length or self.tracks_roll or self.torsion or self.spacing is not None)
+
+    @property
+    def turns(self) -> int:
+        """Turns of a face that are tracked: two tilts, and the roll if it is."""
+        return 3 if self.tracks_roll else 2
+
+    @property
+    def spacings(self) -> int:
+        """Number S of spacing rows."""
+        return 0 if self.spacing is None else len(self.spacing)
+
+    def of(self, family: CurveFamily) -> CurveShape:
+        """Return the same with another family or number of control vertices."""
+        return replace(self, family=family)
+
+    @cached_property
+    def _home_roll(self) -> Array:
+        roll = np.zeros(len(self.nodes)) if self.roll is None else self.roll
+        turn = np.zeros((len(roll), 3, 3))
+        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(roll)
+        turn[:, 1, 0] = np.sin(roll)
+        turn[:, 0, 1] = -turn[:, 1, 0]
+        turn[:, 2, 2] = 1.0
+        return turn
+
+    def rows(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
+        """Return the rows at control vertices (V, 3), torsion (T,), with the frame (3, 3) of the base face.
+
+        Nodes by arc length move along the curve when it changes: x_dot = J_s p_dot + x' s_dot; the paper's eq. (35)
+        has the first term alone.
+
+        Raises
+        ------
+        CurveError
+            The curve has no tangent or no frame somewhere.
+        """
+        curve = Curve(self.family, vertices, torsion, base_frame)
+        s = curve.arc_parameter(self.nodes) if self.by_arc_length else self.nodes
+        position_rows, spin_rows = curve.position_jacobian(s), curve.orientation_jacobian(s)
+        if self.by_arc_length:
+            rates = curve.arc_node_rates(s)[:, None, :]
+            position_rows = position_rows + curve.derivative(s)[:, :, None] * rates
+            spin_rows = spin_rows + curve.frame_rate(s)[:, :, None] * rates
+        position = curve.position(s)
+        spacing, spacing_rows = np.zeros(0), np.zeros((0, curve.coordinates))
+        if self.spacing is not None:
+            start = np.zeros((1, 3, curve.coordinates))
+            start[0, range(3), range(3)] = 1.0
+            steps = np.diff(np.vstack([vertices[:1], position]), axis=0)
+            distance = np.linalg.norm(steps, axis=1)
+            change = np.diff(np.concatenate([start, position_rows]), axis=0)
+            spacing = distance - self.spacing
+            spacing_rows = np.einsum("kc,kcd->kd", steps / distance[:, None], change)
+        return CurveRows(position, position_rows, curve.frame(s) @ self._home_roll, spin_rows, spacing, spacing_rows)
+
+
+class TurnRows(NamedTuple):
+    """Turns between faces and curve: (K, R) residuals, rows over the faces' nodes (K, R, 9) and the curve (K, R, D)."""
+
+    residual: Array
+    face: Array
+    curve: Array
+
+
+def turn_rows(rows: CurveRows, rotation: Array, spin: Array, turns: int) -> TurnRows:
+    """Return the turns between faces, `rotation` (K, 3, 3) and `spin` (K, 3, 9), and the curve's frames.
+
+    The first two are cosines between the face's x and y axes and the tangent, the third the sine of the roll. Each is
+    a function of the relative rotation alone: its rate is c . (face's less curve's angular velocity).
+    """
+    frame = rows.frame
+    x, y = rotation[:, :, 0], rotation[:, :, 1]
+    tangent = frame[:, :, 2]
+    residual = [np.einsum("kc,kc->k", axis, tangent) for axis in (x, y)]
+    combined = [np.cross(axis, tangent) for axis in (x, y)]
+    if turns == 3:
+        first, second = frame[:, :, 0], frame[:, :, 1]
+        residual.append(0.5 * np.einsum("kc,kc->k", x, second) - 0.5 * np.einsum("kc,kc->k", y, first))
+        combined.append(0.5 * (np.cross(x, second) - np.cross(y, first)))
+    c = np.stack(combined, axis=1)
+    return TurnRows(np.stack(residual, axis=1), c @ spin, -c @ rows.spin_rows)
