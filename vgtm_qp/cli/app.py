@@ -17,6 +17,7 @@ from vgtm_qp.cli.output import ExitCode, document, note
 from vgtm_qp.cli.replay import replay
 from vgtm_qp.cli.schema import schema
 from vgtm_qp.cli.solve import solve
+from vgtm_qp.cli.study import study
 from vgtm_qp.cli.verify import verify
 from vgtm_qp.cli.view import view
 from vgtm_qp.errors import ProblemError, VgtmError, nearest
@@ -49,6 +50,7 @@ _COMMANDS: dict[str, Callable[..., int | None]] = {
     "solve": solve,
     "verify": verify,
     "compare": compare,
+    "study": study,
     "check": check,
     "list": list_problems,
     "view": view,

@@ -1,0 +1,5 @@
+"""Studies: the paper's figures and sweeps over methods, each from one command, resumable, on any number of processes."""
+
+from vgtm_qp.study.study import STUDIES, Study, run_study
+
+__all__ = ["STUDIES", "Study", "run_study"]

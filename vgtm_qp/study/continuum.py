@@ -1,0 +1,106 @@
+"""Figure 3: trusses approach the continuum; the gap between arm and curve against the number of bays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.methods.compare import markdown_table
+from vgtm_qp.methods.curve_first import CurveFirstResolver
+from vgtm_qp.methods.presets import with_method
+from vgtm_qp.study.arms import bending_problem
+from vgtm_qp.study.drawing import MARKS, draw_truss, label, panels
+from vgtm_qp.study.statistics import exponent
+from vgtm_qp.study.workers import Row, Task
+
+TITLE = "Figure 3: trusses approach the continuum"
+TIMED = False
+
+_HEIGHT = 4.0
+_MODULES = ("octahedral", "hexapod", "longeron")
+_MEASURES = {
+    "axis": "arm's axis off the curve [m]",
+    "radius": "furthest node off the curve [m]",
+    "angle": "face normal off the tangent [rad]",
+}
+
+
+def tasks(short: bool) -> list[Task]:
+    """Return one task a module and number of bays."""
+    bays = (4, 8) if short else (4, 8, 16, 32, 64)
+    return [{"module": module, "bays": n, "steps": 50} for module in _MODULES for n in bays]
+
+
+def run(module: str, bays: int, steps: int) -> Row:
+    """Bend an arm of 4 m, its bays the smaller the more there are; return its distances from its curve, m."""
+    unit = _HEIGHT / bays / (1.0 if module == "longeron" else float(np.sqrt(2.0 / 3.0)))
+    sizes = {"longeron": unit, "batten": unit, "stroke": [0.2 * unit, 3.0 * unit], "member_radius": 0.0}
+    problem = bending_problem(bays, steps=steps, goal=(0.3, 0.1, -0.1), module=module, vertices=5, **sizes)
+    resolver = CurveFirstResolver(with_method(problem, "curve-pseudoinverse-obstacles"))
+    plan = make_plan(problem, *resolver.tip())
+    value = plan.path.start
+    for mark in plan.marks:
+        done = resolver.follow(plan.path, value, float(mark))
+        if done.reason:
+            return {"failed": done.reason}
+        value = float(mark)
+    nodes, truss, curve = resolver.state.nodes, resolver.arm.truss, resolver.curve
+    resolver.arm.kinematics.evaluate(nodes)
+    points = curve.position(np.linspace(0.0, 1.0, 4001))
+    centres = resolver.arm.kinematics.face_centres(nodes)
+    middle = np.linspace(0.0, 1.0, 9)[None, :, None]
+    axis = (centres[:-1, None] + middle * np.diff(centres, axis=0)[:, None]).reshape(-1, 3)
+    normals = resolver.arm.kinematics.face_rotation[:, :, 2]
+    cosine = np.einsum("kc,kc->k", normals, curve.tangent(resolver.motion.s))
+    frame = {"nodes": nodes.tolist(), "members": truss.members.tolist(), "actuated": truss.actuated.tolist()}
+    return {
+        "axis": _furthest(axis, points),
+        "radius": _furthest(nodes, points),
+        "angle": float(np.arccos(np.clip(cosine, -1.0, 1.0)).max()),
+        "curve": points[::100].tolist(),
+        **(frame if bays <= 16 else {}),
+    }
+
+
+def _furthest(points: np.ndarray, curve: np.ndarray) -> float:
+    from scipy.spatial import KDTree
+
+    return float(KDTree(curve).query(points)[0].max())
+
+
+def draw(rows: Sequence[Row]) -> Figure:
+    """Draw arms of one module, and the measures against the number of bays."""
+    figure, axes = panels(2, 3, width=3.0, height=2.9)
+    shown = [row for row in rows if row["module"] == "octahedral" and "nodes" in row][:3]
+    for panel, row in zip(axes, shown, strict=False):
+        draw_truss(panel, np.array(row["nodes"]), np.array(row["members"]), np.array(row["actuated"]))
+        panel.plot(*np.array(row["curve"])[:, [0, 2]].T, color="tab:red", linewidth=1.0)
+        label(panel, "x [m]", "z [m]", f"{row['bays']} bays", legend=False)
+    for panel in axes[len(shown) : 3]:
+        panel.set_axis_off()
+    for panel, (key, name) in zip(axes[3:], _MEASURES.items(), strict=True):
+        for mark, module in zip(MARKS, _MODULES, strict=False):
+            mine = [row for row in rows if row["module"] == module]
+            panel.loglog([r["bays"] for r in mine], [r[key] for r in mine], "--", marker=mark, markersize=4, label=module)
+        label(panel, "bays", name)
+    return figure
+
+
+def text(rows: Sequence[Row]) -> str:
+    """Give the order of convergence of each measure."""
+    bays = sorted({row["bays"] for row in rows})
+    table = []
+    for module in _MODULES:
+        mine = {row["bays"]: row for row in rows if row["module"] == module}
+        for key, name in _MEASURES.items():
+            order = -exponent(list(mine), [row[key] for row in mine.values()]) if len(mine) > 1 else float("nan")
+            cells = [f"{mine[n][key]:.2e}" if n in mine else "-" for n in bays]
+            table.append((module, name, *cells, f"{order:.2f}"))
+    header = ("module", "", *[f"{n} bays" for n in bays], "order")
+    return (
+        f"An arm of {_HEIGHT:g} m, bent by 0.3 of its height, with bays the smaller the more there are; its faces track "
+        f"the curve exactly. The order is that of the fit error = c / bays^order.\n\n{markdown_table(header, table)}"
+    )

@@ -1,0 +1,87 @@
+"""Success, actuator travel and time against the number of control vertices (section 4.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+
+from vgtm_qp.curve import degree_of_redundancy
+from vgtm_qp.methods.compare import markdown_table, run_method
+from vgtm_qp.problem import load_problem
+from vgtm_qp.study.drawing import MARKS, label, panels
+from vgtm_qp.study.workers import Row, Task
+
+TITLE = "Variable degree of redundancy: the number of control vertices"
+TIMED = True
+
+_CASES = (
+    ("five_bay_two_cubes", "qp"),
+    ("ten_bay_round_a_cube", "qp"),
+    ("five_bay_free", "curve-pseudoinverse-corrected"),
+    ("ten_bay_round_a_cube", "curve-pseudoinverse-obstacles"),
+)
+
+
+def tasks(short: bool) -> list[Task]:
+    """Return one task a case and number of vertices."""
+    vertices = (4, 6) if short else (3, 4, 5, 6, 7, 8, 9, 10, 12, 14)
+    cases = _CASES[2:3] if short else _CASES
+    return [{"problem": p, "method": m, "vertices": v} for p, m in cases for v in vertices]
+
+
+def run(problem: str, method: str, vertices: int) -> Row:
+    """Return success, reach, travel and step time with that many control vertices."""
+    loaded = load_problem(problem).replace({"curve.control_vertices": vertices})
+    row, _ = run_method(loaded, method)
+    return {
+        "solved": row.solved,
+        "reached": row.reached,
+        "travel": row.actuator_travel,
+        "step_time": row.step_time,
+        "reason": row.reason,
+        "spare": degree_of_redundancy(vertices, 3),
+    }
+
+
+def draw(rows: Sequence[Row]) -> Figure:
+    """Draw reach, travel of the solved ones, and step time."""
+    figure, axes = panels(1, 3, width=3.4, height=3.1)
+    for mark, case in zip(MARKS, _CASES, strict=False):
+        mine = _of(rows, case)
+        if not mine:
+            continue
+        style = {"marker": mark, "markersize": 4, "linestyle": "--", "label": f"{case[0]}: {case[1]}"}
+        axes[0].plot([r["vertices"] for r in mine], [r["reached"] for r in mine], **style)
+        done = [r for r in mine if r["solved"]]
+        axes[1].plot([r["vertices"] for r in done], [r["travel"] for r in done], **style)
+        timed = [r for r in mine if r["step_time"] is not None]
+        axes[2].semilogy([r["vertices"] for r in timed], [1e3 * r["step_time"] for r in timed], **style)
+    label(axes[0], "control vertices", "part of the path", "how far")
+    label(axes[1], "control vertices", "actuator travel [m]", "solved maneuvers", legend=False)
+    label(axes[2], "control vertices", "median step [ms]", "time", legend=False)
+    return figure
+
+
+def text(rows: Sequence[Row]) -> str:
+    """Give the table."""
+    vertices = sorted({row["vertices"] for row in rows})
+    table = []
+    for case in _CASES:
+        mine = {row["vertices"]: row for row in _of(rows, case)}
+        if mine:
+            cells = [_cell(mine[v]) if v in mine else "-" for v in vertices]
+            table.append((f"{case[0]}: {case[1]}", *cells))
+    header = ("path covered; travel [m]", *[f"V = {v} ({degree_of_redundancy(v, 3)})" for v in vertices])
+    return (
+        "In brackets the free motions of the curve once base and tip are held, 3 V - 5 - 3. A curve with more of them "
+        f"than the arm means nothing to it; one with too few cannot pass.\n\n{markdown_table(header, table)}"
+    )
+
+
+def _of(rows: Sequence[Row], case: tuple[str, str]) -> list[Row]:
+    return [row for row in rows if (row["problem"], row["method"]) == case]
+
+
+def _cell(row: Row) -> str:
+    return f"yes; {row['travel']:.2f}" if row["solved"] else f"no, {100 * row['reached']:.0f} %"

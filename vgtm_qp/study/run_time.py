@@ -1,0 +1,150 @@
+"""Figure 9: run time of 50 steps against the number of bays, for every method."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.methods import make_resolver, with_method
+from vgtm_qp.methods.compare import markdown_table
+from vgtm_qp.study.arms import bending_problem
+from vgtm_qp.study.drawing import MARKS, label, panels
+from vgtm_qp.study.statistics import exponent
+from vgtm_qp.study.workers import Row, Task
+
+TITLE = "Figure 9: run time against the number of bays"
+TIMED = True
+
+_STEPS = 50
+_REACH = 1.2
+_NAMES = {
+    "pseudoinverse": "eq. (28), dense, SVD",
+    "pseudoinverse-weighted": "eq. (28), dense, Cholesky",
+    "pseudoinverse-sparse": "eq. (28), sparse KKT",
+    "curve-pseudoinverse": "curve, recursive",
+    "curve-pseudoinverse-parallel": "curve, parallel",
+    "qp": "QP, certified",
+}
+_WITH_CUBES = {
+    "pseudoinverse-obstacles": "eq. (28), sparse, potential, corrected",
+    "curve-pseudoinverse-obstacles": "curve, parallel, potential, corrected",
+    "qp": "QP, certified",
+}
+_DENSE_BAYS = 80
+_FIT_FROM = 10
+
+
+def tasks(short: bool) -> list[Task]:
+    """Return one task a method and number of bays, without and with cubes."""
+    bays = (2, 5) if short else (2, 5, 10, 20, 40, 80, 160)
+    found = [
+        {"bays": n, "method": method, "cubes": False}
+        for method in _NAMES
+        for n in bays
+        if n <= _DENSE_BAYS or method not in ("pseudoinverse", "pseudoinverse-weighted")
+    ]
+    return found + [{"bays": n, "method": m, "cubes": True} for m in _WITH_CUBES for n in bays if n >= 5]
+
+
+def run(bays: int, method: str, cubes: bool) -> Row:
+    """Return the time of 50 steps, s: their median fifty times over, and their sum."""
+    height = bays * np.sqrt(2.0 / 3.0)
+    part = min(_REACH / height, 0.3)
+    goal = (part, 0.3 * part, -0.4 * part)
+    # A curve with many more motions than the arm cannot be tracked: at most two vertices more than bays.
+    problem = bending_problem(bays, steps=_STEPS, goal=goal, vertices=min(6, bays + 2), cubes=cubes)
+    resolver = make_resolver(with_method(problem, method))
+    plan = make_plan(problem, *resolver.tip())
+    value, times, reason, home = plan.path.start, [], "", resolver.state
+    # Kernels are loaded and memory is touched in a step that does not count.
+    resolver.follow(plan.path, value, float(plan.marks[0]))
+    resolver.state = home
+    for mark in plan.marks:
+        while value < mark and not reason and len(times) < 4 * _STEPS:
+            clock = perf_counter()
+            step = resolver.follow(plan.path, value, float(mark))
+            times.append(perf_counter() - clock)
+            reason = step.reason
+            value = float(mark) if step.progress >= 1.0 - 1e-9 else value + step.progress * (float(mark) - value)
+    fixed = resolver.arm.layout.fixed
+    drift = np.abs(resolver.state.lengths - resolver.arm.home_lengths)[fixed].max()
+    return {
+        "time": _STEPS * float(np.median(times)),
+        "sum": float(np.sum(times)),
+        "steps": len(times),
+        "reached": float((value - plan.path.start) / (plan.path.end - plan.path.start)),
+        "reason": reason,
+        "drift": float(drift),
+    }
+
+
+def draw(rows: Sequence[Row]) -> Figure:
+    """Draw time against bays, without and with cubes."""
+    figure, axes = panels(1, 2, width=4.2, height=3.6)
+    for panel, cubes, names in zip(axes, (False, True), (_NAMES, _WITH_CUBES), strict=True):
+        for mark, (method, name) in zip(MARKS, names.items(), strict=False):
+            mine = _of(rows, method, cubes)
+            line = "-" if method == "qp" else "--" if method.startswith("curve") else ":"
+            panel.loglog([r["bays"] for r in mine], [r["time"] for r in mine], line, marker=mark, markersize=4, label=name)
+        title = "two cubes, clearance watched" if cubes else "no obstacles"
+        label(panel, "bays", f"time of {_STEPS} steps [s]", title)
+    return figure
+
+
+def text(rows: Sequence[Row]) -> str:
+    """Say how the times grow, and whether the curve is still faster than a sparse solver."""
+    parts = [
+        f"{_STEPS} steps of a free octahedral arm, the tip moving by at most {_REACH} m; {_STEPS} times the median "
+        "step. The pseudoinverse methods do not correct drift, keep no limits and know no obstacles, as in the paper; "
+        "the QP keeps limits and clearances and proves them between the states."
+    ]
+    for cubes, names in ((False, _NAMES), (True, _WITH_CUBES)):
+        bays = sorted({row["bays"] for row in rows if row["cubes"] is cubes})
+        if not bays:
+            continue
+        table = []
+        for method, name in names.items():
+            mine = {row["bays"]: row for row in _of(rows, method, cubes)}
+            cells = [f"{1e3 * mine[n]['time']:.0f}" + ("*" if mine[n]["reason"] else "") if n in mine else "-" for n in bays]
+            fit = [n for n in mine if n >= _FIT_FROM]
+            growth = f"n^{exponent(fit, [mine[n]['time'] for n in fit]):.2f}" if len(fit) > 1 else "-"
+            table.append((name, *cells, growth))
+        header = ("with two cubes [ms]" if cubes else "no obstacles [ms]", *[f"{n} bays" for n in bays], "growth")
+        parts.append(markdown_table(header, table))
+    parts.append(f"Growth fitted from {_FIT_FROM} bays on; * broke down on the way.")
+    parts.append(_verdict(rows))
+    return "\n\n".join(parts)
+
+
+def _verdict(rows: Sequence[Row]) -> str:
+    def times(method: str) -> dict[int, float]:
+        return {row["bays"]: row["time"] for row in _of(rows, method, False)}
+
+    lines, ratios = [], []
+    for way in ("curve-pseudoinverse", "curve-pseudoinverse-parallel"):
+        curve = times(way)
+        for method in ("pseudoinverse", "pseudoinverse-sparse"):
+            other = times(method)
+            shared = sorted(set(curve) & set(other))
+            if shared:
+                n = shared[-1]
+                ratio = other[n] / curve[n]
+                lines.append(
+                    f"At {n} bays {_NAMES[method]} takes {ratio:.2g} times as long as the curve method "
+                    f"({_NAMES[way].removeprefix('curve, ')})."
+                )
+                ratios += [ratio] if method == "pseudoinverse-sparse" else []
+    if ratios and max(ratios) < 1.0:
+        lines.append("The paper's advantage exists against dense algebra; against a sparse solver it is gone.")
+    elif ratios:
+        lines.append("Against a sparse solver little of the paper's advantage over dense algebra is left.")
+    return " ".join(lines)
+
+
+def _of(rows: Sequence[Row], method: str, cubes: bool) -> list[Row]:
+    mine = [row for row in rows if row["method"] == method and row["cubes"] is cubes]
+    return sorted(mine, key=lambda row: int(row["bays"]))

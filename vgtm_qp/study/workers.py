@@ -1,0 +1,160 @@
+"""Independent tasks on one process, several processes or a Dask cluster; a task that crashes loses itself alone."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from vgtm_qp.errors import MissingExtraError
+
+Task = dict[str, Any]
+Row = dict[str, Any]
+
+HANG = 900.0
+"""Seconds after which a task counts as hung."""
+
+
+def run_task(function: str, task: Task) -> Row:
+    """Return the row of a task: `function` is ``"module:name"``; an exception becomes a row that says so."""
+    module, name = function.split(":")
+    try:
+        return dict(getattr(import_module(module), name)(**task))
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        return {"failed": f"{type(error).__name__}: {error} ({os.path.basename(last.filename)}:{last.lineno})"}
+
+
+def run_here(function: str, tasks: Sequence[Task]) -> Iterator[tuple[int, Row]]:
+    """Yield number and row of each task, one after another in this process."""
+    for k, task in enumerate(tasks):
+        yield k, run_task(function, task)
+
+
+def run_processes(
+    function: str, tasks: Sequence[Task], workers: int, *, hang: float = HANG
+) -> Iterator[tuple[int, Row]]:
+    """Yield number and row of each task as `workers` processes finish them.
+
+    A process that dies, or takes longer than `hang` seconds for a task, loses that task alone: another takes its
+    place, and the task is tried once more when all others are done, with no other beside it. If that fails too, its
+    row says so.
+    """
+    again: list[int] = []
+    for k, row in _pool(function, tasks, list(range(len(tasks))), workers, hang):
+        if row is None:
+            again.append(k)
+        else:
+            yield k, row
+    for k in again:
+        for _, row in _pool(function, tasks, [k], 1, hang):
+            yield k, row or {"failed": f"its process died, or took longer than {hang:g} s, twice"}
+
+
+def run_dask(function: str, tasks: Sequence[Task], address: str) -> Iterator[tuple[int, Row]]:
+    """Yield number and row of each task as the workers of a dask.distributed cluster finish them.
+
+    Raises
+    ------
+    MissingExtraError
+        Dask is not installed.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ImportError:
+        raise MissingExtraError("cluster", "distributed") from None
+    with Client(address) as client:  # type: ignore[no-untyped-call]
+        futures = {client.submit(run_task, function, task, pure=False): k for k, task in enumerate(tasks)}
+        again = []
+        for future in as_completed(futures):  # type: ignore[no-untyped-call]
+            if future.status == "finished":
+                yield futures[future], future.result()
+            else:
+                again.append(futures[future])
+        for k in again:
+            future = client.submit(run_task, function, tasks[k], pure=False)
+            failed = future.exception()
+            yield k, {"failed": f"its worker died twice: {failed}"} if failed else future.result()
+
+
+class _Worker:
+    """A process that answers one task at a time."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        # Inherited by the new process before it imports NumPy: one BLAS thread a worker.
+        before = os.environ.get("OPENBLAS_NUM_THREADS")
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+        try:
+            self._process.start()
+        finally:
+            if before is None:
+                del os.environ["OPENBLAS_NUM_THREADS"]
+            else:
+                os.environ["OPENBLAS_NUM_THREADS"] = before
+        theirs.close()
+        self.number, self.started = -1, 0.0
+
+    def give(self, function: str, number: int, task: Task) -> None:
+        self.number, self.started = number, time.monotonic()
+        self.pipe.send((function, task))
+
+    def stop(self) -> None:
+        self._process.kill()
+        self._process.join()
+        self.pipe.close()
+
+
+def _pool(
+    function: str, tasks: Sequence[Task], numbers: list[int], workers: int, hang: float
+) -> Iterator[tuple[int, Row | None]]:
+    """Yield number and row of each task, None where its process died or hung."""
+    waiting = list(numbers)
+    busy: list[_Worker] = []
+    try:
+        while waiting or busy:
+            while waiting and len(busy) < workers:
+                worker = _Worker()
+                busy.append(worker)
+                number = waiting.pop(0)
+                worker.give(function, number, tasks[number])
+            ready: list[Any] = wait([worker.pipe for worker in busy], timeout=0.5)
+            for worker in list(busy):
+                row: Row | None = None
+                if worker.pipe in ready:
+                    try:
+                        row = worker.pipe.recv()
+                    except (EOFError, OSError):
+                        row = None
+                elif time.monotonic() - worker.started < hang:
+                    continue
+                yield worker.number, row
+                if row is not None and waiting:
+                    number = waiting.pop(0)
+                    worker.give(function, number, tasks[number])
+                    continue
+                busy.remove(worker)
+                worker.stop()
+    finally:
+        for worker in busy:
+            worker.stop()
+
+
+def _serve(pipe: Connection) -> None:
+    """Answer tasks until the other end closes; an interrupt is the other process's business."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    answer: Callable[[str, Task], Row] = run_task
+    while True:
+        try:
+            function, task = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(answer(function, task))
