@@ -255,7 +255,6 @@ class Clearance:
         end_time: float,
         floor: float,
         self_floor: float | None = None,
-        end_excess: float = 0.0,
     ) -> BetweenReport:
         """Prove that no surface distance falls below its floor while the nodes move on straight lines.
 
@@ -271,8 +270,6 @@ class Clearance:
             s; the obstacles move meanwhile.
         floor, self_floor : float
             For obstacles and, if it differs, between members, m; not negative.
-        end_excess : float
-            The end is held to floors higher by this, m; see ``BetweenReport.kept_at_end``.
 
         Raises
         ------
@@ -281,23 +278,18 @@ class Clearance:
         """
         floor = max(floor, 0.0)
         self_floor = floor if self_floor is None else max(self_floor, 0.0)
-        candidates, motion = self._covering(
-            start, start_time, floor + end_excess, self_floor + end_excess, end, end_time
-        )
+        candidates, motion = self._covering(start, start_time, floor, self_floor, end, end_time)
         proven = min(candidates.beyond(motion))
         found: list[tuple[Group, Found]] = []
-        kept_at_end = True
         for group in candidates.groups:
             least = self_floor if group.is_self else floor
-            at_end = least + end_excess
-            lower, others = group.lower(motion, at_end)
-            open_ = ~(lower >= at_end)
+            lower, others = group.lower(motion, least)
+            open_ = ~(lower >= least)
             proven = min(proven, others, float(lower[~open_].min(initial=np.inf)))
             rows = np.flatnonzero(open_)
             if len(rows):
                 result = sweep_group(group, rows, start, end, start_time, end_time, least)
                 proven = min(proven, result.proven)
-                kept_at_end &= result.at_end >= at_end
                 if len(result.rows):
                     found.append((group, result))
         parts = [self._failing(g, r, start, end, start_time, end_time) for g, r in found]
@@ -308,7 +300,7 @@ class Clearance:
             fractions.append(np.full(len(enclosed), 1.0 / 32.0))
         failing = join(parts, self.names)
         least = min([proven, float(failing.distance.min(initial=np.inf)), *(r.worst for _, r in found)])
-        return BetweenReport(not parts, least, np.concatenate([np.zeros(0), *fractions]), failing, kept_at_end)
+        return BetweenReport(not parts, least, np.concatenate([np.zeros(0), *fractions]), failing)
 
     def _failing(
         self, group: Group, found: Found, start: Array, end: Array, start_time: float, end_time: float

@@ -113,8 +113,6 @@ class BetweenReport:
     clearance : float
         Proven lower bound of the surface distances over the motion; the least distance found where not
         certified.
-    kept_at_end : bool
-        No pair is below the floor that was asked for at the end of the motion.
     fraction : (F,)
         For each failing pair, where on the motion (0 < s <= 1) the least distance was found.
     failing : NearPairs
@@ -125,7 +123,6 @@ class BetweenReport:
     clearance: float
     fraction: Array
     failing: NearPairs
-    kept_at_end: bool = True
 
     def failing_parameters(self, apart: float = 0.05) -> list[float]:
         """Return the fractions, worst pair first, without those nearer than `apart` to a worse one."""

@@ -30,15 +30,12 @@ class Found:
         Where on the motion each of those was found nearest, 0 < s <= 1.
     worst : float
         Least distance found of those, m.
-    at_end : float
-        Least distance of all pairs asked for at the end of the motion, exact, m.
     """
 
     proven: float
     rows: Index
     fraction: Array
     worst: float = np.inf
-    at_end: float = np.inf
 
     def placed(
         self, group: Group, start: Array, end: Array, start_time: float, end_time: float
@@ -96,9 +93,8 @@ def sweep_group(
     count = len(rows)
     k, left, right = np.arange(count), np.zeros(count), np.ones(count)
     answer = group.sweep(*motion.whole(), rows)
-    at_end = float(answer[:, 2].min())
     if (answer[:, 0] >= floor).all():
-        return Found(float(answer[:, 0].min()), rows[:0], left[:0], at_end=at_end)
+        return Found(float(answer[:, 0].min()), rows[:0], left[:0])
     failed = np.zeros(count, dtype=bool)
     worst, proven = np.full(count, np.inf), np.full(count, np.inf)
     fraction = np.full(count, 0.5)
@@ -127,7 +123,7 @@ def sweep_group(
     kept = float(proven[~failed].min(initial=np.inf))
     if len(chosen):
         fraction[chosen] = _nearest_fraction(group, motion, rows, chosen, worst[chosen], fraction[chosen])
-    return Found(kept, rows[chosen], fraction[chosen], float(worst[chosen].min(initial=np.inf)), at_end)
+    return Found(kept, rows[chosen], fraction[chosen], float(worst[chosen].min(initial=np.inf)))
 
 
 def _nearest_fraction(

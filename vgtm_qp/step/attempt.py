@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.condensed import InfeasibleStepError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.linearise import Target
-from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.path import PathPoint
+from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.state import State
 from vgtm_qp.step.task import TipTask
 
@@ -186,14 +187,13 @@ class Attempt:
             if settled is None:
                 continue
             closed, X = settled, settled.X
-            after = separation.holds(X, target.time, short)
+            report = separation.between(state.nodes, X, state.time, target.time, short)
+            after = separation.holds(X, target.time, short, proven=report.certified)
+            phases.add("acceptance")
             if after is None:
-                phases.add("acceptance")
                 continue
             if separation.turns_too_far(state.nodes, X):
                 return outcome("an offset joint turns too far in one step", count)
-            report = separation.between(state.nodes, X, state.time, target.time, short)
-            phases.add("acceptance")
             if report.certified:
                 return outcome("", count)
             stations.extend(s for s in report.failing_parameters() if s not in stations)

@@ -69,10 +69,15 @@ class Separation:
             found[pair] = min(found.get(pair, np.inf), float(pairs.distance[k]))
         return found
 
-    def holds(self, X: Array, time: float, before: Shortfall) -> Shortfall | None:
-        """Return what is too near at `X`, or None where a pair is that was not `before`, or comes nearer."""
+    def holds(self, X: Array, time: float, before: Shortfall, *, proven: bool = False) -> Shortfall | None:
+        """Return what is too near at `X`, or None where a pair is that was not `before`, or comes nearer.
+
+        `proven` is whether :meth:`between` was certified for the way there, which then holds for its end too.
+        """
         if not self._angles_hold(X):
             return None
+        if proven and not before:
+            return {}
         after = self.shortfall(X, time)
         if all(distance >= before.get(pair, np.inf) - self.distances.rounding for pair, distance in after.items()):
             return after
@@ -122,6 +127,7 @@ class Separation:
             time,
             min(kept.influence, kept.safe + reach),
             use_fcl=motion,
+            fcl_reach=kept.safe + reach / 3.0,
             self_reach=min(kept.influence, kept.self_safe + 2.0 * reach),
         )
         rows = clearance_rows(self.monitor, pairs, kept.safe + kept.margin, kept.self_safe + kept.margin)
