@@ -35,6 +35,7 @@ def make_manifest(
     status: str,
     reached: float,
     blocked_by: Iterable[str] = (),
+    stop: Mapping[str, Any] | None = None,
     method: str,
     solver: str,
     setup_time: float,
@@ -56,6 +57,8 @@ def make_manifest(
         How far along the path, 0 to 1.
     blocked_by : iterable of str
         Names of what stopped it.
+    stop : mapping, optional
+        What ``Stop.to_dict`` returns.
     method, solver : str
         As in the problem's ``[method]``.
     setup_time : float
@@ -74,6 +77,7 @@ def make_manifest(
         "status": status,
         "reached": float(reached),
         "blocked_by": list(blocked_by),
+        "stop": None if stop is None else dict(stop),
         "method": method,
         "solver": solver,
         "setup_time": float(setup_time),

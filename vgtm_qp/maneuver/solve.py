@@ -17,7 +17,8 @@ from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.checks import check_problem
-from vgtm_qp.step.resolver import Step, StepStatus
+from vgtm_qp.step.resolver import Resolver, Step, StepStatus
+from vgtm_qp.step.stops import Stop, StopKind
 
 if TYPE_CHECKING:
     from vgtm_qp.methods import AnyResolver
@@ -74,15 +75,11 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     _add_state(record, resolver, plan, 0.0, 0.0, dict.fromkeys(resolver.phases, 0.0))
     setup_time = perf_counter() - started
 
-    status, blocked_by = "solved", ()
     try:
-        last = _run(resolver, plan, record, progress)
+        stop = _run(resolver, plan, record, progress)
     except KeyboardInterrupt:
-        status, blocked_by = "blocked", ("interrupted",)
-    else:
-        if last is not None:
-            status, blocked_by = "blocked", last.blocked_by
-    maneuver = _assemble(problem, resolver, record, status, blocked_by, setup_time)
+        stop = Stop(StopKind.INTERRUPTED)
+    maneuver = _assemble(problem, resolver, record, stop, setup_time)
     if not verify:
         return maneuver
     from vgtm_qp.verify import verify as check
@@ -90,8 +87,8 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     return maneuver.with_certificate(check(maneuver))
 
 
-def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress | None) -> Step | None:
-    """Step along the plan; return the step at which the arm stopped for good, or None where it came through."""
+def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress | None) -> Stop | None:
+    """Step along the plan; return why the arm stopped for good, or None where it came through."""
     value, start, end = plan.path.start, plan.path.start, plan.path.end
     stalled = 0
     for k, mark in enumerate(plan.marks):
@@ -101,7 +98,7 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
             step = resolver.follow(plan.path, value, float(mark), dt=dt)
             seconds = perf_counter() - clock
             if step.status is StepStatus.BLOCKED:
-                return step
+                return _stop(resolver, plan, value, float(mark), dt, step)
             value = (
                 float(mark)
                 if step.status is StepStatus.REACHED
@@ -111,10 +108,16 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
             _add_state(record, resolver, plan, value, seconds, phases)
             stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
             if stalled >= _STALLED_STEPS:
-                return step
+                return _stop(resolver, plan, value, float(mark), dt, step)
             if progress is not None:
                 progress((value - start) / (end - start), step)
     return None
+
+
+def _stop(resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step) -> Stop:
+    if isinstance(resolver, Resolver):
+        return resolver.explain(plan.path, value, mark, dt=dt, reason=step.reason)
+    return Stop(StopKind.NONLINEAR, dict.fromkeys(step.blocked_by, 0.0), reason=step.reason)
 
 
 def _add_state(
@@ -144,8 +147,7 @@ def _assemble(
     problem: Problem,
     resolver: AnyResolver,
     record: _Record,
-    status: str,
-    blocked_by: tuple[str, ...],
+    stop: Stop | None,
     setup_time: float,
 ) -> Maneuver:
     truss, task = resolver.arm.truss, resolver.arm.task
@@ -158,9 +160,10 @@ def _assemble(
     manifest = make_manifest(
         problem.to_dict(),
         arm_record(truss),
-        status=status,
+        status="solved" if stop is None else "blocked",
         reached=reached,
-        blocked_by=blocked_by,
+        blocked_by=() if stop is None else stop.names,
+        stop=None if stop is None else stop.to_dict(),
         method=problem.method.name,
         solver=problem.method.solver,
         setup_time=setup_time,

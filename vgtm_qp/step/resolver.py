@@ -13,13 +13,14 @@ from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.arm import Arm, build_arm
-from vgtm_qp.step.checks import unreachable_tip
 from vgtm_qp.step.attempt import Attempt
+from vgtm_qp.step.checks import unreachable_tip
 from vgtm_qp.step.limits import length_box
 from vgtm_qp.step.linearise import Target
-from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
+from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.state import State, frozen
+from vgtm_qp.step.stops import Limits, Stop, StopKind, explain
 
 Array = NDArray[np.float64]
 
@@ -105,15 +106,9 @@ class Resolver:
             mistakes = list(unreachable_tip(problem, arm))
             if mistakes:
                 raise ProblemError(str(problem.source or problem.name), mistakes)
-        self._attempt = Attempt(
-            arm.engine,
-            arm.task,
-            Separation(
-                arm.truss,
-                arm.monitor,
-                Distances(arm.safe, arm.self_safe, arm.influence, arm.margin, arm.minimum_angle),
-            ),
-        )
+        distances = Distances(arm.safe, arm.self_safe, arm.influence, arm.margin, arm.minimum_angle)
+        self._separation = Separation(arm.truss, arm.monitor, distances)
+        self._attempt = Attempt(arm.engine, arm.task, self._separation)
         self.state = arm.home_state()
         truss = arm.truss
         self._actuator_names = tuple(truss.member_names[k] for k in truss.actuators)
@@ -271,6 +266,31 @@ class Resolver:
         )
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return Step(status, progress, self.state, "", outcome.iterations, *told)
+
+    def explain(self, path: Path, start: float, end: float, *, dt: float | None = None, reason: str = "") -> Stop:
+        """Return why the arm does not get on from its present state along `path` from its value `start` to `end`.
+
+        Worth asking after a step that was blocked or hardly moved; `reason` is that step's. The state is unchanged.
+        """
+        dt = self.arm.dt if dt is None else dt
+        return explain(self.arm, self._separation, self.state, path, start, end, self._limits_now(dt), reason)
+
+    def _limits_now(self, dt: float) -> Limits:
+        """Return the boxes of a step of `dt`, s, from the present state, and what sets each of their sides."""
+        state, actuators = self.state, self.arm.truss.actuators
+        stroke, rate, _ = self._limits
+        length = state.lengths[actuators]
+        lower, upper = length_box(length, state.length_rates[actuators], *self._limits, dt, state.duration or None)
+
+        def kinds(bound: Array, end: Array, fastest: Array) -> list[StopKind]:
+            kind = np.where(np.abs(bound - fastest) < 1e-9, StopKind.RATE, StopKind.ACCELERATION)
+            kind = np.where(np.abs(bound - end) < 1e-9, StopKind.STROKE, kind)
+            kind = np.where(stroke[:, 0] == stroke[:, 1], StopKind.LOCKED, kind)
+            return [StopKind(name) for name in kind.tolist()]
+
+        low = kinds(lower, stroke[:, 0], length - rate * dt)
+        high = kinds(upper, stroke[:, 1], length + rate * dt)
+        return Limits(lower, upper, self._actuator_names, low, high)
 
 
 def _vector(value: ArrayLike, name: str) -> Array:

@@ -1,0 +1,234 @@
+"""Why an arm stops: the smallest set of rows that together leave it no way along its path, found at the state itself.
+
+To first order the arm can cover the share alpha of a piece of path that is the greatest one with
+
+    J d_rho = E d_a,   tip rows d_rho = alpha rate,   clearance and angle rows,   limits <= d_a <= limits,
+
+a linear program in the actuators' displacements. Where alpha is next to nothing, the rows with multipliers say why;
+those without which the arm stays blocked are left out one after another, until each one that remains is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.optimize import linprog
+from scipy.sparse.linalg import splu
+
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.arm import Arm
+from vgtm_qp.step.path import Path
+from vgtm_qp.step.separation import Separation
+from vgtm_qp.step.state import State
+
+Array = NDArray[np.float64]
+
+_TRUST = 0.05
+"""How far actuators move in the linear program, m: further, its rows mean little."""
+_BLOCKED = 0.02
+"""A share of the way, within the trust, below which the arm counts as blocked."""
+_PRESSES = 1e-7
+
+
+class StopKind(StrEnum):
+    """What stops an arm."""
+
+    OBSTACLE = "obstacle"
+    MEMBERS = "members"
+    ANGLE = "angle"
+    STROKE = "stroke"
+    RATE = "rate"
+    ACCELERATION = "acceleration"
+    LOCKED = "locked"
+    SINGULAR = "singular pose"
+    OUT_OF_REACH = "out of reach"
+    NONLINEAR = "nonlinear"
+    INTERRUPTED = "interrupted"
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Why an arm stopped.
+
+    Attributes
+    ----------
+    kind : StopKind
+        ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
+        where the tip cannot start in that direction whatever the limits; ``out of reach`` where the arm is stretched
+        towards a goal further away; ``nonlinear`` where no row forbids the step to first order.
+    multipliers : dict
+        Rows of the set, the most decisive first, and the share of the way that each costs per metre (radian).
+    obstacles : tuple of str
+        Names of the obstacles in the set.
+    reason : str
+        What the last attempt said.
+    """
+
+    kind: StopKind
+    multipliers: Mapping[str, float] = field(default_factory=dict)
+    obstacles: tuple[str, ...] = ()
+    reason: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the rows of the set, or the kind of the stop where there are none."""
+        return tuple(self.multipliers) or (str(self.kind),)
+
+    def __str__(self) -> str:
+        parts = [str(self.kind), ", ".join(self.multipliers), self.reason if self.kind is StopKind.NONLINEAR else ""]
+        return ": ".join(part for part in parts if part)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data."""
+        return {
+            "kind": str(self.kind),
+            "multipliers": dict(self.multipliers),
+            "obstacles": list(self.obstacles),
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Boxes of the actuators' lengths (n_a,) at the end of a step, m, and what each side is called."""
+
+    lower: Array
+    upper: Array
+    names: Sequence[str]
+    low_kind: Sequence[StopKind]
+    high_kind: Sequence[StopKind]
+
+
+def explain(
+    arm: Arm, separation: Separation, state: State, path: Path, start: float, end: float, limits: Limits, reason: str
+) -> Stop:
+    """Return why the arm does not get on from `state` along `path` from its value `start` towards `end`."""
+    program = _Program(arm, separation, state, path, start, end, limits)
+    share, pressing = program.solve(np.ones(program.count, dtype=bool))
+    if share > _BLOCKED:
+        return Stop(StopKind.NONLINEAR, reason=reason)
+    kept = np.zeros(program.count, dtype=bool)
+    kept[np.flatnonzero(pressing > _PRESSES)] = True
+    if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= _BLOCKED:
+        kind = StopKind.OUT_OF_REACH if _outward(arm, state, path, start) else StopKind.SINGULAR
+        return Stop(kind, reason=reason)
+    for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: pressing[k]):
+        kept[k] = False
+        if program.solve(kept)[0] > _BLOCKED:
+            kept[k] = True
+    _, pressing = program.solve(kept)
+    chosen = sorted(np.flatnonzero(kept).tolist(), key=lambda k: -pressing[k])
+    kinds = [program.kind(k) for k in chosen]
+    kind = next(kind for kind in StopKind if kind in kinds)
+    if set(kinds) == {StopKind.STROKE} and len(chosen) >= arm.truss.bays and _outward(arm, state, path, start):
+        kind = StopKind.OUT_OF_REACH
+    multipliers: dict[str, float] = {}
+    for k in chosen:
+        name = program.name(k)
+        multipliers[name] = max(multipliers.get(name, 0.0), float(pressing[k]))
+    obstacles = [o.name for o in arm.monitor.obstacles if any(name.endswith(f" / {o.name}") for name in multipliers)]
+    return Stop(kind, multipliers, tuple(obstacles), reason)
+
+
+class _Program:
+    """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        separation: Separation,
+        state: State,
+        path: Path,
+        start: float,
+        end: float,
+        limits: Limits,
+    ) -> None:
+        truss, layout, kinematics = arm.truss, arm.layout, arm.kinematics
+        X = state.nodes
+        kinematics.evaluate(X)
+        member, flat, column = layout.length_scatter
+        size = layout.node_columns
+        jacobian = sparse.csc_matrix((kinematics.gradient.reshape(-1)[flat], (member, column)), shape=(size, size))
+        selection = np.zeros((size, len(truss.actuators)))
+        selection[truss.actuators, np.arange(len(truss.actuators))] = 1.0
+        response = splu(jacobian).solve(selection)
+        padded = np.zeros((truss.node_count, 3, len(truss.actuators)))
+        padded[truss.free] = response.reshape(-1, 3, len(truss.actuators))
+
+        tip = arm.task.rows(X, path.at(start))
+        rate = tip.rate * (end - start)
+        length = float(np.linalg.norm(rate))
+        # Within the trust the arm covers about so much of the way.
+        self._unit = min(1.0, _TRUST / length) if length > 0.0 else 1.0
+        jacobian_tip = np.einsum("rkc,kcn->rn", tip.jacobian.reshape(len(rate), -1, 3), padded[truss.tip])
+        self._equal = np.column_stack([jacobian_tip, -rate * self._unit])
+
+        self._rows: ClearanceRows = separation.rows(X, state.time, 0.0, 2.0 * _TRUST, {}, 0.0)
+        near = np.einsum("rsc,rscn->rn", self._rows.coefficients, padded[self._rows.nodes])
+        self._near = np.column_stack([-near, np.zeros(len(near))])
+        self._near_bound = np.maximum(-(self._rows.lower - separation.distances.margin), 0.0)
+        now = state.lengths[truss.actuators]
+        self._low = np.minimum(limits.lower - now, 0.0)
+        self._high = np.maximum(limits.upper - now, 0.0)
+        self._limits = limits
+        self.count = len(self._rows) + 2 * len(now)
+
+    def solve(self, kept: NDArray[np.bool_]) -> tuple[float, Array]:
+        """Return the greatest share alpha with the `kept` rows, and the multiplier of every row."""
+        near, actuators = len(self._rows), len(self._low)
+        low = np.where(kept[near : near + actuators], np.maximum(self._low, -_TRUST), -_TRUST)
+        high = np.where(kept[near + actuators :], np.minimum(self._high, _TRUST), _TRUST)
+        rows = np.flatnonzero(kept[:near])
+        cost = np.zeros(actuators + 1)
+        cost[-1] = -1.0
+        answer = linprog(
+            cost,
+            A_ub=self._near[rows],
+            b_ub=self._near_bound[rows],
+            A_eq=self._equal,
+            b_eq=np.zeros(len(self._equal)),
+            bounds=[*zip(low, high, strict=True), (0.0, 1.0)],
+            method="highs",
+        )
+        multipliers = np.zeros(self.count)
+        if answer.status != 0:
+            return 0.0, multipliers
+        multipliers[rows] = -answer.ineqlin.marginals
+        lower = np.where(low > -_TRUST, answer.lower.marginals[:-1], 0.0)
+        upper = np.where(high < _TRUST, -answer.upper.marginals[:-1], 0.0)
+        multipliers[near : near + actuators] = lower
+        multipliers[near + actuators :] = upper
+        return float(answer.x[-1]), np.maximum(multipliers, 0.0) * self._unit
+
+    def name(self, k: int) -> str:
+        """Return the name of row `k`."""
+        near, actuators = len(self._rows), len(self._low)
+        if k < near:
+            return self._rows.name(k)
+        return f"{self.kind(k)}: {self._limits.names[(k - near) % actuators]}"
+
+    def kind(self, k: int) -> StopKind:
+        """Return what row `k` is about."""
+        near, actuators = len(self._rows), len(self._low)
+        if k >= near:
+            side = self._limits.low_kind if k < near + actuators else self._limits.high_kind
+            return side[(k - near) % actuators]
+        name = self._rows.name(k)
+        if name.startswith("angle: "):
+            return StopKind.ANGLE
+        return StopKind.MEMBERS if " / member " in name else StopKind.OBSTACLE
+
+
+def _outward(arm: Arm, state: State, path: Path, start: float) -> bool:
+    """Return whether the path leads away from the base at `start`, within about 60 degrees."""
+    truss = arm.truss
+    point = path.at(start)
+    way = point.position - state.nodes[truss.base].mean(axis=0)
+    speed = float(np.linalg.norm(point.velocity))
+    return speed > 0.0 and float(way @ point.velocity) > 0.5 * speed * float(np.linalg.norm(way))
