@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError
 
+from vgtm_qp.cli.bench import bench
 from vgtm_qp.cli.check import check
 from vgtm_qp.cli.compare import compare
 from vgtm_qp.cli.doctor import doctor
@@ -58,6 +59,7 @@ _COMMANDS: dict[str, Callable[..., int | None]] = {
     "replay": replay,
     "schema": schema,
     "doctor": doctor,
+    "bench": bench,
 }
 for order, (name, command) in enumerate(_COMMANDS.items()):
     app.command(command, name=name, sort_key=order)

@@ -1,0 +1,137 @@
+"""Baselines: other ways to take the same steps, each behind ``place`` and ``step``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.bench.nonlinear import NonlinearStep
+from vgtm_qp.errors import SolverError
+from vgtm_qp.methods import AnyResolver, make_resolver
+from vgtm_qp.methods.curve_first import CurveFirstResolver
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.path import Path
+from vgtm_qp.step.resolver import StepStatus
+from vgtm_qp.step.state import State
+
+Array = NDArray[np.float64]
+Name = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp"]
+
+
+class Contestant(Protocol):
+    """Takes one step from where it was placed."""
+
+    def place(self, state: State) -> None:
+        """Stand in `state`; not measured."""
+        ...
+
+    def step(self, path: Path, start: float, end: float, dt: float) -> bool:
+        """Move along `path` from its value `start` to `end` in `dt` seconds; False where that failed."""
+        ...
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A baseline: what it is, the longest arm that it is tried on, and how it is made."""
+
+    title: str
+    most_bays: int
+    make: Callable[[Problem], Contestant]
+
+
+class BarePseudoinverse:
+    """Eq. (28) alone: one dense J^+ by singular values; no null-space vector, limit, clearance or check."""
+
+    def __init__(self, problem: Problem) -> None:
+        # Any solver serves that makes no kernels, for none is asked.
+        changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
+        self._arm = arm = build_arm(problem.replace(changes))
+        layout, task = arm.layout, arm.task
+        first = layout.node_column[arm.truss.tip]
+        self._tip = (first[:, None] + np.arange(3)).reshape(-1)
+        self._lengths = np.zeros((arm.truss.member_count, layout.node_columns))
+        self._J = np.zeros((len(task.row_names) + len(layout.fixed), layout.node_columns))
+        self._x = np.zeros(len(self._J))
+        self._nodes = arm.truss.home
+        self.reached = self._nodes
+
+    def place(self, state: State) -> None:
+        """See :class:`Contestant`."""
+        self._nodes = state.nodes
+
+    def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
+        """See :class:`Contestant`."""
+        arm, J, x = self._arm, self._J, self._x
+        arm.kinematics.evaluate(self._nodes)
+        tip = arm.task.rows(self._nodes, path.at(end))
+        rows = len(tip.error)
+        J[:rows, self._tip] = tip.jacobian
+        J[rows:] = arm.layout.length_jacobian(arm.kinematics.gradient, self._lengths)[arm.layout.fixed]
+        x[:rows] = tip.error
+        X = np.array(self._nodes)
+        X[arm.truss.free] += (np.linalg.pinv(J) @ x).reshape(-1, 3)
+        self.reached = X
+        return True
+
+
+class ResolverStep:
+    """A resolver of the package, with `changes` to the problem's method."""
+
+    def __init__(self, problem: Problem, changes: dict[str, Any]) -> None:
+        self.resolver: AnyResolver = make_resolver(problem.replace(changes))
+
+    def place(self, state: State) -> None:
+        """See :class:`Contestant`."""
+        resolver = self.resolver
+        if isinstance(resolver, CurveFirstResolver):
+            resolver.curve = replace(resolver.curve, control_vertices=state.control_vertices)
+        elif state.control_vertices.shape != resolver.state.control_vertices.shape:
+            state = replace(state, control_vertices=resolver.state.control_vertices)
+        resolver.state = state
+
+    def step(self, path: Path, start: float, end: float, dt: float) -> bool:
+        """See :class:`Contestant`."""
+        return self.resolver.follow(path, start, end, dt=dt).status is StepStatus.REACHED
+
+
+def _changed(**changes: Any) -> Callable[[Problem], Contestant]:
+    named = {f"method.{key}": value for key, value in changes.items()}
+    return lambda problem: ResolverStep(problem, named)
+
+
+BASELINES: dict[Name, Baseline] = {
+    "eq28": Baseline("eq. (28), dense pseudoinverse alone", 100, BarePseudoinverse),
+    "eq28-sparse": Baseline(
+        "eq. (28), banded",
+        1000,
+        _changed(name="pseudoinverse", algebra="sparse", tracking="none", hard_tracking=False),
+    ),
+    "curve": Baseline(
+        "curve by pseudoinverse, bays after it",
+        1000,
+        _changed(name="curve-pseudoinverse", tracking="recursive", hard_tracking=False),
+    ),
+    "ipopt": Baseline("one nonlinear program a step, IPOPT", 20, NonlinearStep),
+    "osqp": Baseline("the same QPs, sparse, OSQP", 200, _changed(solver="osqp")),
+    "piqp": Baseline("the same QPs, sparse, PIQP", 200, _changed(solver="piqp")),
+}
+NAMES: tuple[Name, ...] = get_args(Name)
+
+
+def make_baseline(name: Name, problem: Problem, bays: int) -> Contestant:
+    """Return a baseline for a problem.
+
+    Raises
+    ------
+    VgtmError
+        It cannot serve that problem, or the arm is longer than it is tried on.
+    """
+    baseline = BASELINES[name]
+    if bays > baseline.most_bays:
+        raise SolverError(f"not tried on more than {baseline.most_bays} bays")
+    return baseline.make(problem)

@@ -1,0 +1,147 @@
+"""What a fresh process takes: start of the command, set-up with a warm or a cold cache of kernels, memory.
+
+Run as ``python -m vgtm_qp.bench.fresh`` it is that process: a problem in JSON on stdin, the measures on
+stdout.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from vgtm_qp.errors import SolverError
+
+_PACKAGE_PARENT = Path(__file__).resolve().parents[2]
+_STEPS = 5
+_REPEATS = 3
+_HELP = "from vgtm_qp.cli import main; main(['--help'])"
+
+
+@dataclass(frozen=True)
+class Fresh:
+    """Measures of a process that sets up a problem and takes a few steps.
+
+    Attributes
+    ----------
+    imports : float
+        Seconds to import what a resolver needs.
+    setup : float
+        Seconds from the problem to a resolver that can take its first step, kernels included.
+    first_step : float
+        Seconds.
+    peak_memory, imported_memory : int
+        Greatest resident memory after some steps, and after the imports alone, bytes.
+    """
+
+    imports: float
+    setup: float
+    first_step: float
+    peak_memory: int
+    imported_memory: int
+
+
+def measure_start() -> dict[str, float]:
+    """Return CPU seconds of a bare interpreter, of one that imports the package, and of ``vgtm --help``.
+
+    Each is the least of three, since only what disturbs them makes them differ.
+    """
+    scripts = {"python": "pass", "import": "import vgtm_qp", "help": _HELP}
+    return {name: min(_cpu_seconds(script) for _ in range(_REPEATS)) for name, script in scripts.items()}
+
+
+def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> Fresh:
+    """Return what a fresh process takes for a problem in the form of ``Problem.to_dict``.
+
+    Parameters
+    ----------
+    problem
+    cold
+        With an empty cache of kernels, in a temporary folder, in the place of the user's.
+
+    Raises
+    ------
+    SolverError
+        That process failed; the message has the last line that it said.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        environment = _environment() | ({"VGTM_CACHE": folder} if cold else {})
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", "vgtm_qp.bench.fresh"],
+            input=json.dumps(problem),
+            capture_output=True,
+            text=True,
+            env=environment,
+        )
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raise SolverError(f"set-up in a fresh process failed: {lines[-1]}")
+    return Fresh(**json.loads(done.stdout))
+
+
+def _measured(problem: dict[str, Any]) -> dict[str, float]:
+    """Set a problem up in this process, take some steps, and return the measures."""
+    started = perf_counter()
+    from vgtm_qp.maneuver.plan import make_plan
+    from vgtm_qp.problem import Problem
+    from vgtm_qp.step.resolver import Resolver
+
+    loaded = Problem.from_dict(problem)
+    imports, imported = perf_counter() - started, _peak_memory()
+    clock = perf_counter()
+    resolver = Resolver(loaded)
+    plan = make_plan(loaded, *resolver.tip())
+    setup = perf_counter() - clock
+    first_step, value = 0.0, plan.path.start
+    for mark in plan.marks[:_STEPS]:
+        clock = perf_counter()
+        resolver.follow(plan.path, value, float(mark))
+        first_step = first_step or perf_counter() - clock
+        value = float(mark)
+    return {
+        "imports": imports,
+        "setup": setup,
+        "first_step": first_step,
+        "peak_memory": _peak_memory(),
+        "imported_memory": imported,
+    }
+
+
+def _peak_memory() -> int:
+    """Return the greatest resident memory of this process, bytes.
+
+    On Linux ``ru_maxrss`` begins with what the parent had when it forked; the status file does not.
+    """
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        status = ""
+    for line in status.splitlines():
+        if line.startswith("VmHWM:"):
+            return 1024 * int(line.split()[1])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _cpu_seconds(script: str) -> float:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-P", "-c", script], check=True, capture_output=True, env=_environment())
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def _environment() -> dict[str, str]:
+    """Return the environment in which a child finds this very package."""
+    found = [str(_PACKAGE_PARENT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(found)}
+
+
+if __name__ == "__main__":
+    print(json.dumps(_measured(json.load(sys.stdin))))

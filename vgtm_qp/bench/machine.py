@@ -1,0 +1,80 @@
+"""What a measurement was taken on; NumPy is not imported, since its BLAS reads the number of threads then."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+_THREADS = (
+    "OPENBLAS_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+_PACKAGES = ("vgtm-qp", "numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl")
+
+
+def pin_threads() -> bool:
+    """Hold BLAS and OpenMP to one thread here and in child processes; False where BLAS was loaded before.
+
+    The matrices of a step are small: with a second thread a pseudoinverse of ten bays takes a hundred times
+    as long.
+    """
+    late = "numpy" in sys.modules and any(os.environ.get(name) != "1" for name in _THREADS[:2])
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    return not late
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return processor, cores, load, system, Python and C compiler."""
+    from vgtm_qp.compiled import compiler
+
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "load": [round(value, 2) for value in os.getloadavg()],
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "compiler": compiler(),
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of the packages that count, None where one is not installed."""
+    found: dict[str, str | None] = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def commit() -> str | None:
+    """Return the commit of the source tree that this runs from, with "+" if changed since; None elsewhere."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        head, changes = (
+            subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True)
+            for arguments in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head.stdout.strip() + ("+" if changes.stdout.strip() else "")
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(named, platform.processor() or platform.machine())

@@ -1,0 +1,256 @@
+"""Timing: one resolver by itself over whole maneuvers, then in turn with a baseline, step by step.
+
+In turn, both take each step from the state that the resolver had reached, and which of them is first alternates:
+a machine that slows down slows both, and the ratio of their medians holds. What is left in the processor's caches
+differs, by up to a third after a large baseline, to the disadvantage of the smaller one. Ratios are those of
+CPU time: where processes wait for their turn, what takes longer is interrupted more often. Garbage is collected
+as it is for every user.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter, process_time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vgtm_qp.bench.contestants import Contestant
+from vgtm_qp.errors import VgtmError
+from vgtm_qp.maneuver.plan import Plan
+from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.state import State
+
+Array = NDArray[np.float64]
+
+_LEAST_STEPS = 10
+_WARM_UP = 5
+_STALLED_PROGRESS, _STALLED_STEPS = 1e-3, 10
+_OVERRUN = 5.0
+"""However few steps there were, a run ends after so many times its duration."""
+
+
+class Spent(NamedTuple):
+    """What a step took, s: by the clock, and of the processor."""
+
+    wall: float
+    cpu: float
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds a step: median, 95th and 99th percentile by the clock, median CPU time, over so many steps."""
+
+    median: float
+    p95: float
+    p99: float
+    cpu: float
+    steps: int
+
+    @classmethod
+    def of(cls, spent: Sequence[Spent]) -> Timing:
+        """Return the timing of one or more steps."""
+        wall, cpu = np.array(spent, dtype=float).T
+        median, p95, p99 = (float(value) for value in np.percentile(wall, (50, 95, 99)))
+        return cls(median, p95, p99, float(np.median(cpu)), len(wall))
+
+
+@dataclass(frozen=True)
+class Breakdown:
+    """Where the time of a step goes: mean seconds in each phase, which sum to `total`.
+
+    The mean is that of the middle half of the steps in the order of their time, so that one which the system
+    interrupted does not decide. ``other`` is what the resolver does outside its phases.
+    """
+
+    total: float
+    phases: dict[str, float]
+
+    @classmethod
+    def of(cls, seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> Breakdown:
+        """Return the breakdown of steps (S,), with the seconds of each in every phase."""
+        times = np.asarray(seconds, dtype=float)
+        count = len(times)
+        middle = np.argsort(times, kind="stable")[count // 4 : max(count - count // 4, count // 4 + 1)]
+        total = float(times[middle].mean())
+        means = {
+            name: float(np.asarray(values, dtype=float)[middle].mean()) for name, values in phases.items()
+        }
+        return cls(total, means | {"other": total - sum(means.values())})
+
+
+@dataclass
+class Steps:
+    """Steps that the resolver took by itself.
+
+    Attributes
+    ----------
+    spent : list of Spent
+    phases : dict of lists of float
+        Seconds of each step in every phase.
+    qps : list of int
+        QPs solved in each step.
+    covered : float
+        The greatest part of the maneuver that a pass over it came through, 0 to 1.
+    stopped_by : str
+        What blocked the arm on the way, empty where nothing did.
+    """
+
+    spent: list[Spent] = field(default_factory=list)
+    phases: dict[str, list[float]] = field(default_factory=dict)
+    qps: list[int] = field(default_factory=list)
+    covered: float = 0.0
+    stopped_by: str = ""
+
+
+@dataclass
+class Pairs:
+    """Times of a baseline and of the resolver, of the same steps; `failed` counts steps without an answer."""
+
+    theirs: list[Spent] = field(default_factory=list)
+    ours: list[Spent] = field(default_factory=list)
+    failed: int = 0
+
+    @property
+    def ratio(self) -> float:
+        """Median CPU time of the baseline over that of the resolver, of the same steps."""
+        return Timing.of(self.theirs).cpu / Timing.of(self.ours).cpu
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a step begins: the state, its piece of the path, and its duration, s."""
+
+    state: State
+    start: float
+    end: float
+    dt: float
+
+
+class _Walk:
+    """A resolver that goes along a plan again and again."""
+
+    def __init__(self, resolver: Resolver, plan: Plan) -> None:
+        self._resolver, self._plan = resolver, plan
+        self.stuck = ""
+        self.restart()
+
+    def restart(self) -> bool:
+        """Go home; False where the arm was stuck there, so that it is of no use to try again."""
+        hopeless = bool(self.stuck) and self.covered == 0.0
+        self._resolver.state = self._resolver.arm.home_state()
+        self._value, self._index, self._stalled, self.stuck = self._plan.path.start, 0, 0, ""
+        return not hopeless
+
+    @property
+    def covered(self) -> float:
+        """The part of the path behind the arm, 0 to 1."""
+        path = self._plan.path
+        return (self._value - path.start) / (path.end - path.start)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the plan is done or the arm is stuck."""
+        return self._index == len(self._plan.marks) or bool(self.stuck)
+
+    @property
+    def place(self) -> _Place:
+        """Where the next step begins."""
+        marks = self._plan.marks
+        end = float(marks[self._index])
+        before = float(marks[self._index - 1]) if self._index else self._plan.path.start
+        return _Place(self._resolver.state, self._value, end, end - before)
+
+    def step(self) -> tuple[Spent, int]:
+        """Take a step; return what it took and its QPs."""
+        place = self.place
+        wall, cpu = perf_counter(), process_time()
+        step = self._resolver.follow(self._plan.path, place.start, place.end, dt=place.dt)
+        spent = Spent(perf_counter() - wall, process_time() - cpu)
+        self._stalled = self._stalled + 1 if step.progress < _STALLED_PROGRESS else 0
+        if step.status is StepStatus.BLOCKED or self._stalled == _STALLED_STEPS:
+            self.stuck = ", ".join(step.blocked_by) or "nothing that has a name"
+        elif step.status is StepStatus.SLOWED:
+            self._value += step.progress * (place.end - place.start)
+        else:
+            self._value = place.end
+            self._index += 1
+        return spent, step.qps
+
+
+class _Clock:
+    """Says how long a run goes on: as told, but for a few steps at least where they are not too slow."""
+
+    def __init__(self, seconds: float, steps: int) -> None:
+        self._seconds, self._steps, self._started = seconds, steps, perf_counter()
+
+    def goes_on(self, count: int) -> bool:
+        """Whether there is to be a step after `count` of them; always a first one."""
+        if count == 0 or count >= self._steps:
+            return count == 0
+        limit = self._seconds * (_OVERRUN if count < _LEAST_STEPS else 1.0)
+        return perf_counter() - self._started < limit
+
+
+def run_alone(resolver: Resolver, plan: Plan, *, seconds: float, steps: int) -> Steps:
+    """Return up to `steps` steps of whole maneuvers, as many as `seconds` suffice for, after a warm-up."""
+    walk = _Walk(resolver, plan)
+    warm_up = _Clock(seconds, _WARM_UP)
+    for count in range(_WARM_UP):
+        if walk.ended or not warm_up.goes_on(count):
+            break
+        walk.step()
+    walk.restart()
+    found, clock = Steps(), _Clock(seconds, steps)
+    before = dict(resolver.phases)
+    while clock.goes_on(len(found.spent)):
+        spent, qps = walk.step()
+        found.spent.append(spent)
+        found.qps.append(qps)
+        now = dict(resolver.phases)
+        for name, total in now.items():
+            found.phases.setdefault(name, []).append(total - before[name])
+        before = now
+        found.covered = max(found.covered, walk.covered)
+        if walk.ended:
+            found.stopped_by = found.stopped_by or walk.stuck
+            if not walk.restart():
+                break
+    return found
+
+
+def run_in_turn(resolver: Resolver, baseline: Contestant, plan: Plan, *, seconds: float, steps: int) -> Pairs:
+    """Return the times of a baseline and of the resolver over the same steps, taken in turn."""
+    walk, found = _Walk(resolver, plan), Pairs()
+    _take(baseline, walk.place, plan)
+    clock, count = _Clock(seconds, steps), 0
+    while clock.goes_on(count):
+        place = walk.place
+        if count % 2:
+            ours, _ = walk.step()
+            theirs, answered = _take(baseline, place, plan)
+        else:
+            theirs, answered = _take(baseline, place, plan)
+            ours, _ = walk.step()
+        count += 1
+        if answered:
+            found.theirs.append(theirs)
+            found.ours.append(ours)
+        else:
+            found.failed += 1
+        if walk.ended and not walk.restart():
+            break
+    return found
+
+
+def _take(contestant: Contestant, place: _Place, plan: Plan) -> tuple[Spent, bool]:
+    """Let a baseline take the step at `place`; return what it took and whether it found an answer."""
+    contestant.place(place.state)
+    wall, cpu = perf_counter(), process_time()
+    try:
+        answered = contestant.step(plan.path, place.start, place.end, place.dt)
+    except (VgtmError, np.linalg.LinAlgError):
+        answered = False
+    return Spent(perf_counter() - wall, process_time() - cpu), answered

@@ -1,0 +1,127 @@
+"""The baseline of general-purpose optimisation: a nonlinear program a step over the node positions, by IPOPT.
+
+Its structure is fixed, so that it is built once and started from the last answer; clearances enter
+linearised, as they do in the QP. With exact distances, and rebuilt when the near pairs change, it would take
+several times as long.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.limits import length_box
+from vgtm_qp.step.linearise import clearance_rows
+from vgtm_qp.step.path import Path
+from vgtm_qp.step.state import State
+
+Array = NDArray[np.float64]
+
+_PAIRS = 24
+_OPTIONS: dict[str, Any] = {
+    "print_time": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": 1e-9,
+    "ipopt.constr_viol_tol": 1e-10,
+    "ipopt.max_iter": 200,
+    "ipopt.warm_start_init_point": "yes",
+    "ipopt.warm_start_bound_push": 1e-6,
+    "ipopt.warm_start_slack_bound_push": 1e-6,
+    "ipopt.warm_start_mult_bound_push": 1e-6,
+    "ipopt.mu_init": 1e-4,
+    "ipopt.bound_relax_factor": 0.0,
+}
+
+
+class NonlinearStep:
+    """Steps of a truss with pin joints and a base at rest: exact lengths and tip, the QP's truss terms."""
+
+    def __init__(self, problem: Problem) -> None:
+        # Any solver serves that makes no kernels, for none is asked.
+        changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
+        self._arm = arm = build_arm(problem.replace(changes))
+        truss, weights = arm.truss, problem.method.weights
+        free = 3 * len(truss.free)
+        x, x0 = ca.SX.sym("x", free), ca.SX.sym("x0", free)
+        goal, across = ca.SX.sym("goal", 3), ca.SX.sym("across", 2, 3)
+        rows = ca.SX.sym("rows", _PAIRS, free)
+        column = arm.layout.node_column
+        nodes = [x[c : c + 3] if c >= 0 else ca.DM(home) for c, home in zip(column, truss.home, strict=True)]
+        lengths = ca.vertcat(*(ca.norm_2(nodes[i] - nodes[j]) for i, j in truss.members))
+        before = ca.substitute(lengths, x, x0)
+        tip = sum(weight * nodes[n] for weight, n in zip(truss.tip_weights, truss.tip, strict=True))
+        ends = [(tip - goal)[arm.task.axes.tolist()]]
+        if arm.task.turns:
+            # The normal of the tip's triangle is the z-axis of its frame.
+            a, b, c = (nodes[n] for n in truss.tip[:3])
+            ends.append(ca.mtimes(across, ca.cross(b - a, c - a)))
+        end = ca.vertcat(*ends)
+        actuators = truss.actuators.tolist()
+        changed = (lengths - before)[actuators]
+        off_home = lengths[actuators] - arm.home_lengths[truss.actuators]
+        objective = 0.5 * (
+            weights.node_rate * ca.sumsqr(x - x0)
+            + weights.actuator_rate * ca.sumsqr(changed)
+            + weights.stroke_centring * ca.sumsqr(off_home)
+        )
+        parameters = ca.vertcat(x0, goal, ca.vec(across), ca.vec(rows))
+        g = ca.vertcat(lengths, end, ca.mtimes(rows, x - x0))
+        self._solver = ca.nlpsol("step", "ipopt", {"x": x, "p": parameters, "f": objective, "g": g}, _OPTIONS)
+        self._ends = int(end.numel())
+        self._rows = np.zeros((_PAIRS, free))
+        self._multipliers = np.zeros(free), np.zeros(int(g.numel()))
+        self._state = arm.home_state()
+
+    def place(self, state: State) -> None:
+        """Stand in `state`."""
+        self._state = state
+
+    def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
+        """Move to the value `end` of `path` in `dt` seconds; False where IPOPT fails."""
+        arm, state = self._arm, self._state
+        truss, actuators = arm.truss, arm.truss.actuators
+        here, goal = state.nodes[truss.free].reshape(-1), path.at(end)
+        lower, upper = arm.home_lengths.copy(), arm.home_lengths.copy()
+        limits = truss.stroke[actuators], truss.rate[actuators], truss.acceleration[actuators]
+        lower[actuators], upper[actuators] = length_box(
+            state.lengths[actuators], state.length_rates[actuators], *limits, dt, state.duration or None
+        )
+        floors = self._clearances(state)
+        zero = np.zeros(self._ends)
+        across = goal.rotation[:, :2].T
+        moved = state.motion[truss.free].reshape(-1)
+        answer = self._solver(
+            x0=here + moved,
+            p=np.concatenate([here, goal.position, across.T.reshape(-1), self._rows.T.reshape(-1)]),
+            lbg=np.concatenate([lower, zero, floors]),
+            ubg=np.concatenate([upper, zero, np.full(_PAIRS, np.inf)]),
+            lam_x0=self._multipliers[0],
+            lam_g0=self._multipliers[1],
+        )
+        if not self._solver.stats()["success"]:
+            return False
+        self._multipliers = np.asarray(answer["lam_x"]).reshape(-1), np.asarray(answer["lam_g"]).reshape(-1)
+        self.reached = np.array(state.nodes)
+        self.reached[truss.free] = np.asarray(answer["x"]).reshape(-1, 3)
+        return True
+
+    def _clearances(self, state: State) -> Array:
+        """Write the rows of the nearest pairs; return their lower bounds (24,), m. Rows may ask nothing."""
+        arm = self._arm
+        pairs = arm.monitor.near(state.nodes, state.time, arm.influence, use_fcl=False)
+        found = clearance_rows(arm.monitor, pairs, arm.safe, arm.self_safe)
+        nearest = np.argsort(-found.lower)[:_PAIRS]
+        self._rows[:] = 0.0
+        floors = np.full(_PAIRS, -1.0)
+        floors[: len(nearest)] = np.minimum(found.lower[nearest], 0.0)
+        first = arm.layout.node_column[found.nodes[nearest]]
+        row, slot = np.nonzero(first >= 0)
+        columns = first[row, slot][:, None] + np.arange(3)
+        np.add.at(self._rows, (row[:, None], columns), found.coefficients[nearest[row], slot])
+        return floors

@@ -1,0 +1,266 @@
+"""The document of a measurement: every scene's numbers, growth with the bays, ratios to an older one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.bench.contestants import BASELINES, Name, make_baseline
+from vgtm_qp.bench.fresh import Fresh, measure_fresh, measure_start
+from vgtm_qp.bench.machine import commit, describe_machine, versions
+from vgtm_qp.bench.measure import Breakdown, Timing, run_alone, run_in_turn
+from vgtm_qp.bench.scenes import Scene
+from vgtm_qp.errors import ResultError, VgtmError
+from vgtm_qp.maneuver.plan import Plan, make_plan
+from vgtm_qp.step.resolver import Resolver
+
+SCHEMA_VERSION = 1
+LEAST_BAYS = 50
+"""Growth with the bays is fitted from here on: below, what every step costs hides it."""
+
+
+@dataclass(frozen=True)
+class Against:
+    """A baseline on a scene.
+
+    Attributes
+    ----------
+    step : Timing or None
+        Its own steps.
+    ours : float or None
+        Median CPU time of the resolver over the same steps, s.
+    ratio : float or None
+        Its median CPU time over that.
+    failed : int
+        Steps that it found no answer to; they are not in the times.
+    skipped : str
+        Why it was not measured, empty where it was.
+    """
+
+    step: Timing | None = None
+    ours: float | None = None
+    ratio: float | None = None
+    failed: int = 0
+    skipped: str = ""
+
+
+@dataclass(frozen=True)
+class SceneReport:
+    """What was measured on a scene; seconds, bytes.
+
+    Attributes
+    ----------
+    covered : float
+        The part of the maneuver that the measured steps came through, 0 to 1.
+    stopped_by : str
+        What blocked the arm, empty where nothing did.
+    qps : float
+        QPs a step.
+    warm, cold : Fresh
+        Measures of a fresh process; `cold` where it was asked for.
+    """
+
+    name: str
+    kind: str
+    bays: int
+    tracking: str
+    members: int
+    actuators: int
+    obstacles: int
+    covered: float
+    stopped_by: str
+    step: Timing
+    breakdown: Breakdown
+    qps: float
+    warm: Fresh
+    cold: Fresh | None
+    baselines: dict[str, Against]
+
+
+def measure_scene(
+    scene: Scene, names: Sequence[Name], *, seconds: float, steps: int, cold: bool = False
+) -> SceneReport:
+    """Measure one scene: alone, in turn with each of the baselines, and in fresh processes.
+
+    Parameters
+    ----------
+    seconds, steps
+        Each run, alone and in turn with each baseline, ends after so many steps or when so much time has passed.
+    cold
+        Set up with an empty cache of kernels too.
+    """
+    problem = scene.problem
+    resolver = Resolver(problem)
+    plan = make_plan(problem, *resolver.tip())
+    alone = run_alone(resolver, plan, seconds=seconds, steps=steps)
+    against: dict[str, Against] = {
+        name: _against(scene, name, resolver, plan, seconds=seconds, steps=steps) for name in names
+    }
+    data = problem.to_dict()
+    truss = resolver.arm.truss
+    return SceneReport(
+        name=scene.name,
+        kind=scene.kind,
+        bays=scene.bays,
+        tracking=scene.tracking,
+        members=truss.member_count,
+        actuators=len(truss.actuators),
+        obstacles=len(problem.obstacle),
+        covered=alone.covered,
+        stopped_by=alone.stopped_by,
+        step=Timing.of(alone.spent),
+        breakdown=Breakdown.of([spent.wall for spent in alone.spent], alone.phases),
+        qps=float(np.mean(alone.qps)),
+        warm=measure_fresh(data),
+        cold=measure_fresh(data, cold=True) if cold else None,
+        baselines=against,
+    )
+
+
+def _against(
+    scene: Scene, name: Name, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
+) -> Against:
+    try:
+        baseline = make_baseline(name, scene.problem, scene.bays)
+    except VgtmError as error:
+        return Against(skipped=str(error).splitlines()[0])
+    pairs = run_in_turn(resolver, baseline, plan, seconds=seconds, steps=steps)
+    if not pairs.theirs:
+        return Against(failed=pairs.failed, skipped="found no answer to any step")
+    return Against(Timing.of(pairs.theirs), Timing.of(pairs.ours).cpu, pairs.ratio, pairs.failed)
+
+
+def measure(
+    scenes: Iterable[Scene],
+    names: Sequence[Name],
+    *,
+    seconds: float,
+    steps: int,
+    cold: bool = False,
+    pinned: bool = True,
+    progress: Callable[[Scene], None] | None = None,
+) -> dict[str, Any]:
+    """Measure scenes and return the document, plain data for JSON.
+
+    Parameters
+    ----------
+    scenes, names
+        What is measured, against which baselines.
+    seconds, steps, cold
+        See :func:`measure_scene`.
+    pinned
+        Whether BLAS was held to one thread; see :func:`vgtm_qp.bench.machine.pin_threads`.
+    progress
+        Called before each scene.
+    """
+    document: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "machine": describe_machine(),
+        "versions": versions(),
+        "settings": {"seconds": seconds, "steps": steps, "cold": cold, "one_blas_thread": pinned},
+        "baselines": {name: BASELINES[name].title for name in names},
+        "start": measure_start(),
+        "scenes": [],
+    }
+    for scene in scenes:
+        if progress is not None:
+            progress(scene)
+        report = measure_scene(scene, names, seconds=seconds, steps=steps, cold=cold)
+        document["scenes"].append(asdict(report))
+    document["growth"] = growth(document["scenes"])
+    return document
+
+
+def growth(scenes: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the exponent of the bays in the CPU time of a step between two cubes, by method and tracking.
+
+    Fitted by least squares of the logarithms over arms of 50 bays and more, where there are two at least.
+    """
+    points: dict[tuple[str, str], list[tuple[int, float]]] = {}
+    for scene in scenes:
+        if scene["kind"] != "cubes" or scene["bays"] < LEAST_BAYS:
+            continue
+        medians = {"qp": scene["step"]["cpu"]}
+        medians |= {name: found["step"]["cpu"] for name, found in scene["baselines"].items() if found["step"]}
+        for method, median in medians.items():
+            points.setdefault((method, scene["tracking"]), []).append((scene["bays"], median))
+    return [
+        {
+            "method": method,
+            "tracking": tracking,
+            "bays": [bays for bays, _ in found],
+            "exponent": _exponent(np.array(found, dtype=float)),
+        }
+        for (method, tracking), found in points.items()
+        if len({bays for bays, _ in found}) > 1
+    ]
+
+
+def _exponent(points: NDArray[np.float64]) -> float:
+    """Return the slope of the second column over the first (P, 2), both taken as logarithms."""
+    x, y = (np.log(points) - np.log(points).mean(axis=0)).T
+    return float(x @ y / (x @ x))
+
+
+def load_document(path: Path) -> dict[str, Any]:
+    """Return a document that was printed before.
+
+    Raises
+    ------
+    ResultError
+        The file cannot be read, or is something else.
+    """
+    wrong = f"{path} is not what vgtm bench --json prints"
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ResultError(f"{wrong}: {error}") from None
+    keys = ("schema_version", "commit", "time", "scenes")
+    if not isinstance(document, dict) or any(key not in document for key in keys):
+        raise ResultError(f"{wrong}: it has to have {', '.join(keys)}")
+    if document["schema_version"] != SCHEMA_VERSION:
+        raise ResultError(f"{path} has schema version {document['schema_version']}, not {SCHEMA_VERSION}")
+    return document
+
+
+def compare(new: dict[str, Any], old: dict[str, Any]) -> dict[str, Any]:
+    """Return the ratios of a document to an older one, scene by scene, for the scenes that both have.
+
+    ``cpu`` is the ratio of the median CPU times. Between two runs the machine itself may have changed;
+    ``corrected`` is that ratio with both times divided by those of the baseline ``by``, the first that both have.
+    """
+    before = {scene["name"]: scene for scene in old["scenes"]}
+    rows = []
+    for scene in new["scenes"]:
+        other = before.get(scene["name"])
+        if other is None:
+            continue
+        by = next((name for name in BASELINES if _ratio(scene, name) and _ratio(other, name)), None)
+        rows.append(
+            {
+                "name": scene["name"],
+                "old": other["step"]["cpu"],
+                "new": scene["step"]["cpu"],
+                "cpu": scene["step"]["cpu"] / other["step"]["cpu"],
+                "p99": scene["step"]["p99"] / other["step"]["p99"],
+                "setup": scene["warm"]["setup"] / other["warm"]["setup"],
+                "memory": scene["warm"]["peak_memory"] / other["warm"]["peak_memory"],
+                "corrected": _ratio(other, by) / _ratio(scene, by) if by else None,
+                "by": by,
+            }
+        )
+    return {"commit": old["commit"], "time": old["time"], "scenes": rows}
+
+
+def _ratio(scene: dict[str, Any], name: str) -> float:
+    """Return a baseline's ratio on a scene, 0 where it has none."""
+    return float(scene["baselines"].get(name, {}).get("ratio") or 0.0)

@@ -1,0 +1,131 @@
+"""The scenes that are measured: bundled maneuvers, and the one between two cubes for any number of bays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from vgtm_qp.problem import Problem, load_problem
+
+Kind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral"]
+Tracking = Literal["elastic", "hard"]
+
+KINDS: tuple[Kind, ...] = get_args(Kind)
+TRACKINGS: tuple[Tracking, ...] = get_args(Tracking)
+BAYS = (5, 10, 20, 50, 100, 200, 500, 1000)
+CLUTTERED_BAYS = 50
+CLUTTER = 100
+
+_BUNDLED_BAYS = 5
+_BAY = math.sqrt(2.0 / 3.0)
+"""Height of an octahedral bay whose members are all 1 m long, m."""
+_SHIFT, _SINK = 1.6, 0.78
+"""What the tip is moved by sideways, and down for five bays, m."""
+_EDGE = 0.9
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A problem to be measured.
+
+    Attributes
+    ----------
+    name : str
+        Kind, bays, and "hard" where the faces stay on the curve exactly.
+    kind : str
+    bays : int
+    tracking : str
+        "elastic", "hard", or "none" where there is no curve.
+    problem : Problem
+    """
+
+    name: str
+    kind: Kind
+    bays: int
+    tracking: str
+    problem: Problem
+
+
+def make_scenes(
+    kinds: Iterable[Kind] = KINDS, bays: Sequence[int] = BAYS, trackings: Sequence[Tracking] = TRACKINGS
+) -> list[Scene]:
+    """Return the scenes of these kinds; `bays` are those of the arms between two cubes.
+
+    A direction of the tip cannot be held with hard tracking, so that ``pointing`` is elastic alone.
+    """
+    scenes = []
+    for kind in dict.fromkeys(kinds):
+        if kind == "tetrahedral":
+            problem = load_problem("tetrahedral_truss_circle")
+            scenes.append(Scene("tetrahedral", kind, 14, "none", problem))
+            continue
+        for count in _bays_of(kind, bays):
+            problem = _problem(kind, count)
+            for tracking in ("elastic",) if kind == "pointing" else dict.fromkeys(trackings):
+                hard = tracking == "hard"
+                name = f"{kind}-{count}" + ("-hard" if hard else "")
+                scenes.append(
+                    Scene(name, kind, count, tracking, problem.replace({"method.hard_tracking": hard}))
+                )
+    return scenes
+
+
+def _bays_of(kind: Kind, bays: Sequence[int]) -> Iterable[int]:
+    if kind == "cubes":
+        return dict.fromkeys(bays)
+    return (CLUTTERED_BAYS,) if kind == "clutter" else (_BUNDLED_BAYS,)
+
+
+def _problem(kind: Kind, bays: int) -> Problem:
+    if kind == "free":
+        return load_problem("five_bay_free")
+    if kind == "pointing":
+        return load_problem("five_bay_two_cubes_pointing")
+    problem = load_problem("five_bay_two_cubes")
+    if bays != _BUNDLED_BAYS:
+        problem = _scaled(problem, bays)
+    if kind == "clutter":
+        cubes = [*problem.to_dict()["obstacle"], *_clutter(bays, CLUTTER - len(problem.obstacle))]
+        problem = problem.replace({"obstacle": cubes, "name": f"{bays}-bay arm among {CLUTTER} cubes"})
+    return problem
+
+
+def _scaled(problem: Problem, bays: int) -> Problem:
+    """Return the maneuver of the five-bay arm for another one, with steps of the same length.
+
+    The cubes keep their distance from the arm and stand at the same parts of its height, so that it has to
+    bend round them; the tip goes sideways by as much, and down by what an arm of that height loses.
+    """
+    height = bays * _BAY
+    stretch = bays / _BUNDLED_BAYS
+    cubes = []
+    for cube in problem.to_dict()["obstacle"]:
+        x, y, z = cube["center"]
+        cubes.append({**cube, "center": [x, y, stretch * z]})
+    return problem.replace(
+        {
+            "name": f"{bays}-bay arm between two cubes",
+            "truss.bays": bays,
+            "curve.control_vertices": min(bays + 1, 8),
+            "maneuver.waypoint": [{"time": 10.0, "position": [_SHIFT, 0.0, height - _SINK / stretch]}],
+            "obstacle": cubes,
+        }
+    )
+
+
+def _clutter(bays: int, count: int) -> list[dict[str, Any]]:
+    """Return cubes in a spiral round the arm, near it below and as far away above as the tip will go."""
+    height = bays * _BAY
+    cubes: list[dict[str, Any]] = []
+    for k in range(count):
+        part = (k + 1.0) / (count + 1.0)
+        angle = k * _GOLDEN_ANGLE
+        # Half a diagonal of the cube and the nodes' circle of 0.58 m stay apart whichever way the cube lies.
+        distance = 1.45 + 1.2 * _SHIFT * part**1.5
+        center = [distance * math.cos(angle), distance * math.sin(angle), part * height]
+        pose = {"center": center, "rotation_vector": [0.0, 0.0, angle]}
+        cubes.append({"name": f"cube {k + 3}", "shape": "box", "size": _EDGE} | pose)
+    return cubes

@@ -1,0 +1,131 @@
+"""A document as tables that can be read on a terminal and pasted into Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+_WIDTH = 240
+_PHASES = ("distance", "qp", "correction", "acceptance", "other")
+
+
+def render(document: dict[str, Any], *, width: int = _WIDTH) -> str:
+    """Return the tables of a document as text."""
+    console = Console(width=width, color_system=None)
+    with console.capture() as captured:
+        console.print(Group(*_parts(document)))
+    lines = captured.get().splitlines()
+    return "\n".join(line.rstrip() for line in lines).strip("\n")
+
+
+def _parts(document: dict[str, Any]) -> Iterator[RenderableType]:
+    machine, start, settings = document["machine"], document["start"], document["settings"]
+    load = machine["load"][0]
+    threads = "one BLAS thread" if settings["one_blas_thread"] else "BLAS THREADS NOT PINNED"
+    cores = f"{machine['cores']} cores, load {load}"
+    yield f"{machine['processor']}, {cores}, Python {machine['python']}, {threads}"
+    yield escape(", ".join(f"{name} {version}" for name, version in document["versions"].items() if version))
+    yield (
+        f"CPU to start: python {start['python']:.3f} s, import vgtm_qp {start['import']:.3f} s, "
+        f"vgtm --help {start['help']:.3f} s\n"
+    )
+    yield _steps(document["scenes"])
+    if document["baselines"]:
+        yield ""
+        yield _baselines(document)
+    if document["growth"]:
+        yield ""
+        yield _growth(document["growth"])
+    if "compared" in document:
+        yield ""
+        yield _compared(document["compared"])
+
+
+def _steps(scenes: Sequence[dict[str, Any]]) -> Table:
+    known = [name for scene in scenes for name in scene["breakdown"]["phases"]]
+    phases = sorted(dict.fromkeys(known), key=lambda name: _PHASES.index(name) if name in _PHASES else -1)
+    heads = ("steps", "QPs", "median", "p95", "p99", "CPU", *phases, "set-up", "cold", "memory", "covered")
+    rows = []
+    for scene in scenes:
+        step, cold = scene["step"], scene["cold"]
+        rows.append(
+            (
+                scene["name"],
+                str(step["steps"]),
+                f"{scene['qps']:.2f}",
+                *(_time(step[key]) for key in ("median", "p95", "p99", "cpu")),
+                *(_time(scene["breakdown"]["phases"].get(name)) for name in phases),
+                _time(scene["warm"]["setup"]),
+                _time(cold["setup"] if cold else None),
+                f"{scene['warm']['peak_memory'] / 1e6:.0f} MB",
+                f"{100 * scene['covered']:.0f} %"
+                + (f", {scene['stopped_by']}" if scene["stopped_by"] else ""),
+            )
+        )
+    return _table(("one step", *heads), rows)
+
+
+def _baselines(document: dict[str, Any]) -> RenderableType:
+    names = list(document["baselines"])
+    rows = []
+    for scene in document["scenes"]:
+        cells = [_against(scene["baselines"][name]) for name in names]
+        rows.append((scene["name"], _time(scene["step"]["cpu"]), *cells))
+    titles = "\n".join(f"{name}: {title}" for name, title in document["baselines"].items())
+    table = _table(("CPU, and ratio to ours in turn", "ours", *names), rows)
+    return Group(table, "", escape(titles))
+
+
+def _against(found: dict[str, Any]) -> str:
+    if not found["step"]:
+        return "-"
+    failed = f", {found['failed']} failed" if found["failed"] else ""
+    return f"{_time(found['step']['cpu'])}, x {found['ratio']:.3g}{failed}"
+
+
+def _growth(rows: Iterable[dict[str, Any]]) -> Table:
+    cells = [
+        (row["method"], row["tracking"], ", ".join(map(str, row["bays"])), f"{row['exponent']:.2f}")
+        for row in rows
+    ]
+    return _table(("method", "tracking", "bays", "growth exponent"), cells)
+
+
+def _compared(found: dict[str, Any]) -> Table:
+    rows = [
+        (
+            row["name"],
+            _time(row["old"]),
+            _time(row["new"]),
+            f"{row['cpu']:.2f}",
+            f"{row['corrected']:.2f} by {row['by']}" if row["by"] else "-",
+            *(f"{row[key]:.2f}" for key in ("p99", "setup", "memory")),
+        )
+        for row in found["scenes"]
+    ]
+    since = f"new / old, {(found['commit'] or found['time'])[:10]}"
+    return _table((since, "old CPU", "new CPU", "ratio", "corrected", "p99", "set-up", "memory"), rows)
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    table = Table(box=box.MARKDOWN)
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="right" if k else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
+
+
+def _time(seconds: float | None) -> str:
+    """Return a time with three digits and its unit."""
+    if seconds is None:
+        return "-"
+    for factor, unit in ((1e6, "us"), (1e3, "ms")):
+        if seconds * factor < 999.5:
+            return f"{seconds * factor:.3g} {unit}"
+    return f"{seconds:.3g} s"
