@@ -1,4 +1,4 @@
-"""Whole maneuvers: the bundled scenes come through, a wall stops the arm safely, no random scene does harm."""
+"""Whole maneuvers: the bundled scenes come through, a wall stops the arm safely, random scenes do no harm."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_wall_stops_the_arm_safely_and_is_named(solver):
 
 
 def test_out_of_reach_the_limits_are_named():
-    """A target beyond what the strokes allow: the arm stretches, stops, and says which actuators end there."""
+    """A target beyond the strokes: the arm stretches, stops, and says which actuators end there."""
     maneuver = solve(arm_problem((0.0, 0.0, 2.62), bays=3, steps=15, truss={"stroke": [0.9, 1.2]}))
     assert maneuver.status == "blocked"
     assert 0.05 < maneuver.reached < 0.95

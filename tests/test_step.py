@@ -615,6 +615,20 @@ def test_staying_where_it_is_is_a_step_too(crate_problem):
     np.testing.assert_allclose(resolver.tip()[0], here, atol=1e-8)
 
 
+@pytest.mark.parametrize("solver", ["daqp", "piqp"])
+@pytest.mark.parametrize("way", [1e-3, 1e-5, 2e-6, 5e-7, 1e-9])
+def test_a_short_way_is_covered_as_surely_as_a_long_one(solver, way):
+    """What pulls in the null space must not outweigh progress, however little there is left to go."""
+    resolver = Resolver(arm_problem(bays=3, method={"solver": solver}))
+    start = resolver.tip()[0]
+    for target in targets_to(np.array([0.7, 0.2, 1.9]), start, 4):
+        resolver.step(position=target)
+    for direction in np.vstack([np.eye(3), -np.eye(3)]):
+        goal = resolver.tip()[0] + way * direction
+        assert resolver.step(position=goal).status is StepStatus.REACHED
+        np.testing.assert_allclose(resolver.tip()[0], goal, atol=2e-8)
+
+
 def test_a_solver_that_fails_blocks_the_step_and_leaves_the_state(crate_problem, monkeypatch):
     import qpsolvers
 
