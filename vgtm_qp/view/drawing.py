@@ -28,6 +28,9 @@ _STROKE_COLOURS = np.array([(0.05, 0.30, 0.80), (0.66, 0.48, 0.72), (0.84, 0.10,
 """Shortest, middle and longest; told apart by the colour-blind, and from the fixed grey."""
 
 _CURVE_POINTS = 49
+_SURROUNDINGS = 0.25
+_FIELD_OF_VIEW, _ELEVATION = float(np.radians(32.0)), float(np.radians(14.0))
+_SIDES = np.radians([-62.0, -118.0, 62.0, 118.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,23 +190,43 @@ class Camera:
 
 
 def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
-    """Return a camera that sees all states (T, N, 3) and the obstacles, across the way of the tip (T, 3)."""
-    points = [nodes.reshape(-1, 3)]
-    points += [mesh.vertices + mesh.center for mesh in drawing.obstacles]
-    cloud = np.concatenate(points)
-    low, high = np.percentile(points[0], (0, 100), axis=0)
+    """Return a camera on the arm in all states (T, N, 3) and what is near it, across the way of the tip (T, 3).
+
+    Of four sides it is the one from which obstacles hide least of the arm.
+    """
+    points = nodes.reshape(-1, 3)
+    low, high = points.min(axis=0), points.max(axis=0)
     reach = float(np.linalg.norm(high - low))
-    near = np.all(np.abs(cloud - (low + high) / 2) < 1.2 * reach, axis=1)
-    low, high = cloud[near].min(axis=0), cloud[near].max(axis=0)
-    target = (low + high) / 2
+    corners = [
+        np.clip(mesh.vertices + mesh.center, low - _SURROUNDINGS * reach, high + _SURROUNDINGS * reach)
+        for mesh in drawing.obstacles
+    ]
+    seen = np.concatenate([points, *corners])
+    target = (seen.min(axis=0) + seen.max(axis=0)) / 2
+    distance = 0.6 * float(np.linalg.norm(np.ptp(seen, axis=0))) / np.tan(_FIELD_OF_VIEW / 2)
     away = tip[int(np.argmax(np.linalg.norm((tip - tip[0])[:, :2], axis=1)))] - tip[0]
     heading = np.arctan2(away[1], away[0]) if np.linalg.norm(away[:2]) > 1e-6 * reach else 0.0
-    azimuth, elevation, field_of_view = heading - np.radians(62.0), np.radians(14.0), np.radians(32.0)
-    direction = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
-    distance = 0.56 * float(np.linalg.norm(high - low)) / np.tan(field_of_view / 2)
-    return Camera(target + distance * direction, target, float(field_of_view))
+    positions = [target + distance * _direction(heading + side, _ELEVATION) for side in _SIDES]
+    hidden = [_hidden(drawing.obstacles, position, nodes[[0, -1]].reshape(-1, 3)) for position in positions]
+    return Camera(positions[int(np.argmin(hidden))], target, _FIELD_OF_VIEW)
+
+
+def _direction(azimuth: float, elevation: float) -> Array:
+    flat = np.cos(elevation)
+    return np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)])
+
+
+def _hidden(obstacles: Sequence[ObstacleMesh], eye: Array, points: Array) -> int:
+    """Return how many of points (K, 3) are behind the box round an obstacle, seen from `eye` (3,)."""
+    ways = points - eye
+    ways = np.where(np.abs(ways) < 1e-12, 1e-12, ways)
+    behind = np.zeros(len(points), dtype=bool)
+    for mesh in obstacles:
+        walls = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) + mesh.center - eye
+        crossings = np.sort(walls[:, None] / ways, axis=0)
+        enters, leaves = crossings[0].max(axis=1), crossings[1].min(axis=1)
+        behind |= (enters < leaves) & (enters < 1.0) & (leaves > 0.0)
+    return int(behind.sum())
 
 
 def resampled(time: Array, values: Array, at: Array) -> Array:

@@ -168,9 +168,8 @@ class _Page:
 
     def _add_widgets(self) -> None:
         gui, session = self._server.gui, self._session
-        gui.configure_theme(
-            control_layout="collapsible", control_width="large", show_logo=False, show_share_button=False
-        )
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
         gui.set_panel_label(session.drawing.name or "vgtm")
         self._read_out = gui.add_html(read_out(session, ""))
         with gui.add_folder("Maneuver"):
