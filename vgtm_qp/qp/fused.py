@@ -5,6 +5,7 @@ It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in 10 to 20 times less ti
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import daqp
@@ -100,16 +101,26 @@ class FusedSolver:
         self._scale = 1.0 / np.sqrt(layout.weights.node_rate)
         self._spread = np.zeros((0, len(truss.free) + 1, 3))
         self._place = np.where(truss.base, len(truss.free), layout.node_column // 3)
-        self._constant_normal = np.full(3, np.nan)
         self._constant = np.zeros((self._size - 1, self._size - 1))
         self._hard = layout.hard_rows
-        self._goal_pull = np.zeros((layout.vertices, 3))
-        self._goal_weight = np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
+        self._draw(layout)
         self._settling = np.zeros((0, actuators)), np.ones(actuators, dtype=bool)
         self._reserve(self._size + 64)
         if self._hard:
             self._soft = np.ones(self._stack.shape[1])
             self._soft[nodes : nodes + self._hard] = 0.0
+
+    def drawn(self, layout: Layout) -> FusedSolver:
+        """Return the solver of a layout that differs in the control vertices with goals alone; buffers are shared."""
+        other = copy.copy(self)
+        other._draw(layout)
+        return other
+
+    def _draw(self, layout: Layout) -> None:
+        self.layout = layout
+        self._goal_pull = np.zeros((layout.vertices, 3))
+        self._goal_weight = np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
+        self._constant_normal = np.full(3, np.nan)
 
     def load(
         self,

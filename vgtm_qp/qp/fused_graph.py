@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -147,7 +148,7 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
     curve_gradient, offset, normal = ca.MX.zeros(0, 1), ca.MX.zeros(3, 0), ca.MX.zeros(3)
     gaps: list[ca.MX] = []
     tilts: list[ca.MX] = []
-    given: list[ca.MX] = []
+    told: list[ca.MX] = []
     if layout.vertices:
         faces = Frames(truss.home[truss.faces], truss.face_frames, truss.faces, constants, "face")
         rotations, _ = faces.at(X)
@@ -164,7 +165,7 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
             curve_slopes = constants.add("curve_slopes", layout.curve_slopes)
             curve_node = _curve_node(layout, len(actuators))
         else:
-            given = _given_curve(layout)
+            told = _given_curve(layout)
             every = ca.vertcat(ca.vec(offset), ca.MX.zeros(layout.torsion))
             curve_node = _given_curve_node(layout, len(actuators))
         turn_scale = ca.sqrt(ca.vertcat(tangent, tangent, roll)[: layout.turns])
@@ -181,20 +182,19 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
             if layout.general is None:
                 arguments += [vertices, offset, normal, curve_weights[:, k], curve_slopes[:, k]]
             else:
-                position, rows, frame, spin = given[0][:, k], *(table[:, block] for table in given[1:4])
-                arguments += [position, rows, frame, spin, every, normal]
+                arguments += [told[0][:, k], *(table[:, block] for table in told[1:4]), every, normal]
             gap, tilt = curve_node(*arguments, truss.face_weights[face], gap_on, turn_on)
             gaps.append(ca.sqrt(tracking) * gap)
             tilts.append(ca.repmat(turn_scale, 1, gap.shape[1]) * tilt)
         if layout.spacings:
-            stretch = ca.horzcat(_free_columns(given[5], normal), motion * given[4] + given[5].T @ every)
+            stretch = ca.horzcat(_free_columns(told[5], normal), motion * told[4] + told[5].T @ every)
             fixed = ca.MX.zeros(layout.spacings, len(actuators))
             tilts.append(ca.sqrt(spacing) * ca.horzcat(fixed, stretch))
         top = ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, layout.free_curve), top[:, -1])
         bend = ca.DM(layout.polygon_bending)
         pull = curve_rate * offset + smoothness * ((offset + motion * vertices) @ bend)
         curve_gradient = ca.vertcat(ca.dot(pull[:, 1], normal), ca.vec(pull[:, 2:]), ca.MX.zeros(layout.torsion))
-    inputs = [X, Y, base, vertices, symbols.lower, symbols.upper, motion, *given, *constants.symbols]
+    inputs = [X, Y, base, vertices, symbols.lower, symbols.upper, motion, *told, *constants.symbols]
     results = [
         ca.vertcat(top, *gaps, *tilts),
         tip_rows,
@@ -227,7 +227,7 @@ def _given_curve(layout: Layout) -> list[ca.MX]:
     return [ca.MX.sym(name, *shape) for name, shape in shapes.items()]
 
 
-def _free_columns(rows: ca.SX, normal: ca.SX) -> ca.SX:
+def _free_columns(rows: Any, normal: Any) -> Any:
     """Return (R, q) rows over what the base leaves free of the curve's coordinates, from (D, R)."""
     return ca.horzcat(rows[3:6, :].T @ normal, rows[6:, :].T)
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.truss.kinematics import member_nodes
@@ -85,6 +86,11 @@ class Layout:
     def general(self) -> CurveShape | None:
         """The curve's shape where its rows have to be computed anew for each QP; None where tables do."""
         return None if self.shape is None or self.shape.is_plain else self.shape
+
+    @property
+    def family(self) -> CurveFamily | None:
+        """The curve's family, where its shape is known."""
+        return None if self.shape is None else self.shape.family
 
     @property
     def is_tabled(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -80,9 +80,10 @@ class CurveShape:
         """Number S of spacing rows."""
         return 0 if self.spacing is None else len(self.spacing)
 
-    def of(self, family: CurveFamily) -> CurveShape:
-        """Return the same with another family or number of control vertices."""
-        return replace(self, family=family)
+    @property
+    def parameters(self) -> Array:
+        """(K,) parameters for tables of weights; those of arc-length nodes are found anew at each curve."""
+        return self.nodes
 
     @cached_property
     def _home_roll(self) -> Array:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.curve.families import CurveFamily, make_family
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
@@ -18,6 +17,7 @@ from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, make_solver
 from vgtm_qp.step.base import BaseMotion
+from vgtm_qp.step.curve import home_curve
 from vgtm_qp.step.engine import Engine, FusedEngine, PlainEngine
 from vgtm_qp.step.linearise import Linearisation
 from vgtm_qp.step.path import rotation_from_vector
@@ -51,6 +51,12 @@ class Arm:
         Least angle between members that share a node, rad.
     dt : float
         Duration of a step, s.
+    torsion : (T,)
+        Torsion coordinates of the curve at home, rad.
+    vertex_goals : (V, 3) or None
+        Where the problem draws control vertices, m.
+    solver : str
+        Name of the QP solver.
     jams : tuple of (str, float)
         Actuated members that lock later than at the start, and the times, s.
     base_motion : BaseMotion or None
@@ -75,6 +81,9 @@ class Arm:
     margin: float
     dt: float
     minimum_angle: float = 0.0
+    torsion: Array = field(default_factory=lambda: np.zeros(0))
+    vertex_goals: Array | None = None
+    solver: str = DEFAULT_SOLVER
     base_motion: BaseMotion | None = None
     jams: tuple[tuple[str, float], ...] = ()
     measure: Clearance | None = None
@@ -85,12 +94,21 @@ class Arm:
             return self.monitor.least(X, time, among=among)[0]
         return self.measure.least(member_ends(self.truss, X).reshape(-1, 3), time, among=among)[0]
 
+    def base_at(self, time: float) -> tuple[Array | None, Array | None]:
+        """Return positions (N, 3), m, whose rows at base nodes are theirs at `time`, and the base's rotation (3, 3).
+
+        None twice where the base rests.
+        """
+        motion = self.base_motion
+        return (None, None) if motion is None else (motion.nodes(time), motion.rotation(time))
+
     def home_state(self) -> State:
         """Return the arm at rest in its home pose at time 0."""
         return State(
             time=0.0,
             nodes=frozen(self.truss.home),
             control_vertices=frozen(self.control_vertices),
+            torsion=frozen(self.torsion),
             lengths=frozen(self.home_lengths),
             length_rates=frozen(np.zeros(self.truss.member_count)),
             motion=frozen(np.zeros_like(self.truss.home)),
@@ -113,7 +131,8 @@ def build_arm(problem: Problem) -> Arm:
     kinematics = Kinematics(truss)
     kinematics.evaluate(truss.home)
     task = TipTask(problem.end_effector.track, kinematics)
-    layout, control_vertices = _layout(problem, truss, task)
+    curve = home_curve(problem, truss, task)
+    layout = curve.layout
     clearance = problem.clearance
     options: dict[str, Any] = {
         "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
@@ -134,7 +153,10 @@ def build_arm(problem: Problem) -> Arm:
         engine=make_engine(problem.method.solver, layout, kinematics, task),
         monitor=monitor,
         home_lengths=truss.home_lengths,
-        control_vertices=control_vertices,
+        control_vertices=curve.vertices,
+        torsion=curve.torsion,
+        vertex_goals=curve.vertex_goals,
+        solver=problem.method.solver,
         safe=clearance.safe,
         self_safe=clearance.between_members,
         influence=clearance.influence,
@@ -152,6 +174,16 @@ def _widest_offset(truss: Truss) -> Array:
     if truss.joints is None:
         return np.zeros(truss.member_count)
     return np.asarray(np.linalg.norm(truss.joints.offset, axis=2).max(axis=1))
+
+
+def reshaped(arm: Arm, layout: Layout) -> Arm:
+    """Return the arm with another curve: a layout of :func:`vgtm_qp.step.curve.with_curve`."""
+    engine: Engine
+    if isinstance(arm.engine, FusedEngine) and layout.family is arm.layout.family:
+        engine = arm.engine.drawn(layout)
+    else:
+        engine = make_engine(arm.solver, layout, arm.kinematics, arm.task)
+    return replace(arm, layout=layout, engine=engine)
 
 
 def make_engine(solver: str, layout: Layout, kinematics: Kinematics, task: TipTask) -> Engine:
@@ -194,45 +226,6 @@ def make_obstacle(spec: Any) -> shapes.Obstacle:
     if spec.shape == "cylinder":
         return shapes.cylinder(spec.name, spec.center, spec.radius, spec.height, rotation, spec.velocity)
     return shapes.mesh(spec.name, spec.file, spec.center, rotation, spec.scale, spec.velocity)
-
-
-def _layout(problem: Problem, truss: Truss, task: TipTask) -> tuple[Layout, Array]:
-    """Return the QP's layout and the control vertices of the curve at home, (V, 3)."""
-    method = problem.method
-    if method.tracking == "none" or not len(truss.faces) or problem.curve is None:
-        empty = np.zeros((0, 0))
-        layout = Layout(truss, empty, empty, np.zeros(0, dtype=np.int64), task.row_names, method.weights)
-        return layout, np.zeros((0, 3))
-    spec = problem.curve
-    options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
-    family = make_family(spec.family, spec.control_vertices, **options)
-    centres = np.einsum("fk,fkc->fc", truss.face_weights, truss.home[truss.faces])
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
-    s = travelled[1:] / travelled[-1]
-    layout = Layout(
-        truss,
-        family.weights(s),
-        family.weights(s, 1),
-        np.arange(1, len(truss.faces)),
-        task.row_names,
-        method.weights,
-        hard_tracking=method.hard_tracking,
-    )
-    return layout, _fitted_vertices(family, s, centres)
-
-
-def _fitted_vertices(family: CurveFamily, s: Array, centres: Array) -> Array:
-    """Return the control vertices (V, 3) at home: on the straight axis, or fitted to the faces of a bent arm."""
-    start, end = centres[0], centres[-1]
-    vertices = start + np.outer(family.abscissae, end - start)
-    bent = np.max(np.abs(np.vstack([family.weights(0.0), family.weights(s)]) @ vertices - centres))
-    if bent > 1e-9 * float(np.linalg.norm(end - start)):
-        weights = family.weights(s)
-        second = np.diff(np.eye(len(vertices)), n=2, axis=0)
-        system = np.vstack([weights[:, 1:], 1e-3 * second[:, 1:]])
-        known = np.vstack([centres[1:] - np.outer(weights[:, 0], start), -1e-3 * np.outer(second[:, 0], start)])
-        vertices = np.vstack([start, np.linalg.lstsq(system, known, rcond=None)[0]])
-    return np.asarray(vertices)
 
 
 def step_duration(maneuver: Any) -> float:

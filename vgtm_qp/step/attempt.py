@@ -87,6 +87,8 @@ class Outcome:
         QPs solved.
     shortfall : Shortfall or None
         What is still too near in the new configuration; None where that was not looked at.
+    torsion : (T,)
+        The new torsion coordinates, rad.
     """
 
     accepted: bool
@@ -98,6 +100,7 @@ class Outcome:
     rows: ClearanceRows | None = None
     iterations: int = 0
     shortfall: Shortfall | None = None
+    torsion: Array = field(default_factory=lambda: np.zeros(0))
 
 
 class Attempt:
@@ -138,7 +141,7 @@ class Attempt:
         """Do it, with pairs that are too `short` of their clearance driven apart by `gain`, m."""
         phases, span, separation = self.phases, target.end - target.start, self.separation
         duration = target.time - state.time
-        X, vertices, progress = state.nodes, state.control_vertices, 0.0
+        X, vertices, torsion, progress = state.nodes, state.control_vertices, state.torsion, 0.0
         guess = share * state.motion
         Y = X + 0.5 * guess
         reach = _MOTION_MARGIN * self._expected(target, guess)
@@ -149,7 +152,8 @@ class Attempt:
         after: Shortfall | None = None
 
         def outcome(reason: str, count: int) -> Outcome:
-            return Outcome(not reason, closed, vertices, progress, reason, first, first_rows, count, after)
+            told = (first, first_rows, count, after, torsion)
+            return Outcome(not reason, closed, vertices, progress, reason, *told)
 
         for count in range(1, self.max_qps + 1):
             motion = count == 1
@@ -164,7 +168,8 @@ class Attempt:
             phases.add("distance")
             goal = target.path.at(target.start + progress * span)
             try:
-                solution = self._solve(X, Y if motion else X, vertices, target, goal, progress, rows, motion=motion)
+                at = (X, Y if motion else X, vertices, target, goal, progress, rows)
+                solution = self._solve(*at, motion=motion, torsion=torsion)
             except InfeasibleStepError:
                 return outcome("infeasible", count)
             except SolverError as error:
@@ -176,7 +181,7 @@ class Attempt:
             X = X + solution.nodes
             if target.base is not None:
                 X = np.where(self.task.base[:, None], target.base, X)
-            vertices = vertices + solution.vertices
+            vertices, torsion = vertices + solution.vertices, torsion + solution.torsion
             progress = min(max(progress + solution.progress, 0.0), 1.0)
             left = (1.0 - progress) * span * float(np.abs([goal.velocity, goal.spin]).max())
             if left <= self.tolerances.tip:
@@ -205,16 +210,16 @@ class Attempt:
                 return outcome("clearance between the states", count)
         return outcome("no convergence", self.max_qps)
 
-    def _solve(self, *at: Any, motion: bool) -> StepSolution:
+    def _solve(self, *at: Any, motion: bool, torsion: Array) -> StepSolution:
         """Return the engine's answer; where even a zero step is forbidden by the margin, without the margin."""
         rows = at[-1]
         try:
-            return self.engine.solve(*at, motion=motion)
+            return self.engine.solve(*at, motion=motion, torsion=torsion)
         except InfeasibleStepError:
             if not motion or not len(rows) or rows.lower.max() <= 0.0:
                 raise
         np.minimum(rows.lower, 0.0, out=rows.lower)
-        return self.engine.solve(*at, motion=motion)
+        return self.engine.solve(*at, motion=motion, torsion=torsion)
 
     def _settle(self, X: Array, target: Target, goal: PathPoint) -> Closed | None:
         """Return the configuration near `X` with its lengths closed and the tip at `goal`; None where another QP is due."""

@@ -11,6 +11,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from vgtm_qp.errors import Mistake
+from vgtm_qp.curve.redundancy import excess_freedom
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
@@ -74,7 +75,14 @@ def find_warnings(problem: Problem, arm: Arm) -> list[Mistake]:
     certain = {mistake.key for mistake in check_problem(problem, arm)}
     warnings = [mistake for distance, mistake in _at_home(problem, arm) if distance > 0.0]
     doubtful = [mistake for mistake in _inside_obstacles(problem, arm, 0.0) if mistake.key not in certain]
-    return [*warnings, *doubtful]
+    return [*warnings, *doubtful, *excess_of_freedom(problem, arm)]
+
+
+def excess_of_freedom(problem: Problem, arm: Arm) -> Iterator[Mistake]:
+    """Yield the number of control vertices if the curve has more freedom than the arm that tracks it."""
+    text = excess_freedom(arm.layout.free_curve, len(arm.truss.actuators))
+    if text is not None:
+        yield problem.mistake(("curve", "control_vertices"), text)
 
 
 def longest_ways(truss: Truss, sources: NDArray[np.int64]) -> Array:

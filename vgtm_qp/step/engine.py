@@ -15,6 +15,7 @@ from scipy.linalg.lapack import dgesv
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
 from vgtm_qp.qp.lengths import LengthSolver
+from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
 from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
@@ -136,6 +137,10 @@ class FusedEngine:
         self._solver = solver
         self._task = task
 
+    def drawn(self, layout: Layout) -> FusedEngine:
+        """Return the engine for a layout that differs in the control vertices with goals alone."""
+        return FusedEngine(self._solver.drawn(layout), self._task)
+
     def solve(
         self,
         X: Array,
@@ -153,7 +158,7 @@ class FusedEngine:
         solver, shape = self._solver, self._solver.layout.general
         curve = None
         if shape is not None:
-            frame = base_frame(solver.layout.truss, target)
+            frame = base_frame(solver.layout.truss, target.base_rotation)
             curve = shape.rows(vertices, np.zeros(0) if torsion is None else torsion, frame)
         solver.load(
             X,

@@ -135,7 +135,7 @@ class Linearisation:
         curve = None
         if layout.general is not None:
             rows = layout.general.rows(
-                vertices, np.zeros(0) if torsion is None else torsion, base_frame(layout.truss, target)
+                vertices, np.zeros(0) if torsion is None else torsion, base_frame(layout.truss, target.base_rotation)
             )
             turns = turn_rows(rows, kinematics.face_rotation[tracked], face_spin[tracked], layout.turns)
             curve = CurveNumbers(
@@ -197,9 +197,10 @@ class Linearisation:
         )
 
 
-def base_frame(truss: Truss, target: Target) -> Array:
-    """Return (3, 3) the frame of the base face at the end of the step."""
-    return truss.face_frames[0] if target.base_rotation is None else target.base_rotation @ truss.face_frames[0]
+def base_frame(truss: Truss, rotation: Array | None) -> Array:
+    """Return (3, 3) the frame of the base face where the base is rotated by `rotation` (3, 3), or rests."""
+    home = truss.face_frames[0]
+    return home if rotation is None else np.asarray(rotation @ home)
 
 
 def clearance_rows(

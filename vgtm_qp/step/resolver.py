@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vgtm_qp.curve.curve import Curve
+from vgtm_qp.curve.families import CurveFamily
+from vgtm_qp.curve.redundancy import add_control_vertices, remove_control_vertices
 from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
-from vgtm_qp.step.arm import Arm, build_arm
+from vgtm_qp.step.arm import Arm, build_arm, reshaped
 from vgtm_qp.step.attempt import Attempt
-from vgtm_qp.step.checks import unreachable_tip
+from vgtm_qp.step.checks import excess_of_freedom, unreachable_tip
+from vgtm_qp.step.curve import curve_key, with_curve
 from vgtm_qp.step.limits import length_box
-from vgtm_qp.step.linearise import Target
+from vgtm_qp.step.linearise import Target, base_frame
 from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
 from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.state import State, frozen
@@ -106,6 +112,8 @@ class Resolver:
             mistakes = list(unreachable_tip(problem, arm))
             if mistakes:
                 raise ProblemError(str(problem.source or problem.name), mistakes)
+            for excess in excess_of_freedom(problem, arm):
+                warnings.warn(f"{excess.key} = {excess.value}: {excess.expected}", stacklevel=2)
         distances = Distances(arm.safe, arm.self_safe, arm.influence, arm.margin, arm.minimum_angle)
         self._separation = Separation(arm.truss, arm.monitor, distances)
         self._attempt = Attempt(arm.engine, arm.task, self._separation)
@@ -117,6 +125,8 @@ class Resolver:
             truss.rate[truss.actuators],
             truss.acceleration[truss.actuators],
         )
+        self._vertex_goals = arm.vertex_goals
+        self._arms: dict[tuple[object, ...], Arm] = {}
         self._row_names = [f"stroke: {name}" for name in self._actuator_names]
         self._locked: set[str] = set()
         self._jams = sorted(arm.jams, key=lambda jam: -jam[1])
@@ -151,6 +161,83 @@ class Resolver:
         self._limits[0][k] = self.state.lengths[self.arm.truss.actuators[k]]
         self._row_names[k] = f"locked: {name}"
         self._locked.add(name)
+
+    @property
+    def control_vertex_goals(self) -> dict[int, Array]:
+        """Where control vertices are drawn to, m, by their index; may be set as a whole."""
+        drawn = self.arm.layout.vertex_goals
+        return {i: np.array(self._vertex_goals[i]) for i in drawn} if self._vertex_goals is not None else {}
+
+    @control_vertex_goals.setter
+    def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
+        vertices = len(self.state.control_vertices)
+        places = np.full((vertices, 3), np.nan)
+        for index, position in goals.items():
+            if not (isinstance(index, int | np.integer) and 0 <= index < vertices):
+                last = f"0 to {vertices - 1}" if vertices else "none: there is no curve"
+                raise GoalError(f"{index!r} is not a control vertex; they are {last}")
+            places[index] = _vector(position, f"the goal of control vertex {index}")
+        drawn = tuple(sorted(int(index) for index in goals))
+        if drawn != self.arm.layout.vertex_goals:
+            self._reshape(self.arm.layout.family, drawn)
+        self._vertex_goals = places if drawn else None
+
+    def set_control_vertex_goal(self, index: int, position: ArrayLike | None) -> None:
+        """Draw a control vertex to a place in the null space of the tip's motion; None lets it go.
+
+        The arm follows as far as the tip's goal, limits and clearance let it.
+
+        Parameters
+        ----------
+        index
+            Control vertex, 0 at the base; p_0 and the direction of p_1 belong to the base.
+        position
+            (3,) where it should go, m, or None.
+
+        Raises
+        ------
+        GoalError
+            There is no such control vertex, or the position is not three finite numbers.
+        """
+        goals: dict[int, ArrayLike] = dict(self.control_vertex_goals)
+        goals.pop(index, None)
+        self.control_vertex_goals = goals if position is None else {**goals, index: position}
+
+    def set_control_vertices(self, count: int) -> float:
+        """Give the curve another number of control vertices where it is; return how far it moved, m.
+
+        More of them move a Bezier curve or B-spline by rounding only; fewer are fitted. Goals of control vertices end.
+
+        Raises
+        ------
+        GoalError
+            The arm has no curve.
+        CurveError
+            So few control vertices cannot keep both ends and the base tangent.
+        """
+        shape = self.arm.layout.shape
+        if shape is None:
+            raise GoalError("this arm has no curve whose control vertices could change")
+        self.control_vertex_goals = {}
+        state = self.state
+        frame = base_frame(self.arm.truss, self.arm.base_at(state.time)[1])
+        curve = Curve(shape.family, state.control_vertices, state.torsion, frame)
+        more = count - len(state.control_vertices)
+        change = add_control_vertices(curve, more) if more >= 0 else remove_control_vertices(curve, -more)
+        if more:
+            self._reshape(change.curve.family, ())
+            self.state = replace(state, control_vertices=frozen(change.curve.control_vertices))
+        return change.change
+
+    def _reshape(self, family: CurveFamily | None, vertex_goals: tuple[int, ...]) -> None:
+        """Go on with another curve; what was built for one is kept for the next time."""
+        self._arms[curve_key(self.arm.layout)] = self.arm
+        wanted = with_curve(self.arm.layout, family, vertex_goals)
+        key = curve_key(wanted)
+        if key not in self._arms:
+            self._arms[key] = reshaped(self.arm, wanted)
+        self.arm = self._arms[key]
+        self._attempt.engine = self.arm.engine
 
     def _until_jam(self, dt: float) -> float:
         """Lock what jams by now; return the part of a step of `dt` that ends at the next jam, 1 where none is due."""
@@ -238,11 +325,11 @@ class Resolver:
         lower, upper = length_box(
             state.lengths[actuators], state.length_rates[actuators], *self._limits, dt, state.duration or None
         )
-        base = None if self.arm.base_motion is None else self.arm.base_motion.nodes(state.time + dt)
+        then = (state.time + dt, *self.arm.base_at(state.time + dt), self._vertex_goals)
         share, outcome = 1.0, None
         while share >= smallest:
             reach = start + share * whole * (end - start)
-            target = Target(path, start, reach, lower, upper, state.time + dt, base)
+            target = Target(path, start, reach, lower, upper, *then)
             outcome = self._attempt.run(state, target, share)
             if outcome.accepted:
                 break
@@ -258,6 +345,7 @@ class Resolver:
             time=state.time + dt,
             nodes=frozen(closed.X),
             control_vertices=frozen(outcome.control_vertices),
+            torsion=frozen(outcome.torsion),
             lengths=frozen(closed.lengths),
             length_rates=frozen((closed.lengths - state.lengths) / dt),
             motion=frozen(closed.X - state.nodes),

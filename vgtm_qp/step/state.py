@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ class State:
         Node positions, m.
     control_vertices : (V, 3)
         Reference curve, m; V = 0 without a curve.
+    torsion : (T,)
+        Torsion coordinates of the curve's frame, rad.
     lengths : (M,)
         Member lengths, m.
     length_rates : (M,)
@@ -51,4 +53,5 @@ class State:
     length_rates: Array
     motion: Array
     duration: float = 0.0
+    torsion: Array = field(default_factory=lambda: frozen(np.zeros(0)))
     shortfall: Mapping[Pair, float] | None = None
