@@ -90,6 +90,36 @@ def test_a_way_through_an_obstacle_is_refused_and_the_obstacle_named():
     assert "wall" in read_out(session, "")
 
 
+def test_a_held_control_vertex_is_drawn_while_the_tip_stays():
+    session = Session(vq.load_problem("five_bay_free"))
+    tip, start = session.tip, session.state.control_vertices[3].copy()
+    goal = start + np.array([0.4, 0.2, 0.0])
+    session.want_vertex(3, goal)
+    for _ in range(40):
+        session.advance(PERIOD)
+    assert np.linalg.norm(session.state.control_vertices[3] - goal) < 0.1 * np.linalg.norm(start - goal)
+    assert np.allclose(session.tip, tip, atol=1e-6)
+    session.want_vertex(3, None)
+    assert not session.advance(PERIOD)
+
+
+@pytest.mark.parametrize("method", ["pseudoinverse", "curve-pseudoinverse"])
+def test_the_older_methods_enter_the_cube_where_the_qp_keeps_out(session: Session, method: str):
+    goal = np.array([1.6, 0.0, 3.0])
+    session.want_tip(goal)
+    for _ in range(120):
+        session.advance(PERIOD)
+    assert np.allclose(session.tip, goal, atol=1e-3)
+    assert session.reading().clearance >= session.problem.clearance.safe - 1e-9
+    session.change({"method.name": method})
+    session.go_home()
+    session.want_tip(goal)
+    for _ in range(120):
+        session.advance(PERIOD)
+    assert session.reading().clearance < 0.0
+    assert "#b91c1c" in read_out(session, "")
+
+
 def test_a_changed_setting_keeps_the_state_and_a_wrong_one_changes_nothing(session: Session):
     session.want_tip(session.tip + np.array([0.1, 0.0, 0.0]))
     for _ in range(10):

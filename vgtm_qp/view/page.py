@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 _PERIOD = 1.0 / 30.0
 _READ_OUT_PERIOD = 0.1
 _LEAST_EXPONENT = -4.0
+_HINT = "Drag the red ball: the tip follows. Hold a green one: the curve is drawn there, the tip stays."
 _TARGET_COLOUR = (214, 39, 40)
 _SLIDERS = (
     "node_rate",
@@ -91,11 +92,14 @@ class _Page:
         self._scene.look(camera_for(session.drawing, nodes, path))
         self._target = self._add_handle("/tip target", session.target, 0.085, _TARGET_COLOUR, self._drag_tip)
         colour = tuple(round(255 * channel) for channel in CURVE_COLOUR)
-        self._vertices = [
-            self._add_handle(f"/control vertex {i}", point, 0.06, colour, self._drag_vertex(i))
-            for i, point in enumerate(state.control_vertices)
-            if session.vertices_can_be_wanted and i > 0
-        ]
+        # The first vertex belongs to the base, and the tip has a ball of its own at the last.
+        self._vertices = {
+            i: self._add_handle(
+                f"/control vertex {i}", state.control_vertices[i], 0.06, colour, self._drag_vertex(i)
+            )
+            for i in range(1, len(state.control_vertices) - 1)
+            if session.vertices_can_be_wanted
+        }
         self._add_widgets()
         if maneuver:
             self._show(maneuver)
@@ -142,7 +146,7 @@ class _Page:
         session = self._session
         self._scene.move(session.state.nodes, session.state.control_vertices, session.state.time)
         self._target.position = session.target
-        for i, handle in enumerate(self._vertices, start=1):
+        for i, handle in self._vertices.items():
             handle.position = session.vertex_goals.get(i, session.state.control_vertices[i])
 
     def _add_handle(self, name: str, position: Array, radius: float, colour: Any, moved: Any) -> Any:
@@ -162,7 +166,12 @@ class _Page:
     def _drag_vertex(self, index: int) -> Callable[[Array, bool], None]:
         def moved(position: Array, released: bool) -> None:
             self._pause()
-            self._session.want_vertex(index, None if released else position)
+            if self._session.vertices_can_be_wanted:
+                self._session.want_vertex(index, None if released else position)
+            else:
+                self._message = (
+                    f"the method {self._session.problem.method.name} takes no goals of control vertices"
+                )
 
         return moved
 
@@ -179,7 +188,7 @@ class _Page:
             )
             again = gui.add_button("Solve and play", hint="from home, with the method and weights set below")
         with gui.add_folder("By hand"):
-            gui.add_markdown("Drag the red ball: the tip follows. Press *Home* to start again.")
+            gui.add_markdown(_HINT)
             home = gui.add_button("Home")
             method = gui.add_dropdown("method", METHODS, initial_value=session.problem.method.name)
             safe = gui.add_slider(
