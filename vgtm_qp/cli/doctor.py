@@ -13,7 +13,7 @@ from vgtm_qp.cli.output import ExitCode, Json, document, say, table
 _CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
 _EXTRAS = {
     "view": ("viser",),
-    "export": ("viser", "mcap", "mcap-ros2-support", "pillow", "pyyaml"),
+    "export": ("viser", "mcap", "mcap-ros2-support", "imageio-ffmpeg", "pillow", "pyyaml"),
     "mujoco": ("mujoco",),
     "cluster": ("dask", "distributed"),
     "test": ("hypothesis", "jsonschema", "mypy", "playwright", "pytest", "pytest-xdist", "rosbags", "ruff"),
