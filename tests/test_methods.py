@@ -279,9 +279,7 @@ def test_a_moving_base_enters_the_conventional_solution() -> None:
     base = resolver.arm.truss.base
     np.testing.assert_allclose(states[-1][base] - states[0][base], [[0.095, 0.0, 0.0475]] * 3, atol=2e-3)
     fixed = resolver.arm.layout.fixed
-    np.testing.assert_allclose(
-        resolver.state.lengths[fixed], resolver.arm.home_lengths[fixed], atol=1e-10
-    )
+    np.testing.assert_allclose(resolver.state.lengths[fixed], resolver.arm.home_lengths[fixed], atol=1e-10)
     data["method"] |= {"name": "curve-pseudoinverse", "tracking": "recursive"}
     with pytest.raises(CurveError, match="moving base"):
         make_resolver(Problem.from_dict(data))

@@ -25,7 +25,9 @@ def study(
     workers: Annotated[int, Parameter(help="processes; studies of run time use one, alone")] = 1,
     dask: Annotated[str | None, Parameter(help="address of a dask.distributed scheduler")] = None,
     short: Annotated[bool, Parameter(negative="", help="a quick look: fewer and smaller runs")] = False,
-    output: Annotated[Path, Parameter(name=["--output", "-o"], help="folder of the results")] = Path("studies"),
+    output: Annotated[Path, Parameter(name=["--output", "-o"], help="folder of the results")] = Path(
+        "studies"
+    ),
     json: Json = False,
 ) -> int:
     """Run studies and write rows (CSV, JSON), a figure (PDF) and a text (Markdown) for each.
@@ -47,9 +49,7 @@ def study(
     written = []
     for name, title in titles.items():
         with _bar(title, shown=not json) as progress:
-            place = run_study(
-                name, output, short=short, workers=workers, dask=dask, progress=progress
-            )
+            place = run_study(name, output, short=short, workers=workers, dask=dask, progress=progress)
         written.append({"study": name, "title": title, "folder": str(place)})
         if not json:
             say((place / f"{name}.md").read_text())

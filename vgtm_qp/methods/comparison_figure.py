@@ -29,7 +29,7 @@ def plot_comparison(report: Report) -> Figure:
     rows = dict(zip(keys, report.rows, strict=True))
     lines = -(-len(keys) // _COLUMNS)
     figure = Figure(figsize=(11.0, 3.1 * lines + 3.0), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=[3.1 * lines, 3.0])
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[3.1 * lines, 3.0]).ravel()
     panels = upper.subplots(lines, min(_COLUMNS, len(keys)), squeeze=False).ravel()
     for axes in panels[len(keys) :]:
         axes.set_axis_off()
@@ -44,7 +44,9 @@ def plot_comparison(report: Report) -> Figure:
 def _draw_maneuver(axes: Axes, row: Row, maneuver: Maneuver | None, limits: tuple[Array, Array]) -> None:
     verdict = "solved" if row.solved else "keeps all but drifts" if row.kept else "failed"
     colour = {"solved": "tab:green", "failed": "tab:red"}.get(verdict, "tab:orange")
-    axes.set_title(f"{row.method}\n{verdict}, {100 * row.reached:.0f} % of the path", fontsize=7.5, color=colour)
+    axes.set_title(
+        f"{row.method}\n{verdict}, {100 * row.reached:.0f} % of the path", fontsize=7.5, color=colour
+    )
     axes.set_aspect("equal")
     axes.set_xlim(limits[0][0], limits[1][0])
     axes.set_ylim(limits[0][1], limits[1][1])
@@ -59,7 +61,9 @@ def _draw_maneuver(axes: Axes, row: Row, maneuver: Maneuver | None, limits: tupl
         ends = maneuver.nodes[index][maneuver.members][:, :, [0, 2]]
         actuated = maneuver.member_actuated
         axes.add_collection(LineCollection(list(ends[~actuated]), colors="0.35", linewidths=0.7, alpha=shade))
-        axes.add_collection(LineCollection(list(ends[actuated]), colors="tab:blue", linewidths=0.9, alpha=shade))
+        axes.add_collection(
+            LineCollection(list(ends[actuated]), colors="tab:blue", linewidths=0.9, alpha=shade)
+        )
     axes.plot(*maneuver.tip_position[:, [0, 2]].T, color="tab:red", linewidth=0.8)
     if not row.solved:
         axes.set_xlabel(_folded(row.reason), fontsize=6.0)
@@ -72,7 +76,11 @@ def _draw_curves(area: Any, report: Report, several: bool) -> None:
         maneuver = report.maneuvers.get((row.problem, row.method))
         if maneuver is None:
             continue
-        style: dict[str, Any] = {"color": f"C{k % 10}", "linestyle": ("-", "--", ":")[k // 10 % 3], "linewidth": 1.1}
+        style: dict[str, Any] = {
+            "color": f"C{k % 10}",
+            "linestyle": ("-", "--", ":")[k // 10 % 3],
+            "linewidth": 1.1,
+        }
         fixed = ~maneuver.member_actuated
         off = np.abs(maneuver.member_lengths - maneuver.member_lengths[0])[:, fixed].max(axis=1, initial=0.0)
         near = np.where(np.isfinite(maneuver.clearance), maneuver.clearance, np.nan)

@@ -57,7 +57,7 @@ class _Group:
     def matrices(self, values: Array) -> tuple[Array, Array]:
         """Return the derivatives by own nodes (K, r, c) and by those before (K, r, b)."""
         flat = np.bincount(self._target, weights=values[self._source], minlength=int(np.prod(self.shape)))
-        stacked = flat.reshape(self.shape)
+        stacked = flat.reshape(self.shape).astype(np.float64, copy=False)
         return stacked[:, :, : self.columns], stacked[:, :, self.columns :]
 
     def stacked(self, lengths: Array, moved: Array, turned: Array) -> Array:
@@ -161,7 +161,7 @@ def least_norm(A: Array, b: Array) -> Array:
     rows, columns = A.shape[-2:]
     try:
         if rows == columns:
-            return np.linalg.solve(A, b)
+            return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
         At = np.swapaxes(A, -1, -2)
         return np.asarray(At @ np.linalg.solve(A @ At, b))
     except np.linalg.LinAlgError:

@@ -1,4 +1,4 @@
-"""The conventional solution, eqs. (25)-(28): the whole truss at once by a pseudoinverse, without limits or clearance."""
+"""The conventional solution, eqs. (25)-(28): the whole truss at once, without limits or clearance."""
 
 from __future__ import annotations
 
@@ -117,8 +117,26 @@ class SparseSolution:
         block_row = np.broadcast_to(block, (nodes // 3, 3, 3)).ravel()
         block_column = np.broadcast_to(np.swapaxes(block, 1, 2), (nodes // 3, 3, 3)).ravel()
         self._no_blocks = np.zeros(3 * nodes)
-        rows = [block_row, diagonal, y + member, column, a + index, y + truss.actuators, u + tip_row, tip_column]
-        columns = [block_column, diagonal, column, y + member, y + truss.actuators, a + index, tip_column, u + tip_row]
+        rows = [
+            block_row,
+            diagonal,
+            y + member,
+            column,
+            a + index,
+            y + truss.actuators,
+            u + tip_row,
+            tip_column,
+        ]
+        columns = [
+            block_column,
+            diagonal,
+            column,
+            y + member,
+            y + truss.actuators,
+            a + index,
+            tip_column,
+            u + tip_row,
+        ]
         self._system = BandedSystem(np.concatenate(rows), np.concatenate(columns), int(self._parts[-1]))
         self._damped = np.zeros(members + tips)
         self._damped[layout.fixed] = self._damped[members:] = -self._damping

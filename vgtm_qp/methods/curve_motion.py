@@ -148,7 +148,13 @@ class CurveMotion:
         return Objective(hessian, gradient)
 
     def follow_qp(
-        self, curve: Curve, piece: tuple[PathPoint, PathPoint], now: PathPoint, progress: float, time: float, X: Array
+        self,
+        curve: Curve,
+        piece: tuple[PathPoint, PathPoint],
+        now: PathPoint,
+        progress: float,
+        time: float,
+        X: Array,
     ) -> tuple[Curve, float, tuple[str, ...]]:
         """Return the curve after one QP with clearance, the change of progress, and the active rows.
 

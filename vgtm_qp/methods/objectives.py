@@ -88,7 +88,7 @@ def potential_curvature(distance: Array, influence: float) -> Array:
 
 
 def potential_field(monitor: Clearance, X: Array, time: float, influence: float) -> tuple[Array, Array]:
-    """Return the potential's gradient (N, 3), 1/m, by the node positions, and blocks (N, 3, 3), 1/m^2, above its Hessian.
+    """Return the potential's gradient (N, 3), 1/m, by the nodes, and blocks (N, 3, 3), 1/m^2, above its Hessian.
 
     The plain gradient asks for steps that grow without end as a distance shrinks. With the curvature along the
     normals each pair asks for a part of its own distance. A block for each node is enough for a bound: the square of

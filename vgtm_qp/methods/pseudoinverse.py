@@ -81,4 +81,4 @@ def null_space_vector(N: Array, start: Array, objective: Objective) -> Array:
     H = objective.hessian
     scale = float(np.trace(H)) / len(H)
     system = N.T @ H @ N + scale * (np.eye(len(H)) - N)
-    return np.linalg.solve(system, -N.T @ (objective.gradient + H @ start))
+    return np.asarray(np.linalg.solve(system, -N.T @ (objective.gradient + H @ start)), dtype=np.float64)

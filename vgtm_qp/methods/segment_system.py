@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.path import turn_between, vector_from_rotation
@@ -106,7 +105,7 @@ class SegmentSystem:
             values.append(turning.ravel()[entries.turn_source])
         rows, width = entries.shape
         flat = np.bincount(entries.target, weights=np.concatenate(values), minlength=rows * width)
-        matrix = flat.reshape(rows, width)
+        matrix = flat.reshape(rows, width).astype(np.float64, copy=False)
         return matrix[:, : segment.columns], matrix[:, segment.columns :]
 
     def displacement(self, moved: Array, turned: Array) -> Array:
@@ -131,7 +130,7 @@ class SegmentSystem:
 
 
 def _function(layout: Layout, members: int, turns: bool) -> ca.Function:
-    """Return (member nodes (3, Q m), face nodes (3, 3), constants) -> lengths, gradients and, if it turns, frame, spin."""
+    """Return (member nodes (3, Q m), face nodes, constants) -> lengths, gradients and, if it turns, frame and spin."""
     slots = layout.member_nodes.shape[1]
     nodes, face = ca.MX.sym("nodes", 3, slots * members), ca.MX.sym("face", 3, 3)
     inputs, outputs = [nodes, face], []

@@ -1,4 +1,4 @@
-"""Studies: the paper's figures and sweeps over methods, each from one command, resumable, on any number of processes."""
+"""Studies: the paper's figures and sweeps over methods, from one command, resumable, on many processes."""
 
 from vgtm_qp.study.study import STUDIES, Study, run_study
 

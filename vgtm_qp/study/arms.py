@@ -8,6 +8,7 @@ import numpy as np
 
 from vgtm_qp.problem import Problem
 from vgtm_qp.truss.build import build_truss
+from vgtm_qp.truss.truss import Truss
 
 DURATION = 10.0
 
@@ -38,7 +39,7 @@ def bending_problem(
         "maneuver": {"steps": steps, "waypoint": [{"time": DURATION, "position": [0.0, 0.0, 1.0]}]},
         "clearance": {"safe": 0.08, "influence": 0.5},
     }
-    built = build_truss(Problem.from_dict(data).truss)
+    built = built_truss(Problem.from_dict(data))
     tip = built.tip_weights @ built.home[built.tip]
     data["maneuver"]["waypoint"][0]["position"] = (tip + built.height * np.array(goal)).tolist()
     if cubes:
@@ -47,3 +48,9 @@ def bending_problem(
             for name, x, part in (("right cube", 1.15, 0.539), ("left cube", -1.15, 0.637))
         ]
     return Problem.from_dict(data)
+
+
+def built_truss(problem: Problem) -> Truss:
+    """Return the truss of a problem that has one."""
+    assert problem.truss is not None, "a serial arm"
+    return build_truss(problem.truss)

@@ -12,11 +12,10 @@ from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.methods.compare import markdown_table, run_method
 from vgtm_qp.problem import Problem
-from vgtm_qp.study.arms import bending_problem
+from vgtm_qp.study.arms import bending_problem, built_truss
 from vgtm_qp.study.drawing import MARKS, label, panels
 from vgtm_qp.study.statistics import wilson_interval
 from vgtm_qp.study.workers import Row, Task
-from vgtm_qp.truss.build import build_truss
 
 TITLE = "Clutter: success over random scenes"
 TIMED = False
@@ -58,7 +57,7 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
     azimuth, aside = random.uniform(0.0, 2.0 * np.pi), random.uniform(0.15, 0.45)
     goal = (aside * np.cos(azimuth), aside * np.sin(azimuth), -random.uniform(0.3, 0.7) * aside)
     problem = bending_problem(_BAYS, steps=steps, goal=goal)
-    truss = build_truss(problem.truss)  # type: ignore[arg-type]
+    truss = built_truss(problem)
     target = np.array(problem.maneuver.waypoint[0].position)  # type: ignore[union-attr]
     found: list[dict[str, Any]] = []
     for _ in range(_TRIES):
@@ -106,7 +105,15 @@ def draw(rows: Sequence[Row]) -> Figure:
             high.append(max(most - share, 0.0))
         places = np.array(densities) + 0.08 * (k - len(methods) / 2)
         axes[0].errorbar(
-            places, shares, [low, high], marker=mark, markersize=4, linestyle="--", capsize=2, linewidth=0.9, label=method
+            places,
+            shares,
+            [low, high],
+            marker=mark,
+            markersize=4,
+            linestyle="--",
+            capsize=2,
+            linewidth=0.9,
+            label=method,
         )
     axes[0].set_ylim(-0.03, 1.03)
     label(axes[0], "cubes", "part of the scenes solved")
@@ -129,9 +136,10 @@ def text(rows: Sequence[Row]) -> str:
         table.append((method, *cells))
     header = ("solved (95 % interval)", *[f"{d} cubes, of {counts[d]}" for d in densities])
     return (
-        f"Five octahedral bays, seed {rows[0]['seed']}, scenes numbered from 0 at each density. Solved: the whole path, "
-        "every stroke and every clearance kept at and between the states, members and tip off by at most 1 mm. No scene "
-        f"is known to have a solution, so that the QP's misses are not all its own.\n\n{markdown_table(header, table)}"
+        f"Five octahedral bays, seed {rows[0]['seed']}, scenes numbered from 0 at each density. Solved: the whole "
+        "path, every stroke and every clearance kept at and between the states, members and tip off by at most 1 mm. "
+        f"No scene is known to have a solution, so that the QP's misses are not all its own."
+        f"\n\n{markdown_table(header, table)}"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,7 +17,7 @@ TITLE = "Figure 4: space curves and their control polygons"
 TIMED = False
 
 _POLYGON = ((0.0, 0.0), (0.0, 1.0), (0.9, 1.8), (0.3, 2.9), (1.5, 3.3), (2.4, 2.6))
-_FAMILIES = (
+_FAMILIES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("bezier", {}),
     ("b-spline", {"degree": 3}),
     ("beta-spline", {"bias": 1.0, "tension": 0.0}),
@@ -30,10 +31,10 @@ def tasks(short: bool) -> list[Task]:
     return [{"family": name, "options": options, "samples": samples} for name, options in _FAMILIES]
 
 
-def run(family: str, options: dict[str, float], samples: int) -> Row:
+def run(family: str, options: dict[str, Any], samples: int) -> Row:
     """Return points of the curve over one control polygon, and its greatest distance from the polygon, m."""
     polygon = np.array(_POLYGON)
-    made = make_family(family, len(polygon), **options)  # type: ignore[arg-type]
+    made = make_family(family, len(polygon), **options)
     points = made.weights(np.linspace(0.0, 1.0, samples)) @ polygon
     start, leg = polygon[:-1], np.diff(polygon, axis=0)
     share = np.einsum("plc,lc->pl", points[:, None] - start, leg) / (leg**2).sum(axis=1)
@@ -46,7 +47,9 @@ def draw(rows: Sequence[Row]) -> Figure:
     """Draw each curve with the polygon."""
     figure, axes = panels(1, len(rows), width=2.3, height=2.8)
     for panel, row in zip(axes, rows, strict=True):
-        panel.plot(*np.array(_POLYGON).T, "o--", color="0.5", markersize=3, linewidth=0.8, label="control polygon")
+        panel.plot(
+            *np.array(_POLYGON).T, "o--", color="0.5", markersize=3, linewidth=0.8, label="control polygon"
+        )
         panel.plot(*np.array(row["points"]).T, color="tab:red", linewidth=1.4, label="curve")
         panel.set_aspect("equal")
         label(panel, "x [m]", "z [m]", _name(row), legend=row is rows[0])
@@ -67,4 +70,4 @@ def text(rows: Sequence[Row]) -> str:
 
 def _name(row: Row) -> str:
     options = ", ".join(f"{key} {value:g}" for key, value in row["options"].items() if key != "degree")
-    return row["family"] + (f", {options}" if options else "")
+    return str(row["family"]) + (f", {options}" if options else "")

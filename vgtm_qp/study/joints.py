@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from vgtm_qp.errors import SolverError
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.problem import load_problem
@@ -16,6 +16,8 @@ from vgtm_qp.step.arm import build_arm
 from vgtm_qp.study.drawing import MARKS, label, panels
 from vgtm_qp.study.workers import Row, Task
 from vgtm_qp.truss.kinematics import Kinematics
+
+Array = NDArray[np.float64]
 
 TITLE = "Offset joints: what ignoring them costs"
 TIMED = False
@@ -34,41 +36,42 @@ def run(problem: str, offset: float) -> Row:
     """Solve with pin joints, then give the strokes to an arm with offset joints; return the error of its tip, m."""
     loaded = load_problem(problem)
     maneuver = solve(loaded, verify=False)
-    arm = build_arm(loaded.replace({"truss.joint_offset": offset, "truss.stroke": None, "method.solver": "piqp"}))
+    arm = build_arm(
+        loaded.replace({"truss.joint_offset": offset, "truss.stroke": None, "method.solver": "piqp"})
+    )
     kinematics, truss = arm.kinematics, arm.truss
     X = np.array(truss.home)
     errors = []
     for row in range(len(maneuver.time)):
         change = maneuver.member_lengths[row] - maneuver.member_lengths[0]
-        _place(kinematics, arm.layout, X, arm.home_lengths + change)
+        if not _place(kinematics, arm.layout, X, arm.home_lengths + change):
+            break
         errors.append(float(np.linalg.norm(kinematics.tip_position(X) - maneuver.tip_position[row])))
-    travel = float(np.linalg.norm(maneuver.tip_position[-1] - maneuver.tip_position[0]))
-    return {"tip_error": max(errors), "end_error": errors[-1], "tip_travel": travel, "solved": maneuver.status}
+    return {"tip_error": max(errors), "posed": len(errors) - 1, "steps": maneuver.steps}
 
 
-def _place(kinematics: Kinematics, layout: Layout, X: np.ndarray, lengths: np.ndarray) -> None:
-    """Move the nodes in place so that all members have their lengths (Newton, damped where it must be)."""
+def _place(kinematics: Kinematics, layout: Layout, X: Array, lengths: Array) -> bool:
+    """Move the nodes in place until all members have their lengths (Newton, damped); whether they can."""
     free = layout.truss.free
     for _ in range(60):
         kinematics.evaluate(X)
         error = lengths - kinematics.lengths
         worst = float(np.abs(error).max())
         if worst < _TOLERANCE:
-            return
+            return True
         J = layout.length_jacobian(kinematics.gradient)
         X[free] += min(1.0, 0.2 / worst) * np.linalg.solve(J, error).reshape(-1, 3)
-    raise SolverError("no pose of the arm with offset joints has these lengths")
+    return False
 
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw the tip error against the offset."""
     figure, axes = panels(1, 1, width=4.2, height=3.2)
     for mark, problem in zip(MARKS, _PROBLEMS, strict=False):
-        mine = [row for row in rows if row["problem"] == problem]
+        mine = [row for row in rows if row["problem"] == problem and row["posed"] == row["steps"]]
         if mine:
-            axes[0].loglog(
-                [r["offset"] for r in mine], [r["tip_error"] for r in mine], "--", marker=mark, markersize=4, label=problem
-            )
+            offsets, errors = [row["offset"] for row in mine], [row["tip_error"] for row in mine]
+            axes[0].loglog(offsets, errors, "--", marker=mark, markersize=4, label=problem)
     label(axes[0], "joint offset [m]", "greatest tip error [m]")
     return figure
 
@@ -80,10 +83,17 @@ def text(rows: Sequence[Row]) -> str:
     for problem in _PROBLEMS:
         mine = {row["offset"]: row for row in rows if row["problem"] == problem}
         if mine:
-            table.append((problem, *[f"{1e3 * mine[o]['tip_error']:.1f}" if o in mine else "-" for o in offsets]))
+            table.append((problem, *[_cell(mine[o]) if o in mine else "-" for o in offsets]))
     header = ("greatest tip error [mm]", *[f"{1e3 * o:g} mm" for o in offsets])
     return (
         "Strokes found for ideal pin joints are given to an arm whose members end the given distance from the nodes, "
-        "along the member at home. At home both have the same Jacobian; off it they differ. Members are 1 m long.\n\n"
+        "along the member at home. At home both have the same Jacobian; off it they differ. Members are 1 m long. "
+        "Where no pose near the last one has the strokes any more, the step is given.\n\n"
         f"{markdown_table(header, table)}"
     )
+
+
+def _cell(row: Row) -> str:
+    if row["posed"] < row["steps"]:
+        return f"none from step {row['posed'] + 1}"
+    return f"{1e3 * row['tip_error']:.1f}"

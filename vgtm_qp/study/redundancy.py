@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -51,7 +52,12 @@ def draw(rows: Sequence[Row]) -> Figure:
         mine = _of(rows, case)
         if not mine:
             continue
-        style = {"marker": mark, "markersize": 4, "linestyle": "--", "label": f"{case[0]}: {case[1]}"}
+        style: dict[str, Any] = {
+            "marker": mark,
+            "markersize": 4,
+            "linestyle": "--",
+            "label": f"{case[0]}: {case[1]}",
+        }
         axes[0].plot([r["vertices"] for r in mine], [r["reached"] for r in mine], **style)
         done = [r for r in mine if r["solved"]]
         axes[1].plot([r["vertices"] for r in done], [r["travel"] for r in done], **style)

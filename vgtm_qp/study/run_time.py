@@ -12,7 +12,7 @@ from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import make_resolver, with_method
 from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.study.arms import bending_problem
-from vgtm_qp.study.drawing import MARKS, label, panels
+from vgtm_qp.study.drawing import MARKS, label, mark_bays, panels
 from vgtm_qp.study.statistics import exponent
 from vgtm_qp.study.workers import Row, Task
 
@@ -59,7 +59,8 @@ def run(bays: int, method: str, cubes: bool) -> Row:
     problem = bending_problem(bays, steps=_STEPS, goal=goal, vertices=min(6, bays + 2), cubes=cubes)
     resolver = make_resolver(with_method(problem, method))
     plan = make_plan(problem, *resolver.tip())
-    value, times, reason, home = plan.path.start, [], "", resolver.state
+    times: list[float] = []
+    value, reason, home = plan.path.start, "", resolver.state
     # Kernels are loaded and memory is touched in a step that does not count.
     resolver.follow(plan.path, value, float(plan.marks[0]))
     resolver.state = home
@@ -69,7 +70,9 @@ def run(bays: int, method: str, cubes: bool) -> Row:
             step = resolver.follow(plan.path, value, float(mark))
             times.append(perf_counter() - clock)
             reason = step.reason
-            value = float(mark) if step.progress >= 1.0 - 1e-9 else value + step.progress * (float(mark) - value)
+            value = (
+                float(mark) if step.progress >= 1.0 - 1e-9 else value + step.progress * (float(mark) - value)
+            )
     fixed = resolver.arm.layout.fixed
     drift = np.abs(resolver.state.lengths - resolver.arm.home_lengths)[fixed].max()
     return {
@@ -89,7 +92,15 @@ def draw(rows: Sequence[Row]) -> Figure:
         for mark, (method, name) in zip(MARKS, names.items(), strict=False):
             mine = _of(rows, method, cubes)
             line = "-" if method == "qp" else "--" if method.startswith("curve") else ":"
-            panel.loglog([r["bays"] for r in mine], [r["time"] for r in mine], line, marker=mark, markersize=4, label=name)
+            panel.loglog(
+                [r["bays"] for r in mine],
+                [r["time"] for r in mine],
+                line,
+                marker=mark,
+                markersize=4,
+                label=name,
+            )
+        mark_bays(panel, [row["bays"] for row in rows if row["cubes"] is cubes])
         title = "two cubes, clearance watched" if cubes else "no obstacles"
         label(panel, "bays", f"time of {_STEPS} steps [s]", title)
     return figure
@@ -109,11 +120,18 @@ def text(rows: Sequence[Row]) -> str:
         table = []
         for method, name in names.items():
             mine = {row["bays"]: row for row in _of(rows, method, cubes)}
-            cells = [f"{1e3 * mine[n]['time']:.0f}" + ("*" if mine[n]["reason"] else "") if n in mine else "-" for n in bays]
+            cells = [
+                f"{1e3 * mine[n]['time']:.0f}" + ("*" if mine[n]["reason"] else "") if n in mine else "-"
+                for n in bays
+            ]
             fit = [n for n in mine if n >= _FIT_FROM]
             growth = f"n^{exponent(fit, [mine[n]['time'] for n in fit]):.2f}" if len(fit) > 1 else "-"
             table.append((name, *cells, growth))
-        header = ("with two cubes [ms]" if cubes else "no obstacles [ms]", *[f"{n} bays" for n in bays], "growth")
+        header = (
+            "with two cubes [ms]" if cubes else "no obstacles [ms]",
+            *[f"{n} bays" for n in bays],
+            "growth",
+        )
         parts.append(markdown_table(header, table))
     parts.append(f"Growth fitted from {_FIT_FROM} bays on; * broke down on the way.")
     parts.append(_verdict(rows))
@@ -139,7 +157,9 @@ def _verdict(rows: Sequence[Row]) -> str:
                 )
                 ratios += [ratio] if method == "pseudoinverse-sparse" else []
     if ratios and max(ratios) < 1.0:
-        lines.append("The paper's advantage exists against dense algebra; against a sparse solver it is gone.")
+        lines.append(
+            "The paper's advantage exists against dense algebra; against a sparse solver it is gone."
+        )
     elif ratios:
         lines.append("Against a sparse solver little of the paper's advantage over dense algebra is left.")
     return " ".join(lines)

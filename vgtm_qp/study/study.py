@@ -28,7 +28,7 @@ STUDIES = {
     "joints": "vgtm_qp.study.joints",
     "clutter": "vgtm_qp.study.clutter",
 }
-"""The module of each study. It has ``TITLE``, ``TIMED``, ``tasks(short)``, ``run(**task)``, ``draw(rows)``, ``text(rows)``."""
+"""The module of each study: ``TITLE``, ``TIMED``, ``tasks(short)``, ``run(**task)``, ``draw(rows)``, ``text(rows)``."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any
 
 from vgtm_qp.errors import MissingExtraError
@@ -19,6 +20,8 @@ Row = dict[str, Any]
 
 HANG = 900.0
 """Seconds after which a task counts as hung."""
+_BEGUN = {"begun": True}
+"""What a process says when it takes up a task: the time that it needed to start is not the task's."""
 
 
 def run_task(function: str, task: Task) -> Row:
@@ -28,7 +31,7 @@ def run_task(function: str, task: Task) -> Row:
         return dict(getattr(import_module(module), name)(**task))
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
-        return {"failed": f"{type(error).__name__}: {error} ({os.path.basename(last.filename)}:{last.lineno})"}
+        return {"failed": f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"}
 
 
 def run_here(function: str, tasks: Sequence[Task]) -> Iterator[tuple[int, Row]]:
@@ -69,10 +72,10 @@ def run_dask(function: str, tasks: Sequence[Task], address: str) -> Iterator[tup
         from distributed import Client, as_completed
     except ImportError:
         raise MissingExtraError("cluster", "distributed") from None
-    with Client(address) as client:  # type: ignore[no-untyped-call]
+    with Client(address) as client:
         futures = {client.submit(run_task, function, task, pure=False): k for k, task in enumerate(tasks)}
         again = []
-        for future in as_completed(futures):  # type: ignore[no-untyped-call]
+        for future in as_completed(futures):
             if future.status == "finished":
                 yield futures[future], future.result()
             else:
@@ -101,10 +104,10 @@ class _Worker:
             else:
                 os.environ["OPENBLAS_NUM_THREADS"] = before
         theirs.close()
-        self.number, self.started = -1, 0.0
+        self.number, self.started, self.begun = -1, 0.0, False
 
     def give(self, function: str, number: int, task: Task) -> None:
-        self.number, self.started = number, time.monotonic()
+        self.number, self.started, self.begun = number, time.monotonic(), False
         self.pipe.send((function, task))
 
     def stop(self) -> None:
@@ -134,7 +137,10 @@ def _pool(
                         row = worker.pipe.recv()
                     except (EOFError, OSError):
                         row = None
-                elif time.monotonic() - worker.started < hang:
+                    if row == _BEGUN:
+                        worker.started, worker.begun = time.monotonic(), True
+                        continue
+                elif time.monotonic() - worker.started < (hang if worker.begun else HANG):
                     continue
                 yield worker.number, row
                 if row is not None and waiting:
@@ -157,4 +163,5 @@ def _serve(pipe: Connection) -> None:
             function, task = pipe.recv()
         except EOFError:
             return
+        pipe.send(_BEGUN)
         pipe.send(answer(function, task))

@@ -1,0 +1,99 @@
+"""Comparisons: failures are shown as failures, the report in its three forms, the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import vgtm_qp as vq
+from vgtm_qp.cli import main
+from vgtm_qp.errors import GoalError
+from vgtm_qp.methods import PRESETS, with_method
+
+METHODS = ["qp", "pseudoinverse", "pseudoinverse-corrected", "curve-pseudoinverse-plain"]
+
+
+@pytest.fixture(scope="module")
+def report() -> vq.Report:
+    problem = vq.load_problem("five_bay_two_cubes").replace({"maneuver.steps": 30})
+    return vq.compare(problem, methods=METHODS)
+
+
+def test_each_method_is_held_against_the_same_verification(report: vq.Report) -> None:
+    assert [row.method for row in report.rows] == METHODS
+    qp = report.row("qp")
+    assert qp.solved
+    assert qp.kept
+    assert qp.least_clearance is not None
+    assert qp.least_clearance >= 0.08 - 1e-4
+    faithful = report.row("pseudoinverse")
+    assert not faithful.solved
+    assert not faithful.kept
+    assert faithful.member_drift is not None
+    assert faithful.member_drift > 1e-3
+    corrected = report.row("pseudoinverse-corrected")
+    assert corrected.member_drift is not None
+    assert corrected.member_drift < 1e-9
+    assert "clearance" in corrected.reason
+    assert corrected.actuator_travel is not None
+    assert corrected.actuator_travel > 0.5
+
+
+def test_a_breakdown_is_shown_with_its_step(report: vq.Report) -> None:
+    row = report.row("curve-pseudoinverse-plain")
+    assert row.status == "blocked"
+    assert row.reached < 1.0
+    assert row.reason.startswith(f"step {row.steps + 1}: ")
+
+
+def test_the_report_as_table_data_and_figure(report: vq.Report, tmp_path: Path) -> None:
+    table = report.markdown()
+    assert table.count("\n| ") == 1 + len(METHODS)
+    assert "Measured on:" in table
+    assert [row["method"] for row in json.loads(report.json())["rows"]] == METHODS
+    report.figure().savefig(tmp_path / "compare.pdf")
+    assert (tmp_path / "compare.pdf").stat().st_size > 10_000
+
+
+def test_a_method_that_an_arm_cannot_have_is_refused_in_its_row() -> None:
+    problem = vq.load_problem("five_bay_free").replace(
+        {"truss.base_motion": [{"time": 10.0, "position": [0.1, 0.0, 0.0]}], "maneuver.steps": 10}
+    )
+    report = vq.compare(problem, methods=["curve-pseudoinverse", "pseudoinverse"])
+    assert report.rows[0].status == "refused"
+    assert "moving base" in report.rows[0].reason
+    assert report.rows[1].status == "solved"
+    assert "refused" in report.json()
+    report.figure()
+
+
+def test_every_preset_is_a_valid_method() -> None:
+    problem = vq.load_problem("five_bay_free")
+    for name in PRESETS:
+        changed = with_method(problem, name)
+        assert changed.method.name == PRESETS[name]["method.name"]
+    with pytest.raises(GoalError, match='did you mean "qp-none"'):
+        with_method(problem, "qp-nun")
+
+
+def test_the_command_writes_table_data_and_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "out"
+    arguments = ["compare", "five_bay_free", "--methods", "qp,curve-pseudoinverse-corrected"]
+    assert main([*arguments, "--output", str(folder), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert [row["solved"] for row in data["rows"]] == [True, True]
+    assert json.loads((folder / "compare.json").read_text()) == data
+    assert "curve-pseudoinverse-corrected" in (folder / "compare.md").read_text()
+    assert (folder / "compare.pdf").read_bytes().startswith(b"%PDF")
+    assert main(["compare", "five_bay_free", "--methods", "magic"]) == 2
+
+
+def test_the_study_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["study", "figure4", "--short", "--output", str(tmp_path), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["studies"][0]["study"] == "figure4"
+    assert (tmp_path / "figure4" / "figure4.pdf").exists()
+    assert main(["study", "figure5", "--output", str(tmp_path)]) == 2
+    assert main(["study", "figure4", "--workers", "0", "--output", str(tmp_path)]) == 2
