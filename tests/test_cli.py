@@ -102,7 +102,7 @@ def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
 @pytest.mark.parametrize(
     ("tokens", "words"),
     [
-        (["slove", "free.toml"], ['did you mean "solve"', "solve, verify, check", "schema, doctor"]),
+        (["slove", "free.toml"], ['did you mean "solve"', "solve, verify, ", "schema, doctor"]),
         (["solve"], ["PROBLEM"]),
         (["solve", "free.toml", "extra"], ["extra"]),
         (["solve", "free.toml", "--bogus"], ["--bogus", "--solver", "--figure"]),
