@@ -110,8 +110,8 @@ def text(rows: Sequence[Row]) -> str:
     """Say how the times grow, and whether the curve is still faster than a sparse solver."""
     parts = [
         f"{_STEPS} steps of a free octahedral arm, the tip moving by at most {_REACH} m; {_STEPS} times the median "
-        "step, in processor time of one thread. The pseudoinverse methods do not correct drift, keep no limits and know no "
-        "obstacles, as in the paper; the QP keeps limits and clearances and proves them between the states."
+        "step, in processor time of one thread. The pseudoinverse methods do not correct drift, keep no limits and "
+        "know no obstacles, as in the paper; the QP keeps limits and clearances and proves them between the states."
     ]
     for cubes, names in ((False, _NAMES), (True, _WITH_CUBES)):
         bays = sorted({row["bays"] for row in rows if row["cubes"] is cubes})
