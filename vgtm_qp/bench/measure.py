@@ -2,7 +2,7 @@
 
 In turn, both take each step from the state that the resolver had reached, and which of them is first alternates:
 a machine that slows down slows both, and the ratio of their medians holds. What is left in the processor's caches
-differs, by up to a third after a large baseline, to the disadvantage of the smaller one. Ratios are those of
+differs, by up to a half after a large baseline, to the disadvantage of the smaller one. Ratios are those of
 CPU time: where processes wait for their turn, what takes longer is interrupted more often. Garbage is collected
 as it is for every user.
 """

@@ -60,8 +60,8 @@ def _steps(scenes: Sequence[dict[str, Any]]) -> Table:
                 f"{scene['qps']:.2f}",
                 *(_time(step[key]) for key in ("median", "p95", "p99", "cpu")),
                 *(_time(scene["breakdown"]["phases"].get(name)) for name in phases),
-                _time(scene["warm"]["setup"]),
-                _time(cold["setup"] if cold else None),
+                _setup(scene["warm"]),
+                _setup(cold),
                 f"{scene['warm']['peak_memory'] / 1e6:.0f} MB",
                 f"{100 * scene['covered']:.0f} %"
                 + (f", {scene['stopped_by']}" if scene["stopped_by"] else ""),
@@ -79,6 +79,10 @@ def _baselines(document: dict[str, Any]) -> RenderableType:
     titles = "\n".join(f"{name}: {title}" for name, title in document["baselines"].items())
     table = _table(("CPU, and ratio to ours in turn", "ours", *names), rows)
     return Group(table, "", escape(titles))
+
+
+def _setup(fresh: dict[str, Any] | None) -> str:
+    return f"{_time(fresh['setup'])} (CPU {_time(fresh['setup_cpu'])})" if fresh else "-"
 
 
 def _against(found: dict[str, Any]) -> str:
