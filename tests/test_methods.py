@@ -9,7 +9,7 @@ from method_problems import MODULES, free_problem, run
 import vgtm_qp as vq
 from vgtm_qp.errors import CurveError
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.methods import make_resolver
+from vgtm_qp.methods import condensation, make_resolver
 from vgtm_qp.methods.conventional import ConventionalResolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.objectives import potential_curvature, potential_field, potential_slope
@@ -70,6 +70,15 @@ def test_parallel_tracking_is_recursive_tracking(module: str, correct: bool) -> 
     problem = free_problem(module, tracking="parallel", **options)
     parallel = run(CurveFirstResolver(problem), problem)
     np.testing.assert_allclose(parallel, recursive, atol=1e-9)
+
+
+def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    ways = []
+    for least in (1, 1000):
+        monkeypatch.setattr(condensation, "THREADED", least)
+        problem = free_problem("octahedral", name="curve-pseudoinverse", tracking="parallel", correct=True)
+        ways.append(run(CurveFirstResolver(problem), problem, 5))
+    np.testing.assert_array_equal(ways[0], ways[1])
 
 
 @pytest.mark.parametrize("module", MODULES)

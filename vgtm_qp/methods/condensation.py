@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +18,10 @@ from vgtm_qp.truss.kinematics import Kinematics
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+
+THREADED = 2000
+"""Bays from which the factorisations are shared out to threads: about a millisecond's work, below which it is no gain."""
 
 
 class CurveNodes(NamedTuple):
@@ -161,11 +167,21 @@ def least_norm(A: Array, b: Array) -> Array:
     rows, columns = A.shape[-2:]
     try:
         if rows == columns:
-            return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+            return _solve(A, b)
         At = np.swapaxes(A, -1, -2)
-        return np.asarray(At @ np.linalg.solve(A @ At, b))
+        return np.asarray(At @ _solve(A @ At, b))
     except np.linalg.LinAlgError:
         raise SolverError("tracking: a bay is in a singular pose") from None
+
+
+def _solve(A: Array, b: Array) -> Array:
+    """Solve one system or a stack of them; many bays are shared out to threads, which LAPACK lets run side by side."""
+    cores = os.cpu_count() or 1
+    if A.ndim < 3 or len(A) < THREADED or cores < 2:
+        return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+    pieces = np.array_split(np.arange(len(A)), cores)
+    with ThreadPoolExecutor(cores) as pool:
+        return np.concatenate(list(pool.map(lambda piece: np.linalg.solve(A[piece], b[piece]), pieces)))
 
 
 def rotation_vectors(rotations: Array) -> Array:
