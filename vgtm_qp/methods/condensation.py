@@ -21,7 +21,7 @@ Index = NDArray[np.int64]
 
 
 THREADED = 2000
-"""Bays from which the factorisations are shared out to threads: about a millisecond's work, below which it is no gain."""
+"""Bays from which factorisations are shared out to threads: a few milliseconds of work; for less it does not pay."""
 
 
 class CurveNodes(NamedTuple):
