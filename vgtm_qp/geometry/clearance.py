@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +34,7 @@ class Clearance:
     Parameters
     ----------
     members : (M, 2) int
-        Nodes of each member, or other points whose positions are given.
+        Nodes of each member.
     radius : (M,)
         Capsule radii, m.
     obstacles
@@ -50,8 +50,8 @@ class Clearance:
         together.
     fcl_reach : float or None
         Pairs nearer than this are asked of FCL too; by default 2.5 `safe`.
-    joined : (M, 2) int or None
-        Nodes that each member is joined to, where `members` are other points; members that share one may touch.
+    ends : callable or None
+        From node positions (N, 3) to member ends (M, 2, 3), m, where those are not the nodes.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Clearance:
         member_names: Sequence[str] | None = None,
         self_influence: float | None = None,
         fcl_reach: float | None = None,
-        joined: ArrayLike | None = None,
+        ends: Callable[[Array], Array] | None = None,
     ) -> None:
         self.members = np.asarray(members, dtype=np.int64).reshape(-1, 2)
         self.radius = np.broadcast_to(np.asarray(radius, dtype=float), len(self.members)).copy()
@@ -79,8 +79,9 @@ class Clearance:
         names = tuple(member_names) if member_names is not None else tuple(map(str, range(len(self.members))))
         self.names = Names(names, tuple(o.name for o in self.obstacles), tuple(self.pieces.obstacle.tolist()))
         self.fcl = FclQueries(self.pieces)
-        nodes = self.members if joined is None else np.asarray(joined, dtype=np.int64).reshape(-1, 2)
-        self._members = Members(self.members, self.radius, nodes)
+        self._ends = ends
+        points = self.members if ends is None else np.arange(2 * len(self.members)).reshape(-1, 2)
+        self._members = Members(points, self.radius, self.members)
         self._kernels = Kernels()
         self._kernels.prepare({*self.pieces.shape.tolist()} | ({"segment"} if self_collision else set()))
         self._candidates: Candidates | None = None
@@ -121,6 +122,7 @@ class Clearance:
         reach = self.influence if reach is None else reach
         fcl_reach = (self.fcl_reach if fcl_reach is None else fcl_reach) if use_fcl else 0.0
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
+        X = self._points(X)
         candidates, motion = self._covering(X, time, reach, self_reach)
         parts = []
         wasted = 0
@@ -136,6 +138,10 @@ class Clearance:
                 parts.append(self._distinct(part) if group.shape == "triangle" else part)
         self._tire(candidates, X, time, wasted)
         return self._with_enclosed(join(parts, self.names), X, time)
+
+    def _points(self, X: Array) -> Array:
+        """Return the points that members end at, from node positions (N, 3)."""
+        return X if self._ends is None else self._ends(X).reshape(-1, 3)
 
     def _tire(self, candidates: Candidates, X: Array, time: float, wasted: int) -> None:
         """Renew the reference once the pairs evaluated for nothing have cost as much as that does."""
@@ -197,7 +203,7 @@ class Clearance:
         among : {"all", "obstacles", "members"}
             Pairs with obstacles, pairs of members, or both.
         """
-        wanted = _AMONG[among]
+        wanted, X = _AMONG[among], self._points(X)
         best, pair = np.inf, None
         enclosed = self._enclosed(X, time) if False in wanted else None
         if enclosed is not None:
@@ -239,6 +245,7 @@ class Clearance:
             For obstacles and, if it differs, between members, m.
         """
         self_floor = floor if self_floor is None else self_floor
+        X = self._points(X)
         candidates, motion = self._covering(X, time, max(floor, 0.0), max(self_floor, 0.0))
         for group in candidates.groups:
             least = self_floor if group.is_self else floor
@@ -256,7 +263,7 @@ class Clearance:
         floor: float,
         self_floor: float | None = None,
     ) -> BetweenReport:
-        """Prove that no surface distance falls below its floor while the nodes move on straight lines.
+        """Prove that no surface distance falls below its floor while the members' ends move on straight lines.
 
         Motion bounds first, then fixed separating planes, then halves of the time for the pairs that are
         left. What is not proven after twelve halvings is refused: the answer may be a false alarm, never a
@@ -278,6 +285,7 @@ class Clearance:
         """
         floor = max(floor, 0.0)
         self_floor = floor if self_floor is None else max(self_floor, 0.0)
+        start, end = self._points(start), self._points(end)
         candidates, motion = self._covering(start, start_time, floor, self_floor, end, end_time)
         proven = min(candidates.beyond(motion))
         found: list[tuple[Group, Found]] = []
@@ -315,7 +323,7 @@ class Clearance:
         parts = []
         for obstacle, solid in self._solids.items():
             inside = solid.contains(X, time)
-            member = np.flatnonzero(inside[self.members].any(axis=1))
+            member = np.flatnonzero(inside[self._members.nodes].any(axis=1))
             if not len(member):
                 continue
             piece = np.flatnonzero(self.pieces.obstacle == obstacle)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import Mistake, ProblemError
+from vgtm_qp.errors import ProblemError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
-from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
+from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, make_solver
 from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.curve import home_curve
@@ -29,7 +30,7 @@ from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 
-FUSED_ACTUATORS = 60
+FUSED_ACTUATORS = 45
 """Up to so many actuators the dense condensed QP is the faster one."""
 
 
@@ -62,9 +63,7 @@ class Arm:
     base_motion : BaseMotion or None
         None where the base rests.
     measure : Clearance or None
-        What the clearance of a state is measured with: members between the ends that offset joints give them, and
-        pairs of members whether they must keep apart or not. None where the monitor sees the same. It sees members
-        from node to node, wider by the offset of their joints: it may call safe unsafe, never the other way.
+        What the clearance of a state is measured with where the monitor does not see pairs of members.
     """
 
     truss: Truss
@@ -92,7 +91,7 @@ class Arm:
         """Return the exact least surface distance at node positions `X` (N, 3), m; see ``Clearance.least``."""
         if self.measure is None:
             return self.monitor.least(X, time, among=among)[0]
-        return self.measure.least(member_ends(self.truss, X).reshape(-1, 3), time, among=among)[0]
+        return self.measure.least(X, time, among=among)[0]
 
     def base_at(self, time: float) -> tuple[Array | None, Array | None]:
         """Return positions (N, 3), m, whose rows at base nodes are theirs at `time`, and the base's rotation (3, 3).
@@ -140,11 +139,9 @@ def build_arm(problem: Problem) -> Arm:
         "influence": clearance.influence,
         "member_names": truss.member_names,
     }
-    monitor = Clearance(
-        truss.members, truss.radius + _widest_offset(truss), self_collision=clearance.self_collision, **options
-    )
-    apart = truss.joints is not None or not clearance.self_collision
-    ends = np.arange(2 * truss.member_count).reshape(-1, 2)
+    if truss.joints is not None:
+        options["ends"] = partial(member_ends, truss)
+    monitor = Clearance(truss.members, truss.radius, self_collision=clearance.self_collision, **options)
     return Arm(
         truss=truss,
         kinematics=kinematics,
@@ -165,15 +162,8 @@ def build_arm(problem: Problem) -> Arm:
         minimum_angle=clearance.minimum_angle,
         base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
-        measure=Clearance(ends, truss.radius, joined=truss.members, **options) if apart else None,
+        measure=None if clearance.self_collision else Clearance(truss.members, truss.radius, **options),
     )
-
-
-def _widest_offset(truss: Truss) -> Array:
-    """Return (M,) how far a point of a member between its ends can be from the line between its nodes, m."""
-    if truss.joints is None:
-        return np.zeros(truss.member_count)
-    return np.asarray(np.linalg.norm(truss.joints.offset, axis=2).max(axis=1))
 
 
 def reshaped(arm: Arm, layout: Layout) -> Arm:

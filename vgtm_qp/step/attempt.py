@@ -19,6 +19,7 @@ from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.state import State
 from vgtm_qp.step.task import TipTask
+from vgtm_qp.step.tracking import HardTracking
 
 Array = NDArray[np.float64]
 
@@ -28,6 +29,8 @@ _MOTION_MARGIN = 3.0
 
 
 _SETTLING_STEPS = 4
+_DEVIATION = 0.1
+"""An offset joint that may take a member's end further from its chord turns too far in one step, m."""
 
 
 @dataclass(frozen=True)
@@ -112,10 +115,12 @@ class Attempt:
         task: TipTask,
         separation: Separation,
         *,
+        tracking: HardTracking | None = None,
         tolerances: Tolerances | None = None,
         max_qps: int = 8,
     ) -> None:
         self.engine = engine
+        self.tracking = tracking
         self.task = task
         self.separation = separation
         self.tolerances = tolerances or Tolerances()
@@ -196,12 +201,16 @@ class Attempt:
             if settled is None:
                 continue
             closed, X = settled, settled.X
+            if self.tracking is not None:
+                gap = self.tracking.error(X, vertices, torsion, target.base_rotation)
+                if not gap <= self.tolerances.tracking:
+                    continue
             report = separation.between(state.nodes, X, state.time, target.time, short)
             after = separation.holds(X, target.time, short, proven=report.certified)
             phases.add("acceptance")
             if after is None:
                 continue
-            if separation.turns_too_far(state.nodes, X):
+            if not separation.deviation(state.nodes, X) < _DEVIATION:
                 return outcome("an offset joint turns too far in one step", count)
             if report.certified:
                 return outcome("", count)

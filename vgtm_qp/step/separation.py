@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.geometry.clearance import BetweenReport, Clearance, Pair
 from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.linearise import clearance_rows
 from vgtm_qp.truss.kinematics import member_ends
 from vgtm_qp.truss.truss import Truss
@@ -26,8 +27,8 @@ Shortfall = Mapping[Pair, float]
 _NEAR_ANGLE = 0.3
 """Members that meet at an angle larger than the least one by this, rad, are far from it."""
 
-_TURN = 0.3
-"""A joint's triangle may change by this share of itself in one step."""
+_BETWEEN = 5e-5
+"""Members with offset joints may come nearer by this between states, m: half of the published tolerance."""
 
 
 @dataclass(frozen=True)
@@ -90,18 +91,12 @@ class Separation:
             min([least, *(distance for pair, distance in before.items() if pair.is_self == is_self)])
             for least, is_self in ((kept.safe, False), (kept.self_safe, True))
         )
-        return self.monitor.between(
-            start, end, start_time, end_time, floor - kept.rounding, max(self_floor - kept.rounding, 0.0)
-        )
+        spare = -kept.rounding if self._truss.joints is None else self.deviation(start, end) - _BETWEEN
+        return self.monitor.between(start, end, start_time, end_time, floor + spare, max(self_floor + spare, 0.0))
 
-    def turns_too_far(self, start: Array, end: Array) -> bool:
-        """Return whether an offset joint turns so far in a step that its members' ways have no useful bound."""
-        joints = self._truss.joints
-        if joints is None:
-            return False
-        before, after = (_joint_vectors(X[joints.triangle]) for X in (start, end))
-        change = np.linalg.norm(after - before, axis=-1)
-        return bool(np.any(change > _TURN * np.minimum(*(np.linalg.norm(v, axis=-1) for v in (before, after)))))
+    def deviation(self, start: Array, end: Array) -> float:
+        """Return how far members' ends leave their chords at most, m: offset joints turn on the way."""
+        return 2.0 * chord_deviation(self._truss, start, end)
 
     def rows(
         self, X: Array, time: float, duration: float, reach: float, short: Shortfall, gain: float
@@ -204,11 +199,3 @@ def _corners(truss: Truss) -> Index:
             at.setdefault(node, []).append((member, end))
     found = [(a, b) for meeting in at.values() for k, a in enumerate(meeting) for b in meeting[k + 1 :]]
     return np.array(found, dtype=np.int64).reshape(-1, 2, 2)
-
-
-def _joint_vectors(corner: Array) -> Array:
-    """Return (N, 4, 3) what a joint's frame is made of: the triangle's two sides, its bisector and its normal."""
-    first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    u = first / np.linalg.norm(first, axis=1, keepdims=True)
-    v = second / np.linalg.norm(second, axis=1, keepdims=True)
-    return np.stack([first, second, u + v, np.cross(first, second)], axis=1)
