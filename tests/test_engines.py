@@ -9,9 +9,9 @@ import pytest
 from arms import TRUSSES, make_layout, random_pose
 
 from vgtm_qp.curve.families import make_family
+from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
-from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.shape import CurveShape, turn_rows
 from vgtm_qp.qp.solvers import make_solver
@@ -22,6 +22,12 @@ from vgtm_qp.truss.kinematics import Kinematics
 
 ELIMINABLE = [name for name in TRUSSES if name != "graph"]
 TRACKS = {"hexapod": ("position", "orientation"), "longeron": ("x", "pointing")}
+
+
+@pytest.fixture(autouse=True)
+def _without_a_compiler(monkeypatch):
+    """The graphs themselves are what is compared; so many of them would keep a compiler busy for minutes."""
+    monkeypatch.setenv("VGTM_CC", "none")
 
 
 SHAPES = {
@@ -60,7 +66,9 @@ def engines(name, *, joint_offset=0.0, track=None, vertices=5, **options):
         layout = shaped(layout, **options)
     stages = elimination_stages(layout)
     assert stages is not None
-    plain = PlainEngine(Linearisation(layout, kinematics, task, truss.home_lengths), make_solver("daqp", layout))
+    plain = PlainEngine(
+        Linearisation(layout, kinematics, task, truss.home_lengths), make_solver("daqp", layout)
+    )
     return layout, kinematics, plain, FusedEngine(FusedSolver(layout, stages, task.axes), task)
 
 
@@ -73,7 +81,11 @@ def make_step(layout, kinematics, rng, *, base=False):
     lengths = kinematics.lengths[truss.actuators].copy()
     here, rotation = kinematics.tip_position(X), kinematics.tip_rotation.copy()
     turn = rotation_from_vector([0.02, -0.01, 0.015])
-    path = Path(np.array([0.0, 2.0]), np.stack([here, here + [0.03, 0.02, -0.02]]), np.stack([rotation, turn @ rotation]))
+    path = Path(
+        np.array([0.0, 2.0]),
+        np.stack([here, here + np.array([0.03, 0.02, -0.02])]),
+        np.stack([rotation, turn @ rotation]),
+    )
     moved = None
     if base:
         moved = truss.home @ rotation_from_vector([0.01, -0.02, 0.015]).T + [0.01, 0.0, 0.02]
@@ -95,12 +107,14 @@ def pressing(rows, answer):
     """The rows, each asking for a little more than a solution without them gives: some become active."""
     moved = np.where(np.isfinite(answer.nodes), answer.nodes, 0.0)
     value = np.einsum("rsc,rsc->r", rows.coefficients, moved[rows.nodes])
-    return ClearanceRows(rows.nodes, rows.coefficients, value + [1e-4, -1e-2, -1e-2], rows.name)
+    return ClearanceRows(rows.nodes, rows.coefficients, value + np.array([1e-4, -1e-2, -1e-2]), rows.name)
 
 
 def assert_same_answer(found, wanted, tolerance=1e-10):
     for which in ("nodes", "actuators", "vertices", "progress"):
-        np.testing.assert_allclose(getattr(found, which), getattr(wanted, which), atol=tolerance, err_msg=which)
+        np.testing.assert_allclose(
+            getattr(found, which), getattr(wanted, which), atol=tolerance, err_msg=which
+        )
 
 
 @pytest.mark.parametrize("base", [False, True])
@@ -154,7 +168,9 @@ def test_both_engines_give_one_answer_on_every_curve(name, shape, family):
         arguments = (X, Y if motion else X, vertices, target, target.path.at(progress), progress)
         options = {"motion": motion, "torsion": torsion}
         pressed = pressing(rows, plain.solve(*arguments, rows, **options))
-        found, wanted, other = (engine.solve(*arguments, pressed, **options) for engine in (fused, plain, full))
+        found, wanted, other = (
+            engine.solve(*arguments, pressed, **options) for engine in (fused, plain, full)
+        )
         assert_same_answer(found, wanted)
         np.testing.assert_allclose(found.torsion, wanted.torsion, atol=1e-10)
         assert_same_answer(other, wanted, 3e-6)
@@ -164,9 +180,7 @@ def test_both_engines_give_one_answer_on_every_curve(name, shape, family):
 
 @pytest.mark.parametrize("name", ["hexapod", "tetrahedral-123", "tetrahedral-23"])
 def test_both_engines_keep_the_whole_pose_of_faces_on_the_curve(name):
-    layout, kinematics, plain, fused = engines(
-        name, vertices=6, track=("z",), shape="torsion", hard=True
-    )
+    layout, kinematics, plain, fused = engines(name, vertices=6, track=("z",), shape="torsion", hard=True)
     X, Y, vertices, target, rows = make_step(layout, kinematics, np.random.default_rng(11))
     target = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0)
     torsion = np.array([0.05, -0.02])
@@ -177,9 +191,13 @@ def test_both_engines_keep_the_whole_pose_of_faces_on_the_curve(name):
     truss = layout.truss
     moved = X + answers[0].nodes
     kinematics.evaluate(moved)
-    curve = layout.shape.rows(vertices + answers[0].vertices, torsion + answers[0].torsion, truss.face_frames[0])
+    curve = layout.shape.rows(
+        vertices + answers[0].vertices, torsion + answers[0].torsion, truss.face_frames[0]
+    )
     gap = kinematics.face_centres(moved)[layout.tracked] - curve.position
-    turns = turn_rows(curve, kinematics.face_rotation[layout.tracked], kinematics.face_spin[layout.tracked], 3)
+    turns = turn_rows(
+        curve, kinematics.face_rotation[layout.tracked], kinematics.face_spin[layout.tracked], 3
+    )
     kinematics.evaluate(X)
     before = layout.shape.rows(vertices, torsion, truss.face_frames[0])
     first = kinematics.face_centres(X)[layout.tracked] - before.position
@@ -212,10 +230,16 @@ def test_rows_of_a_curve_are_its_derivatives(shape, family):
         np.testing.assert_allclose(
             rows.position_rows[:, :, k], (ahead.position - behind.position) / (2 * h), atol=1e-7
         )
-        turned = (ahead.frame @ behind.frame.transpose(0, 2, 1) - behind.frame @ ahead.frame.transpose(0, 2, 1)) / 2
+        turned = (
+            ahead.frame @ behind.frame.transpose(0, 2, 1) - behind.frame @ ahead.frame.transpose(0, 2, 1)
+        ) / 2
         spin = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=1) / (2 * h)
-        np.testing.assert_allclose(rows.spin_rows[:, :, k], spin, atol=2e-3 if family == "beta-spline" else 2e-5)
-        np.testing.assert_allclose(rows.spacing_rows[:, k], (ahead.spacing - behind.spacing) / (2 * h), atol=1e-7)
+        np.testing.assert_allclose(
+            rows.spin_rows[:, :, k], spin, atol=2e-3 if family == "beta-spline" else 2e-5
+        )
+        np.testing.assert_allclose(
+            rows.spacing_rows[:, k], (ahead.spacing - behind.spacing) / (2 * h), atol=1e-7
+        )
 
 
 def test_turn_rows_are_the_derivatives_of_their_residuals():
@@ -252,7 +276,9 @@ def test_spacing_is_measured_from_the_base():
 def test_names_of_general_rows_are_unique_and_measured():
     layout, kinematics, plain, _ = engines("hexapod", shape="everything", goals=(3,))
     X, _, vertices, target, rows = make_step(layout, kinematics, np.random.default_rng(0))
-    numbers = plain._linearisation.numbers(X, vertices, target, 0.0, rows, motion=True, torsion=np.array([0.1]))
+    numbers = plain._linearisation.numbers(
+        X, vertices, target, 0.0, rows, motion=True, torsion=np.array([0.1])
+    )
     qp = FullBuilder(layout).build(replace(numbers, clearance=ClearanceRows()))
     names = [label.name for label in qp.rows]
     assert len(set(names)) == len(names) == qp.A.shape[0]

@@ -123,7 +123,9 @@ class CurveShape:
             change = np.diff(np.concatenate([start, position_rows]), axis=0)
             spacing = distance - self.spacing
             spacing_rows = np.einsum("kc,kcd->kd", steps / distance[:, None], change)
-        return CurveRows(position, position_rows, curve.frame(s) @ self._home_roll, spin_rows, spacing, spacing_rows)
+        return CurveRows(
+            position, position_rows, curve.frame(s) @ self._home_roll, spin_rows, spacing, spacing_rows
+        )
 
 
 class TurnRows(NamedTuple):

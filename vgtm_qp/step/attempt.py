@@ -20,6 +20,7 @@ from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.state import State
 from vgtm_qp.step.task import TipTask
 from vgtm_qp.step.tracking import HardTracking
+from vgtm_qp.step.tracking import HardTracking
 
 Array = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ _DEVIATION = 0.1
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What an accepted state is held against: lengths and tip in m (rad).
+    """What an accepted state is held against: lengths, tip and, where faces track hard, tracking in m (rad).
 
     They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. A tip
     that is further off than `settling` after a QP calls for another one.
@@ -45,6 +46,7 @@ class Tolerances:
     stroke: float = 1e-10
     tip: float = 1e-8
     settling: float = 1e-3
+    tracking: float = 1e-7
 
 
 @dataclass
@@ -116,10 +118,12 @@ class Attempt:
         separation: Separation,
         *,
         tracking: HardTracking | None = None,
+        tracking: HardTracking | None = None,
         tolerances: Tolerances | None = None,
         max_qps: int = 8,
     ) -> None:
         self.engine = engine
+        self.tracking = tracking
         self.tracking = tracking
         self.task = task
         self.separation = separation
@@ -201,6 +205,10 @@ class Attempt:
             if settled is None:
                 continue
             closed, X = settled, settled.X
+            if self.tracking is not None:
+                gap = self.tracking.error(X, vertices, torsion, target.base_rotation)
+                if not gap <= self.tolerances.tracking:
+                    continue
             if self.tracking is not None:
                 gap = self.tracking.error(X, vertices, torsion, target.base_rotation)
                 if not gap <= self.tolerances.tracking:

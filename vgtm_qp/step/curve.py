@@ -120,7 +120,11 @@ def with_curve(layout: Layout, family: CurveFamily | None, vertex_goals: tuple[i
 def curve_key(layout: Layout) -> tuple[object, ...]:
     """Return what tells curves of one arm from one another."""
     family = layout.family
-    knots = () if family is None else (family.name, family.degree, family.control_vertices, *family.knots.tolist())
+    knots = (
+        ()
+        if family is None
+        else (family.name, family.degree, family.control_vertices, *family.knots.tolist())
+    )
     return (*knots, "goals", *layout.vertex_goals)
 
 
@@ -139,7 +143,9 @@ def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) 
     off = points - start - fractions[:, None] * (end - start)
     if np.abs(off).max() <= 1e-9 * float(np.linalg.norm(end - start)):
         # Families without linear precision run along the axis at a speed of their own.
-        even = np.abs(straight.position(fractions) - points).max() <= 1e-12 * float(np.linalg.norm(end - start))
+        even = np.abs(straight.position(fractions) - points).max() <= 1e-12 * float(
+            np.linalg.norm(end - start)
+        )
         return fractions if even else straight.arc_parameter(fractions), straight.control_vertices
     weights = family.weights(fractions)
     second = np.diff(np.eye(family.control_vertices), n=2, axis=0)

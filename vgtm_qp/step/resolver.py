@@ -27,6 +27,7 @@ from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
 from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.stops import Limits, Stop, StopKind, explain
+from vgtm_qp.step.tracking import HardTracking
 
 Array = NDArray[np.float64]
 
@@ -116,7 +117,7 @@ class Resolver:
                 warnings.warn(f"{excess.key} = {excess.value}: {excess.expected}", stacklevel=2)
         distances = Distances(arm.safe, arm.self_safe, arm.influence, arm.margin, arm.minimum_angle)
         self._separation = Separation(arm.truss, arm.monitor, distances)
-        self._attempt = Attempt(arm.engine, arm.task, self._separation)
+        self._attempt = Attempt(arm.engine, arm.task, self._separation, tracking=_hard_tracking(arm))
         self.state = arm.home_state()
         truss = arm.truss
         self._actuator_names = tuple(truss.member_names[k] for k in truss.actuators)
@@ -237,7 +238,7 @@ class Resolver:
         if key not in self._arms:
             self._arms[key] = reshaped(self.arm, wanted)
         self.arm = self._arms[key]
-        self._attempt.engine = self.arm.engine
+        self._attempt.engine, self._attempt.tracking = self.arm.engine, _hard_tracking(self.arm)
 
     def _until_jam(self, dt: float) -> float:
         """Lock what jams by now; return the part of a step of `dt` that ends at the next jam, 1 where none is due."""
@@ -379,6 +380,10 @@ class Resolver:
         low = kinds(lower, stroke[:, 0], length - rate * dt)
         high = kinds(upper, stroke[:, 1], length + rate * dt)
         return Limits(lower, upper, self._actuator_names, low, high)
+
+
+def _hard_tracking(arm: Arm) -> HardTracking | None:
+    return HardTracking(arm.layout, arm.kinematics) if arm.layout.hard_tracking else None
 
 
 def _vector(value: ArrayLike, name: str) -> Array:
