@@ -101,13 +101,12 @@ def draw(rows: Sequence[Row]) -> Figure:
     for panel in axes[len(shown) : 3]:
         panel.set_axis_off()
     for panel, (key, name) in zip(axes[3:], _MEASURES.items(), strict=True):
-        for mark, module in zip(MARKS, _MODULES, strict=False):
+        for k, (mark, module) in enumerate(zip(MARKS, _MODULES, strict=False)):
             mine = [row for row in rows if row["module"] == module]
             if mine and max(row[key] for row in mine) > _EXACT:
                 values = [row[key] for row in mine]
-                panel.loglog(
-                    [row["bays"] for row in mine], values, "--", marker=mark, markersize=4, label=module
-                )
+                style: dict[str, Any] = {"color": f"C{k}", "marker": mark, "markersize": 4, "label": module}
+                panel.loglog([row["bays"] for row in mine], values, "--", **style)
         mark_bays(panel, [row["bays"] for row in rows])
         label(panel, "bays", name)
     return figure
