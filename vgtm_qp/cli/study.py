@@ -17,7 +17,7 @@ def study(
         list[str],
         Parameter(
             name="NAME",
-            help="figure3, figure4, figure7, figure8, figure9, redundancy, joints, clutter, or all",
+            help="figure3, figure4, figure7, figure8, figure9, redundancy, joints, clutter, robustness, or all",
         ),
     ],
     /,
@@ -25,6 +25,11 @@ def study(
     workers: Annotated[int, Parameter(help="processes; studies of run time use one, alone")] = 1,
     dask: Annotated[str | None, Parameter(help="address of a dask.distributed scheduler")] = None,
     short: Annotated[bool, Parameter(negative="", help="a quick look: fewer and smaller runs")] = False,
+    scenes: Annotated[int | None, Parameter(help="number of random scenes, of robustness")] = None,
+    seed: Annotated[int | None, Parameter(help="seed of the random scenes, of robustness")] = None,
+    ipopt: Annotated[
+        bool, Parameter(negative="", help="solve them by IPOPT too, step by step, of robustness")
+    ] = False,
     output: Annotated[Path, Parameter(name=["--output", "-o"], help="folder of the results")] = Path(
         "studies"
     ),
@@ -46,10 +51,14 @@ def study(
     titles = {name: Study.named(name).title for name in wanted}
     if workers < 1:
         raise GoalError(f"--workers must be 1 or more, not {workers}")
+    given = {"scenes": scenes, "seed": seed, "ipopt": ipopt or None}
+    options = {key: value for key, value in given.items() if value is not None}
+    for name in titles:
+        Study.named(name).tasks(short=short, **options)
     written = []
     for name, title in titles.items():
         with _bar(title, shown=not json) as progress:
-            place = run_study(name, output, short=short, workers=workers, dask=dask, progress=progress)
+            place = run_study(name, output, short=short, workers=workers, dask=dask, progress=progress, options=options)
         written.append({"study": name, "title": title, "folder": str(place)})
         if not json:
             say((place / f"{name}.md").read_text())

@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ STUDIES = {
     "redundancy": "vgtm_qp.study.redundancy",
     "joints": "vgtm_qp.study.joints",
     "clutter": "vgtm_qp.study.clutter",
+    "robustness": "vgtm_qp.study.robustness",
 }
 """The module of each study: ``TITLE``, ``TIMED``, ``tasks(short)``, ``run(**task)``, ``draw(rows)``, ``text(rows)``."""
 
@@ -61,9 +63,20 @@ class Study:
         module = import_module(STUDIES[name])
         return cls(name, module.TITLE, module.TIMED, module)
 
-    def tasks(self, *, short: bool = False) -> list[Task]:
-        """Return the keyword arguments of each run, as JSON data; `short` for a quick look."""
-        return list(self._module.tasks(short))
+    def tasks(self, *, short: bool = False, **options: Any) -> list[Task]:
+        """Return the keyword arguments of each run, as JSON data; `short` for a quick look.
+
+        Raises
+        ------
+        GoalError
+            The study has no such option.
+        """
+        known = list(signature(self._module.tasks).parameters)[1:]
+        for name in options:
+            if name not in known:
+                choices = ", ".join(known) or "none"
+                raise GoalError(f'study "{self.name}" has no option "{name}"; it has {choices}')
+        return list(self._module.tasks(short, **options))
 
     def draw(self, rows: Sequence[Row]) -> Figure:
         """Return the study's figure."""
@@ -87,6 +100,7 @@ def run_study(
     workers: int = 1,
     dask: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Path:
     """Run a study, or what is left of it, and write its rows, figure and text.
 
@@ -103,11 +117,13 @@ def run_study(
         Address of a dask.distributed scheduler, in the place of processes.
     progress
         Called with the numbers of tasks done and in all.
+    options
+        Of the study: ``scenes``, ``seed`` and ``ipopt`` of robustness.
 
     Raises
     ------
     GoalError
-        There is no such study.
+        There is no such study, or it has no such option.
     MissingExtraError
         A cluster is asked for and Dask is not installed.
     """
@@ -116,7 +132,7 @@ def run_study(
     study = Study.named(name)
     place = folder / name
     place.mkdir(parents=True, exist_ok=True)
-    tasks = study.tasks(short=short)
+    tasks = study.tasks(short=short, **(options or {}))
     log = place / "rows.jsonl"
     known = _known_rows(log)
     keys = [_key(task) for task in tasks]
@@ -141,7 +157,8 @@ def run_study(
     failed = [row for row in rows if "failed" in row]
     lines = [f"## {study.title}", "", study.text(rows).strip(), ""]
     lines += [f"Not counted: a run that failed, {row['failed']}" for row in failed]
-    again = f"vgtm study {name}{' --short' if short else ''}"
+    told = (f" --{key}" if value is True else f" --{key} {value}" for key, value in (options or {}).items())
+    again = f"vgtm study {name}{' --short' if short else ''}{''.join(told)}"
     lines += [f"Measured on: {describe_machine(found)}. Made again by `{again}`.", ""]
     (place / f"{name}.md").write_text("\n".join(lines))
     return place

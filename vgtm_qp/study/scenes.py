@@ -1,0 +1,219 @@
+"""Random scenes from a seed: an arm, cubes, and a tip goal of a clear shape of the same arm, or any goal at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.geometry import shapes
+from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import Arm, build_arm
+from vgtm_qp.step.path import rotation_from_vector
+
+Array = NDArray[np.float64]
+
+MODULES = ("octahedral", "double-octahedral", "hexapod", "longeron", "tetrahedral")
+SAFE = 0.08
+_ROOM = 0.02
+_SHARES = 20
+_LEAST_SINGULAR_VALUE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A random problem.
+
+    Attributes
+    ----------
+    number : int
+        Its number under the seed.
+    reachable : bool
+        Whether the goal is the tip pose of a shape that keeps every limit and clearance. That there is such a shape
+        does not mean that it can be reached along the straight path.
+    problem : Problem
+    shape : (N, 3) or None
+        That shape, m.
+    """
+
+    number: int
+    reachable: bool
+    problem: Problem
+    shape: Array | None
+
+
+def random_scene(seed: int, number: int, *, steps: int = 30) -> Scene:
+    """Return scene `number` of a `seed`: always the same, whichever scenes were made before it."""
+    random = np.random.default_rng([seed, number])
+    truss = _truss(random)
+    directed = bool(random.random() < 0.4)
+    reachable = bool(random.random() < 0.75)
+    waypoint: dict[str, Any] = {"time": 10.0, "position": [0, 0, 1]} | (
+        {"pointing": [0, 0, 1]} if directed else {}
+    )
+    problem: dict[str, Any] = {
+        "name": f"scene {seed}-{number}",
+        "truss": truss,
+        "curve": {"family": "bezier", "control_vertices": min(8, truss["bays"] + 1)},
+        "end_effector": {"track": ["position", "pointing"] if directed else ["position"]},
+        "maneuver": {"steps": steps, "waypoint": [waypoint]},
+        "clearance": {"safe": SAFE, "influence": 0.5},
+    }
+    arm = build_arm(Problem.from_dict(problem))
+    home = arm.truss.home
+    shape = random_shape(arm, random)
+    kinematics = arm.kinematics
+    if reachable:
+        kinematics.evaluate(shape)
+        waypoint["position"] = kinematics.tip_position(shape).tolist()
+        if directed:
+            waypoint["pointing"] = kinematics.tip_rotation[:, 2].tolist()
+    else:
+        kinematics.evaluate(home)
+        aim = random.normal(size=3)
+        aim[2] = abs(aim[2])
+        reach = arm.truss.height * random.uniform(0.3, 1.2)
+        waypoint["position"] = (aim * (reach / np.linalg.norm(aim))).tolist()
+        if directed:
+            waypoint["pointing"] = (kinematics.tip_rotation[:, 2] + 0.5 * random.normal(size=3)).tolist()
+    problem["obstacle"] = _cubes(arm, random, shape if reachable else None, int(random.integers(1, 9)))
+    return Scene(number, reachable, Problem.from_dict(problem), shape if reachable else None)
+
+
+def _truss(random: np.random.Generator) -> dict[str, Any]:
+    truss: dict[str, Any] = {
+        "module": str(random.choice(MODULES)),
+        "bays": int(random.integers(5, 13)),
+        "member_radius": 0.03,
+    }
+    if random.random() < 0.3:
+        truss["rate"] = float(random.uniform(0.1, 0.5))
+    if random.random() < 0.15:
+        truss["joint_offset"] = float(random.uniform(0.02, 0.08))
+    return truss
+
+
+def random_shape(arm: Arm, random: np.random.Generator) -> Array:
+    """Return node positions (N, 3) of a bent shape within the strokes whose members keep their clearance, m.
+
+    Actuator lengths vary smoothly along and around the arm; they are approached from home by Newton's method, and
+    the furthest shape is taken that is neither near a singular pose nor in its own way.
+    """
+    truss, kinematics = arm.truss, arm.kinematics
+    actuators = truss.actuators
+    least, most = 0.15 * truss.height, random.uniform(0.3, 0.9) * truss.height
+    furthest = truss.home
+    kinematics.evaluate(truss.home)
+    singular = _LEAST_SINGULAR_VALUE * _least_singular_value(arm)
+    for _ in range(20):
+        X = truss.home.copy()
+        wanted = _random_lengths(arm, random)
+        good = X.copy()
+        for share in np.arange(1, _SHARES + 1) / _SHARES:
+            goal = arm.home_lengths.copy()
+            goal[actuators] += share * (wanted - goal[actuators])
+            if not _newton(arm, X, goal, singular):
+                break
+            if arm.monitor.least(X, among="members")[0] < SAFE:
+                break
+            good = X.copy()
+            if _tip_motion(arm, good) > most:
+                break
+        if _tip_motion(arm, good) > _tip_motion(arm, furthest):
+            furthest = good
+        if _tip_motion(arm, furthest) >= least:
+            break
+    kinematics.evaluate(furthest)
+    return np.asarray(furthest)
+
+
+def _tip_motion(arm: Arm, X: Array) -> float:
+    return float(np.linalg.norm(arm.kinematics.tip_position(X) - arm.kinematics.tip_position(arm.truss.home)))
+
+
+def _random_lengths(arm: Arm, random: np.random.Generator) -> Array:
+    """Return (n_a,) lengths that change smoothly along and around the arm, m."""
+    truss = arm.truss
+    actuators = truss.actuators
+    middle = truss.home[truss.members[actuators]].mean(axis=1)
+    z = middle[:, 2] / truss.height
+    angle = np.arctan2(middle[:, 1], middle[:, 0])
+    turn = random.uniform(0.0, 2.0 * np.pi, 3)
+    wave = random.normal(0.0, 0.3) + random.normal(0.0, 0.2, len(actuators))
+    for k in range(3):
+        wave = wave + random.normal() * np.cos(np.pi * k * z) * np.cos(angle - turn[k])
+    wave *= random.uniform(0.3, 0.95) / max(float(np.abs(wave).max()), 1e-9)
+    home = arm.home_lengths[actuators]
+    room = np.where(wave > 0.0, truss.stroke[actuators, 1] - home, home - truss.stroke[actuators, 0])
+    return np.asarray(home + wave * room)
+
+
+def _least_singular_value(arm: Arm) -> float:
+    jacobian = arm.layout.length_jacobian(arm.kinematics.gradient)
+    if not np.all(np.isfinite(jacobian)):
+        return 0.0
+    return float(np.linalg.svd(jacobian, compute_uv=False)[-1])
+
+
+def _newton(arm: Arm, X: Array, lengths: Array, singular: float) -> bool:
+    """Bring all lengths to `lengths` (M,) in place; False where the pose is singular or Newton's method fails."""
+    free = arm.truss.free
+    for _ in range(8):
+        arm.kinematics.evaluate(X)
+        error = lengths - arm.kinematics.lengths
+        if float(np.max(np.abs(error))) < 1e-11:
+            return True
+        if _least_singular_value(arm) < singular:
+            return False
+        jacobian = arm.layout.length_jacobian(arm.kinematics.gradient)
+        X[free] += np.linalg.solve(jacobian, error).reshape(-1, 3)
+    return False
+
+
+def _cubes(arm: Arm, random: np.random.Generator, shape: Array | None, count: int) -> list[dict[str, Any]]:
+    """Return `count` cubes, or as many as find a place, near the arm and clear of its home and goal shapes.
+
+    The straight path of the tip to a goal that can be reached is kept free of them, for the tip's face at least.
+    """
+    truss = arm.truss
+    states = [truss.home] if shape is None else [truss.home, shape]
+    tips = np.stack([state[truss.tip] for state in states])
+    way = np.linspace(0.0, 1.0, 21)[:, None, None]
+    passage = (tips[0] + way * (tips[-1] - tips[0])).reshape(-1, 3)
+    cubes: list[dict[str, Any]] = []
+    for _ in range(60):
+        if len(cubes) == count:
+            break
+        state = states[int(random.integers(len(states)))]
+        anchor = state[int(random.choice(truss.free))]
+        offset = random.normal(size=3)
+        edge = float(random.uniform(0.3, 1.1))
+        center = anchor + offset * (random.uniform(0.1, 1.2) + edge / 2) / np.linalg.norm(offset)
+        vector = random.normal(size=3) * (random.random() < 0.5)
+        cube = shapes.box("", center.tolist(), edge, rotation_from_vector(vector))
+        if any(_distance(arm, cube, X) < SAFE + _ROOM for X in states):
+            continue
+        local = np.abs((passage - center) @ rotation_from_vector(vector)) - edge / 2
+        if float(np.linalg.norm(np.maximum(local, 0.0), axis=1).min()) < SAFE + 0.1:
+            continue
+        cubes.append(
+            {
+                "name": f"cube {len(cubes) + 1}",
+                "shape": "box",
+                "center": center.tolist(),
+                "size": edge,
+                "rotation_vector": vector.tolist(),
+            }
+        )
+    return cubes
+
+
+def _distance(arm: Arm, obstacle: shapes.Obstacle, X: Array) -> float:
+    truss = arm.truss
+    monitor = Clearance(
+        truss.members, truss.radius, [obstacle], safe=SAFE, influence=0.5, self_collision=False
+    )
+    return monitor.least(X)[0]
