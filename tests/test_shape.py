@@ -264,7 +264,7 @@ def test_more_control_vertices_leave_the_curve_where_it_is(family, torsion):
 def test_a_curve_that_is_freer_than_the_arm_is_warned_of_with_the_number():
     problem = arm_problem(bays=3, curve={"control_vertices": 7})
     with pytest.warns(
-        UserWarning, match=r"control_vertices = 7: .*16 degrees of freedom and the arm 9: 7 of them"
+        UserWarning, match=r"control_vertices = 7: 4 or fewer.*16 degrees of freedom and the arm 9: 7 of them"
     ):
         Resolver(problem)
     assert any("the arm 9" in mistake.expected for mistake in find_warnings(problem, build_arm(problem)))

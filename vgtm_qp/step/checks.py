@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from vgtm_qp.errors import Mistake
-from vgtm_qp.curve.redundancy import excess_freedom
+from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
@@ -80,9 +80,11 @@ def find_warnings(problem: Problem, arm: Arm) -> list[Mistake]:
 
 def excess_of_freedom(problem: Problem, arm: Arm) -> Iterator[Mistake]:
     """Yield the number of control vertices if the curve has more freedom than the arm that tracks it."""
-    text = excess_freedom(arm.layout.free_curve, len(arm.truss.actuators))
+    freedom = len(arm.truss.actuators)
+    text = excess_freedom(arm.layout.free_curve, freedom)
     if text is not None:
-        yield problem.mistake(("curve", "control_vertices"), text)
+        most = max((freedom + BASE_ROWS - arm.layout.torsion) // 3, 3)
+        yield problem.mistake(("curve", "control_vertices"), f"{most} or fewer; {text}")
 
 
 def longest_ways(truss: Truss, sources: NDArray[np.int64]) -> Array:

@@ -174,7 +174,7 @@ class Resolver:
         vertices = len(self.state.control_vertices)
         places = np.full((vertices, 3), np.nan)
         for index, position in goals.items():
-            if not (isinstance(index, int | np.integer) and 0 <= index < vertices):
+            if index not in range(vertices):
                 last = f"0 to {vertices - 1}" if vertices else "none: there is no curve"
                 raise GoalError(f"{index!r} is not a control vertex; they are {last}")
             places[index] = _vector(position, f"the goal of control vertex {index}")
