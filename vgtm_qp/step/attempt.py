@@ -20,7 +20,6 @@ from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.state import State
 from vgtm_qp.step.task import TipTask
 from vgtm_qp.step.tracking import HardTracking
-from vgtm_qp.step.tracking import HardTracking
 
 Array = NDArray[np.float64]
 
@@ -118,12 +117,10 @@ class Attempt:
         separation: Separation,
         *,
         tracking: HardTracking | None = None,
-        tracking: HardTracking | None = None,
         tolerances: Tolerances | None = None,
         max_qps: int = 8,
     ) -> None:
         self.engine = engine
-        self.tracking = tracking
         self.tracking = tracking
         self.task = task
         self.separation = separation
@@ -205,10 +202,6 @@ class Attempt:
             if settled is None:
                 continue
             closed, X = settled, settled.X
-            if self.tracking is not None:
-                gap = self.tracking.error(X, vertices, torsion, target.base_rotation)
-                if not gap <= self.tolerances.tracking:
-                    continue
             if self.tracking is not None:
                 gap = self.tracking.error(X, vertices, torsion, target.base_rotation)
                 if not gap <= self.tolerances.tracking:
