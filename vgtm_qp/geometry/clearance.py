@@ -157,8 +157,7 @@ class Clearance:
         contacts = group.contacts_of(segments, others, rows)
         if fcl_reach > 0.0 and group.shape in FclQueries.SHAPES:
             asked = np.flatnonzero(contacts.distance < fcl_reach)
-            radius = group.radius[rows]
-            self.fcl.improve(group.shape, group.other[rows], radius, segments, others, contacts, asked)
+            self.fcl.improve(group.other[rows], group.radius[rows], segments, others, contacts, asked)
         return contacts
 
     def _pairs(self, group: Group, rows: Index, contacts: Contacts, first: Index, second: Index) -> NearPairs:

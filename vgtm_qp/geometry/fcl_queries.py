@@ -1,27 +1,27 @@
-"""Distances by python-fcl, each held against a bound that can be proven; an answer that fails it is not used.
+"""Distances by python-fcl, each held against the exact one; an answer that differs from it is not used.
 
 FCL's distance from a capsule to a box is always too large, and for members parallel to edges on round
-coordinates too large by up to a metre (FCL issue 508). So the capsule has radius zero, the caller subtracts
-the radius, and an answer counts only if the plane through its own witness points separates segment and piece
-by as much. FCL's signed distance is never asked for: it can end the process.
+coordinates too large by up to a metre (FCL issue 508). So the capsule has radius zero, the radius is subtracted,
+and an answer counts only where the closed form agrees. FCL's signed distance is never asked for: it can end the
+process.
 """
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.exact import plane_function
 from vgtm_qp.geometry.groups import Contacts
 from vgtm_qp.geometry.shapes import Pieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_CERTIFIED = 1e-9
+_AGREEMENT = 1e-9
+"""How far FCL and the closed form may be apart, m."""
 
 
 class FclQueries:
@@ -39,7 +39,6 @@ class FclQueries:
         self.asked = self.replaced = 0
         self._pieces = pieces
         self._objects: dict[int, Any] = {}
-        self._planes: dict[str, Batch] = {}
         self._member: Any = None
 
     def _start(self) -> None:
@@ -63,16 +62,9 @@ class FclQueries:
         return self._objects[piece]
 
     def improve(
-        self,
-        shape: str,
-        pieces: Index,
-        radius: Array,
-        segments: Array,
-        parameters: Array,
-        contacts: Contacts,
-        rows: Index,
+        self, pieces: Index, radius: Array, segments: Array, parameters: Array, contacts: Contacts, rows: Index
     ) -> None:
-        """Ask FCL for `rows` and write the answers that hold into `contacts`.
+        """Ask FCL for `rows`, which should be few, and write the answers that hold into `contacts`.
 
         Parameters
         ----------
@@ -81,61 +73,40 @@ class FclQueries:
         contacts
             Exact, from surface to surface; they stay where FCL's answer is refused.
         """
-        if not len(rows):
-            return
-        if self._member is None:
+        if len(rows) and self._member is None:
             self._start()
-        ends = segments[rows]
-        answers = self._ask(pieces[rows], ends, parameters[rows])
-        gap = answers[:, 1:4] - answers[:, 4:7]
-        length = np.sqrt(np.einsum("kc,kc->k", gap, gap))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            normal = gap / length[:, None]
-        if shape not in self._planes:
-            self._planes[shape] = Batch(plane_function(shape))
-        proven = self._planes[shape](ends, parameters[rows], normal)[:, 0]
-        # Comparisons with NaN are false: a penetration, where FCL gives no normal, is refused too.
-        holds = (answers[:, 0] > 0.0) & (np.abs(answers[:, 0] - proven) <= _CERTIFIED)
-        self.asked += len(rows)
-        self.replaced += int(len(rows) - np.count_nonzero(holds))
-        contacts.distance[rows[holds]] = proven[holds] - radius[rows[holds]]
         # Where the nearest point is not unique, FCL may give one between the two ends of the contact.
-        holds &= ~contacts.two()[rows]
-        good = rows[holds]
-        axis = ends[holds, 3:] - ends[holds, :3]
-        offset = answers[holds, 1:4] - ends[holds, :3]
-        square = np.maximum(np.einsum("kc,kc->k", axis, axis), 1e-300)
-        contacts.t[good] = np.clip(np.einsum("kc,kc->k", axis, offset) / square, 0.0, 1.0)
-        contacts.normal[good] = normal[holds]
-        contacts.point[good] = answers[holds, 4:7]
+        unique = ~contacts.two()
+        for k in rows.tolist():
+            start, end = segments[k, :3].tolist(), segments[k, 3:].tolist()
+            if self._pieces.moving:
+                self._object(int(pieces[k])).setTranslation(parameters[k, :3])
+            distance, point, witness = self._ask(int(pieces[k]), start, end)
+            self.asked += 1
+            if not (distance > 0.0 and abs(distance - radius[k] - contacts.distance[k]) <= _AGREEMENT):
+                self.replaced += 1
+            elif unique[k]:
+                axis = segments[k, 3:] - segments[k, :3]
+                contacts.t[k] = min(max(float(axis @ (point - start)) / float(axis @ axis), 0.0), 1.0)
+                contacts.normal[k] = (point - witness) / distance
+                contacts.point[k] = witness
 
-    def _ask(self, pieces: Index, ends: Array, parameters: Array) -> Array:
-        """Return FCL's distance and witness points on member and piece, (K, 7)."""
-        answers = np.empty((len(ends), 7))
-        middle = 0.5 * (ends[:, :3] + ends[:, 3:])
-        axis = ends[:, 3:] - ends[:, :3]
-        length = np.sqrt(np.einsum("kc,kc->k", axis, axis))
-        turns = _quaternions(axis, length).tolist()
-        moving = self._pieces.moving
-        member, capsule, request = self._member, self._capsule, self._request
-        distance, result_of = self._fcl.distance, self._fcl.DistanceResult
-        for k, (piece, size) in enumerate(zip(pieces.tolist(), length.tolist(), strict=True)):
-            obstacle = self._object(piece)
-            if moving:
-                obstacle.setTranslation(parameters[k, :3])
-            capsule.lz = size
-            member.setQuatRotation(turns[k])
-            member.setTranslation(middle[k])
-            result = result_of()
-            answers[k, 0] = distance(member, obstacle, request, result)
-            answers[k, 1:4], answers[k, 4:7] = result.nearest_points
-        return answers
+    def _ask(self, piece: int, start: list[float], end: list[float]) -> tuple[float, Array, Array]:
+        """Return FCL's distance and its witness points on the segment and on the piece."""
+        x, y, z = (b - a for a, b in zip(start, end, strict=True))
+        length = sqrt(x * x + y * y + z * z)
+        self._capsule.lz = length
+        self._member.setQuatRotation(_quaternion(x, y, z, length))
+        self._member.setTranslation(np.array([0.5 * (a + b) for a, b in zip(start, end, strict=True)]))
+        result = self._fcl.DistanceResult()
+        distance = self._fcl.distance(self._member, self._object(piece), self._request, result)
+        return distance, *result.nearest_points
 
 
-def _quaternions(axis: Array, length: Array) -> Array:
-    """Return quaternions w, x, y, z (K, 4) that turn the z axis onto `axis`."""
-    w = length + axis[:, 2]
-    quaternion = np.stack([w, -axis[:, 1], axis[:, 0], np.zeros(len(axis))], axis=1)
-    opposite = w <= 1e-9 * length
-    quaternion[opposite] = (0.0, 1.0, 0.0, 0.0)
-    return np.asarray(quaternion / np.linalg.norm(quaternion, axis=1)[:, None])
+def _quaternion(x: float, y: float, z: float, length: float) -> list[float]:
+    """Return the quaternion w, x, y, z that turns the z axis onto a vector."""
+    w = length + z
+    if w <= 1e-9 * length:
+        return [0.0, 1.0, 0.0, 0.0]
+    size = sqrt(w * w + x * x + y * y)
+    return [w / size, -y / size, x / size, 0.0]

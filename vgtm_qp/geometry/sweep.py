@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _DEPTH = 12
+_PIECES = 16
 _SAMPLES = np.linspace(0.0, 1.0, 33)[1:-1]
 
 
@@ -71,11 +72,6 @@ class _Motion:
         elif group.moving:
             self.change -= np.tile(group.displacement(end_time - start_time, rows), 2)
 
-    def whole(self) -> tuple[Array, Array, Array, Array]:
-        """Return segments at the start and the end, and parameters at the start and the end."""
-        others = self.others + self.other_change if self._is_self else self.others
-        return self.segments, self.segments + self.change, self.others, others
-
     def at(self, k: Index, fraction: Array) -> tuple[Array, Array]:
         """Return segments and parameters of the pairs `k` at their `fraction`."""
         s = fraction[:, None]
@@ -91,8 +87,12 @@ def sweep_group(
     """Return which of the pairs `rows` stay above `floor` over the motion, provably."""
     motion = _Motion(group, rows, start, end, start_time, end_time)
     count = len(rows)
-    k, left, right = np.arange(count), np.zeros(count), np.ones(count)
-    answer = group.sweep(*motion.whole(), rows)
+    # Few pairs are cut at once as finely as costs no more than the whole motion does: one call instead of several.
+    pieces = max(_PIECES // count, 1)
+    k = np.repeat(np.arange(count), pieces)
+    cuts = np.arange(pieces + 1) / pieces
+    left, right = np.tile(cuts[:-1], count), np.tile(cuts[1:], count)
+    answer = _swept(group, motion, rows, k, left, right)
     if (answer[:, 0] >= floor).all():
         return Found(float(answer[:, 0].min()), rows[:0], left[:0])
     failed = np.zeros(count, dtype=bool)
@@ -100,9 +100,7 @@ def sweep_group(
     fraction = np.full(count, 0.5)
     for depth in range(_DEPTH + 1):
         if depth:
-            a, other_a = motion.at(k, left)
-            b, other_b = motion.at(k, right)
-            answer = group.sweep(a, b, other_a, other_b, rows[k])
+            answer = _swept(group, motion, rows, k, left, right)
         # Negated comparisons also catch what is not a number.
         open_ = ~(answer[:, 0] >= floor)
         np.minimum.at(proven, k[~open_], answer[~open_, 0])
@@ -124,6 +122,13 @@ def sweep_group(
     if len(chosen):
         fraction[chosen] = _nearest_fraction(group, motion, rows, chosen, worst[chosen], fraction[chosen])
     return Found(kept, rows[chosen], fraction[chosen], float(worst[chosen].min(initial=np.inf)))
+
+
+def _swept(group: Group, motion: _Motion, rows: Index, k: Index, left: Array, right: Array) -> Array:
+    """Return the sweep of the pairs `k` between the fractions `left` and `right` of the motion, (len(k), 3)."""
+    a, other_a = motion.at(k, left)
+    b, other_b = motion.at(k, right)
+    return group.sweep(a, b, other_a, other_b, rows[k])
 
 
 def _nearest_fraction(

@@ -6,16 +6,16 @@ A pair that is already nearer than it may be does not stop the arm: it may not c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.geometry.clearance import BetweenReport, Clearance, Pair
+from vgtm_qp.geometry.clearance import BetweenReport, Clearance, NearPairs, Pair
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.linearise import clearance_rows
-from vgtm_qp.truss.kinematics import member_ends
+from vgtm_qp.truss.kinematics import EndKinematics, member_ends
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
@@ -23,6 +23,9 @@ Index = NDArray[np.int64]
 
 Shortfall = Mapping[Pair, float]
 """Pairs that are nearer than they may be, with their distances, m."""
+
+_BINDING = 0.01
+"""Pairs that are nearer than this to their floor, m, are asked of FCL too."""
 
 _NEAR_ANGLE = 0.3
 """Members that meet at an angle larger than the least one by this, rad, are far from it."""
@@ -55,6 +58,7 @@ class Separation:
         self.monitor = monitor
         self.distances = distances
         self._truss = truss
+        self._ends = None if truss.joints is None else EndKinematics(truss)
         self._corners = _corners(truss) if distances.minimum_angle > 0.0 else np.zeros((0, 2, 2), dtype=np.int64)
 
     def shortfall(self, X: Array, time: float) -> Shortfall:
@@ -122,10 +126,10 @@ class Separation:
             time,
             min(kept.influence, kept.safe + reach),
             use_fcl=motion,
-            fcl_reach=kept.safe + reach / 3.0,
+            fcl_reach=kept.safe + _BINDING,
             self_reach=min(kept.influence, kept.self_safe + 2.0 * reach),
         )
-        rows = clearance_rows(self.monitor, pairs, kept.safe + kept.margin, kept.self_safe + kept.margin)
+        rows = self._clearance_rows(X, pairs)
         if motion:
             np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
         for k in np.flatnonzero(pairs.distance < np.where(pairs.is_self, kept.self_safe, kept.safe)) if short else ():
@@ -144,9 +148,23 @@ class Separation:
         kept = self.distances
         found = []
         for s in stations:
-            pairs = self.monitor.near(start + s * (X - start), start_time + s * (time - start_time), 1.5 * kept.safe)
-            found.append(clearance_rows(self.monitor, pairs, kept.safe + kept.margin, kept.self_safe + kept.margin, s))
+            at = start + s * (X - start)
+            pairs = self.monitor.near(at, start_time + s * (time - start_time), 1.5 * kept.safe)
+            found.append(self._clearance_rows(at, pairs, s))
         return found
+
+    def _clearance_rows(self, X: Array, pairs: NearPairs, fraction: float = 1.0) -> ClearanceRows:
+        """Return the rows of pairs found at `X`; those of members in offset joints go over the joints' triangles."""
+        kept = self.distances
+        floors = kept.safe + kept.margin, kept.self_safe + kept.margin
+        rows = clearance_rows(self.monitor, pairs, *floors, fraction)
+        if self._ends is None or not len(rows):
+            return rows
+        self._ends.evaluate(X)
+        both = np.stack([pairs.member, np.where(pairs.is_self, pairs.other, pairs.member)], axis=1)
+        jacobian = self._ends.jacobian[both].reshape(len(rows), 4, 3, 9)
+        coefficients = np.einsum("rsc,rscn->rsn", rows.coefficients, jacobian).reshape(len(rows), 12, 3)
+        return replace(rows, nodes=self._ends.nodes[both].reshape(len(rows), 12), coefficients=coefficients)
 
     def names(self, short: Shortfall) -> tuple[str, ...]:
         """Return what is too near, nearest first."""
