@@ -154,10 +154,9 @@ def _verdict(rows: Sequence[Row]) -> str:
             shared = sorted(set(curve) & set(other))
             if shared:
                 n = shared[-1]
-                left[method, way] = other[n] / curve[n]
-                gains.append(
-                    f"{left[method, way]:.2g} times as fast in the {_NAMES[way].removeprefix('curve, ')} form"
-                )
+                gain = left[method, way] = other[n] / curve[n]
+                factor = f"{gain:.0f}" if gain >= 10.0 else f"{gain:.1f}"
+                gains.append(f"{factor} times as fast in the {_NAMES[way].removeprefix('curve, ')} form")
         if gains:
             lines.append(f"Against {algebra} the curve method is {' and '.join(gains)}, at {n} bays.")
     sparse = [gain for (method, _), gain in left.items() if method == "pseudoinverse-sparse"]
