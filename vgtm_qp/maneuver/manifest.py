@@ -36,6 +36,7 @@ def make_manifest(
     reached: float,
     blocked_by: Iterable[str] = (),
     stop: Mapping[str, Any] | None = None,
+    way_out: str = "",
     method: str,
     solver: str,
     setup_time: float,
@@ -59,6 +60,8 @@ def make_manifest(
         Names of what stopped it.
     stop : mapping, optional
         What ``Stop.to_dict`` returns.
+    way_out : str
+        How the redundancy was resolved where the problem's own way came to a dead end earlier.
     method, solver : str
         As in the problem's ``[method]``.
     setup_time : float
@@ -78,6 +81,7 @@ def make_manifest(
         "reached": float(reached),
         "blocked_by": list(blocked_by),
         "stop": None if stop is None else dict(stop),
+        "way_out": way_out,
         "method": method,
         "solver": solver,
         "setup_time": float(setup_time),

@@ -15,7 +15,9 @@ from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.manifest import arm_record, make_manifest, mesh_record
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.maneuver.ways_out import ways_out
 from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
@@ -75,16 +77,38 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     _add_state(record, resolver, plan, 0.0, 0.0, dict.fromkeys(resolver.phases, 0.0))
     setup_time = perf_counter() - started
 
+    way = ""
     try:
         stop = _run(resolver, plan, record, progress)
+        if stop is not None and isinstance(resolver, Resolver):
+            way, record, stop = _retry(problem, record, stop, progress)
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
-    maneuver = _assemble(problem, resolver, record, stop, setup_time)
+    maneuver = _assemble(problem, resolver, record, stop, setup_time, way)
     if not verify:
         return maneuver
     from vgtm_qp.verify import verify as check
 
     return maneuver.with_certificate(check(maneuver))
+
+
+def _retry(
+    problem: Problem, record: _Record, stop: Stop, progress: Progress | None
+) -> tuple[str, _Record, Stop | None]:
+    """Return what comes furthest of the maneuver that stopped and of other ways to do it, by name."""
+    best: tuple[str, _Record, Stop | None] = ("", record, stop)
+    for name, other in ways_out(problem, stop):
+        # A kernel takes longer to compile than a maneuver to solve without it.
+        resolver = Resolver(build_arm(other, compiled=False))
+        plan = make_plan(other, *resolver.tip())
+        tried = _Record()
+        _add_state(tried, resolver, plan, 0.0, 0.0, dict.fromkeys(resolver.phases, 0.0))
+        found = _run(resolver, plan, tried, progress)
+        if found is None:
+            return name, tried, None
+        if tried.rows["progress"][-1] > best[1].rows["progress"][-1] + _STALLED_PROGRESS:
+            best = (name, tried, found)
+    return best
 
 
 def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress | None) -> Stop | None:
@@ -149,6 +173,7 @@ def _assemble(
     record: _Record,
     stop: Stop | None,
     setup_time: float,
+    way: str,
 ) -> Maneuver:
     truss, task = resolver.arm.truss, resolver.arm.task
     meshes = {
@@ -164,6 +189,7 @@ def _assemble(
         reached=reached,
         blocked_by=() if stop is None else stop.names,
         stop=None if stop is None else stop.to_dict(),
+        way_out=way,
         method=problem.method.name,
         solver=problem.method.solver,
         setup_time=setup_time,

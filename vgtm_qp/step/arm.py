@@ -114,8 +114,8 @@ class Arm:
         )
 
 
-def build_arm(problem: Problem) -> Arm:
-    """Return the arm of a problem, ready to move.
+def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
+    """Return the arm of a problem, ready to move; not `compiled`, it is built sooner and steps more slowly.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def build_arm(problem: Problem) -> Arm:
         kinematics=kinematics,
         layout=layout,
         task=task,
-        engine=make_engine(problem.method.solver, layout, kinematics, task),
+        engine=make_engine(problem.method.solver, layout, kinematics, task, compiled=compiled),
         monitor=monitor,
         home_lengths=truss.home_lengths,
         control_vertices=curve.vertices,
@@ -176,7 +176,9 @@ def reshaped(arm: Arm, layout: Layout) -> Arm:
     return replace(arm, layout=layout, engine=engine)
 
 
-def make_engine(solver: str, layout: Layout, kinematics: Kinematics, task: TipTask) -> Engine:
+def make_engine(
+    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask, *, compiled: bool = True
+) -> Engine:
     """Return the engine that solves the steps of an arm with the solver of that name.
 
     Raises
@@ -184,7 +186,7 @@ def make_engine(solver: str, layout: Layout, kinematics: Kinematics, task: TipTa
     SolverError
         There is no such solver, or it is not installed.
     """
-    if solver == DEFAULT_SOLVER:
+    if solver == DEFAULT_SOLVER and compiled:
         stages = elimination_stages(layout)
         if stages is not None and len(layout.truss.actuators) <= FUSED_ACTUATORS:
             return FusedEngine(FusedSolver(layout, stages, task.axes), task)

@@ -53,6 +53,7 @@ def run(seed: int, number: int, steps: int, ipopt: bool) -> Row:
         "failures": list(maneuver.certificate.failures()) if maneuver.certificate else ["not verified"],
         "stop": stop["kind"] if stop else "",
         "blocked_by": manifest["blocked_by"],
+        "way_out": manifest["way_out"],
         "seconds": process_time() - started,
     }
     if ipopt:
@@ -111,6 +112,9 @@ def text(rows: Sequence[Row]) -> str:
             ],
         ),
     ]
+    ways = Counter(row["way_out"] for row in rows if row["way_out"] and row["status"] == "solved")
+    if ways:
+        parts.append("Solved by another way out: " + ", ".join(f"{way} {n}" for way, n in ways.most_common()) + ".")
     stops = Counter(row["stop"] for row in rows if row["stop"])
     if stops:
         parts.append(
