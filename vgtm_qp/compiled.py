@@ -7,6 +7,7 @@ compiler the CasADi virtual machine evaluates the same graph, 4 to 10 times slow
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shlex
@@ -60,7 +61,9 @@ def _library(function: ca.Function, cc: str) -> Path | None:
     generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
     generator.add(function)
     source = generator.dump()
-    key = hashlib.sha256("\0".join((source, cc, *_FLAGS, ca.__version__, _machine())).encode()).hexdigest()[:32]
+    key = hashlib.sha256("\0".join((source, cc, *_FLAGS, ca.__version__, _machine())).encode()).hexdigest()[
+        :32
+    ]
     target = cache_directory() / f"{function.name()}-{key}.so"
     if target.exists():
         return target
@@ -83,8 +86,17 @@ def compile_function(function: ca.Function) -> ca.Function:
     if cc is None:
         return function
     with _building:
-        library = _library(function, cc)
-    return function if library is None else ca.external(function.name(), str(library))
+        for _ in range(2):
+            library = _library(function, cc)
+            if library is None:
+                break
+            try:
+                return ca.external(function.name(), str(library))
+            except RuntimeError:
+                # Cut short by a full disk, or from a machine with another C library: compiled once more.
+                with contextlib.suppress(OSError):
+                    library.unlink(missing_ok=True)
+    return function
 
 
 class Kernel:
@@ -113,15 +125,19 @@ class Kernel:
         self._evaluate()
 
     def bind_input(self, index: int, array: Array) -> None:
-        """Let argument `index` be read from `array` (C-contiguous float64, of the same size), which the kernel keeps."""
+        """Let argument `index` be read from `array` (C-contiguous float64, of its size), which the kernel keeps."""
         if array.size != self.inputs[index].size or not array.flags.c_contiguous or array.dtype != np.float64:
             raise ValueError(f"argument {index} takes {self.inputs[index].size} contiguous float64 numbers")
         self.inputs[index] = array
         self._buffer.set_arg(index, memoryview(array.reshape(-1)))
 
     def bind_output(self, index: int, array: Array) -> None:
-        """Let result `index` be written to `array` (C-contiguous float64, of the same size), which the kernel keeps."""
-        if array.size != self.outputs[index].size or not array.flags.c_contiguous or array.dtype != np.float64:
+        """Let result `index` be written to `array` (C-contiguous float64, of its size), which the kernel keeps."""
+        if (
+            array.size != self.outputs[index].size
+            or not array.flags.c_contiguous
+            or array.dtype != np.float64
+        ):
             raise ValueError(f"result {index} gives {self.outputs[index].size} contiguous float64 numbers")
         self.outputs[index] = array
         self._buffer.set_res(index, memoryview(array.reshape(-1)))

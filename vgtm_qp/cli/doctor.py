@@ -102,7 +102,7 @@ def _hindrance(folder: Path) -> str:
     from vgtm_qp.cli.files import why_not_writable
 
     hindrance = why_not_writable(folder)
-    return f"; CANNOT BE WRITTEN, every process compiles again: {hindrance}" if hindrance else ""
+    return f"; CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else ""
 
 
 def _kernels() -> str:
