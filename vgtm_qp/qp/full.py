@@ -1,6 +1,6 @@
 """The whole QP of one step, every column and row with a name, a kind and a unit.
 
-    minimise  1/2 z' diag-block(P) z + q' z   subject to   row_lower <= A z <= row_upper,  column_lower <= z <= column_upper
+    minimise  1/2 z' P z + q' z   subject to   row_lower <= A z <= row_upper,  column_lower <= z <= column_upper
 
 z holds the displacements over the step of nodes, actuators, control vertices and path progress, and the gaps between
 faces and curve after it; because actuators and gaps are columns of their own, P is constant and only A's values change.
@@ -31,9 +31,9 @@ class Label(NamedTuple):
     unit: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StepQP:
-    """A step's QP as data. Arrays are shared with the builder and valid until the next build.
+    """A step's QP as data. Arrays are its builder's, and valid until that builds again.
 
     Attributes
     ----------
@@ -96,10 +96,14 @@ class StepQP:
         found += [(self.columns[k].name, float(column[k])) for k in np.flatnonzero(column > tolerance)]
         return sorted(found, key=lambda item: -item[1])
 
+    def __repr__(self) -> str:
+        return f"<StepQP: {len(self.columns)} columns, {len(self.rows)} rows>"
+
     def __str__(self) -> str:
         columns = Counter((label.kind, label.unit) for label in self.columns)
         rows = Counter((label.kind, label.unit) for label in self.rows)
-        lines = [f"QP of one step: {len(self.columns)} columns, {len(self.rows)} rows, {self.A.nnz} nonzeros", "columns"]
+        lines = [f"QP of one step: {len(self.columns)} columns, {len(self.rows)} rows, {self.A.nnz} nonzeros"]
+        lines.append("columns")
         lines += [f"  {count:6d}  {kind} [{unit}]" for (kind, unit), count in columns.items()]
         lines.append("rows")
         for (kind, unit), count in rows.items():
@@ -128,7 +132,10 @@ class FullBuilder:
             "progress": 1,
         }
         ends = np.cumsum(list(sizes.values()))
-        self.column = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        self.column = {
+            name: slice(int(end - size), int(end))
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
         self.size = int(ends[-1])
         diagonal = [
             np.full(sizes["nodes"], weights.node_rate),
@@ -198,7 +205,10 @@ class FullBuilder:
         self._hessian.data[-1] = numbers.progress_curvature
 
         column_lower, column_upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
-        column_lower[self.column["actuators"]], column_upper[self.column["actuators"]] = numbers.lower, numbers.upper
+        column_lower[self.column["actuators"]], column_upper[self.column["actuators"]] = (
+            numbers.lower,
+            numbers.upper,
+        )
         column_lower[-1], column_upper[-1] = numbers.progress_lower, numbers.progress_upper
         if layout.hard_tracking:
             column_lower[self.column["position"]] = column_upper[self.column["position"]] = 0.0
@@ -227,7 +237,9 @@ class FullBuilder:
             self._labels,
         )
 
-    def solution(self, z: Array, row_multipliers: Array, column_multipliers: Array, iterations: int) -> StepSolution:
+    def solution(
+        self, z: Array, row_multipliers: Array, column_multipliers: Array, iterations: int
+    ) -> StepSolution:
         """Return `z` and the multipliers in the arm's terms."""
         truss = self.layout.truss
         nodes = np.zeros((truss.node_count, 3))
@@ -246,8 +258,14 @@ class FullBuilder:
     def _columns(self) -> tuple[Label, ...]:
         layout, truss = self.layout, self.layout.truss
         axes = "xyz"
-        labels = [Label(f"node {truss.node_names[n]} {a}", "node displacement", "m") for n in truss.free for a in axes]
-        labels += [Label(f"stroke: {truss.member_names[m]}", "actuator displacement", "m") for m in truss.actuators]
+        labels = [
+            Label(f"node {truss.node_names[n]} {a}", "node displacement", "m")
+            for n in truss.free
+            for a in axes
+        ]
+        labels += [
+            Label(f"stroke: {truss.member_names[m]}", "actuator displacement", "m") for m in truss.actuators
+        ]
         labels += [
             Label(f"control vertex p{i} {a}", "control vertex displacement", "m")
             for i in range(layout.vertices)
@@ -255,7 +273,9 @@ class FullBuilder:
         ]
         labels += [Label(f"torsion {j + 1}", "torsion", "rad") for j in range(layout.torsion)]
         labels += [Label(f"gap: face {k} {a}", "tracking gap", "m") for k in layout.tracked for a in axes]
-        labels += [Label(f"tilt: face {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in self._turns]
+        labels += [
+            Label(f"tilt: face {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in self._turns
+        ]
         labels += [Label(f"stretch: piece {k}", "spacing gap", "m") for k in range(layout.spacings)]
         return (*labels, Label("progress along the path", "progress", "1"))
 
@@ -285,7 +305,10 @@ class FullBuilder:
         flat = (tip_columns[:, None] + np.arange(3)).reshape(-1)[present]
         add(np.repeat(np.arange(tip), len(flat)), np.tile(flat, tip))
         add(np.arange(tip), np.full(tip, column["progress"].start))
-        labels += [Label(name, "end effector", "m" if name[-1] in "xyz" and "rot" not in name else "rad") for name in layout.tip_rows]
+        labels += [
+            Label(name, "end effector", "m" if name[-1] in "xyz" and "rot" not in name else "rad")
+            for name in layout.tip_rows
+        ]
         if not layout.vertices:
             return np.concatenate(rows), np.concatenate(cols), tuple(labels)
 
@@ -325,7 +348,9 @@ class FullBuilder:
         else:
             add(*(grid.reshape(-1) for grid in np.meshgrid(np.arange(turns * tracked), curve, indexing="ij")))
         add(np.arange(turns * tracked), column["tangent"].start + np.arange(turns * tracked))
-        labels += [Label(f"tilt: face {f} {a}", "tangent", "rad") for f in layout.tracked for a in self._turns]
+        labels += [
+            Label(f"tilt: face {f} {a}", "tangent", "rad") for f in layout.tracked for a in self._turns
+        ]
         if layout.spacings:
             pieces = np.arange(layout.spacings)
             add(*(grid.reshape(-1) for grid in np.meshgrid(pieces, curve, indexing="ij")))

@@ -16,6 +16,7 @@ from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.curve.redundancy import add_control_vertices, remove_control_vertices
 from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
+from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.arm import Arm, build_arm, reshaped
 from vgtm_qp.step.attempt import Attempt
@@ -28,6 +29,7 @@ from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.stops import Limits, Stop, StopKind, explain
 from vgtm_qp.step.tracking import HardTracking
+from vgtm_qp.step.whole import whole_qp
 
 Array = NDArray[np.float64]
 
@@ -274,6 +276,40 @@ class Resolver:
             The goal is not three finite numbers, names a coordinate that is not tracked or the direction twice, or
             `dt` is not a positive number; the state is unchanged.
         """
+        return self.follow(self._path_to(position, pointing, rotation_vector), 0.0, 1.0, dt=dt)
+
+    def build(
+        self,
+        *,
+        position: ArrayLike | None = None,
+        pointing: ArrayLike | None = None,
+        rotation_vector: ArrayLike | None = None,
+        dt: float | None = None,
+    ) -> StepQP:
+        """Return the QP that a step to a goal starts with, to read, to print or to solve elsewhere; nothing moves.
+
+        Every row and column has a name, a kind and a unit. It is the whole QP, whatever smaller one with the same
+        answer the solver is given, and holds every pair within influence.
+
+        Parameters
+        ----------
+        position, pointing, rotation_vector, dt
+            As :meth:`step` takes them.
+
+        Raises
+        ------
+        GoalError
+            As :meth:`step` raises it.
+        """
+        path, dt = self._path_to(position, pointing, rotation_vector), self._duration(dt)
+        return whole_qp(
+            self.arm, self._separation, self.state, self._target(path, 0.0, 1.0, dt, self._box(dt))
+        )
+
+    def _path_to(
+        self, position: ArrayLike | None, pointing: ArrayLike | None, rotation_vector: ArrayLike | None
+    ) -> Path:
+        """Return the straight way from the tip's present pose to a goal."""
         self._check_tracked(position=position, pointing=pointing, rotation_vector=rotation_vector)
         here, rotation = self.tip()
         there = here if position is None else _vector(position, "position")
@@ -287,13 +323,16 @@ class Resolver:
             turned = rotation_from_vector(_vector(rotation_vector, "rotation_vector"))
         else:
             turned = rotation
-        path = Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation, turned]))
-        return self.follow(path, 0.0, 1.0, dt=dt)
+        return Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation, turned]))
 
     def _check_tracked(self, **goal: ArrayLike | None) -> None:
         """Refuse a goal for coordinates that no row of the QP steers, and two goals for one."""
         task = self.arm.task
-        served = {"position": bool(len(task.axes)), "pointing": bool(task.turns), "rotation_vector": bool(task.turns)}
+        served = {
+            "position": bool(len(task.axes)),
+            "pointing": bool(task.turns),
+            "rotation_vector": bool(task.turns),
+        }
         for name, value in goal.items():
             if value is not None and not served[name]:
                 tracked = ", ".join(task.track)
@@ -307,7 +346,9 @@ class Resolver:
         kinematics.evaluate(self.state.nodes)
         return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
 
-    def follow(self, path: Path, start: float, end: float, *, dt: float | None = None, smallest: float = 1 / 64) -> Step:
+    def follow(
+        self, path: Path, start: float, end: float, *, dt: float | None = None, smallest: float = 1 / 64
+    ) -> Step:
         """Move along `path` from its value `start` towards `end` in one step; pieces are halved until one is safe.
 
         A step in which an actuator of the problem jams ends at that time, with the part of the way until then.
@@ -317,21 +358,14 @@ class Resolver:
         GoalError
             `dt` is not a positive number; the state is unchanged.
         """
-        dt = self.arm.dt if dt is None else dt
-        if not (np.isfinite(dt) and dt > 0.0):
-            raise GoalError(f"dt must be a positive number of seconds, not {dt!r}; the state of the arm is unchanged")
+        dt = self._duration(dt)
         whole = self._until_jam(dt)
         dt *= whole
-        state, actuators = self.state, self.arm.truss.actuators
-        lower, upper = length_box(
-            state.lengths[actuators], state.length_rates[actuators], *self._limits, dt, state.duration or None
-        )
-        then = (state.time + dt, *self.arm.base_at(state.time + dt), self._vertex_goals)
+        state, box = self.state, self._box(dt)
         share, outcome = 1.0, None
         while share >= smallest:
             reach = start + share * whole * (end - start)
-            target = Target(path, start, reach, lower, upper, *then)
-            outcome = self._attempt.run(state, target, share)
+            outcome = self._attempt.run(state, self._target(path, start, reach, dt, box), share)
             if outcome.accepted:
                 break
             share /= 2
@@ -356,7 +390,27 @@ class Resolver:
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return Step(status, progress, self.state, "", outcome.iterations, *told)
 
-    def explain(self, path: Path, start: float, end: float, *, dt: float | None = None, reason: str = "") -> Stop:
+    def _duration(self, dt: float | None) -> float:
+        dt = self.arm.dt if dt is None else dt
+        if not (np.isfinite(dt) and dt > 0.0):
+            raise GoalError(
+                f"dt must be a positive number of seconds, not {dt!r}; the state of the arm is unchanged"
+            )
+        return dt
+
+    def _box(self, dt: float) -> tuple[Array, Array]:
+        """Return the least and greatest lengths of the actuators at the end of a step of `dt`, s, m."""
+        state, actuators = self.state, self.arm.truss.actuators
+        length, rate = state.lengths[actuators], state.length_rates[actuators]
+        return length_box(length, rate, *self._limits, dt, state.duration or None)
+
+    def _target(self, path: Path, start: float, end: float, dt: float, box: tuple[Array, Array]) -> Target:
+        then = self.state.time + dt
+        return Target(path, start, end, *box, then, *self.arm.base_at(then), self._vertex_goals)
+
+    def explain(
+        self, path: Path, start: float, end: float, *, dt: float | None = None, reason: str = ""
+    ) -> Stop:
         """Return why the arm does not get on from its present state along `path` from its value `start` to `end`.
 
         Worth asking after a step that was blocked or hardly moved; `reason` is that step's. The state is unchanged.
@@ -369,7 +423,7 @@ class Resolver:
         state, actuators = self.state, self.arm.truss.actuators
         stroke, rate, _ = self._limits
         length = state.lengths[actuators]
-        lower, upper = length_box(length, state.length_rates[actuators], *self._limits, dt, state.duration or None)
+        lower, upper = self._box(dt)
 
         def kinds(bound: Array, end: Array, fastest: Array) -> list[StopKind]:
             kind = np.where(np.abs(bound - fastest) < 1e-9, StopKind.RATE, StopKind.ACCELERATION)
@@ -392,5 +446,7 @@ def _vector(value: ArrayLike, name: str) -> Array:
     except (TypeError, ValueError):
         vector = np.zeros(0)
     if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise GoalError(f"{name} must be three finite numbers, not {value!r}; the state of the arm is unchanged")
+        raise GoalError(
+            f"{name} must be three finite numbers, not {value!r}; the state of the arm is unchanged"
+        )
     return vector

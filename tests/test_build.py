@@ -1,0 +1,67 @@
+"""The QP that a resolver shows is the one that its step starts with, and says what each of its numbers is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import vgtm_qp as vq
+
+GOAL = [0.1, 0.0, 4.0]
+
+
+@pytest.fixture
+def resolver():
+    resolver = vq.Resolver(vq.load_problem("five_bay_two_cubes").replace({"method.solver": "piqp"}))
+    assert resolver.step(position=[0.05, 0.0, 4.04]).status == "reached"
+    return resolver
+
+
+def test_its_solution_is_the_first_motion_of_the_step(resolver):
+    qp = resolver.build(position=GOAL)
+    limits = (qp.row_lower.copy(), qp.row_upper.copy())
+    from vgtm_qp.qp.solvers import _Piqp
+
+    z, *_ = _Piqp()(qp, same_structure=False)
+    solution = resolver.step(position=GOAL)._solution
+    moved = {label.name: value for label, value in zip(qp.columns, z, strict=True)}
+    np.testing.assert_allclose(
+        [moved[f"stroke: {name}"] for name in resolver._actuator_names], solution.actuators, atol=1e-7
+    )
+    assert moved["progress along the path"] == pytest.approx(solution.progress, abs=1e-7)
+    np.testing.assert_array_equal(limits, (qp.row_lower, qp.row_upper))
+
+
+def test_every_row_and_column_has_a_name_a_kind_and_a_unit(resolver):
+    qp = resolver.build(position=GOAL)
+    assert qp.A.shape == (len(qp.rows), len(qp.columns))
+    assert qp.P.shape == (len(qp.columns), len(qp.columns))
+    assert all(
+        label.name and label.kind and label.unit in ("m", "rad", "1") for label in qp.rows + qp.columns
+    )
+    assert len({label.name for label in qp.columns}) == len(qp.columns)
+    text = str(qp)
+    for label in qp.rows + qp.columns:
+        assert f"{label.kind} [{label.unit}]" in text
+    assert "right cube" in text
+    assert len(repr(qp)) < 80
+
+
+def test_building_moves_nothing(resolver):
+    state = resolver.state
+    first, second = resolver.build(position=GOAL), resolver.build(position=[0.0, 0.1, 4.0])
+    assert resolver.state is state
+    assert not np.array_equal(first.A.data, second.A.data)
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        ({"position": [0.0, np.nan, 4.0]}, "three finite numbers"),
+        ({"pointing": [0.0, 0.0, 1.0]}, "not tracked, only position"),
+        ({"position": GOAL, "dt": 0.0}, "positive number of seconds"),
+    ],
+)
+def test_what_step_refuses_build_refuses(resolver, goal, message):
+    with pytest.raises(vq.GoalError, match=message):
+        resolver.build(**goal)
