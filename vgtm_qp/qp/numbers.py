@@ -17,8 +17,8 @@ class ClearanceRows:
     """Linearised clearances: sum over slots of coefficients . d rho[nodes] >= lower, in m.
 
     ``nodes`` (R, 4) are node indices: the two ends of the member, then those of the other member in a self pair
-    (repeated with zero coefficients otherwise). ``coefficients`` is (R, 4, 3). Base nodes may occur; their
-    displacement is already part of ``lower``.
+    (repeated with zero coefficients otherwise); with offset joints (R, 12), the triangles of those four ends.
+    ``coefficients`` is (R, 4, 3) or (R, 12, 3). Base nodes may occur; their displacement is already part of ``lower``.
     """
 
     nodes: Index = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))
@@ -34,12 +34,21 @@ class ClearanceRows:
         known = np.einsum("rsc,rsc->r", self.coefficients, displacement[self.nodes])
         return replace(self, lower=self.lower - known)
 
+    def _widened(self, width: int) -> ClearanceRows:
+        """Return the rows with `width` slots, the new ones with zero coefficients."""
+        more = ((0, 0), (0, width - self.nodes.shape[1]))
+        return replace(
+            self, nodes=np.pad(self.nodes, more, mode="edge"), coefficients=np.pad(self.coefficients, (*more, (0, 0)))
+        )
+
     def joined(self, other: ClearanceRows) -> ClearanceRows:
         """Return these rows followed by `other`'s."""
         count, first, second = len(self), self.name, other.name
+        width = max(self.nodes.shape[1], other.nodes.shape[1])
+        parts = [rows._widened(width) for rows in (self, other)]
         return ClearanceRows(
-            np.concatenate([self.nodes, other.nodes]),
-            np.concatenate([self.coefficients, other.coefficients]),
+            np.concatenate([rows.nodes for rows in parts]),
+            np.concatenate([rows.coefficients for rows in parts]),
             np.concatenate([self.lower, other.lower]),
             lambda k: first(k) if k < count else second(k - count),
         )

@@ -5,6 +5,7 @@ A pair that is already nearer than it may be does not stop the arm: it may not c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -26,6 +27,8 @@ Shortfall = Mapping[Pair, float]
 
 _BINDING = 0.01
 """Pairs that are nearer than this to their floor, m, are asked of FCL too."""
+
+_MOST_PIECES = 16
 
 _NEAR_ANGLE = 0.3
 """Members that meet at an angle larger than the least one by this, rad, are far from it."""
@@ -95,8 +98,22 @@ class Separation:
             min([least, *(distance for pair, distance in before.items() if pair.is_self == is_self)])
             for least, is_self in ((kept.safe, False), (kept.self_safe, True))
         )
-        spare = -kept.rounding if self._truss.joints is None else self.deviation(start, end) - _BETWEEN
-        return self.monitor.between(start, end, start_time, end_time, floor + spare, max(self_floor + spare, 0.0))
+        if self._truss.joints is None:
+            floors = floor - kept.rounding, max(self_floor - kept.rounding, 0.0)
+            return self.monitor.between(start, end, start_time, end_time, *floors)
+        # Cut in k pieces the ends leave their chords by a k-th of a k-th.
+        deviation = self.deviation(start, end)
+        pieces = min(math.ceil(math.sqrt(max(deviation / _BETWEEN, 1.0))), _MOST_PIECES) if deviation < 1.0 else 1
+        spare = deviation / pieces**2 - _BETWEEN
+        floors, lowest = (floor + spare, max(self_floor + spare, 0.0)), np.inf
+        for k in range(pieces):
+            here, there = (start + share * (end - start) for share in (k / pieces, (k + 1) / pieces))
+            times = (start_time + share * (end_time - start_time) for share in (k / pieces, (k + 1) / pieces))
+            report = self.monitor.between(here, there, *times, *floors)
+            lowest = min(lowest, report.clearance)
+            if not report.certified:
+                break
+        return replace(report, clearance=lowest, fraction=(k + report.fraction) / pieces)
 
     def deviation(self, start: Array, end: Array) -> float:
         """Return how far members' ends leave their chords at most, m: offset joints turn on the way."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
+from vgtm_qp.errors import TrussError
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
@@ -121,6 +122,38 @@ def member_ends(truss: Truss, X: Array) -> Array:
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     frames = np.stack([x, np.cross(z, x), z], axis=-1)
     return np.asarray(ends + np.einsum("mexy,mey->mex", frames[truss.members], truss.joints.offset))
+
+
+class EndKinematics:
+    """The ends r_ik of members in offset joints and their Jacobians, eqs. (13), (20) and (21), at one configuration.
+
+    Attributes
+    ----------
+    nodes : (M, 2, 3) int
+        The triangle that places each end, its own node first.
+    ends : (M, 2, 3)
+        m; overwritten by `evaluate`, as is the next.
+    jacobian : (M, 2, 3, 9)
+        d end / d (positions of ``nodes``).
+    """
+
+    def __init__(self, truss: Truss, *, compiled: bool = True) -> None:
+        if truss.joints is None:
+            raise TrussError("this truss has pin joints: its members end in the nodes")
+        self.nodes = truss.joints.triangle[truss.members]
+        corners, offset = ca.SX.sym("corners", 3, 3), ca.SX.sym("offset", 3)
+        end = corners[:, 0] + joint_frame(*(corners[:, c] for c in range(3))) @ offset
+        one = ca.Function("end", [corners, offset], [end, ca.densify(ca.jacobian(end, ca.vec(corners)))])
+        count = 2 * truss.member_count
+        self._kernel = Kernel(one.map(count), compiled=compiled)
+        self._kernel.inputs[1][:] = truss.joints.offset.reshape(-1)
+        self.ends = self._kernel.outputs[0].reshape(-1, 2, 3)
+        self.jacobian = self._kernel.outputs[1].reshape(-1, 2, 9, 3).transpose(0, 1, 3, 2)
+
+    def evaluate(self, X: Array) -> None:
+        """Overwrite ends and Jacobians with those at node positions `X` (N, 3), m."""
+        self._kernel.inputs[0][:] = X[self.nodes].reshape(-1)
+        self._kernel()
 
 
 class Kinematics:

@@ -1,0 +1,137 @@
+"""Members that end in offset joints, eqs. (12)-(21): their ends, their clearance rows and proofs, their maneuvers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arms import TRUSSES, arm_problem, central_differences, random_pose
+
+import vgtm_qp as vq
+from vgtm_qp.errors import TrussError
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.truss.kinematics import EndKinematics, member_ends
+
+
+@pytest.mark.parametrize("name", TRUSSES)
+def test_ends_and_their_jacobians_are_those_of_the_formulas(name):
+    truss = TRUSSES[name](joint_offset=0.1)
+    X = random_pose(truss, np.random.default_rng(1))
+    kinematics = EndKinematics(truss, compiled=False)
+    kinematics.evaluate(X)
+    np.testing.assert_allclose(kinematics.ends, member_ends(truss, X), atol=1e-14)
+    wanted = central_differences(lambda Y: member_ends(truss, Y), X)
+    found = np.zeros_like(wanted)
+    for member, end, corner in np.ndindex(*kinematics.nodes.shape):
+        node = kinematics.nodes[member, end, corner]
+        found[member, end, :, node] += kinematics.jacobian[member, end, :, 3 * corner : 3 * corner + 3]
+    np.testing.assert_allclose(found, wanted, atol=1e-8)
+
+
+def test_pin_joints_have_no_ends_of_their_own():
+    with pytest.raises(TrussError, match="pin joints"):
+        EndKinematics(TRUSSES["octahedral"]())
+
+
+def beside_a_cube(joint_offset=0.1, **more):
+    return arm_problem(
+        (0.6, 0.1, 2.9),
+        bays=4,
+        truss={"joint_offset": joint_offset, **more},
+        obstacle=[{"name": "cube", "shape": "box", "center": [0.95, 0.1, 2.0], "size": 0.5}],
+        clearance={"safe": 0.05, "influence": 0.4},
+    )
+
+
+def separation_of(arm):
+    return Separation(arm.truss, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence, margin=0.0))
+
+
+def test_clearance_rows_are_the_derivatives_of_the_distances():
+    """Distances by their definition at moved nodes, against the rows: the joints' rotation is part of both."""
+    rng = np.random.default_rng(2)
+    arm = build_arm(beside_a_cube())
+    truss, monitor = arm.truss, arm.monitor
+    X = truss.home + 0.02 * rng.normal(size=truss.home.shape)
+    rows = separation_of(arm).rows(X, 0.0, 0.0, 1.0, {}, 0.0)
+    assert rows.nodes.shape[1] == 12
+    step = rng.normal(size=X.shape)
+    h, names = 1e-6, [rows.name(k) for k in range(len(rows))]
+    change = np.einsum("rsc,rsc->r", rows.coefficients, step[rows.nodes])
+
+    def distances(Y):
+        pairs = monitor.near(Y, 0.0, 0.6, use_fcl=False)
+        found = {}
+        for k in range(len(pairs)):
+            found[pairs.name(k)] = min(found.get(pairs.name(k), np.inf), float(pairs.distance[k]))
+        return found
+
+    ahead, behind = distances(X + h * step), distances(X - h * step)
+    single = [k for k, name in enumerate(names) if names.count(name) == 1]
+    assert sum("cube" in names[k] for k in single) >= 3
+    for k in single:
+        wanted = (ahead[names[k]] - behind[names[k]]) / (2 * h)
+        assert change[k] == pytest.approx(wanted, abs=1e-5), names[k]
+
+
+def test_rows_of_different_widths_join():
+    narrow = ClearanceRows(np.array([[0, 1, 2, 3]]), np.ones((1, 4, 3)), np.zeros(1))
+    wide = ClearanceRows(np.arange(12)[None], 2.0 * np.ones((1, 12, 3)), np.ones(1))
+    for first, second in ((narrow, wide), (wide, narrow)):
+        joined = first.joined(second)
+        moved = np.random.default_rng(0).normal(size=(12, 3))
+        value = np.einsum("rsc,rsc->r", joined.coefficients, moved[joined.nodes])
+        alone = [np.einsum("rsc,rsc->r", r.coefficients, moved[r.nodes])[0] for r in (first, second)]
+        np.testing.assert_allclose(value, alone)
+        assert list(joined.lower) == [first.lower[0], second.lower[0]]
+
+
+def test_a_proof_of_the_way_holds_at_every_instant_of_it():
+    rng = np.random.default_rng(4)
+    arm = build_arm(beside_a_cube())
+    separation, truss, monitor = separation_of(arm), arm.truss, arm.monitor
+    certified = 0
+    for _ in range(12):
+        start, end = (truss.home + 0.05 * rng.normal(size=truss.home.shape) for _ in range(2))
+        end = start + 0.5 * (end - start)
+        least = min(
+            monitor.least(start + s * (end - start), 0.0, among="obstacles")[0] for s in np.linspace(0, 1, 41)
+        )
+        report = separation.between(start, end, 0.0, 0.0, {})
+        if report.certified:
+            certified += 1
+            assert least >= arm.safe - 5e-5 - 1e-9
+        else:
+            assert least < arm.safe + 1e-3 or not monitor.keeps(end, 0.0, 0.0, arm.self_safe)
+            assert np.all((report.fraction >= 0.0) & (report.fraction <= 1.0))
+    assert certified > 0
+
+
+@pytest.mark.parametrize(
+    ("module", "bays", "offset"),
+    [
+        ("octahedral", 4, 0.1),
+        ("double-octahedral", 2, 0.05),
+        ("hexapod", 3, 0.1),
+        ("longeron", 4, 0.1),
+        ("tetrahedral", 3, 0.1),
+    ],
+)
+def test_maneuvers_with_offset_joints_are_certified(module, bays, offset, monkeypatch):
+    monkeypatch.setenv("VGTM_CC", "none")
+    problem = arm_problem(bays=bays, truss={"module": module, "stroke": None, "joint_offset": offset})
+    home = build_arm(problem).truss
+    tip = home.tip_weights @ home.home[home.tip]
+    goal = (tip + np.array([0.12, 0.04, -0.05]) * home.height).tolist()
+    side = [tip[0] + 0.42 + 0.25 + 0.06 + 0.577 - 0.15, 0.0, 0.5 * home.height]
+    problem = problem.replace(
+        {
+            "maneuver.waypoint": [{"time": 5.0, "position": goal}],
+            "maneuver.steps": 6,
+            "obstacle": [{"name": "cube", "shape": "box", "center": side, "size": 0.5}],
+        }
+    )
+    maneuver = vq.solve(problem)
+    assert maneuver.status == "solved", maneuver.manifest["blocked_by"]
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
