@@ -89,6 +89,14 @@ def test_a_figure_is_drawn(capsys, folder):
     assert (folder / "frames.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("tokens", [("solve", "free.toml", "--html", "page.html"), ("view", "free.toml")])
+def test_a_missing_extra_is_named_before_any_work(capsys, folder, monkeypatch, tokens):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    code, out, err = run(capsys, *tokens)
+    assert (code, out, err) == (2, "", "vgtm: viser is not installed: pip install 'vgtm-qp[view]'\n")
+    assert not (folder / "free.npz").exists()
+
+
 def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
     code, out, _ = run(capsys, "solve", "five_bay_blocked_by_wall", "--json")
     summary = json.loads(out)

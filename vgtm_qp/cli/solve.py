@@ -54,7 +54,10 @@ def solve(
     if figure is not None:
         check_writable(figure, "--figure", (".pdf", ".png", ".svg"))
     if html is not None:
+        from vgtm_qp.view.scene import import_viser
+
         check_writable(html, "--html", (".html",))
+        import_viser()
 
     from vgtm_qp.maneuver.solve import solve as run
     from vgtm_qp.verify import verify as certify

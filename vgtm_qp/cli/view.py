@@ -27,7 +27,9 @@ def view(
     from vgtm_qp.maneuver.result import load_result
     from vgtm_qp.problem import load_problem
     from vgtm_qp.view.page import view as serve
+    from vgtm_qp.view.scene import import_viser
 
+    import_viser()
     loaded = load_result(shown) if shown.lower().endswith(".npz") else load_problem(shown)
     note("interrupt (Ctrl-C) to end")
     try:
