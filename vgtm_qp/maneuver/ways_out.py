@@ -7,6 +7,7 @@ takes. The ways stand in the order of what they bought over random scenes (``vgt
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.problem import Problem
@@ -22,7 +23,7 @@ def ways_out(problem: Problem, stop: Stop) -> Iterator[tuple[str, Problem]]:
     if not method.retries or stop.kind in _HOPELESS:
         return
     weights = method.weights
-    ways = {
+    ways: dict[str, dict[str, Any]] = {
         "actuators drawn to their home lengths": {
             "method.weights.stroke_centring": 10.0 * max(weights.stroke_centring, 0.02)
         },

@@ -4,8 +4,9 @@ To first order the arm can cover the share alpha of a piece of path that is the 
 
     J d_rho = E d_a,   tip rows d_rho = alpha rate,   clearance and angle rows,   limits <= d_a <= limits,
 
-a linear program in the actuators' displacements. Where alpha is next to nothing, the rows with multipliers say why;
-those without which the arm stays blocked are left out one after another, until each one that remains is needed.
+a linear program in the actuators' displacements. The rows with multipliers hold it back; those without which it is
+held as before are left out one after another, until each one that remains is needed. An arm may stop although a little
+way is left to first order: close to a fold of its motion the curvature takes what the rows leave.
 """
 
 from __future__ import annotations
@@ -33,6 +34,10 @@ _TRUST = 0.05
 """How far actuators move in the linear program, m: further, its rows mean little."""
 _BLOCKED = 0.02
 """A share of the way, within the trust, below which the arm counts as blocked."""
+_FREER = 2.0
+"""Rows without which the arm gets on by so many times more are those that hold it."""
+_SINGULAR = 0.1
+"""A share below which the tip moves far less than the actuators do."""
 _PRESSES = 1e-7
 
 
@@ -111,16 +116,15 @@ def explain(
     """Return why the arm does not get on from `state` along `path` from its value `start` towards `end`."""
     program = _Program(arm, separation, state, path, start, end, limits)
     share, pressing = program.solve(np.ones(program.count, dtype=bool))
-    if share > _BLOCKED:
-        return Stop(StopKind.NONLINEAR, reason=reason)
+    bar = max(_BLOCKED, _FREER * share)
     kept = np.zeros(program.count, dtype=bool)
     kept[np.flatnonzero(pressing > _PRESSES)] = True
-    if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= _BLOCKED:
+    if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= bar:
         kind = StopKind.OUT_OF_REACH if _outward(arm, state, path, start) else StopKind.SINGULAR
-        return Stop(kind, reason=reason)
+        return Stop(kind if share <= _SINGULAR else StopKind.NONLINEAR, reason=reason)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: pressing[k]):
         kept[k] = False
-        if program.solve(kept)[0] > _BLOCKED:
+        if program.solve(kept)[0] > bar:
             kept[k] = True
     _, pressing = program.solve(kept)
     chosen = sorted(np.flatnonzero(kept).tolist(), key=lambda k: -pressing[k])
