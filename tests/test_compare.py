@@ -37,6 +37,7 @@ def test_each_method_is_held_against_the_same_verification(report: vq.Report) ->
     assert corrected.member_drift is not None
     assert corrected.member_drift < 1e-9
     assert "clearance" in corrected.reason
+    assert (qp.rank, faithful.rank) == (None, 33), "30 longerons and the tip's position"
     assert corrected.actuator_travel is not None
     assert corrected.actuator_travel > 0.5
 

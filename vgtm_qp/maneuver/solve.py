@@ -196,6 +196,8 @@ def _assemble(
         directory=Path(problem.source).parent if problem.source else Path.cwd(),
         meshes=meshes,
     )
+    # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank only.
+    manifest["jacobian_rank"] = getattr(resolver, "rank", None)
     rotation = record.array("tip_target_rotation")
     count = len(record.rows["time"])
     return Maneuver(

@@ -45,6 +45,8 @@ class Row:
         Step and reason of a breakdown, or the first tolerance that verification found broken.
     actuator_travel : float
         Sum over actuators and steps of the changes of length.
+    rank : int or None
+        Of the Jacobian of eq. (26) in the last step, where the method reveals it.
     """
 
     problem: str
@@ -63,6 +65,7 @@ class Row:
     actuator_travel: float | None = None
     step_time: float | None = None
     setup_time: float | None = None
+    rank: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +191,7 @@ def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
         actuator_travel=float(travel),
         step_time=summary["step_time"]["median"],
         setup_time=summary["setup_time"],
+        rank=maneuver.manifest.get("jacobian_rank"),
     )
 
 
