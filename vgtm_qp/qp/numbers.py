@@ -56,7 +56,9 @@ class ClearanceRows:
 
 @dataclass(frozen=True, eq=False)
 class CurveNumbers:
-    """Rows of a curve that is more than its tables, over its D = 3 V + T coordinates d_c::
+    """Rows of a curve that is more than its tables, over its D = 3 V + T coordinates d_c.
+
+    They are::
 
         gap     = C d_rho - position d_c + position_rhs           m
         turn    = turn_face d_rho[face] + turn_curve d_c + turn_rhs   rad

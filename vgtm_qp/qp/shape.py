@@ -23,7 +23,7 @@ class CurveRows(NamedTuple):
     position, position_rows : (K, 3), (K, 3, D)
         r(s_k), m.
     frame, spin_rows : (K, 3, 3), (K, 3, D)
-        F(s_k), its third column the tangent, and its angular velocity.
+        F(s_k), its third column the tangent, and its angular velocity; without roll, the tangent and its turning.
     spacing, spacing_rows : (S,), (S, D)
         Distances of successive nodes less those at home, m, from the base on; S = 0 where nobody asks.
     """
@@ -108,7 +108,15 @@ class CurveShape:
         """
         curve = Curve(self.family, vertices, torsion, base_frame)
         s = curve.arc_parameter(self.nodes) if self.by_arc_length else self.nodes
-        position_rows, spin_rows = curve.position_jacobian(s), curve.orientation_jacobian(s)
+        position_rows = curve.position_jacobian(s)
+        if self.tracks_roll:
+            frame, spin_rows = curve.frame(s) @ self._home_roll, curve.orientation_jacobian(s)
+        else:
+            # Without roll only the tangent turns, and the integrals along the curve can be spared.
+            frame, tangent = np.zeros((len(s), 3, 3)), curve.tangent(s)
+            frame[:, :, 2] = tangent
+            turned = np.cross(tangent[:, None, :], np.swapaxes(curve.tangent_jacobian(s), 1, 2))
+            spin_rows = np.swapaxes(turned, 1, 2)
         if self.by_arc_length:
             rates = curve.arc_node_rates(s)[:, None, :]
             position_rows = position_rows + curve.derivative(s)[:, :, None] * rates
@@ -123,9 +131,7 @@ class CurveShape:
             change = np.diff(np.concatenate([start, position_rows]), axis=0)
             spacing = distance - self.spacing
             spacing_rows = np.einsum("kc,kcd->kd", steps / distance[:, None], change)
-        return CurveRows(
-            position, position_rows, curve.frame(s) @ self._home_roll, spin_rows, spacing, spacing_rows
-        )
+        return CurveRows(position, position_rows, frame, spin_rows, spacing, spacing_rows)
 
 
 class TurnRows(NamedTuple):
