@@ -81,7 +81,10 @@ def test_a_maneuver_on_a_moving_base_is_certified(solver, joint_offset):
     np.testing.assert_allclose(maneuver.tip_position[-1], [1.0, 0.2, 2.2], atol=1e-6)
     altered = maneuver.nodes.copy()
     altered[7, :3] += 1e-6
-    assert not vq.verify(type(maneuver)(**{**vars(maneuver), "nodes": altered})).ok
+    assert not vq.verify(type(maneuver)(**{**vars(maneuver), "nodes": altered})).base_error.ok
+    late = {**maneuver.manifest, "problem": problem.to_dict()}
+    late["problem"]["truss"]["base_motion"][0]["position"][1] += 1e-3
+    assert not vq.verify(type(maneuver)(**{**vars(maneuver), "manifest": late})).base_error.ok
 
 
 def locked_problem(locked, **more):

@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from synthetic import LENGTHS, RADIUS, found_clearances, good_maneuver, maneuver_of, place, swing, tripod
 
-import vgtm_qp.verify.check as check
 from vgtm_qp.errors import ResultError
 from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.truss.modules import octahedral
 from vgtm_qp.truss.truss import Joints
-from vgtm_qp.verify import verify, verify_file
+from vgtm_qp.verify import check, verify, verify_file
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Least, Motion
 from vgtm_qp.verify.obstacles import read_obstacles

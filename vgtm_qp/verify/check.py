@@ -208,31 +208,37 @@ def _locking_rows(arm: Arm, problem: Mapping[str, Any], time: Array) -> Array:
 def _base_error(arm: Arm, maneuver: Maneuver, problem: Mapping[str, Any]) -> Array:
     """Return (T, N_c) how far base nodes are from where the problem holds them, m.
 
-    A base that moves, eqs. (7)-(8), is held against its poses at their times, and to a rigid motion between.
+    A base that moves, eqs. (7)-(8), goes from pose to pose on straight lines and single-axis rotations, from its home
+    pose at time 0 on, and stays in the last one.
     """
-    found = maneuver.nodes[:, arm.base]
     home = arm.home[arm.base]
     poses = (problem.get("truss") or {}).get("base_motion") or ()
-    if not poses:
-        return np.asarray(np.linalg.norm(found - home, axis=2))
-    errors = np.stack([_rigid_error(home, state) for state in found])
-    for pose in poses:
-        for row in np.flatnonzero(np.abs(maneuver.time - float(pose["time"])) <= 1e-12):
-            turn, shift = (
-                np.asarray(pose.get(key) or (0.0,) * 3, dtype=float)
-                for key in ("rotation_vector", "position")
-            )
-            placed = home @ rotation_matrix(turn).T + shift
-            errors[row] = np.maximum(errors[row], np.linalg.norm(found[row] - placed, axis=1))
+    shift = np.array([(0.0, 0.0, 0.0), *(pose.get("position") or (0.0,) * 3 for pose in poses)], dtype=float)
+    turn = [np.eye(3)]
+    turn += [
+        rotation_matrix(np.array(pose.get("rotation_vector") or (0.0,) * 3, dtype=float)) for pose in poses
+    ]
+    knots = np.array([0.0, *(float(pose["time"]) for pose in poses)])
+    errors = np.zeros((len(maneuver.time), len(arm.base)))
+    for row, time in enumerate(maneuver.time):
+        k = int(np.clip(np.searchsorted(knots, time, side="right") - 1, 0, max(len(knots) - 2, 0)))
+        share = 0.0
+        if len(knots) > 1:
+            share = float(np.clip((time - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0))
+        after = min(k + 1, len(knots) - 1)
+        part = rotation_matrix(share * _rotation_vector(turn[after] @ turn[k].T)) @ turn[k]
+        placed = home @ part.T + (1.0 - share) * shift[k] + share * shift[after]
+        errors[row] = np.linalg.norm(maneuver.nodes[row, arm.base] - placed, axis=1)
     return errors
 
 
-def _rigid_error(home: Array, state: Array) -> Array:
-    """Return (N_c,) the distances of points from the rigid displacement of `home` that fits best (Kabsch)."""
-    spokes, moved = home - home.mean(axis=0), state - state.mean(axis=0)
-    u, _, vt = np.linalg.svd(spokes.T @ moved)
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return np.asarray(np.linalg.norm(moved - spokes @ u @ mirror @ vt, axis=1))
+def _rotation_vector(rotation: Array) -> Array:
+    """Return the rotation vector (3,), rad, of a rotation by less than half a turn."""
+    twist = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine, cosine = float(np.linalg.norm(twist)) / 2.0, (float(np.trace(rotation)) - 1.0) / 2.0
+    return np.asarray(twist * (0.5 if sine < 1e-9 else float(np.arctan2(sine, cosine)) / (2.0 * sine)))
 
 
 def _member_angle(motion: Motion) -> Least:
