@@ -15,7 +15,7 @@ from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.shape import CurveShape, turn_rows
 from vgtm_qp.qp.solvers import make_solver
-from vgtm_qp.step.engine import FusedEngine, PlainEngine
+from vgtm_qp.step.engine import Accuracy, FusedEngine, PlainEngine
 from vgtm_qp.step.linearise import Linearisation, Target
 from vgtm_qp.step.path import Path, rotation_from_vector
 from vgtm_qp.truss.kinematics import Kinematics
@@ -142,7 +142,10 @@ def test_both_engines_give_one_answer(name, joint_offset, base):
     near = truss.home + 1e-3 * rng.normal(size=X.shape)
     near[truss.base] = truss.home[truss.base]
     for pose in (truss.home, near):
-        closed = [engine.close(pose, target, 1e-12) for engine in (fused, plain)]
+        kinematics.evaluate(pose)
+        goal = replace(target.path.at(0.0), position=kinematics.tip_position(pose) + 1e-5)
+        box = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0)
+        closed = [engine.settle(pose, box, goal, Accuracy(1e-12, np.inf, np.inf)) for engine in (fused, plain)]
         np.testing.assert_allclose(closed[0].X, closed[1].X, atol=1e-9)
         np.testing.assert_allclose(closed[0].lengths, closed[1].lengths, atol=1e-10)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.condensed import FEASIBILITY, UNBOUNDED, InfeasibleStepError, check_answer
-from vgtm_qp.qp.fused_graph import Bound, length_function, row_function
+from vgtm_qp.qp.fused_graph import Bound, row_function, settle_function
 from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution, progress_scale
@@ -81,7 +81,7 @@ class FusedSolver:
         self.layout = layout
         truss = layout.truss
         self._rows = _bound_kernel(row_function(layout, stages))
-        self._lengths = _bound_kernel(length_function(layout, stages))
+        self._settled = _bound_kernel(settle_function(layout, stages))
         self._position_axes = position_axes
         nodes, actuators = layout.node_columns, len(truss.actuators)
         self._actuators = actuators
@@ -229,24 +229,32 @@ class FusedSolver:
             torsion=x[self._torsion : -1],
         )
 
-    def close(self, X: Array, lower: Array, upper: Array, tolerance: float, attempts: int = 3) -> Closed:
-        """Return `X` (N, 3) corrected by Newton on the lengths alone, actuators into their boxes (n_a,), m."""
-        kernel = self._lengths
-        kernel.inputs[1][:] = lower
-        kernel.inputs[2][:] = upper
-        points = X.reshape(-1)
-        for _ in range(attempts):
-            kernel.inputs[0][:] = points
-            kernel()
-            points = kernel.outputs[0]
-            error = float(kernel.outputs[2][0])
-            if error <= tolerance or not error < 1e-2:
-                break
-        out = kernel.outputs
-        return Closed(out[0].reshape(-1, 3).copy(), out[1].copy(), error, out[3].copy(), out[4].reshape(3, 3).T.copy())
+    def settle(
+        self, X: Array, lower: Array, upper: Array, position: Array, rotation: Array
+    ) -> tuple[Closed, Array]:
+        """Return `X` (N, 3) with its lengths closed, actuators in their boxes (n_a,), m, and its tip at a pose.
+
+        Beside it stand the tip's errors before and after settling, (2, n_e).
+        """
+        kernel, gain = self._settled, self.gain()
+        inputs, out = kernel.inputs, kernel.outputs
+        inputs[0][:] = X.reshape(-1)
+        inputs[1][:] = lower
+        inputs[2][:] = upper
+        inputs[3][:] = position
+        inputs[4][:] = rotation.T.reshape(-1)
+        if gain is None:
+            inputs[5][:] = 0.0
+        else:
+            inputs[5].reshape(-1, len(self._place), 3)[:] = gain
+        kernel()
+        closed = Closed(
+            out[0].reshape(-1, 3).copy(), out[1].copy(), float(out[2][0]), out[3].copy(), out[4].reshape(3, 3).T.copy()
+        )
+        return closed, out[5].reshape(2, -1)
 
     def gain(self) -> Array | None:
-        """Return the node displacements (N, 3, n_e) per unit of tip error that leave actuators at their bounds.
+        """Return the node displacements (n_e, N, 3) per unit of tip error that leave actuators at their bounds.
 
         None where they cannot; see :mod:`vgtm_qp.qp.settle`.
         """
@@ -259,8 +267,8 @@ class FusedSolver:
         )
         if gain is None:
             return None
-        nodes = np.zeros((truss.node_count, 3, gain.shape[1]))
-        nodes[truss.free] = (response @ gain).reshape(-1, 3, gain.shape[1])
+        nodes = np.zeros((gain.shape[1], truss.node_count, 3))
+        nodes[:, truss.free] = (gain.T @ response.T).reshape(gain.shape[1], -1, 3)
         return nodes
 
     def _reserve(self, rows: int) -> None:

@@ -15,6 +15,10 @@ from vgtm_qp.qp.layout import Layout
 Array = NDArray[np.float64]
 
 NEWTON_STEPS = 2
+SETTLING_STEPS = 3
+
+_AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
+_TINY = 1e-30
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,34 +42,67 @@ class _Symbols:
         self.fixed = (~truss.actuated).astype(float)
 
 
-def length_function(layout: Layout, stages: list[Stage]) -> Bound:
-    """Return X (3, N), lower, upper (n_a) -> X after Newton on the lengths, lengths there, worst error, tip pose.
+def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
+    """Return the function that closes the lengths of an arm and brings its tip to its goal.
 
-    Fixed members go to their home lengths, actuators to the nearest length in their box.
+    Arguments: X (3, N); lower, upper (n_a); goal position (3) and rotation (3, 3); gain (3 N, n_e), node
+    displacements per unit of tip error.
+
+    Results: X, whose fixed members have their home lengths and whose actuators are in their boxes; lengths there;
+    their worst error; tip position; tip rotation; tip errors (n_e, 2) before the gain was first used and at the end.
     """
     symbols, truss = _Symbols(layout), layout.truss
     graph = TrussGraph(layout, stages, symbols.constants)
+    frames = _tip_frames(layout, symbols.constants) if layout.has_tip_frame else None
+    goal, turned = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
+    gain = ca.MX.sym("gain", 3 * truss.node_count, len(layout.tip_rows))
     actuators = truss.actuators.tolist()
-    X = symbols.X
-    wanted = symbols.home_lengths
 
     def aims(lengths: ca.MX) -> ca.MX:
         aim = symbols.home_lengths * 1.0
         aim[actuators] = ca.fmax(symbols.lower, ca.fmin(symbols.upper, lengths[actuators]))
         return aim
 
-    lengths, gradients = graph.lengths(X)
-    for _ in range(NEWTON_STEPS):
-        X = graph.newton(X, aims(lengths), lengths, gradients)
-        lengths, gradients = graph.lengths(X)
-    wanted = aims(lengths)
-    position = X[:, truss.tip.tolist()] @ ca.DM(truss.tip_weights)
-    rotation = ca.MX.eye(3)
-    if layout.has_tip_frame:
-        rotation, _ = _tip_frames(layout, symbols.constants).at(X)
-    outputs = [X, lengths, ca.norm_inf(wanted - lengths), position, ca.densify(rotation)]
-    inputs = [symbols.X, symbols.lower, symbols.upper, *symbols.constants.symbols]
-    return Bound(ca.Function("lengths", inputs, outputs), symbols.constants.values)
+    def closed(X: ca.MX, steps: int) -> ca.MX:
+        for _ in range(steps):
+            lengths, gradients = graph.lengths(X)
+            X = graph.newton(X, aims(lengths), lengths, gradients)
+        return X
+
+    def tip(X: ca.MX) -> tuple[ca.MX, ca.MX]:
+        position = X[:, truss.tip.tolist()] @ ca.DM(truss.tip_weights)
+        return position, ca.MX.eye(3) if frames is None else frames.at(X)[0]
+
+    X = closed(symbols.X, NEWTON_STEPS)
+    first = error = _tip_error(layout.tip_rows, *tip(X), goal, turned)
+    for step in range(SETTLING_STEPS):
+        X = X + ca.reshape(gain @ error, 3, truss.node_count)
+        X = closed(X, NEWTON_STEPS if step == SETTLING_STEPS - 1 else 1)
+        position, rotation = tip(X)
+        error = _tip_error(layout.tip_rows, position, rotation, goal, turned)
+    lengths, _ = graph.lengths(X)
+    worst = ca.norm_inf(aims(lengths) - lengths)
+    outputs = [X, lengths, worst, position, ca.densify(rotation), ca.horzcat(first, error)]
+    inputs = [symbols.X, symbols.lower, symbols.upper, goal, turned, gain, *symbols.constants.symbols]
+    return Bound(ca.Function("settle", inputs, outputs), symbols.constants.values)
+
+
+def _tip_error(names: tuple[str, ...], position: ca.MX, rotation: ca.MX, goal: ca.MX, turned: ca.MX) -> ca.MX:
+    """Return goal minus value of the tip's rows (n_e, 1), as ``TipTask.residual`` does."""
+    axes = [_AXES[name] for name in names if name in _AXES]
+    parts = [(goal - position)[axes]]
+    twist = None
+    if "tip direction 1" in names:
+        twist, cosine = ca.cross(rotation[:, 2], turned[:, 2]), ca.dot(rotation[:, 2], turned[:, 2])
+        across = rotation[:, :2].T
+    elif "tip rotation x" in names:
+        relative = turned @ rotation.T
+        twist, cosine = ca.inv_skew((relative - relative.T) / 2), (ca.trace(relative) - 1) / 2
+        across = ca.MX.eye(3)
+    if twist is not None:
+        sine = ca.sqrt(ca.dot(twist, twist) + _TINY)
+        parts.append(across @ (twist * (ca.atan2(sine, cosine) / sine)))
+    return ca.vertcat(*parts)
 
 
 def row_function(layout: Layout, stages: list[Stage]) -> Bound:

@@ -13,7 +13,7 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.condensed import InfeasibleStepError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
-from vgtm_qp.step.engine import Engine
+from vgtm_qp.step.engine import Accuracy, Engine
 from vgtm_qp.step.linearise import Target
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.separation import Separation, Shortfall
@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 _MOTION_MARGIN = 3.0
 """A member may move by so many times what is expected of it before a pair that matters can be missed."""
 
-
-_SETTLING_STEPS = 4
 _DEVIATION = 0.1
 """An offset joint that may take a member's end further from its chord turns too far in one step, m."""
 
@@ -127,6 +125,7 @@ class Attempt:
         self.tolerances = tolerances or Tolerances()
         self.max_qps = max_qps
         self.phases = Phases()
+        self._accuracy = Accuracy(self.tolerances.member, self.tolerances.tip, self.tolerances.settling)
 
     def run(self, state: State, target: Target, share: float = 1.0) -> Outcome:
         """Return the outcome of moving from `state` along the target's piece of path; no state is changed.
@@ -197,7 +196,9 @@ class Attempt:
             if not moved < np.inf:
                 return outcome("singular pose", count)
             reach = moved
-            settled = self._settle(X, target, target.path.at(target.start + progress * span))
+            settled = self.engine.settle(
+                X, target, target.path.at(target.start + progress * span), self._accuracy
+            )
             phases.add("correction")
             if settled is None:
                 continue
@@ -230,23 +231,6 @@ class Attempt:
                 raise
         np.minimum(rows.lower, 0.0, out=rows.lower)
         return self.engine.solve(*at, motion=motion, torsion=torsion)
-
-    def _settle(self, X: Array, target: Target, goal: PathPoint) -> Closed | None:
-        """Return the configuration near `X` with its lengths closed and the tip at `goal`; None where another QP is due."""
-        tolerance, gain = self.tolerances, None
-        for _ in range(_SETTLING_STEPS):
-            closed = self.engine.close(X, target, tolerance.member)
-            error = self.task.residual(closed.tip_position, closed.tip_rotation, goal)[0]
-            off = float(np.abs(error).max())
-            if not (closed.error <= tolerance.member and off <= tolerance.settling):
-                return None
-            if off <= tolerance.tip:
-                return closed
-            gain = self.engine.gain() if gain is None else gain
-            if gain is None:
-                return None
-            X = closed.X + gain @ error
-        return None
 
     def _expected(self, target: Target, guess: Array) -> float:
         """Return about how far a node moves in the step, m; anything where the arm was at rest."""

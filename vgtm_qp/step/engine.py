@@ -6,6 +6,7 @@ serves every truss and every solver by name, and is what the fused one is tested
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.fused_graph import SETTLING_STEPS
+from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
 from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.qp.layout import Layout
@@ -25,6 +28,15 @@ from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.task import TipTask, worth_closing
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How exactly members, m, and tip, m or rad, are settled, and from how far off the tip may be brought there."""
+
+    member: float
+    tip: float
+    start: float
 
 
 class Engine(Protocol):
@@ -46,12 +58,8 @@ class Engine(Protocol):
         """Return the QP's answer at `X` (N, 3) with Jacobians at `Y`; raise ``SolverError`` instead of a wrong one."""
         ...
 
-    def gain(self) -> Array | None:
-        """Return what settles the tip after the last QP, (N, 3, n_e); None where only another QP does."""
-        ...
-
-    def close(self, X: Array, target: Target, tolerance: float) -> Closed:
-        """Return the configuration near `X` whose members have their lengths."""
+    def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
+        """Return the configuration near `X` with its lengths closed and the tip at `goal`; None where a QP is due."""
         ...
 
 
@@ -83,11 +91,27 @@ class PlainEngine:
             X, vertices, target, progress, rows, motion=motion, at=at, torsion=torsion
         )
         solution = self._solver.solve(numbers)
-        self._last = numbers, solution
+        # The kinematics overwrites its gradients at the next configuration.
+        self._last = replace(numbers, gradient=numbers.gradient.copy()), solution
         return solution
 
-    def gain(self) -> Array | None:
+    def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
+        gain = self._gain()
+        for step in range(SETTLING_STEPS + 1):
+            closed = self._close(X, target, accuracy.member)
+            task = self._linearisation.task
+            error = task.residual(closed.tip_position, closed.tip_rotation, goal)[0]
+            off = float(np.abs(error).max())
+            if not (closed.error <= accuracy.member and off <= accuracy.start):
+                return None
+            if gain is None or step == SETTLING_STEPS:
+                break
+            X = closed.X + gain @ error
+        return closed if off <= accuracy.tip else None
+
+    def _gain(self) -> Array | None:
+        """Return what settles the tip after the last QP, (N, 3, n_e); None where only another QP does."""
         layout = self._linearisation.layout
         truss, weights = layout.truss, layout.weights
         if layout.hard_tracking or self._last is None:
@@ -108,8 +132,8 @@ class PlainEngine:
         )
         return None if gain is None else every @ gain
 
-    def close(self, X: Array, target: Target, tolerance: float) -> Closed:
-        """See :class:`Engine`."""
+    def _close(self, X: Array, target: Target, tolerance: float) -> Closed:
+        """Return the configuration near `X` whose members have their lengths."""
         layout, kinematics = self._linearisation.layout, self._linearisation.kinematics
         wanted = self._linearisation.home_lengths.copy()
         actuators, free = layout.truss.actuators, layout.truss.free
@@ -128,6 +152,21 @@ class PlainEngine:
                 worst = np.inf
                 break
         return Closed(X, kinematics.lengths.copy(), worst, kinematics.tip_position(X), kinematics.tip_rotation.copy())
+
+
+class ElasticEngine(PlainEngine):
+    """A tip that may leave its path at an exact penalty: there it is where the QP puts it."""
+
+    def __init__(self, linearisation: Linearisation, solver: CondensedSolver) -> None:
+        super().__init__(linearisation, solver)
+        self._elastic = solver
+
+    def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
+        """See :class:`Engine`; a tip that had to leave its path is not moved."""
+        if self._elastic.slack <= accuracy.tip:
+            return super().settle(X, target, goal, accuracy)
+        closed = self._close(X, target, accuracy.member)
+        return closed if closed.error <= accuracy.member else None
 
 
 class FusedEngine:
@@ -176,10 +215,10 @@ class FusedEngine:
             error = worth_closing(error)
         return solver.solve(TipGoal(rate * (target.end - target.start), error, across), progress, rows)
 
-    def gain(self) -> Array | None:
+    def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
-        return self._solver.gain()
-
-    def close(self, X: Array, target: Target, tolerance: float) -> Closed:
-        """See :class:`Engine`."""
-        return self._solver.close(X, target.lower, target.upper, tolerance)
+        closed, errors = self._solver.settle(X, target.lower, target.upper, goal.position, goal.rotation)
+        before, after = np.abs(errors).max(axis=1).tolist()
+        if closed.error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip:
+            return closed
+        return None
