@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 UNBOUNDED = 1e30
 FEASIBILITY = 1e-10
+_SLACK_CURVATURE = 1e-6
 
 
 class InfeasibleStepError(SolverError):
@@ -69,6 +70,9 @@ class CondensedSolver:
         self._curve_hessian = weights.curve_rate * np.eye(coordinates)
         self._curve_hessian[: 3 * vertices, : 3 * vertices] = np.kron(layout.vertex_hessian, np.eye(3))
 
+        self.slack = 0.0
+        """How far the last answer leaves the tip's rows in mode elastic, m or rad."""
+
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Solve one QP.
 
@@ -109,6 +113,11 @@ class CondensedSolver:
         gradient[-1] += numbers.progress_gradient
 
         constraint, lower, upper, sense = self._constraints(numbers, response, particular)
+        if layout.elastic_tip:
+            tip, penalty = len(numbers.tip_rhs), layout.weights.end_effector
+            hessian, gradient, constraint, lower, upper, sense = _with_slacks(
+                hessian, gradient, constraint, lower, upper, sense, tip, penalty
+            )
         x, _, flag, info = daqp.solve(
             hessian, gradient, constraint, upper, lower, sense, primal_tol=FEASIBILITY, eps_prox=0.0
         )
@@ -117,16 +126,17 @@ class CondensedSolver:
         multipliers = np.asarray(info["lam"])
         check_answer(x, multipliers, flag, hessian, gradient, constraint, lower, upper)
 
+        self.slack = float(np.max(x[size:], initial=0.0))
         displacement = np.zeros((truss.node_count, 3))
         displacement[truss.free] = (response @ x[:count] + particular).reshape(-1, 3)
-        moved = curve @ x[count:-1] + curve_offset
+        moved = curve @ x[count : size - 1] + curve_offset
         vertices = moved[: 3 * layout.vertices].reshape(-1, 3)
         clearance = len(numbers.clearance)
         return StepSolution(
             nodes=displacement,
             actuators=x[:count].copy(),
             vertices=vertices,
-            progress=float(x[-1]),
+            progress=float(x[size - 1]),
             actuator_multipliers=multipliers[:count].copy(),
             clearance_multipliers=-multipliers[len(multipliers) - clearance :],
             iterations=int(info["iterations"]),
@@ -223,6 +233,42 @@ class CondensedSolver:
         sense = np.zeros(size + total, dtype=np.int32)
         sense[size : size + tip + hard] = 5
         return constraint, lower, upper, sense
+
+
+def _with_slacks(
+    hessian: Array,
+    gradient: Array,
+    constraint: Array,
+    lower: Array,
+    upper: Array,
+    sense: NDArray[np.int32],
+    tip: int,
+    penalty: float,
+) -> tuple[Array, Array, Array, Array, Array, NDArray[np.int32]]:
+    """Return the QP with two slacks more for each of its first `tip` rows, at an exact penalty.
+
+    The penalty is linear in the slacks, so that a row holds exactly while `penalty` exceeds its multiplier; their
+    curvature is there for a solver of strictly convex QPs alone.
+    """
+    size, slacks = len(gradient), 2 * tip
+    wide = np.zeros((len(constraint), size + slacks))
+    wide[:, :size] = constraint
+    wide[:tip, size : size + tip], wide[:tip, size + tip :] = np.eye(tip), -np.eye(tip)
+    larger = np.zeros((size + slacks, size + slacks))
+    larger[:size, :size] = hessian
+    larger[size:, size:] = _SLACK_CURVATURE * np.eye(slacks)
+
+    def with_bounds(bounds: Array, of_slacks: float) -> Array:
+        return np.concatenate([bounds[:size], np.full(slacks, of_slacks), bounds[size:]])
+
+    return (
+        larger,
+        np.concatenate([gradient, np.full(slacks, penalty)]),
+        wide,
+        with_bounds(lower, 0.0),
+        with_bounds(upper, UNBOUNDED),
+        with_bounds(sense.astype(float), 0.0).astype(np.int32),
+    )
 
 
 def check_answer(

@@ -96,7 +96,7 @@ class RowTable:
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
         """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
         numbers, truss, members = self.numbers, self.layout.truss, self.layout.member_nodes
-        width = max(len(truss.tip), 4, members.shape[1])
+        width = max(len(truss.tip), members.shape[1], numbers.clearance.nodes.shape[1])
         nodes, coefficients = np.zeros((len(rows), width), dtype=np.int64), np.zeros((len(rows), width, 3))
         progress = np.zeros(len(rows))
 

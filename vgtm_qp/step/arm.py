@@ -13,13 +13,14 @@ from vgtm_qp.errors import ProblemError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
+from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, make_solver
 from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.curve import home_curve
-from vgtm_qp.step.engine import Engine, FusedEngine, PlainEngine
+from vgtm_qp.step.engine import ElasticEngine, Engine, FusedEngine, PlainEngine
 from vgtm_qp.step.linearise import Linearisation
 from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.step.state import State, frozen
@@ -50,6 +51,8 @@ class Arm:
         What the QP keeps over the least clearance, m.
     minimum_angle : float
         Least angle between members that share a node, rad.
+    tip_mode : str
+        How strictly the end effector follows its path: ``scaled``, ``hard`` or ``elastic``.
     dt : float
         Duration of a step, s.
     torsion : (T,)
@@ -80,6 +83,7 @@ class Arm:
     margin: float
     dt: float
     minimum_angle: float = 0.0
+    tip_mode: str = "scaled"
     torsion: Array = field(default_factory=lambda: np.zeros(0))
     vertex_goals: Array | None = None
     solver: str = DEFAULT_SOLVER
@@ -126,12 +130,13 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
     """
     _check_supported(problem)
     spec = problem.truss
+    assert spec is not None
     truss = build_truss(spec)
     kinematics = Kinematics(truss)
     kinematics.evaluate(truss.home)
     task = TipTask(problem.end_effector.track, kinematics)
     curve = home_curve(problem, truss, task)
-    layout = curve.layout
+    layout = replace(curve.layout, elastic_tip=problem.end_effector.mode == "elastic")
     clearance = problem.clearance
     options: dict[str, Any] = {
         "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
@@ -160,6 +165,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
         margin=clearance.margin,
         dt=step_duration(problem.maneuver),
         minimum_angle=clearance.minimum_angle,
+        tip_mode=problem.end_effector.mode,
         base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
         measure=None if clearance.self_collision else Clearance(truss.members, truss.radius, **options),
@@ -186,6 +192,9 @@ def make_engine(
     SolverError
         There is no such solver, or it is not installed.
     """
+    if layout.elastic_tip:
+        linearisation = Linearisation(layout, kinematics, task, layout.truss.home_lengths)
+        return ElasticEngine(linearisation, CondensedSolver(layout))
     if solver == DEFAULT_SOLVER and compiled:
         stages = elimination_stages(layout)
         if stages is not None and len(layout.truss.actuators) <= FUSED_ACTUATORS:

@@ -180,7 +180,7 @@ class Linearisation:
             tip_jacobian=tip.jacobian,
             tip_rate=rate,
             tip_rhs=worth_closing(tip.error) if motion else tip.error,
-            progress_lower=-progress,
+            progress_lower=1.0 - progress if layout.elastic_tip else -progress,
             progress_upper=1.0 - progress,
             progress_gradient=curvature * (progress - 2.0),
             progress_curvature=curvature,

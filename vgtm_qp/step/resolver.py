@@ -366,6 +366,11 @@ class Resolver:
         while share >= smallest:
             reach = start + share * whole * (end - start)
             outcome = self._attempt.run(state, self._target(path, start, reach, dt, box), share)
+            if self.arm.tip_mode != "scaled":
+                # The tip stays on time: no smaller piece of the path and no part of it will do.
+                if outcome.accepted and outcome.progress < 1.0 - 1e-9:
+                    outcome = replace(outcome, accepted=False, reason="the tip cannot stay on time")
+                break
             if outcome.accepted:
                 break
             share /= 2

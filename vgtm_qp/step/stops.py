@@ -116,7 +116,7 @@ def explain(
     """Return why the arm does not get on from `state` along `path` from its value `start` towards `end`."""
     program = _Program(arm, separation, state, path, start, end, limits)
     share, pressing = program.solve(np.ones(program.count, dtype=bool))
-    bar = max(_BLOCKED, _FREER * share)
+    bar = min(max(_BLOCKED, _FREER * share), 0.5 * (1.0 + share))
     kept = np.zeros(program.count, dtype=bool)
     kept[np.flatnonzero(pressing > _PRESSES)] = True
     if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= bar:
