@@ -1,4 +1,4 @@
-"""The first maneuver: solve a bundled problem, read its certificate, keep it and show it."""
+"""The first maneuver: solve a bundled problem, read its certificate, keep it and draw it."""
 
 import vgtm_qp as vq
 
@@ -11,5 +11,5 @@ print(maneuver.certificate)
 maneuver.save("first_maneuver.npz")
 maneuver.plot(frames=4).savefig("first_maneuver.png", dpi=150)
 maneuver.plot_clearance().savefig("first_maneuver_clearance.png", dpi=150)
-vq.export_maneuver(maneuver, "first_maneuver.html")
-print("open first_maneuver.html in a browser: it needs neither a server nor a network")
+print("written: first_maneuver.npz and two figures")
+print("as a page in three dimensions, with the extra [view]: vgtm export first_maneuver.npz --to html")
