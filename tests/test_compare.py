@@ -79,6 +79,19 @@ def test_every_preset_is_a_valid_method() -> None:
         with_method(problem, "qp-nun")
 
 
+@pytest.mark.parametrize(
+    ("methods", "says"),
+    [
+        ("qp", r'a list of names, not one text: \["qp"\]'),
+        ([], "at least one method; choices: qp, "),
+        (["qq"], "qq"),
+    ],
+)
+def test_methods_that_are_no_list_of_methods_are_refused(methods: object, says: str) -> None:
+    with pytest.raises(GoalError, match=says):
+        vq.compare(vq.load_problem("five_bay_free"), methods=methods)  # type: ignore[arg-type]
+
+
 def test_the_command_writes_table_data_and_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "out"
     arguments = ["compare", "five_bay_free", "--methods", "qp,curve-pseudoinverse-corrected"]

@@ -128,14 +128,14 @@ def compare(
     problem
         What `load_problem` returns; its weights, gains and solver are those of all methods.
     methods
-        Names of ``vgtm_qp.methods.presets.PRESETS``.
+        Names of ``vgtm_qp.methods.presets.PRESETS``, at least one.
     progress
         Called after each step with the method's name, its part of the path, 0 to 1, and the step.
 
     Raises
     ------
     GoalError
-        There is no method of that name.
+        `methods` is empty, is not a list, or has a name that is no method's.
     """
     check_methods(methods)
     rows, maneuvers = [], {}

@@ -86,7 +86,11 @@ def with_method(problem: Problem, name: str) -> Problem:
 
 
 def check_methods(names: Sequence[str]) -> None:
-    """Raise GoalError for the first name that is not a method's."""
+    """Raise GoalError where there is no name, one text in the place of a list, or a name that is not a method's."""
+    if isinstance(names, str):
+        raise GoalError(f'methods must be a list of names, not one text: ["{names}"]')
+    if not names:
+        raise GoalError(f"methods must name at least one method; choices: {', '.join(PRESETS)}")
     for name in names:
         if name not in PRESETS:
             raise GoalError(f'no method "{name}"{nearest(name, PRESETS)}; choices: {", ".join(PRESETS)}')
