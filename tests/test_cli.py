@@ -82,6 +82,15 @@ def test_options_stand_in_for_those_of_the_problem(capsys):
     assert (summary["steps"], summary["solver"]) == (2, "osqp")
 
 
+@pytest.mark.parametrize("method", ["pseudoinverse", "curve-pseudoinverse"])
+def test_a_method_without_a_qp_names_no_solver(capsys, method):
+    _, out, _ = run(capsys, "solve", "free.toml", "--method", method)
+    assert out.split("method and solver")[1].splitlines()[0].strip() == method
+    summary = json.loads(run(capsys, "verify", "free.npz", "--json")[1])
+    assert summary["results"][0]["status"] == "solved"
+    assert vq.load_result("free.npz").summary()["solver"] is None
+
+
 def test_a_figure_is_drawn(capsys, folder):
     code, out, _ = run(capsys, "solve", "free.toml", "--figure", "frames.png")
     assert code == 0

@@ -126,7 +126,7 @@ def _report(summary: dict[str, Any]) -> str:
         ("tip direction error", _number(summary["max_tip_direction_error"], "rad", "not tracked")),
         ("time of a step, median and 99 %", f"{_milliseconds(step['median'])}, {_milliseconds(step['p99'])}"),
         ("set-up", _milliseconds(summary["setup_time"])),
-        ("method and solver", f"{summary['method']}, {summary['solver']}"),
+        ("method and solver", ", ".join(filter(None, (summary["method"], summary["solver"])))),
     ]
     return "\n".join([*lines, table(rows)])
 

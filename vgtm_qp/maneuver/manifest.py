@@ -38,7 +38,7 @@ def make_manifest(
     stop: Mapping[str, Any] | None = None,
     way_out: str = "",
     method: str,
-    solver: str,
+    solver: str | None,
     setup_time: float,
     directory: str | Path = ".",
     meshes: Mapping[str, Mapping[str, Any]] | None = None,
@@ -62,8 +62,10 @@ def make_manifest(
         What ``Stop.to_dict`` returns.
     way_out : str
         How the redundancy was resolved where the problem's own way came to a dead end earlier.
-    method, solver : str
+    method : str
         As in the problem's ``[method]``.
+    solver : str or None
+        What solved the QPs; None where the method solves none.
     setup_time : float
         s.
     directory : path

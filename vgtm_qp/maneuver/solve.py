@@ -191,7 +191,7 @@ def _assemble(
         stop=None if stop is None else stop.to_dict(),
         way_out=way,
         method=problem.method.name,
-        solver=problem.method.solver,
+        solver=resolver.arm.solver if isinstance(resolver, Resolver) else resolver.solver,
         setup_time=setup_time,
         directory=Path(problem.source).parent if problem.source else Path.cwd(),
         meshes=meshes,

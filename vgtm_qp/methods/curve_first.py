@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from vgtm_qp.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.condensation import CurveNodes, rotation_vectors
-from vgtm_qp.methods.curve_motion import CurveMotion
+from vgtm_qp.methods.curve_motion import CURVE_SOLVER, CurveMotion
 from vgtm_qp.methods.resolver import MethodResolver
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.methods.tracking import Tracker
@@ -57,6 +57,7 @@ class CurveFirstResolver(MethodResolver):
         self._faces = np.array([segment.face for segment in segments])
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._correct, self._is_qp = method.correct, method.name == "qp"
+        self.solver = CURVE_SOLVER if self._is_qp else None
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
         if self._is_qp:

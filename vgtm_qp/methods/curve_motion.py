@@ -21,6 +21,8 @@ from vgtm_qp.step.path import PathPoint, turn_between, vector_from_rotation
 
 Array = NDArray[np.float64]
 
+CURVE_SOLVER = "daqp"
+"""What solves the QP of the curve alone."""
 DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 
 _SAMPLES = 400

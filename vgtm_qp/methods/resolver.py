@@ -31,6 +31,8 @@ class MethodResolver(ABC):
         self.phases = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
         self.rank: int | None = None
         """Rank of the Jacobian in the last step, None where the method does not reveal it."""
+        self.solver: str | None = None
+        """Name of the QP solver, None where the method solves no QP."""
         self._limit = step_limit
         self._steps = 0
         self._mark = 0.0
