@@ -108,8 +108,9 @@ class Separation:
         floors, lowest = (floor + spare, max(self_floor + spare, 0.0)), np.inf
         for k in range(pieces):
             here, there = (start + share * (end - start) for share in (k / pieces, (k + 1) / pieces))
-            times = (start_time + share * (end_time - start_time) for share in (k / pieces, (k + 1) / pieces))
-            report = self.monitor.between(here, there, *times, *floors)
+            lapse = (end_time - start_time) / pieces
+            since = start_time + k * lapse
+            report = self.monitor.between(here, there, since, since + lapse, *floors)
             lowest = min(lowest, report.clearance)
             if not report.certified:
                 break

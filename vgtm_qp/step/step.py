@@ -1,0 +1,74 @@
+"""What one step did: how it ended, the state after it, and the rows that were active in its QP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+
+from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.step.state import State
+
+
+class StepStatus(StrEnum):
+    """How a step ended."""
+
+    REACHED = "reached"
+    SLOWED = "slowed"
+    BLOCKED = "blocked"
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What one call of ``Resolver.step`` did.
+
+    Attributes
+    ----------
+    status : StepStatus
+        ``reached``: the goal was met; ``slowed``: the arm moved on along the way to it, as far as the rows allow;
+        ``blocked``: no safe motion was found and the state is unchanged.
+    progress : float
+        The part of the way that was covered, 0 to 1.
+    state : State
+        The state after the step.
+    reason : str
+        Why the step was cut, empty where it was not.
+    qps : int
+        QPs solved.
+    """
+
+    status: StepStatus
+    progress: float
+    state: State
+    reason: str
+    qps: int
+    _actuators: tuple[str, ...] = field(repr=False)
+    _solution: StepSolution | None = field(default=None, repr=False)
+    _rows: ClearanceRows | None = field(default=None, repr=False)
+
+    @cached_property
+    def multipliers(self) -> dict[str, float]:
+        """Multipliers of the rows that were active in the QP that moved the arm, by name, the greatest first."""
+        if self._solution is None or self._rows is None:
+            return {}
+        found: dict[str, float] = {}
+        pressing = self._solution.clearance_multipliers
+        for k in np.flatnonzero(pressing > 1e-9):
+            name = self._rows.name(int(k))
+            found[name] = max(found.get(name, 0.0), float(pressing[k]))
+        strokes = np.abs(self._solution.actuator_multipliers)
+        for k in np.flatnonzero(strokes > 1e-9):
+            found[self._actuators[k]] = float(strokes[k])
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        """Names of the rows that were active in that QP, most decisive first."""
+        return tuple(self.multipliers)
+
+    @property
+    def blocked_by(self) -> tuple[str, ...]:
+        """Names of the obstacles, members and limits that held the arm back; the reason where there are none."""
+        return self.active or ((self.reason,) if self.reason else ())
