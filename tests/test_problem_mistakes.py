@@ -83,6 +83,8 @@ WRONG = [
     ("bays = 5", "bays = 0x" + "f" * 6000, "truss.bays", "an integer of thousands of digits", "10000"),
     ("bays = 5", "", "truss.bays", "nothing", "number of bays"),
     ("bays = 5", "bayz = 5\nbays = 5", "truss.bayz", "5", 'did you mean "bays"?'),
+    ("bays = 5", "byas = 5", "truss.byas", "5", 'did you mean "bays"?'),
+    ("time = 10.0", "tmie = 10.0", "maneuver.waypoint[0].tmie", "10.0", 'did you mean "time"?'),
     ("[0.6, 1.5]", '["0.6", 1.5]', "truss.stroke[0]", '"0.6"', "a length in metres greater than 0"),
     ("[0.6, 1.5]", "[-0.6, 1.5]", "truss.stroke[0]", "-0.6", "a length in metres greater than 0"),
     ("[0.6, 1.5]", "[0.6, true]", "truss.stroke[1]", "true", "a length in metres"),
@@ -208,6 +210,13 @@ WRONG = [
         '"c"\nshape = "bx"',
         'obstacle[1] ("c").shape',
         '"bx"',
+        'did you mean "box"?',
+    ),
+    (
+        '"right cube"\nshape = "box"',
+        '"c"\nshape = "boks"',
+        'obstacle[1] ("c").shape',
+        '"boks"',
         'did you mean "box"?',
     ),
     ("safe = 0.08", "safe = -0.08", "clearance.safe", "-0.08", "a distance in metres, 0 or more"),
@@ -416,6 +425,11 @@ def test_files_that_a_problem_names_must_exist(tmp_path: Path) -> None:
         (mistake,) = raised.value.mistakes
         assert mistake.key == 'obstacle[0] ("left cube").file'
         assert ('did you mean "part.stl"?' in mistake.expected) == (name == "prat.stl")
+    (tmp_path / "neg.toml").write_text("")
+    file.write_text(mesh.replace("FILE", "neg.stl"))
+    with pytest.raises(ProblemError) as raised:
+        load_problem(file)
+    assert "neg.toml" not in str(raised.value)
 
 
 def test_tables_made_in_python_raise_the_same_error() -> None:

@@ -72,7 +72,13 @@ class MissingExtraError(VgtmError):
         return type(self), (self.extra, self.package)
 
 
+def closest(name: str, choices: Iterable[str]) -> str | None:
+    """Return the one of `choices` that `name` is probably meant for, or None."""
+    # Of names as short as "box" one wrong letter more is already a large part.
+    return next(iter(difflib.get_close_matches(name, list(choices), n=1, cutoff=0.55)), None)
+
+
 def nearest(name: str, choices: Iterable[str]) -> str:
     """Return ``; did you mean "..."?`` for the closest of `choices`, or an empty string."""
-    close = difflib.get_close_matches(name, list(choices), n=1)
-    return f'; did you mean "{close[0]}"?' if close else ""
+    found = closest(name, choices)
+    return "" if found is None else f'; did you mean "{found}"?'

@@ -180,7 +180,8 @@ def _file(value: str, info: ValidationInfo) -> str:
         raise unexpected("the path of a file") from None
     if not found and context.get("check_files", True):
         try:
-            names = [entry.name for entry in path.parent.iterdir() if entry.is_file()]
+            beside = [entry for entry in path.parent.iterdir() if entry.is_file()]
+            names = [entry.name for entry in beside if entry.suffix.lower() == path.suffix.lower()]
         except OSError:
             names = []
         raise unexpected(f"a file that exists; there is none at {path}{nearest(path.name, names)}")

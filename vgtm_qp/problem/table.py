@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any, ClassVar, Self
 
@@ -16,7 +16,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails
 
-from vgtm_qp.errors import Mistake, ProblemError, nearest
+from vgtm_qp.errors import Mistake, ProblemError, closest, nearest
 from vgtm_qp.problem.fields import entry, quoted, unexpected
 
 Place = tuple[str | int, ...]
@@ -53,8 +53,12 @@ class Table(BaseModel):
             try:
                 table = handler(data)
             except ValidationError as error:
+                errors = error.errors(include_url=False)
+                misspelt = cls._misspelt(errors)
                 details = [
-                    cls._detail(found) for found in error.errors(include_url=False) if not _echo(found)
+                    cls._detail(found)
+                    for found in errors
+                    if not (_echo(found) or (found["type"] == "missing" and found["loc"] in misspelt))
                 ]
             else:
                 details = [
@@ -70,6 +74,12 @@ class Table(BaseModel):
             raise wrong
         source = (info.context or {}).get("source") or cls.__name__
         raise ProblemError(str(source), mistakes_in(wrong, data)) from None
+
+    @classmethod
+    def _misspelt(cls, errors: Sequence[ErrorDetails]) -> set[Place]:
+        """Return the keys of this table that an unknown one is probably meant for."""
+        unknown = [str(found["loc"][0]) for found in errors if _is_own(found, "extra_forbidden")]
+        return {(name,) for key in unknown if (name := closest(key, cls.model_fields)) is not None}
 
     @classmethod
     def _detail(cls, found: ErrorDetails) -> InitErrorDetails:
@@ -104,6 +114,11 @@ class Table(BaseModel):
         else:
             phrase = found["msg"][:1].lower() + found["msg"][1:]
         return InitErrorDetails(type=unexpected(phrase), loc=place, input=value)
+
+
+def _is_own(found: ErrorDetails, kind: str) -> bool:
+    """Whether an error is of a kind and about a key of the table itself, not of one inside it."""
+    return found["type"] == kind and len(found["loc"]) == 1
 
 
 def _echo(found: ErrorDetails) -> bool:
