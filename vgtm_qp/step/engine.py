@@ -29,6 +29,9 @@ from vgtm_qp.step.task import TipTask, worth_closing
 
 Array = NDArray[np.float64]
 
+_SETTLED = 1e-3
+"""A tip this much nearer to its goal than it must be gains nothing by another iteration."""
+
 
 @dataclass(frozen=True)
 class Accuracy:
@@ -105,7 +108,7 @@ class PlainEngine:
             off = float(np.abs(error).max())
             if not (closed.error <= accuracy.member and off <= accuracy.start):
                 return None
-            if gain is None or step == SETTLING_STEPS:
+            if gain is None or step == SETTLING_STEPS or off <= _SETTLED * accuracy.tip:
                 break
             X = closed.X + gain @ error
         return closed if off <= accuracy.tip else None
@@ -139,7 +142,7 @@ class PlainEngine:
         actuators, free = layout.truss.actuators, layout.truss.free
         X, worst = X.copy(), np.inf
         for _ in range(5):
-            kinematics.evaluate(X)
+            kinematics.evaluate_members(X)
             wanted[actuators] = np.clip(kinematics.lengths[actuators], target.lower, target.upper)
             error = wanted - kinematics.lengths
             worst = float(np.max(np.abs(error)))
