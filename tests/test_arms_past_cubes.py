@@ -22,6 +22,14 @@ PAST = [
 ]
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _without_a_compiler():
+    """So many arms are built here that the C compiler would take more time than their few steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VGTM_CC", "none")
+        yield
+
+
 @pytest.fixture(scope="module", params=PAST)
 def case(request):
     problem = vq.load_problem(request.param)

@@ -24,6 +24,12 @@ STRIDE = np.array([0.05, 0.0, -0.02])
 WAY = np.array([0.25, 0.1, -0.2])
 
 
+@pytest.fixture(autouse=True)
+def _without_a_compiler(monkeypatch):
+    """So many arms are built here that the C compiler would take more time than their few steps."""
+    monkeypatch.setenv("VGTM_CC", "none")
+
+
 def test_a_base_passes_its_poses_and_is_rigid_between():
     truss = modules.octahedral(2)
     motion = BaseMotion([BasePose(**pose) for pose in POSES], truss)
