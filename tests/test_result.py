@@ -282,6 +282,20 @@ def test_process_killed_while_writing_leaves_the_old_or_the_new_file(saved: Path
         assert load_result(saved).steps == 10
 
 
+def test_what_a_killed_save_left_behind_goes_with_the_next_one(saved: Path) -> None:
+    names = [
+        ".result.npz.0123456789abcdef.tmp",
+        ".result.npz.fedcba9876543210.tmp",
+        ".other.npz.0123456789abcdef.tmp",
+    ]
+    for name in names:
+        saved.with_name(name).write_bytes(b"cut")
+    for name in (names[0], names[2]):
+        os.utime(saved.with_name(name), (0.0, 0.0))
+    good_maneuver().save(saved)
+    assert {entry.name for entry in saved.parent.iterdir()} == {saved.name, *names[1:]}
+
+
 def test_certificate_survives_json() -> None:
     certificate = verify(good_maneuver())
     text = json.dumps(certificate.to_dict(), allow_nan=False)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import secrets
+import time
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+
+_STALE_SECONDS = 60.0
 
 
 class _Layout(NamedTuple):
@@ -237,6 +242,7 @@ class Maneuver:
             finally:
                 scratch.unlink(missing_ok=True)
             _sync_directory(path.parent)
+            _remove_stale_scratch(path)
         except OSError as error:
             raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
         return path
@@ -370,6 +376,16 @@ def _read_array(path: Path, file: Any, name: str) -> NDArray[Any]:
     if not isinstance(array, np.ndarray):
         raise ResultError(f"{path}: {name} is not an array")
     return array
+
+
+def _remove_stale_scratch(path: Path) -> None:
+    """Remove what a save of `path` left behind that was killed; a young one may be that of a save under way."""
+    scratch = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{16}}\.tmp")
+    # The result is saved by now, so what cannot be removed, or another save removes first, is no failure.
+    with suppress(OSError):
+        for entry in path.parent.iterdir():
+            if scratch.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > _STALE_SECONDS:
+                entry.unlink()
 
 
 def _sync_directory(directory: Path) -> None:
