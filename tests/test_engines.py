@@ -143,9 +143,13 @@ def test_both_engines_give_one_answer(name, joint_offset, base):
     near[truss.base] = truss.home[truss.base]
     for pose in (truss.home, near):
         kinematics.evaluate(pose)
-        goal = replace(target.path.at(0.0), position=kinematics.tip_position(pose) + 1e-5)
+        goal = replace(target.path.at(0.0), position=kinematics.tip_position(pose) + 1e-6)
         box = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0)
-        closed = [engine.settle(pose, box, goal, Accuracy(1e-12, np.inf, np.inf)) for engine in (fused, plain)]
+        closed = [engine.settle(pose, box, goal, Accuracy(1e-12, 1e-7, np.inf)) for engine in (fused, plain)]
+        if name == "tetrahedral-2":
+            # From so far off its kept Jacobian leads nowhere: both engines must say that another QP is due.
+            assert closed == [None, None]
+            continue
         np.testing.assert_allclose(closed[0].X, closed[1].X, atol=1e-9)
         np.testing.assert_allclose(closed[0].lengths, closed[1].lengths, atol=1e-10)
 
