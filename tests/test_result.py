@@ -79,6 +79,9 @@ def test_arrays_are_read_only_copies() -> None:
     maneuver = maneuver_of(nodes, time, tripod())
     with pytest.raises(ValueError, match="read-only"):
         maneuver.nodes[0, 0, 0] = 1.0
+    for array in maneuver.arrays.values():
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            array.setflags(write=True)
     nodes[0, 0, 0] += 1.0
     assert maneuver.nodes[0, 0, 0] != nodes[0, 0, 0]
 

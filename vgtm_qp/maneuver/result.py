@@ -132,8 +132,7 @@ class Maneuver:
         arrays = {name: _plain(getattr(self, name)) for name in _LAYOUTS if getattr(self, name) is not None}
         _check_arrays(arrays)
         for name, array in arrays.items():
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, _frozen(array))
         object.__setattr__(self, "manifest", check_manifest(self.manifest))
 
     @property
@@ -328,10 +327,15 @@ def content_digest(arrays: Mapping[str, NDArray[Any]], manifest: Mapping[str, An
 
 
 def _plain(array: Any) -> NDArray[Any]:
-    """Return a copy in the one byte order and width that the file holds."""
+    """Return an array in the one byte order and width that the file holds."""
     array = np.asarray(array)
     wide = {"f": np.float64, "i": np.int64, "u": np.int64}.get(array.dtype.kind)
-    return np.array(array, dtype=wide, order="C", copy=True)
+    return np.asarray(array, dtype=wide, order="C")
+
+
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a copy on immutable bytes, which cannot be made writable again either."""
+    return np.ndarray(array.shape, array.dtype, buffer=array.tobytes())
 
 
 def _check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
