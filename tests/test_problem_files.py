@@ -97,7 +97,7 @@ def test_a_problem_in_python_from_tables_keywords_and_arrays() -> None:
     assert isinstance(problem.maneuver, WaypointManeuver)
     assert problem.maneuver.waypoint[0].position == (0.1, 0.0, 2.5)
     assert problem.obstacle[0].size == (0.5, 0.5, 0.5)  # type: ignore[union-attr]
-    with pytest.raises(ValueError, match="frozen"):
+    with pytest.raises(ProblemError, match="immutable"):
         problem.name = "other"
 
 

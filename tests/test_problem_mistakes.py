@@ -451,6 +451,18 @@ def test_tables_made_in_python_raise_the_same_error() -> None:
         )
 
 
+def test_a_problem_is_not_changed_in_place(tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text(VALID)
+    problem = load_problem(tmp_path / "p.toml")
+    with pytest.raises(ProblemError, match=r'Problem: name: found "other"; expected .*problem\.replace'):
+        problem.name = "other"
+    with pytest.raises(ProblemError, match=r"Clearance: safe: found 0\.1; expected no change"):
+        problem.clearance.safe = 0.1
+    with pytest.raises(ProblemError, match="clearance: found nothing; expected no change"):
+        del problem.clearance
+    assert (problem.name, problem.clearance.safe) == ("unnamed", 0.08)
+
+
 def test_an_error_survives_the_way_back_from_a_worker_process() -> None:
     with pytest.raises(ProblemError) as raised:
         Box(name="b", shape="box", center=(0, 0, 0), size=-1)

@@ -38,6 +38,20 @@ class Table(BaseModel):
 
     called: ClassVar[str] = "this table"
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse a new value of a key."""
+        if not name.startswith("_"):
+            raise self._immutable(name, value)
+        super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        """Refuse to drop a key."""
+        raise self._immutable(name, _MISSING)
+
+    def _immutable(self, name: str, value: Any) -> ProblemError:
+        expected = "no change, since problems are immutable: problem.replace({...}) returns a changed one"
+        return ProblemError(type(self).__name__, [Mistake(name, shown(value), expected)])
+
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         """Yield place and expectation of each value that contradicts another one of this table."""
         yield from ()
