@@ -61,9 +61,9 @@ def _library(function: ca.Function, cc: str) -> Path | None:
     generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
     generator.add(function)
     source = generator.dump()
-    key = hashlib.sha256("\0".join((source, cc, *_FLAGS, ca.__version__, _machine())).encode()).hexdigest()[
-        :32
-    ]
+    key = hashlib.sha256(
+        "\0".join((source, cc, *_FLAGS, ca.CasadiMeta.version(), _machine())).encode()
+    ).hexdigest()[:32]
     target = cache_directory() / f"{function.name()}-{key}.so"
     if target.exists():
         return target
@@ -112,13 +112,15 @@ class Kernel:
     def __init__(self, function: ca.Function, *, compiled: bool = True) -> None:
         self.function = compile_function(function) if compiled else function
         self.is_compiled = self.function is not function
-        self._buffer, self._evaluate = self.function.buffer()
+        buffer: Any
+        buffer, self._evaluate = self.function.buffer()
+        self._buffer = buffer
         self.inputs: list[Array] = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
         self.outputs: list[Array] = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
         for i, array in enumerate(self.inputs):
-            self._buffer.set_arg(i, memoryview(array))
+            self._buffer.set_arg(i, array.data)
         for i, array in enumerate(self.outputs):
-            self._buffer.set_res(i, memoryview(array))
+            self._buffer.set_res(i, array.data)
 
     def __call__(self) -> None:
         """Evaluate: read `inputs`, overwrite `outputs`."""
@@ -129,7 +131,7 @@ class Kernel:
         if array.size != self.inputs[index].size or not array.flags.c_contiguous or array.dtype != np.float64:
             raise ValueError(f"argument {index} takes {self.inputs[index].size} contiguous float64 numbers")
         self.inputs[index] = array
-        self._buffer.set_arg(index, memoryview(array.reshape(-1)))
+        self._buffer.set_arg(index, array.reshape(-1).data)
 
     def bind_output(self, index: int, array: Array) -> None:
         """Let result `index` be written to `array` (C-contiguous float64, of its size), which the kernel keeps."""
@@ -140,7 +142,7 @@ class Kernel:
         ):
             raise ValueError(f"result {index} gives {self.outputs[index].size} contiguous float64 numbers")
         self.outputs[index] = array
-        self._buffer.set_res(index, memoryview(array.reshape(-1)))
+        self._buffer.set_res(index, array.reshape(-1).data)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Refuse to pickle: a kernel holds addresses; build it in the worker."""

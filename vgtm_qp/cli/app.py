@@ -6,7 +6,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 
-from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError
+from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError, UnusedCliTokensError
 
 from vgtm_qp.cli.bench import bench
 from vgtm_qp.cli.check import check
@@ -109,7 +109,18 @@ def _explained(error: CycloptsError) -> str:
         names = [name for argument in error.argument_collection for name in argument.names]
         options = [name for name in names if name.startswith("-")]
         said += f" Options: {', '.join(options)}." if options else ""
+    elif isinstance(error, UnusedCliTokensError) and error.command_chain:
+        extra = ", ".join(f'"{token}"' for token in error.unused_tokens or ())
+        said = f"more than {command} takes: {extra}. Usage: {command}{_usage(error.command_chain[-1])}."
     return f"{said} See {command} --help."
+
+
+def _usage(command: str) -> str:
+    """Return what follows the name of a command: its arguments, its required options, the others."""
+    arguments = app[command].assemble_argument_collection()
+    given = [f" {entry.name}" for entry in arguments if not entry.name.startswith("-")]
+    required = [f" {entry.name} ..." for entry in arguments if entry.required and entry.name.startswith("-")]
+    return "".join([*given, *required, " [OPTIONS]"])
 
 
 def _mistakes(error: ProblemError) -> list[dict[str, str]]:

@@ -58,7 +58,9 @@ def study(
     written = []
     for name, title in titles.items():
         with _bar(title, shown=not json) as progress:
-            place = run_study(name, output, short=short, workers=workers, dask=dask, progress=progress, options=options)
+            place = run_study(
+                name, output, short=short, workers=workers, dask=dask, progress=progress, options=options
+            )
         written.append({"study": name, "title": title, "folder": str(place)})
         if not json:
             say((place / f"{name}.md").read_text())

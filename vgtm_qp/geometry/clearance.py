@@ -150,9 +150,7 @@ class Clearance:
             candidates.refresh(X, time)
             self._wasted = 0
 
-    def _contacts(
-        self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float
-    ) -> Contacts:
+    def _contacts(self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float) -> Contacts:
         segments, others = group.segments(X, rows), group.others(X, time, rows)
         contacts = group.contacts_of(segments, others, rows)
         if fcl_reach > 0.0 and group.shape in FclQueries.SHAPES:

@@ -62,7 +62,13 @@ class FclQueries:
         return self._objects[piece]
 
     def improve(
-        self, pieces: Index, radius: Array, segments: Array, parameters: Array, contacts: Contacts, rows: Index
+        self,
+        pieces: Index,
+        radius: Array,
+        segments: Array,
+        parameters: Array,
+        contacts: Contacts,
+        rows: Index,
     ) -> None:
         """Ask FCL for `rows`, which should be few, and write the answers that hold into `contacts`.
 

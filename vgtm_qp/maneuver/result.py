@@ -301,8 +301,12 @@ def load_result(path: str | Path) -> Maneuver:
             arrays = {name: _read_array(path, file, name) for name in file.files}
     except FileNotFoundError:
         raise ResultError(f"{path}: there is no such file") from None
-    except _UNREADABLE as error:
-        raise ResultError(f"{path}: not a whole result file: {error}") from None
+    except IsADirectoryError:
+        raise ResultError(f"{path}: a folder; expected a result file, .npz") from None
+    except PermissionError:
+        raise ResultError(f"{path}: may not be read: permission denied") from None
+    except _UNREADABLE:
+        raise ResultError(f"{path}: not a whole result file: cut, damaged, or of another kind") from None
     if "manifest" not in arrays:
         raise ResultError(f"{path}: has no manifest, so it is not a result file")
     try:

@@ -28,7 +28,9 @@ def ways_out(problem: Problem, stop: Stop) -> Iterator[tuple[str, Problem]]:
             "method.weights.stroke_centring": 10.0 * max(weights.stroke_centring, 0.02)
         },
         "shorter steps": {"maneuver.steps": 3 * getattr(problem.maneuver, "steps", 0)},
-        "actuator rates as the metric": {"method.weights.actuator_rate": 50.0 * max(weights.actuator_rate, 0.02)},
+        "actuator rates as the metric": {
+            "method.weights.actuator_rate": 50.0 * max(weights.actuator_rate, 0.02)
+        },
         "no curve": {"method.tracking": "none", "method.hard_tracking": False},
     }
     for name, changes in ways.items():

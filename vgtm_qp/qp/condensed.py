@@ -50,7 +50,9 @@ class CondensedSolver:
                 column = layout.node_column[node]
                 if column >= 0:
                     self._centres[k, range(3), range(column, column + 3)] = weight
-        self._face_columns = layout.node_column[truss.faces[layout.tracked]] if vertices else np.zeros((0, 3), int)
+        self._face_columns = (
+            layout.node_column[truss.faces[layout.tracked]] if vertices else np.zeros((0, 3), int)
+        )
         count = nodes + (3 + layout.turns) * curve_nodes + layout.spacings
         self._rows = np.zeros((count, self._size))
         self._rhs = np.zeros(count)
@@ -229,7 +231,9 @@ class CondensedSolver:
             coefficients = clearance.coefficients * (columns >= 0)[..., None]
             flat = np.maximum(columns, 0)[..., None] + np.arange(3)
             constraint[tip + hard :, :count] = np.einsum("rsc,rscn->rn", coefficients, response[flat])
-            lower[size + tip + hard :] = clearance.lower - np.einsum("rsc,rsc->r", coefficients, particular[flat])
+            lower[size + tip + hard :] = clearance.lower - np.einsum(
+                "rsc,rsc->r", coefficients, particular[flat]
+            )
         sense = np.zeros(size + total, dtype=np.int32)
         sense[size : size + tip + hard] = 5
         return constraint, lower, upper, sense
@@ -272,7 +276,14 @@ def _with_slacks(
 
 
 def check_answer(
-    x: Array, y: Array, flag: int, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
+    x: Array,
+    y: Array,
+    flag: int,
+    hessian: Array,
+    gradient: Array,
+    constraint: Array,
+    lower: Array,
+    upper: Array,
 ) -> None:
     """Refuse an answer of DAQP whose primal or dual residual is too large, whatever status it came with.
 

@@ -18,8 +18,8 @@ from vgtm_qp.qp.fused_graph import Bound, row_function, settle_function
 from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution, progress_scale
-from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.qp.settle import held, settling_gain
+from vgtm_qp.qp.shape import CurveRows
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,9 @@ class FusedSolver:
     def _draw(self, layout: Layout) -> None:
         self.layout = layout
         self._goal_pull = np.zeros((layout.vertices, 3))
-        self._goal_weight = np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
+        self._goal_weight = (
+            np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
+        )
         self._constant_normal = np.full(3, np.nan)
 
     def load(
@@ -175,7 +177,11 @@ class FusedSolver:
         if size + rows > len(self._lower):
             self._reserve(2 * (size + rows))
         constraint = self._constraint[:rows]
-        lower, upper, sense = self._lower[: size + rows], self._upper[: size + rows], self._sense[: size + rows]
+        lower, upper, sense = (
+            self._lower[: size + rows],
+            self._upper[: size + rows],
+            self._sense[: size + rows],
+        )
         lower[:count], upper[:count] = self._box[0], self._box[1]
         lower[size - 1], upper[size - 1] = -progress, 1.0 - progress
         tip_rows = self._tip[self._position_axes]
@@ -249,7 +255,11 @@ class FusedSolver:
             inputs[5].reshape(-1, len(self._place), 3)[:] = gain
         kernel()
         closed = Closed(
-            out[0].reshape(-1, 3).copy(), out[1].copy(), float(out[2][0]), out[3].copy(), out[4].reshape(3, 3).T.copy()
+            out[0].reshape(-1, 3).copy(),
+            out[1].copy(),
+            float(out[2][0]),
+            out[3].copy(),
+            out[4].reshape(3, 3).T.copy(),
         )
         return closed, out[5].reshape(2, -1)
 

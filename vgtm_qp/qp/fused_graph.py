@@ -150,7 +150,8 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
     corners = layout.member_nodes
     terms = gradients * ca.vec(moved[:, corners.reshape(-1).tolist()])
     base_rate = ca.sum1(ca.reshape(terms, 3 * corners.shape[1], truss.member_count)).T
-    response = graph.response(gradients, symbols.fixed * (symbols.home_lengths - lengths) - base_rate)
+    missing = ca.DM(symbols.fixed) * (symbols.home_lengths - lengths)
+    response = graph.response(gradients, missing - base_rate)
 
     actuators = truss.actuators.tolist()
     strokes = lengths[actuators]
@@ -191,7 +192,9 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
         rotations, _ = faces.at(X)
         _, spins = faces.at(Y)
         centre = (X + moved)[:, truss.faces[0].tolist()] @ ca.DM(truss.face_weights[0])
-        base_face = Frames(truss.home[truss.faces[:1]], truss.face_frames[:1], truss.faces[:1], constants, "base")
+        base_face = Frames(
+            truss.home[truss.faces[:1]], truss.face_frames[:1], truss.faces[:1], constants, "base"
+        )
         base_rotation, _ = base_face.at(X + moved)
         axes, normal = base_rotation[:, :2], base_rotation[:, 2]
         offset = ca.MX.zeros(3, layout.vertices)
@@ -230,7 +233,9 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
         top = ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, layout.free_curve), top[:, -1])
         bend = ca.DM(layout.polygon_bending)
         pull = curve_rate * offset + smoothness * ((offset + motion * vertices) @ bend)
-        curve_gradient = ca.vertcat(ca.dot(pull[:, 1], normal), ca.vec(pull[:, 2:]), ca.MX.zeros(layout.torsion))
+        curve_gradient = ca.vertcat(
+            ca.dot(pull[:, 1], normal), ca.vec(pull[:, 2:]), ca.MX.zeros(layout.torsion)
+        )
     inputs = [X, Y, base, vertices, symbols.lower, symbols.upper, motion, *told, *constants.symbols]
     results = [
         ca.vertcat(top, *gaps, *tilts),
@@ -285,7 +290,10 @@ def _given_curve_node(layout: Layout, actuators: int) -> ca.Function:
 
     first, second, tangent = (frame[c, :].T for c in range(3))
     x, y = rotation[:, 0], rotation[:, 1]
-    residuals, combined = [ca.dot(x, tangent), ca.dot(y, tangent)], [ca.cross(x, tangent), ca.cross(y, tangent)]
+    residuals, combined = (
+        [ca.dot(x, tangent), ca.dot(y, tangent)],
+        [ca.cross(x, tangent), ca.cross(y, tangent)],
+    )
     if layout.turns == 3:
         residuals.append((ca.dot(x, second) - ca.dot(y, first)) / 2)
         combined.append((ca.cross(x, second) - ca.cross(y, first)) / 2)
@@ -293,7 +301,19 @@ def _given_curve_node(layout: Layout, actuators: int) -> ca.Function:
     turned = c @ spin @ motion_rows
     constant = turn_on * ca.vertcat(*residuals) + turned[:, -1] - c @ (spin_rows.T @ offset)
     turn_rows = ca.horzcat(turned[:, :-1], -c @ _free_columns(spin_rows, normal), constant)
-    inputs = [nodes, motion_rows, rotation, spin, position, position_rows, frame, spin_rows, offset, normal, face]
+    inputs = [
+        nodes,
+        motion_rows,
+        rotation,
+        spin,
+        position,
+        position_rows,
+        frame,
+        spin_rows,
+        offset,
+        normal,
+        face,
+    ]
     outputs = [ca.densify(gap_rows), ca.densify(turn_rows)]
     return ca.Function("curve_node", [*inputs, gap_on, turn_on], outputs)
 
@@ -323,6 +343,21 @@ def _curve_node(layout: Layout, actuators: int) -> ca.Function:
         turn = ca.cross(axis, tangent).T @ spin @ motion_rows
         across = ((axis - along * tangent) / speed).T
         free = ca.horzcat(slopes[1] * (across @ normal), ca.kron(slopes[2:].T, across))
-        tilts.append(ca.horzcat(turn[:, :-1], free, tilt_on * along + turn[:, -1] + across @ (offset @ slopes)))
-    inputs = [nodes, motion_rows, rotation, spin, vertices, offset, normal, weights, slopes, face, gap_on, tilt_on]
+        tilts.append(
+            ca.horzcat(turn[:, :-1], free, tilt_on * along + turn[:, -1] + across @ (offset @ slopes))
+        )
+    inputs = [
+        nodes,
+        motion_rows,
+        rotation,
+        spin,
+        vertices,
+        offset,
+        normal,
+        weights,
+        slopes,
+        face,
+        gap_on,
+        tilt_on,
+    ]
     return ca.Function("curve_node", inputs, [ca.densify(gap_rows), ca.densify(ca.vertcat(*tilts))])

@@ -68,7 +68,9 @@ class TrussGraph:
         lengths, gradients = function(X[:, self._columns], *self._offsets)
         return lengths.T, ca.vec(gradients)
 
-    def _pattern(self, stage: Stage) -> tuple[list[tuple[Index, ca.Sparsity]], list[tuple[Index, ca.Sparsity]]]:
+    def _pattern(
+        self, stage: Stage
+    ) -> tuple[list[tuple[Index, ca.Sparsity]], list[tuple[Index, ca.Sparsity]]]:
         """Return, for D and L, the terms whose sum is the block: gradient positions and the sparsity they fill."""
         nodes = self.layout.member_nodes[stage.members]
         terms = []
@@ -91,7 +93,9 @@ class TrussGraph:
             terms.append(layers)
         return terms[0], terms[1]
 
-    def _block(self, layers: list[tuple[Index, ca.Sparsity]], gradients: ca.MX, shape: tuple[int, int]) -> ca.MX:
+    def _block(
+        self, layers: list[tuple[Index, ca.Sparsity]], gradients: ca.MX, shape: tuple[int, int]
+    ) -> ca.MX:
         block = ca.MX(*shape)
         for flat, sparsity in layers:
             block = block + ca.MX(sparsity, gradients[flat.tolist()])
@@ -102,7 +106,8 @@ class TrussGraph:
         stage = self.stages[k]
         rows = len(stage.members)
         own, earlier = self._blocks[k]
-        return self._block(own, gradients, (rows, rows)), self._block(earlier, gradients, (rows, 3 * len(stage.earlier)))
+        columns = 3 * len(stage.earlier)
+        return self._block(own, gradients, (rows, rows)), self._block(earlier, gradients, (rows, columns))
 
     def _solver(self, D: ca.Sparsity, width: int) -> ca.Function:
         """Return (D, right-hand sides (rows, width)) -> D^-1 rhs by an unrolled sparse QR factorisation."""
@@ -127,8 +132,8 @@ class TrussGraph:
             for column, (row, _) in enumerate(own):
                 unit[row, column] = 1.0
             earlier = len(stage.earlier)
-            arguments = [ca.densify(-L)] if earlier else []
-            arguments += [ca.densify(unit)] if own else []
+            arguments: list[ca.MX] = [ca.densify(-L)] if earlier else []
+            arguments += [ca.MX(ca.densify(unit))] if own else []
             width = 3 * earlier + len(own) + 1
             solved = self._solver(D.sparsity(), width)(D, ca.horzcat(*arguments, rhs[stage.members.tolist()]))
             particular = solved[:, -1]
@@ -138,7 +143,9 @@ class TrussGraph:
                 product = solved[:, : 3 * earlier] @ before
                 columns, particular = product[:, :count], product[:, count] + particular
             if own:
-                spread = ca.DM(ca.Sparsity.triplet(len(own), count, list(range(len(own))), [c for _, c in own]), 1.0)
+                spread = ca.DM(
+                    ca.Sparsity.triplet(len(own), count, list(range(len(own))), [c for _, c in own]), 1.0
+                )
                 columns = columns + solved[:, 3 * earlier : 3 * earlier + len(own)] @ spread
             block = ca.horzcat(ca.densify(columns), particular)
             for j, node in enumerate(stage.nodes):

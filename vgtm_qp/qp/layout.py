@@ -127,7 +127,11 @@ class Layout:
     def turn_weights(self) -> Array:
         """(R K,) weights of the faces' turns; ones where they are hard."""
         weights = [self.weights.tangent, self.weights.tangent, self.weights.roll][: self.turns]
-        return np.ones(self.turns * len(self.tracked)) if self.hard_turns else np.tile(weights, len(self.tracked))
+        return (
+            np.ones(self.turns * len(self.tracked))
+            if self.hard_turns
+            else np.tile(weights, len(self.tracked))
+        )
 
     @cached_property
     def vertex_hessian(self) -> Array:
@@ -159,7 +163,9 @@ class Layout:
     @cached_property
     def polygon_bending(self) -> Array:
         """(V, V) D'D with D the second difference of the control vertices."""
-        second = np.diff(np.eye(self.vertices), n=2, axis=0) if self.vertices > 2 else np.zeros((0, self.vertices))
+        second = (
+            np.diff(np.eye(self.vertices), n=2, axis=0) if self.vertices > 2 else np.zeros((0, self.vertices))
+        )
         return np.asarray(second.T @ second)
 
     @cached_property

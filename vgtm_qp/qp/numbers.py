@@ -38,8 +38,16 @@ class ClearanceRows:
         """Return the rows with `width` slots, the new ones with zero coefficients."""
         more = ((0, 0), (0, width - self.nodes.shape[1]))
         return replace(
-            self, nodes=np.pad(self.nodes, more, mode="edge"), coefficients=np.pad(self.coefficients, (*more, (0, 0)))
+            self,
+            nodes=np.pad(self.nodes, more, mode="edge"),
+            coefficients=np.pad(self.coefficients, (*more, (0, 0))),
         )
+
+    def violated(self) -> ClearanceRows:
+        """Return the rows that a zero displacement violates."""
+        chosen, name = np.flatnonzero(self.lower > 0.0), self.name
+        kept = self.nodes[chosen], self.coefficients[chosen], self.lower[chosen]
+        return ClearanceRows(*kept, lambda k: name(int(chosen[k])))
 
     def joined(self, other: ClearanceRows) -> ClearanceRows:
         """Return these rows followed by `other`'s."""

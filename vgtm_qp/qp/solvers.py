@@ -1,5 +1,7 @@
-"""QP solvers by name: DAQP on the condensed QP, or along the chain of bays where the arm is long; PIQP, OSQP or
-anything else of qpsolvers on the full QP.
+"""QP solvers by name.
+
+DAQP answers the condensed QP, or goes along the chain of bays where the arm is long; PIQP, OSQP or anything else of
+qpsolvers answers the full QP.
 """
 
 from __future__ import annotations
@@ -62,7 +64,9 @@ def make_solver(name: str, layout: Layout) -> StepSolver:
         return FullSolver(layout, _Piqp())
     choices = available_solvers()
     if name not in choices:
-        raise SolverError(f'no solver "{name}" is installed{nearest(name, choices)}; choices: {", ".join(choices)}')
+        raise SolverError(
+            f'no solver "{name}" is installed{nearest(name, choices)}; choices: {", ".join(choices)}'
+        )
     return FullSolver(layout, _QpSolvers(name))
 
 
@@ -95,7 +99,9 @@ class FullSolver:
         scale = 1.0 + float(np.max(np.abs(qp.q))) + float(np.max(np.abs(y), initial=0.0))
         dual = max(qp.dual_residual(z, y, w) / scale, qp.complementarity_residual(z, y / scale, w / scale))
         if not (primal <= PRIMAL_TOLERANCE and dual <= DUAL_TOLERANCE):
-            raise SolverError(f"the answer has a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}")
+            raise SolverError(
+                f"the answer has a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
+            )
         # Only a good answer is a warm start: one that is not a number would stay in the solver for ever.
         self._structure = self.builder.structure
         return self.builder.solution(z, y, w, iterations)
@@ -146,7 +152,7 @@ class _Osqp:
         else:
             solver = self._solver
             solver.update(q=qp.q, l=lower, u=upper, Px=P.data, Ax=A.data)  # type: ignore[attr-defined]
-        result = solver.solve()  # type: ignore[attr-defined]
+        result = solver.solve()
         status = str(result.info.status)
         if "primal infeasible" in status:
             raise InfeasibleStepError(f"osqp: {status}")
@@ -195,7 +201,7 @@ class _Piqp:
         status = solver.solve()
         if status == piqp.PIQP_PRIMAL_INFEASIBLE:
             raise InfeasibleStepError("piqp: primal infeasible")
-        result = solver.result  # type: ignore[attr-defined]
+        result = solver.result
         z = np.array(result.x)
         y = np.zeros(len(qp.row_lower))
         y[equal] = result.y
@@ -209,7 +215,7 @@ class _QpSolvers:
     def __init__(self, name: str) -> None:
         self._name = name
 
-    def __call__(self, qp: StepQP, *, same_structure: bool) -> tuple[Array, Array, Array, int]:
+    def __call__(self, qp: StepQP, *, same_structure: bool) -> tuple[Array, Array, Array, int]:  # noqa: ARG002
         import qpsolvers
 
         equal = qp.row_lower == qp.row_upper

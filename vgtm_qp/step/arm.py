@@ -210,9 +210,13 @@ def _check_supported(problem: Problem) -> None:
         mistakes.append(problem.mistake(("arm",), "[truss]; serial arms are not available in this version"))
     elif problem.truss.module == "plate":
         modules = "octahedral, double-octahedral, hexapod, longeron, tetrahedral or graph"
-        mistakes.append(problem.mistake(("truss", "module"), f"{modules}; plates are not available in this version"))
+        mistakes.append(
+            problem.mistake(("truss", "module"), f"{modules}; plates are not available in this version")
+        )
     if problem.maneuver.kind != "path":
-        mistakes.append(problem.mistake(("maneuver", "kind"), '"path"; deployment is not available in this version'))
+        mistakes.append(
+            problem.mistake(("maneuver", "kind"), '"path"; deployment is not available in this version')
+        )
     if mistakes:
         raise ProblemError(str(problem.source or problem.name), mistakes)
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from vgtm_qp.errors import Mistake
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
+from vgtm_qp.errors import Mistake
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver

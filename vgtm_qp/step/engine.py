@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.fused_graph import SETTLING_STEPS
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
-from vgtm_qp.qp.lengths import LengthSolver
+from vgtm_qp.qp.fused_graph import SETTLING_STEPS
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
 from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
@@ -154,7 +154,9 @@ class PlainEngine:
             except SolverError:
                 worst = np.inf
                 break
-        return Closed(X, kinematics.lengths.copy(), worst, kinematics.tip_position(X), kinematics.tip_rotation.copy())
+        return Closed(
+            X, kinematics.lengths.copy(), worst, kinematics.tip_position(X), kinematics.tip_rotation.copy()
+        )
 
 
 class ElasticEngine(PlainEngine):

@@ -1,8 +1,8 @@
 """How far the ends of members with offset joints leave their chords while the nodes move on straight lines.
 
-An end is r = rho + R o, eq. (13), and the axes of the joint's frame R are unit vectors of polynomials w of the share of
-the way. From |w| >= m, |w'| <= a and |w''| <= b follow |(w/|w|)'| <= a/m and |(w/|w|)''| <= b/m + 3 (a/m)^2, and a curve
-is no further from its chord than an eighth of the greatest second derivative.
+An end is r = rho + R o, eq. (13), and the axes of the joint's frame R are unit vectors of polynomials w of the share
+of the way. From |w| >= m, |w'| <= a and |w''| <= b follow |(w/|w|)'| <= a/m and |(w/|w|)''| <= b/m + 3 (a/m)^2, and
+a curve is no further from its chord than an eighth of the greatest second derivative.
 """
 
 from __future__ import annotations

@@ -61,12 +61,13 @@ class Linearisation:
         self.home_lengths = home_lengths
         self._fixed_lengths = home_lengths[layout.fixed]
         self._home_strokes = home_lengths[layout.truss.actuators]
-        second = np.diff(np.eye(layout.vertices), n=2, axis=0) if layout.vertices > 2 else np.zeros((0, layout.vertices))
-        self._polygon = layout.weights.smoothness * second.T @ second
+        self._polygon = layout.weights.smoothness * layout.polygon_bending
 
     def length_error(self) -> float:
         """Return the largest error of a fixed member at the configuration evaluated last, m."""
-        return float(np.max(np.abs(self.kinematics.lengths[self.layout.fixed] - self._fixed_lengths), initial=0.0))
+        return float(
+            np.max(np.abs(self.kinematics.lengths[self.layout.fixed] - self._fixed_lengths), initial=0.0)
+        )
 
     def _base_rotation(self, X: Array) -> Array:
         """Return (3, 3) the frame of the base face at node positions `X` (N, 3); the kinematics is evaluated there."""
@@ -135,7 +136,9 @@ class Linearisation:
         curve = None
         if layout.general is not None:
             rows = layout.general.rows(
-                vertices, np.zeros(0) if torsion is None else torsion, base_frame(layout.truss, target.base_rotation)
+                vertices,
+                np.zeros(0) if torsion is None else torsion,
+                base_frame(layout.truss, target.base_rotation),
             )
             turns = turn_rows(rows, kinematics.face_rotation[tracked], face_spin[tracked], layout.turns)
             curve = CurveNumbers(
@@ -215,10 +218,13 @@ def clearance_rows(
     nodes = np.empty((count, 4), dtype=np.int64)
     coefficients = np.zeros((count, 4, 3))
     nodes[:, :2] = monitor.members[pairs.member]
-    nodes[:, 2:] = np.where(pairs.is_self[:, None], monitor.members[np.where(pairs.is_self, pairs.other, 0)], nodes[:, :2])
+    others = monitor.members[np.where(pairs.is_self, pairs.other, 0)]
+    nodes[:, 2:] = np.where(pairs.is_self[:, None], others, nodes[:, :2])
     coefficients[:, 0] = ((1.0 - pairs.t) * fraction)[:, None] * pairs.normal
     coefficients[:, 1] = (pairs.t * fraction)[:, None] * pairs.normal
     other = np.where(pairs.is_self, fraction, 0.0)
     coefficients[:, 2] = -((1.0 - pairs.t_other) * other)[:, None] * pairs.normal
     coefficients[:, 3] = -(pairs.t_other * other)[:, None] * pairs.normal
-    return ClearanceRows(nodes, coefficients, np.where(pairs.is_self, self_safe, safe) - pairs.distance, pairs.name)
+    return ClearanceRows(
+        nodes, coefficients, np.where(pairs.is_self, self_safe, safe) - pairs.distance, pairs.name
+    )

@@ -62,7 +62,9 @@ class Separation:
         self.distances = distances
         self._truss = truss
         self._ends = None if truss.joints is None else EndKinematics(truss)
-        self._corners = _corners(truss) if distances.minimum_angle > 0.0 else np.zeros((0, 2, 2), dtype=np.int64)
+        self._corners = (
+            _corners(truss) if distances.minimum_angle > 0.0 else np.zeros((0, 2, 2), dtype=np.int64)
+        )
 
     def shortfall(self, X: Array, time: float) -> Shortfall:
         """Return the pairs that are too near at node positions `X` (N, 3); empty as a rule."""
@@ -87,11 +89,15 @@ class Separation:
         if proven and not before:
             return {}
         after = self.shortfall(X, time)
-        if all(distance >= before.get(pair, np.inf) - self.distances.rounding for pair, distance in after.items()):
+        if all(
+            distance >= before.get(pair, np.inf) - self.distances.rounding for pair, distance in after.items()
+        ):
             return after
         return None
 
-    def between(self, start: Array, end: Array, start_time: float, end_time: float, before: Shortfall) -> BetweenReport:
+    def between(
+        self, start: Array, end: Array, start_time: float, end_time: float, before: Shortfall
+    ) -> BetweenReport:
         """Return the proof that no surfaces come nearer on the way than they may, or than the nearest are already."""
         kept = self.distances
         floor, self_floor = (
@@ -103,7 +109,9 @@ class Separation:
             return self.monitor.between(start, end, start_time, end_time, *floors)
         # Cut in k pieces the ends leave their chords by a k-th of a k-th.
         deviation = self.deviation(start, end)
-        pieces = min(math.ceil(math.sqrt(max(deviation / _BETWEEN, 1.0))), _MOST_PIECES) if deviation < 1.0 else 1
+        pieces = (
+            min(math.ceil(math.sqrt(max(deviation / _BETWEEN, 1.0))), _MOST_PIECES) if deviation < 1.0 else 1
+        )
         spare = deviation / pieces**2 - _BETWEEN
         floors, lowest = (floor + spare, max(self_floor + spare, 0.0)), np.inf
         for k in range(pieces):
@@ -150,7 +158,11 @@ class Separation:
         rows = self._clearance_rows(X, pairs)
         if motion:
             np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
-        for k in np.flatnonzero(pairs.distance < np.where(pairs.is_self, kept.self_safe, kept.safe)) if short else ():
+        for k in (
+            np.flatnonzero(pairs.distance < np.where(pairs.is_self, kept.self_safe, kept.safe))
+            if short
+            else ()
+        ):
             least = kept.self_safe if pairs.is_self[k] else kept.safe
             before = short.get(pairs.pair(int(k)))
             if before is not None:
@@ -186,14 +198,17 @@ class Separation:
 
     def names(self, short: Shortfall) -> tuple[str, ...]:
         """Return what is too near, nearest first."""
-        return tuple(self.monitor.names.clearance(pair) for pair, _ in sorted(short.items(), key=lambda item: item[1]))
+        return tuple(
+            self.monitor.names.clearance(pair) for pair, _ in sorted(short.items(), key=lambda item: item[1])
+        )
 
     def _angles(self, X: Array) -> tuple[Array, Array, Array]:
         """Return angles (K,), rad, and the two members' vectors (K, 3) away from the node they share, m."""
         ends = member_ends(self._truss, X)
         along = ends[:, 1] - ends[:, 0]
         first, second = (
-            np.where(self._corners[:, e, 1, None] == 0, 1.0, -1.0) * along[self._corners[:, e, 0]] for e in range(2)
+            np.where(self._corners[:, e, 1, None] == 0, 1.0, -1.0) * along[self._corners[:, e, 0]]
+            for e in range(2)
         )
         sine = np.linalg.norm(np.cross(first, second), axis=1)
         return np.arctan2(sine, np.einsum("kc,kc->k", first, second)), first, second

@@ -86,7 +86,11 @@ class Stop:
         return tuple(self.multipliers) or (str(self.kind),)
 
     def __str__(self) -> str:
-        parts = [str(self.kind), ", ".join(self.multipliers), self.reason if self.kind is StopKind.NONLINEAR else ""]
+        parts = [
+            str(self.kind),
+            ", ".join(self.multipliers),
+            self.reason if self.kind is StopKind.NONLINEAR else "",
+        ]
         return ": ".join(part for part in parts if part)
 
     def to_dict(self) -> dict[str, Any]:
@@ -111,7 +115,14 @@ class Limits:
 
 
 def explain(
-    arm: Arm, separation: Separation, state: State, path: Path, start: float, end: float, limits: Limits, reason: str
+    arm: Arm,
+    separation: Separation,
+    state: State,
+    path: Path,
+    start: float,
+    end: float,
+    limits: Limits,
+    reason: str,
 ) -> Stop:
     """Return why the arm does not get on from `state` along `path` from its value `start` towards `end`."""
     program = _Program(arm, separation, state, path, start, end, limits)
@@ -130,13 +141,19 @@ def explain(
     chosen = sorted(np.flatnonzero(kept).tolist(), key=lambda k: -pressing[k])
     kinds = [program.kind(k) for k in chosen]
     kind = next(kind for kind in StopKind if kind in kinds)
-    if set(kinds) == {StopKind.STROKE} and len(chosen) >= arm.truss.bays and _outward(arm, state, path, start):
+    if (
+        set(kinds) == {StopKind.STROKE}
+        and len(chosen) >= arm.truss.bays
+        and _outward(arm, state, path, start)
+    ):
         kind = StopKind.OUT_OF_REACH
     multipliers: dict[str, float] = {}
     for k in chosen:
         name = program.name(k)
         multipliers[name] = max(multipliers.get(name, 0.0), float(pressing[k]))
-    obstacles = [o.name for o in arm.monitor.obstacles if any(name.endswith(f" / {o.name}") for name in multipliers)]
+    obstacles = [
+        o.name for o in arm.monitor.obstacles if any(name.endswith(f" / {o.name}") for name in multipliers)
+    ]
     return Stop(kind, multipliers, tuple(obstacles), reason)
 
 
@@ -158,7 +175,9 @@ class _Program:
         kinematics.evaluate(X)
         member, flat, column = layout.length_scatter
         size = layout.node_columns
-        jacobian = sparse.csc_matrix((kinematics.gradient.reshape(-1)[flat], (member, column)), shape=(size, size))
+        jacobian = sparse.csc_matrix(
+            (kinematics.gradient.reshape(-1)[flat], (member, column)), shape=(size, size)
+        )
         selection = np.zeros((size, len(truss.actuators)))
         selection[truss.actuators, np.arange(len(truss.actuators))] = 1.0
         response = splu(jacobian).solve(selection)

@@ -64,16 +64,21 @@ class TipTask:
             raise GoalError(f"the end effector's coordinates {list(track)} name one coordinate twice")
         self.turns = "pointing" if "pointing" in track else "orientation" if "orientation" in track else None
         if self.turns and not kinematics.has_tip_frame:
-            raise GoalError(f'"{self.turns}" needs a tip of three or more nodes; this one has {len(kinematics.truss.tip)}')
+            count = len(kinematics.truss.tip)
+            raise GoalError(f'"{self.turns}" needs a tip of three or more nodes; this one has {count}')
         self.track = tuple(track)
         self.row_names = tuple(rows)
-        self.axes = np.array([_AXES[row[-1]] for row in rows if row in ("tip x", "tip y", "tip z")], dtype=np.int64)
+        self.axes = np.array(
+            [_AXES[row[-1]] for row in rows if row in ("tip x", "tip y", "tip z")], dtype=np.int64
+        )
         self.base = kinematics.truss.base
         self._kinematics = kinematics
         weights = kinematics.truss.tip_weights
         self._position_jacobian = np.kron(weights, np.eye(3))[self.axes]
 
-    def residual(self, position: Array, rotation: Array, goal: PathPoint) -> tuple[Array, Array, Array | None]:
+    def residual(
+        self, position: Array, rotation: Array, goal: PathPoint
+    ) -> tuple[Array, Array, Array | None]:
         """Return error (n_e,) goal minus value, rate (n_e,) along the path, and how the angular velocity is combined.
 
         The last is (r, 3), whose rows times the tip's angular velocity are the tracked turns; None without any.
@@ -99,4 +104,4 @@ class TipTask:
         jacobian = self._position_jacobian
         if across is not None:
             jacobian = np.concatenate([jacobian, across @ (kinematics.tip_spin if spin is None else spin)])
-        return TipRows(jacobian, rate, error)
+        return TipRows(np.asarray(jacobian), rate, error)

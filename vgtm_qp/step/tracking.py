@@ -44,6 +44,8 @@ class HardTracking:
         rows = shape.rows(vertices, torsion, base_frame(layout.truss, base_rotation))
         worst = float(np.abs(centres - rows.position).max(initial=0.0))
         if layout.hard_turns:
-            turns = turn_rows(rows, kinematics.face_rotation[faces], kinematics.face_spin[faces], layout.turns)
+            turns = turn_rows(
+                rows, kinematics.face_rotation[faces], kinematics.face_spin[faces], layout.turns
+            )
             worst = max(worst, float(np.abs(turns.residual).max(initial=0.0)))
         return worst

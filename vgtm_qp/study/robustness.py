@@ -114,7 +114,9 @@ def text(rows: Sequence[Row]) -> str:
     ]
     ways = Counter(row["way_out"] for row in rows if row["way_out"] and row["status"] == "solved")
     if ways:
-        parts.append("Solved by another way out: " + ", ".join(f"{way} {n}" for way, n in ways.most_common()) + ".")
+        parts.append(
+            "Solved by another way out: " + ", ".join(f"{way} {n}" for way, n in ways.most_common()) + "."
+        )
     stops = Counter(row["stop"] for row in rows if row["stop"])
     if stops:
         parts.append(

@@ -1,0 +1,1 @@
+"""Trusses as data, and their kinematics."""

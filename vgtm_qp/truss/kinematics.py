@@ -5,7 +5,6 @@ One member and one face are written as CasADi graphs, differentiated by CasADi, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -227,7 +226,9 @@ def _whole(truss: Truss, *, faces: bool = True) -> ca.Function:
         lengths, gradients = member(columns, ca.DM(truss.joints.offset.reshape(-1, 3).T))
 
     face_count = len(truss.faces) if faces else 0
-    face_results = _frames(truss.home[truss.faces[:face_count]], truss.face_frames[:face_count], X, truss.faces)
+    face_results = _frames(
+        truss.home[truss.faces[:face_count]], truss.face_frames[:face_count], X, truss.faces
+    )
     tip_count = 1 if len(truss.tip) >= 3 else 0
     tip = _frames(truss.home[truss.tip][None][:tip_count], truss.tip_frame[None], X, truss.tip[None])
     return ca.Function("truss" if faces else "members", [X], [lengths, gradients, *face_results, *tip])
@@ -237,9 +238,7 @@ def _frames(home: Array, rotations: Array, X: ca.MX, nodes: Index) -> list[ca.MX
     """Return rotations (3, 3F) and spins (3, 3KF) of F faces with K nodes each."""
     if not len(home):
         return [ca.MX(0, 0), ca.MX(0, 0)]
-    constants = [
-        frame_constants(points, rotation) for points, rotation in zip(home, rotations, strict=False)
-    ]
+    constants = [frame_constants(points, rotation) for points, rotation in zip(home, rotations, strict=False)]
     cosines, sines, alignments = (np.stack(column) for column in zip(*constants, strict=True))
     function = frame_function(home.shape[1]).map(len(home))
     arguments = [ca.DM(cosines.T), ca.DM(sines.T), ca.DM(np.concatenate(alignments, axis=1))]
