@@ -121,7 +121,12 @@ def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
     [
         (["slove", "free.toml"], ['did you mean "solve"', "solve, verify, ", "schema, doctor"]),
         (["solve"], ["PROBLEM"]),
-        (["solve", "free.toml", "extra"], ["extra"]),
+        (
+            ["solve", "free.toml", "extra", "more"],
+            ['more than vgtm solve takes: "extra", "more". Usage: vgtm solve PROBLEM [OPTIONS].'],
+        ),
+        (["doctor", "x"], ['more than vgtm doctor takes: "x". Usage: vgtm doctor [OPTIONS].']),
+        (["export", "a.npz", "b", "--to", "csv"], ["Usage: vgtm export RESULT --to ... [OPTIONS]."]),
         (["solve", "free.toml", "--bogus"], ["--bogus", "--solver", "--figure"]),
         (["solve", "free.toml", "--steps", "many"], ["--steps", "many"]),
         (["solve", "free.toml", "--steps", "0"], ["--steps", "found 0", "integer"]),
@@ -134,7 +139,8 @@ def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
         (["solve", "far.toml"], ["far.toml", "maneuver.waypoint[0].position", "out of any reach"]),
         (["check", "far.toml"], ["far.toml", "maneuver.waypoint[0].position", "out of any reach"]),
         (["verify"], ["RESULT"]),
-        (["verify", "free.toml"], ["free.toml"]),
+        (["verify", "free.toml"], ["free.toml: not a whole result file: cut, damaged, or of another kind"]),
+        (["verify", "."], [".: a folder; expected a result file, .npz"]),
         (["verify", "none.npz"], ["none.npz"]),
     ],
 )
