@@ -214,17 +214,17 @@ def clearance_rows(
     `fraction` is where on the straight way to the end of the step the pairs were found: a displacement of the end state
     moves that point by so much of it. A pair that is already too near may not come nearer, but is not asked to jump.
     """
-    count = len(pairs.distance)
-    nodes = np.empty((count, 4), dtype=np.int64)
-    coefficients = np.zeros((count, 4, 3))
-    nodes[:, :2] = monitor.members[pairs.member]
-    others = monitor.members[np.where(pairs.is_self, pairs.other, 0)]
-    nodes[:, 2:] = np.where(pairs.is_self[:, None], others, nodes[:, :2])
-    coefficients[:, 0] = ((1.0 - pairs.t) * fraction)[:, None] * pairs.normal
-    coefficients[:, 1] = (pairs.t * fraction)[:, None] * pairs.normal
-    other = np.where(pairs.is_self, fraction, 0.0)
-    coefficients[:, 2] = -((1.0 - pairs.t_other) * other)[:, None] * pairs.normal
-    coefficients[:, 3] = -(pairs.t_other * other)[:, None] * pairs.normal
-    return ClearanceRows(
-        nodes, coefficients, np.where(pairs.is_self, self_safe, safe) - pairs.distance, pairs.name
-    )
+    ends = monitor.members[pairs.member]
+    nodes = np.concatenate((ends, ends), axis=1)
+    coefficients = np.zeros((len(pairs.distance), 4, 3))
+    pull = fraction * pairs.normal
+    coefficients[:, 1] = pairs.t[:, None] * pull
+    coefficients[:, 0] = pull - coefficients[:, 1]
+    lower = safe - pairs.distance
+    mutual = np.flatnonzero(pairs.is_self)
+    if len(mutual):
+        nodes[mutual, 2:] = monitor.members[pairs.other[mutual]]
+        coefficients[mutual, 3] = -pairs.t_other[mutual, None] * pull[mutual]
+        coefficients[mutual, 2] = -pull[mutual] - coefficients[mutual, 3]
+        lower[mutual] += self_safe - safe
+    return ClearanceRows(nodes, coefficients, lower, pairs.name)
