@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import vgtm_qp as vq
 from vgtm_qp.errors import ProblemError, VgtmError
 from vgtm_qp.problem import Problem, load_problem
 from vgtm_qp.problem.obstacle import Box
@@ -449,6 +450,24 @@ def test_tables_made_in_python_raise_the_same_error() -> None:
             maneuver={"waypoint": [{"time": 1, "position": [0, 0, 1]}]},
             obstacle=["box"],
         )
+
+
+@pytest.mark.parametrize("function", [vq.solve, vq.Resolver, vq.compare])
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (
+            "five_bay_free",
+            r'found "five_bay_free"; expected a problem: vgtm_qp\.load_problem\("five_bay_free"\)',
+        ),
+        (Path("a.toml"), r'vgtm_qp\.load_problem\("a.toml"\) reads it'),
+        (None, r"found nothing; expected a problem, from vgtm_qp\.load_problem\(path\)"),
+        ({"name": "x"}, "found a table of name; expected a problem"),
+    ],
+)
+def test_what_is_no_problem_is_told_how_to_become_one(function: object, value: object, says: str) -> None:
+    with pytest.raises(VgtmError, match=says):
+        function(value)  # type: ignore[operator]
 
 
 def test_a_problem_is_not_changed_in_place(tmp_path: Path) -> None:

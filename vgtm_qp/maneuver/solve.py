@@ -17,6 +17,7 @@ from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.maneuver.ways_out import ways_out
 from vgtm_qp.problem import Problem
+from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
@@ -63,10 +64,11 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     Raises
     ------
     ProblemError, TrussError, SolverError
-        The problem cannot be set up; no step was taken.
+        The problem cannot be set up, or is none; no step was taken.
     """
     from vgtm_qp.methods import make_resolver
 
+    check_is_problem(problem)
     started = perf_counter()
     resolver = make_resolver(problem)
     mistakes = check_problem(problem, resolver.arm)

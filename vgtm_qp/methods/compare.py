@@ -15,6 +15,7 @@ from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.methods.machine import describe_machine, machine
 from vgtm_qp.methods.presets import DEFAULT_METHODS, check_methods, with_method
 from vgtm_qp.problem import Problem
+from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.step.resolver import Step
 
 if TYPE_CHECKING:
@@ -136,7 +137,10 @@ def compare(
     ------
     GoalError
         `methods` is empty, is not a list, or has a name that is no method's.
+    ProblemError
+        `problem` is none.
     """
+    check_is_problem(problem)
     check_methods(methods)
     rows, maneuvers = [], {}
     for name in methods:

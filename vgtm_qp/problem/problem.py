@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, PrivateAttr, WithJsonSchema, model_validator
 
-from vgtm_qp.errors import Mistake
+from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem.arm import Arm
 from vgtm_qp.problem.fields import Name, expect
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
@@ -147,6 +147,18 @@ class Problem(Table):
             for i, waypoint in enumerate(self.maneuver.waypoint):
                 for key, expected in _unmet(self.end_effector, waypoint):
                     yield ("maneuver", "waypoint", i, key), expected
+
+
+def check_is_problem(value: object) -> None:
+    """Raise ProblemError where a function is given something else in the place of a problem, such as its name."""
+    if isinstance(value, Problem):
+        return
+    if isinstance(value, str | Path):
+        expected = f'a problem: vgtm_qp.load_problem("{value}") reads it'
+    else:
+        expected = "a problem, from vgtm_qp.load_problem(path) or vgtm_qp.Problem(...)"
+    found = shown(str(value) if isinstance(value, Path) else value)
+    raise ProblemError("argument", [Mistake("problem", found, expected)])
 
 
 def _unmet(end_effector: EndEffector, waypoint: Waypoint) -> Iterator[tuple[str, str]]:

@@ -13,6 +13,7 @@ from vgtm_qp.errors import ProblemError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
+from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
@@ -128,6 +129,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
     TrussError
         The truss is not statically determinate.
     """
+    check_is_problem(problem)
     _check_supported(problem)
     spec = problem.truss
     assert spec is not None
