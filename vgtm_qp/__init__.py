@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     )
     from vgtm_qp.export import export_maneuver
     from vgtm_qp.maneuver.certificate import Certificate, Measure
+    from vgtm_qp.maneuver.many import solve_many
     from vgtm_qp.maneuver.result import Maneuver, load_result
     from vgtm_qp.maneuver.solve import solve
     from vgtm_qp.methods.compare import Report, compare
@@ -48,6 +49,7 @@ _HOMES = {
     "vgtm_qp.export": ("export_maneuver",),
     "vgtm_qp.maneuver.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.result": ("Maneuver", "load_result"),
+    "vgtm_qp.maneuver.many": ("solve_many",),
     "vgtm_qp.maneuver.solve": ("solve",),
     "vgtm_qp.methods.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
@@ -88,6 +90,7 @@ __all__ = [
     "load_result",
     "problem_schema",
     "solve",
+    "solve_many",
     "verify",
     "verify_file",
 ]
