@@ -142,7 +142,7 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
 
 def _stop(resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step) -> Stop:
     if isinstance(resolver, Resolver):
-        return resolver.explain(plan.path, value, mark, dt=dt, reason=step.reason)
+        return resolver.explain(plan.path, value, mark, dt=dt, last=step)
     return Stop(StopKind.NONLINEAR, dict.fromkeys(step.blocked_by, 0.0), reason=step.reason)
 
 

@@ -15,7 +15,6 @@ from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.engine import Accuracy, Engine
 from vgtm_qp.step.linearise import Target
-from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.state import State
 from vgtm_qp.step.task import TipTask
@@ -149,7 +148,8 @@ class Attempt:
         X, vertices, torsion, progress = state.nodes, state.control_vertices, state.torsion, 0.0
         guess = share * state.motion
         Y = X + 0.5 * guess
-        reach = _MOTION_MARGIN * self._expected(target, guess)
+        whole = share >= 1.0
+        reach = _MOTION_MARGIN * self._expected(target, guess) if whole else self.separation.distances.influence
         stations: list[float] = []
         first: StepSolution | None = None
         first_rows: ClearanceRows | None = None
@@ -195,7 +195,8 @@ class Attempt:
             moved = float(np.abs(solution.nodes).max())
             if not moved < np.inf:
                 return outcome("singular pose", count)
-            reach = moved
+            # A pair that one correction pushes away must still be there in the next, or two of them take turns.
+            reach = max(reach, moved)
             settled = self.engine.settle(
                 X, target, target.path.at(target.start + progress * span), self._accuracy
             )

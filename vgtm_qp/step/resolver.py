@@ -33,6 +33,9 @@ __all__ = ["Resolver", "Step", "StepStatus"]
 
 Array = NDArray[np.float64]
 
+_TRUST = 0.2
+"""An actuator moves by no more than this times the part of the step that is tried, m, where the whole one failed."""
+
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 
@@ -302,7 +305,8 @@ class Resolver:
         share, outcome = 1.0, None
         while share >= smallest:
             reach = start + share * whole * (end - start)
-            outcome = self._attempt.run(state, self._target(path, start, reach, dt, box), share)
+            near = box if share == 1.0 else _within(state.lengths[self.arm.truss.actuators], share * _TRUST, *box)
+            outcome = self._attempt.run(state, self._target(path, start, reach, dt, near), share)
             if self.arm.tip_mode != "scaled":
                 # The tip stays on time: no smaller piece of the path and no part of it will do.
                 if outcome.accepted and outcome.progress < 1.0 - 1e-9:
@@ -351,14 +355,15 @@ class Resolver:
         return Target(path, start, end, *box, then, *self.arm.base_at(then), self._vertex_goals)
 
     def explain(
-        self, path: Path, start: float, end: float, *, dt: float | None = None, reason: str = ""
+        self, path: Path, start: float, end: float, *, dt: float | None = None, last: Step | None = None
     ) -> Stop:
         """Return why the arm does not get on from its present state along `path` from its value `start` to `end`.
 
-        Worth asking after a step that was blocked or hardly moved; `reason` is that step's. The state is unchanged.
+        Worth asking after a `last` step that was blocked or hardly moved. The state is unchanged.
         """
         dt = self.arm.dt if dt is None else dt
-        return explain(self.arm, self._separation, self.state, path, start, end, self._limits_now(dt), reason)
+        told = ("", {}) if last is None else (last.reason, last.multipliers)
+        return explain(self.arm, self._separation, self.state, path, start, end, self._limits_now(dt), *told)
 
     def _limits_now(self, dt: float) -> Limits:
         """Return the boxes of a step of `dt`, s, from the present state, and what sets each of their sides."""
@@ -380,6 +385,11 @@ class Resolver:
 
 def _hard_tracking(arm: Arm) -> HardTracking | None:
     return HardTracking(arm.layout, arm.kinematics) if arm.layout.hard_tracking else None
+
+
+def _within(length: Array, trust: float, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the part of the boxes (n_a,) that is no further than `trust` from the present lengths, m."""
+    return np.minimum(np.maximum(lower, length - trust), upper), np.maximum(np.minimum(upper, length + trust), lower)
 
 
 def _vector(value: ArrayLike, name: str) -> Array:

@@ -11,7 +11,7 @@ way is left to first order: close to a fold of its motion the curvature takes wh
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -123,22 +123,30 @@ def explain(
     end: float,
     limits: Limits,
     reason: str,
+    pressing: Mapping[str, float],
 ) -> Stop:
-    """Return why the arm does not get on from `state` along `path` from its value `start` towards `end`."""
+    """Return why the arm does not get on from `state` along `path` from its value `start` towards `end`.
+
+    Where no rows forbid it to first order, what was `pressing` on the last step is told, and the `reason` it gave.
+    """
     program = _Program(arm, separation, state, path, start, end, limits)
-    share, pressing = program.solve(np.ones(program.count, dtype=bool))
+    share, costs = program.solve(np.ones(program.count, dtype=bool))
     bar = min(max(_BLOCKED, _FREER * share), 0.5 * (1.0 + share))
     kept = np.zeros(program.count, dtype=bool)
-    kept[np.flatnonzero(pressing > _PRESSES)] = True
+    kept[np.flatnonzero(costs > _PRESSES)] = True
     if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= bar:
         kind = StopKind.OUT_OF_REACH if _outward(arm, state, path, start) else StopKind.SINGULAR
-        return Stop(kind if share <= _SINGULAR else StopKind.NONLINEAR, reason=reason)
-    for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: pressing[k]):
+        if share <= _SINGULAR:
+            return Stop(kind, reason=reason)
+        kinds = [_kind(name) for name in pressing]
+        kind = next((kind for kind in StopKind if kind in kinds), StopKind.NONLINEAR)
+        return Stop(kind, pressing, _obstacles(arm, pressing), reason)
+    for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
         kept[k] = False
         if program.solve(kept)[0] > bar:
             kept[k] = True
-    _, pressing = program.solve(kept)
-    chosen = sorted(np.flatnonzero(kept).tolist(), key=lambda k: -pressing[k])
+    _, costs = program.solve(kept)
+    chosen = sorted(np.flatnonzero(kept).tolist(), key=lambda k: -costs[k])
     kinds = [program.kind(k) for k in chosen]
     kind = next(kind for kind in StopKind if kind in kinds)
     if (
@@ -150,11 +158,22 @@ def explain(
     multipliers: dict[str, float] = {}
     for k in chosen:
         name = program.name(k)
-        multipliers[name] = max(multipliers.get(name, 0.0), float(pressing[k]))
-    obstacles = [
-        o.name for o in arm.monitor.obstacles if any(name.endswith(f" / {o.name}") for name in multipliers)
-    ]
-    return Stop(kind, multipliers, tuple(obstacles), reason)
+        multipliers[name] = max(multipliers.get(name, 0.0), float(costs[k]))
+    return Stop(kind, multipliers, _obstacles(arm, multipliers), reason)
+
+
+def _obstacles(arm: Arm, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the obstacles in the names of rows."""
+    found = [o.name for o in arm.monitor.obstacles if any(name.endswith(f" / {o.name}") for name in names)]
+    return tuple(found)
+
+
+def _kind(name: str) -> StopKind:
+    """Return what the row of that name is about."""
+    first = name.split(":")[0]
+    if first == "clearance":
+        return StopKind.MEMBERS if " / member " in name else StopKind.OBSTACLE
+    return StopKind(first)
 
 
 class _Program:
@@ -242,10 +261,7 @@ class _Program:
         if k >= near:
             side = self._limits.low_kind if k < near + actuators else self._limits.high_kind
             return side[(k - near) % actuators]
-        name = self._rows.name(k)
-        if name.startswith("angle: "):
-            return StopKind.ANGLE
-        return StopKind.MEMBERS if " / member " in name else StopKind.OBSTACLE
+        return _kind(self._rows.name(k))
 
 
 def _outward(arm: Arm, state: State, path: Path, start: float) -> bool:

@@ -1,0 +1,94 @@
+"""The end effector's modes: elastic by an exact penalty, hard, and scaled."""
+
+import numpy as np
+import pytest
+
+import vgtm_qp as vq
+from vgtm_qp.qp.condensed import CondensedSolver
+from vgtm_qp.qp.full import FullBuilder
+from vgtm_qp.qp.solvers import _Piqp
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.linearise import Linearisation, Target
+from vgtm_qp.step.path import Path
+
+
+def three_bays(**changes):
+    data = {
+        "name": "three bays",
+        "truss": {"module": "octahedral", "bays": 3},
+        "curve": {"control_vertices": 4},
+        "maneuver": {"steps": 12, "waypoint": [{"time": 4.0, "position": [0.6, 0.1, 2.1]}]},
+        "clearance": {"safe": 0.05, "influence": 0.5},
+        "method": {"retries": False},
+    }
+    problem = vq.Problem.from_dict(data)
+    return problem.replace(changes) if changes else problem
+
+
+def one_qp(penalty):
+    """Return arm, elastic solver and the numbers of a step whose strokes cannot give all that the tip asks for."""
+    problem = three_bays(**{"end_effector.mode": "elastic", "method.weights.end_effector": penalty})
+    arm = build_arm(problem)
+    X = arm.truss.home
+    arm.kinematics.evaluate(X)
+    start = arm.kinematics.tip_position(X)
+    rotation = arm.kinematics.tip_rotation.copy()
+    path = Path(np.array([0.0, 1.0]), np.stack([start, [*start, 0.1, 0.02, -0.03]]), np.stack([rotation] * 2))
+    lengths = arm.home_lengths[arm.truss.actuators]
+    target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
+    linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
+    rows = vq.Resolver(arm)._separation.rows(X, 0.0, 1.0, 0.1, {}, 0.0)
+    numbers = linearisation.numbers(X, arm.control_vertices, target, 0.0, rows, motion=True)
+    return arm, CondensedSolver(arm.layout), numbers
+
+
+def test_an_elastic_goal_holds_exactly_while_its_penalty_exceeds_the_multiplier():
+    arm, _, numbers = one_qp(1.0)
+    builder = FullBuilder(arm.layout)
+    qp = builder.build(numbers)
+    _, multipliers, _, _ = _Piqp()(qp, same_structure=False)
+    tip = [k for k, label in enumerate(qp.rows) if label.kind == "end effector"]
+    greatest = float(np.abs(multipliers[tip]).max())
+    assert greatest > 1e-3
+    _, above, numbers = one_qp(1.01 * greatest)
+    above.solve(numbers)
+    assert above.slack < 1e-9
+    _, below, numbers = one_qp(0.9 * greatest)
+    below.solve(numbers)
+    assert below.slack > 1e-5
+
+
+def test_an_elastic_tip_stays_on_a_free_path_and_leaves_it_where_it_must():
+    free = vq.solve(three_bays(**{"end_effector.mode": "elastic"}))
+    assert free.status == "solved"
+    assert free.certificate.ok, free.certificate.failures()
+    assert np.abs(free.tip_position - free.tip_target_position).max() < 1e-7
+    far = {
+        "end_effector.mode": "elastic",
+        "maneuver.waypoint": [{"time": 4.0, "position": [0.0, 0.0, 5.0]}],
+        "truss.stroke": [0.9, 1.2],
+    }
+    stretched = vq.solve(
+        three_bays(**{**far, "maneuver.waypoint": [{"time": 4.0, "position": [0.2, 0.0, 2.62]}]})
+    )
+    assert stretched.status == "solved"
+    assert stretched.certificate.ok, stretched.certificate.failures()
+    assert np.abs(stretched.tip_position - stretched.tip_target_position)[-1].max() > 1e-3
+
+
+@pytest.mark.parametrize(("mode", "slower"), [("scaled", True), ("hard", False)])
+def test_slow_actuators_slow_a_scaled_tip_down_and_stop_a_hard_one(mode, slower):
+    maneuver = vq.solve(three_bays(**{"end_effector.mode": mode, "truss.rate": 0.06}))
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    assert (maneuver.status == "solved") == slower
+    if slower:
+        assert len(maneuver.time) - 1 > 12
+    else:
+        assert maneuver.manifest["stop"]["kind"] == "rate"
+        assert all(name.startswith("rate: ") for name in maneuver.blocked_by)
+
+
+def test_a_path_that_stands_still_is_solved():
+    tip = vq.solve(three_bays()).tip_position[0]
+    waypoint = [{"time": 1.0, "position": tip.tolist()}]
+    assert vq.solve(three_bays(**{"maneuver.waypoint": waypoint, "maneuver.steps": 3})).status == "solved"

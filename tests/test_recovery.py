@@ -1,0 +1,153 @@
+"""Starts that break a limit, obstacles that move, angles, offset joints: what recovers, and what never gets worse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arms import mast
+
+import vgtm_qp as vq
+from vgtm_qp.step.joint_ways import chord_deviation
+from vgtm_qp.step.resolver import Resolver
+from vgtm_qp.truss import modules
+from vgtm_qp.truss.kinematics import member_ends
+
+BASE = {
+    "name": "three bays",
+    "truss": {"module": "octahedral", "bays": 3, "stroke": [0.6, 1.5]},
+    "curve": {"control_vertices": 4},
+    "maneuver": {"steps": 20, "waypoint": [{"time": 4.0, "position": [0.0, 0.5, 2.2]}]},
+    "clearance": {"safe": 0.08, "influence": 0.5},
+    "method": {"retries": False},
+}
+
+
+def problem(**changes):
+    found = vq.Problem.from_dict(BASE)
+    return found.replace(changes) if changes else found
+
+
+def box(name, center, size, **more):
+    return {"name": name, "shape": "box", "center": center, "size": size, **more}
+
+
+def beside(gap):
+    """Return a box whose face is `gap` from the surface of the home arm, on the side of x."""
+    home = Resolver(problem()).arm.truss
+    reach = float(home.home[:, 0].max()) + float(home.radius.max())
+    return box("crate", [reach + gap + 0.25, 0.0, 1.2], [0.5, 2.0, 2.0])
+
+
+def test_an_arm_too_near_at_the_start_recovers_monotonically_and_says_so():
+    resolver = Resolver(problem(obstacle=[beside(0.03)]))
+    arm = resolver.arm
+    before = resolver._separation.shortfall(resolver.state.nodes, 0.0)
+    assert before
+    assert any("crate" in name for name in resolver._separation.names(before))
+    short, least = dict(before), min(before.values())
+    tip, _ = resolver.tip()
+    for k in range(12):
+        resolver.step(position=tip + (k + 1) * np.array([0.0, 0.02, -0.005]), dt=0.2)
+        after = resolver.state.shortfall
+        for pair, distance in after.items():
+            assert distance >= short[pair] - 1e-9
+        now = arm.monitor.least(resolver.state.nodes, resolver.state.time, among="obstacles")[0]
+        assert now >= min(least, arm.safe) - 1e-9
+        short, least = dict(after), now
+    assert not short
+    assert least >= arm.safe - 1e-9
+
+
+def test_a_maneuver_from_a_start_that_is_too_near_is_solved_and_its_verification_tells():
+    maneuver = vq.solve(problem(obstacle=[beside(0.05)]))
+    assert maneuver.status == "solved"
+    assert np.all(np.diff(np.minimum(maneuver.clearance, 0.08)) >= -1e-9)
+    assert maneuver.clearance[-1] >= 0.08 - 1e-9
+    assert any("clearance" in line for line in maneuver.certificate.failures())
+
+
+@pytest.mark.parametrize("speed", [0.08, 0.1])
+def test_an_arm_gives_way_to_an_obstacle_that_comes_nearer(speed):
+    crate = box("crate", [1.05, 0.0, 2.5], [0.5, 2.0, 1.0], velocity=[-speed, 0.0, 0.0])
+    maneuver = vq.solve(problem(obstacle=[crate]))
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    assert maneuver.status == "solved"
+    careless = vq.solve(problem()).nodes[-1]
+    assert (
+        Resolver(problem(obstacle=[crate])).arm.monitor.least(careless, 4.0, among="obstacles")[0]
+        < 0.08 - 1e-3
+    )
+
+
+def test_members_keep_a_quarter_of_safe_from_one_another_unless_told_otherwise():
+    assert problem().clearance.between_members == pytest.approx(0.02)
+    assert problem(**{"clearance.self_safe": 0.05}).clearance.between_members == 0.05
+    assert Resolver(problem()).arm.self_safe == pytest.approx(0.02)
+    for name in ("five_bay_two_cubes", "five_bay_two_cubes_pointing"):
+        maneuver = vq.solve(vq.load_problem(name))
+        assert (maneuver.status, len(maneuver.time)) == ("solved", 51)
+        assert maneuver.certificate.ok, maneuver.certificate.failures()
+        assert maneuver.self_clearance.min() >= 0.02 - 1e-9
+
+
+def test_self_clearance_is_reported_where_it_is_not_kept():
+    maneuver = vq.solve(problem(**{"clearance.self_collision": False}))
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    assert np.all(np.isfinite(maneuver.self_clearance))
+
+
+def test_the_least_angle_between_members_that_meet_is_kept():
+    goal = {"maneuver.waypoint": [{"time": 4.0, "position": [0.9, 0.0, 1.9]}]}
+    free = vq.solve(problem(**goal)).certificate.member_angle.value
+    least = free + 0.1
+    bound = vq.solve(problem(**goal, **{"clearance.minimum_angle": least}))
+    assert bound.certificate.ok, bound.certificate.failures()
+    assert least - 1e-6 <= bound.certificate.member_angle.value <= least + 0.05
+    if bound.status != "solved":
+        assert any(name.startswith("angle: ") for name in bound.blocked_by)
+
+
+@pytest.mark.parametrize("truss", [modules.octahedral(2, joint_offset=0.1), mast(0.1)])
+def test_ends_of_offset_joints_stay_within_the_bound_of_their_chords(truss):
+    random = np.random.default_rng(7)
+    for size in (0.01, 0.05, 0.2):
+        start = truss.home + random.uniform(-0.05, 0.05, truss.home.shape)
+        end = start + random.uniform(-size, size, start.shape)
+        bound = chord_deviation(truss, start, end)
+        first, last = member_ends(truss, start), member_ends(truss, end)
+        worst = max(
+            float(
+                np.linalg.norm(
+                    member_ends(truss, start + s * (end - start)) - (first + s * (last - first)), axis=2
+                ).max()
+            )
+            for s in np.linspace(0.05, 0.95, 19)
+        )
+        assert worst <= bound
+        if size < 0.1:
+            assert bound < 100.0 * worst
+    assert chord_deviation(modules.octahedral(2), truss.home[:9], truss.home[:9]) == 0.0
+
+
+def test_offset_joints_pass_cubes_with_clearance_between_their_true_ends():
+    maneuver = vq.solve(
+        problem(**{"truss.joint_offset": 0.06, "truss.stroke": [0.5, 1.35], "obstacle": [beside(0.1)]})
+    )
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+
+
+def test_a_member_that_slides_along_a_cube_does_not_chatter():
+    """Several witness rows on parallel faces: actuator rates change no more than twice as much as in free motion."""
+    free = vq.load_problem("five_bay_free").replace(
+        {"maneuver.waypoint": [{"time": 10.0, "position": [1.2, 0.4, 3.5]}]}
+    )
+    beside_a_face = free.replace({"obstacle": [box("cube", [0.0, 3.05, 2.0], 4.5)]})
+    changes = []
+    for scene in (free, beside_a_face):
+        maneuver = vq.solve(scene)
+        assert maneuver.status == "solved"
+        rate = np.diff(maneuver.member_lengths, axis=0) / np.diff(maneuver.time)[:, None]
+        changes.append(float(np.abs(np.diff(rate, axis=0)).sum()))
+    assert np.count_nonzero(maneuver.clearance < 0.0806) > 30
+    assert changes[1] <= 2.0 * changes[0], changes

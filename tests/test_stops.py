@@ -1,0 +1,132 @@
+"""Honest stops: what is named is what holds the arm, and without it the arm gets further."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import vgtm_qp as vq
+from vgtm_qp.step.stops import StopKind
+
+BASE = {
+    "name": "three bays",
+    "truss": {"module": "octahedral", "bays": 3, "stroke": [0.6, 1.5]},
+    "curve": {"control_vertices": 4},
+    "maneuver": {"steps": 15, "waypoint": [{"time": 4.0, "position": [0.9, 0.0, 1.9]}]},
+    "clearance": {"safe": 0.05, "influence": 0.5},
+    "method": {"retries": False},
+}
+
+
+def problem(**changes):
+    found = vq.Problem.from_dict(BASE)
+    return found.replace(changes) if changes else found
+
+
+def boxes(seed):
+    """Return two or three boxes beside the arm of which some stand in its way."""
+    random = np.random.default_rng(seed)
+    found = []
+    for k in range(int(random.integers(2, 4))):
+        center = [random.uniform(0.95, 1.2), random.uniform(-0.8, 0.8), random.uniform(1.0, 2.3)]
+        found.append({"name": f"box {k}", "shape": "box", "center": center, "size": random.uniform(0.3, 0.6)})
+    return found
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_without_the_named_obstacles_or_limits_a_blocked_arm_gets_further(seed):
+    obstacles = boxes(seed)
+    blocked = vq.solve(problem(obstacle=obstacles))
+    assert blocked.certificate.ok, blocked.certificate.failures()
+    stop = blocked.manifest["stop"]
+    if blocked.status == "solved":
+        assert stop is None
+        return
+    assert stop["multipliers"]
+    assert all(value > 0.0 for value in stop["multipliers"].values())
+    assert set(stop["obstacles"]) <= {entry["name"] for entry in obstacles}
+    changes = {"obstacle": [entry for entry in obstacles if entry["name"] not in stop["obstacles"]]}
+    if not stop["obstacles"]:
+        changes = {"truss.stroke": [0.4, 1.7], "clearance.self_collision": False, "obstacle": obstacles}
+    freer = vq.solve(problem(**changes))
+    assert freer.reached > blocked.reached + 1e-3
+
+
+def test_some_of_the_random_scenes_are_blocked_by_obstacles():
+    kinds = [vq.solve(problem(obstacle=boxes(seed)), verify=False).manifest["stop"] for seed in range(6)]
+    assert any(stop and stop["kind"] == "obstacle" for stop in kinds)
+
+
+def test_the_wall_is_named_and_the_set_is_small():
+    maneuver = vq.solve(vq.load_problem("five_bay_blocked_by_wall"))
+    stop = maneuver.manifest["stop"]
+    assert (stop["kind"], stop["obstacles"]) == ("obstacle", ["wall"])
+    assert 1 <= len(stop["multipliers"]) <= 6
+    assert set(maneuver.blocked_by) == set(stop["multipliers"])
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    json.dumps(maneuver.manifest, allow_nan=False)
+
+
+def test_a_stretched_arm_is_out_of_reach_of_what_lies_further():
+    waypoint = [{"time": 4.0, "position": [0.0, 0.0, 2.62]}]
+    maneuver = vq.solve(problem(**{"maneuver.waypoint": waypoint, "truss.stroke": [0.9, 1.2]}))
+    assert maneuver.status == "blocked"
+    stop = maneuver.manifest["stop"]
+    assert stop["kind"] in ("out of reach", "stroke")
+    assert all(name.startswith("stroke: ") for name in stop["multipliers"])
+    wider = vq.solve(problem(**{"maneuver.waypoint": waypoint, "truss.stroke": [0.5, 1.6]}))
+    assert wider.reached > maneuver.reached
+
+
+def test_a_resolver_explains_a_stop_in_a_control_loop_and_keeps_its_state():
+    resolver = vq.Resolver(
+        problem(
+            obstacle=[{"name": "wall", "shape": "box", "center": [1.2, 0.0, 2.0], "size": [0.3, 6.0, 6.0]}]
+        )
+    )
+    step = None
+    for _ in range(40):
+        step = resolver.step(position=[1.3, 0.0, 2.2])
+        if step.status is vq.StepStatus.BLOCKED or step.progress < 1e-6:
+            break
+    before = resolver.state
+    from vgtm_qp.step.path import Path
+
+    here, rotation = resolver.tip()
+    path = Path(np.array([0.0, 1.0]), np.stack([here, [1.3, 0.0, 2.2]]), np.stack([rotation] * 2))
+    stop = resolver.explain(path, 0.0, 1.0, last=step)
+    assert stop.kind is StopKind.OBSTACLE
+    assert stop.obstacles == ("wall",)
+    assert "wall" in str(stop)
+    assert resolver.state is before
+
+
+@pytest.mark.parametrize("bad", [[np.nan, 0.0, 1.0], [np.inf, 0.0, 1.0], [1.0, 2.0], "up"])
+def test_a_target_that_is_no_number_is_refused_and_the_state_kept(bad):
+    resolver = vq.Resolver(problem())
+    resolver.step(position=[0.1, 0.0, 2.4])
+    before = resolver.state
+    with pytest.raises(vq.GoalError, match="unchanged"):
+        resolver.step(position=bad)
+    assert resolver.state is before
+
+
+def test_another_way_out_is_tried_before_giving_up_and_can_be_turned_off():
+    wall = vq.load_problem("five_bay_blocked_by_wall")
+    patient, hasty = vq.solve(wall), vq.solve(wall.replace({"method.retries": False}))
+    assert hasty.manifest["way_out"] == ""
+    assert patient.reached >= hasty.reached
+
+
+@pytest.mark.slow
+def test_a_dead_end_of_one_shape_is_passed_in_another():
+    from vgtm_qp.study.scenes import random_scene
+
+    scene = random_scene(0, 9).problem
+    assert vq.solve(scene.replace({"method.retries": False}), verify=False).status == "blocked"
+    maneuver = vq.solve(scene)
+    assert maneuver.status == "solved"
+    assert maneuver.manifest["way_out"]
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
