@@ -36,6 +36,11 @@ time = 3.0
 position = {position}
 """
 
+WARNING = (
+    "warning: curve.control_vertices = 6: 3 or fewer; the reference curve has 13 degrees of freedom and the arm 6: "
+    "7 of them mean nothing to the arm; 3 control vertices fewer would do\n"
+)
+
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -53,7 +58,7 @@ def run(capsys: pytest.CaptureFixture[str], *tokens: str) -> tuple[int, str, str
 
 def test_solve_writes_a_verified_result_and_prints_a_table(capsys, folder):
     code, out, err = run(capsys, "solve", "free.toml")
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, WARNING)
     assert out.startswith("free: solved, verified\n")
     assert "result: free.npz" in out
     assert vq.load_result(folder / "free.npz").certificate.ok
@@ -62,7 +67,7 @@ def test_solve_writes_a_verified_result_and_prints_a_table(capsys, folder):
 def test_solve_as_json_is_one_document_with_the_keys_of_the_contract(capsys):
     code, out, err = run(capsys, "solve", "free.toml", "--json", "-o", "a/b.npz")
     summary = json.loads(out)
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, WARNING)
     assert set(summary) >= {
         "name", "status", "reached", "steps", "bays", "method", "solver", "min_clearance", "max_member_error",
         "max_stroke_violation", "max_rate_violation", "max_tip_error", "step_time", "setup_time",

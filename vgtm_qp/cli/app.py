@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError, UnusedCliTokensError
 
@@ -70,7 +73,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if tokens is None else tokens)
     as_json = "--json" in given
     try:
-        code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
+        with _plain_warnings():
+            code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
         return ExitCode.SOLVED if code is None else int(code)
     except CycloptsError as error:
         return _failed(_explained(error), ExitCode.USAGE, as_json)
@@ -86,6 +90,22 @@ def main(tokens: Sequence[str] | None = None) -> int:
         note(traceback.format_exc().rstrip())
         message = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
         return _failed(message, ExitCode.INTERNAL, as_json)
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Print the package's own warnings as one line on stderr each; those of libraries keep their file and line."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def line(message: Warning | str, category: type[Warning], *place: Any) -> None:
+            if category is UserWarning:
+                note(f"warning: {message}")
+            else:
+                show(message, category, *place)
+
+        warnings.showwarning = line
+        yield
 
 
 def _failed(
