@@ -43,12 +43,6 @@ class ClearanceRows:
             coefficients=np.pad(self.coefficients, (*more, (0, 0))),
         )
 
-    def violated(self) -> ClearanceRows:
-        """Return the rows that a zero displacement violates."""
-        chosen, name = np.flatnonzero(self.lower > 0.0), self.name
-        kept = self.nodes[chosen], self.coefficients[chosen], self.lower[chosen]
-        return ClearanceRows(*kept, lambda k: name(int(chosen[k])))
-
     def joined(self, other: ClearanceRows) -> ClearanceRows:
         """Return these rows followed by `other`'s."""
         count, first, second = len(self), self.name, other.name
