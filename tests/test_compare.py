@@ -51,6 +51,8 @@ def test_a_breakdown_is_shown_with_its_step(report: vq.Report) -> None:
 
 def test_the_report_as_table_data_and_figure(report: vq.Report, tmp_path: Path) -> None:
     table = report.markdown()
+    assert str(report) == table
+    assert repr(report).startswith("<Report: qp solved, pseudoinverse not, ")
     assert table.count("\n| ") == 1 + len(METHODS)
     assert "Measured on:" in table
     assert [row["method"] for row in json.loads(report.json())["rows"]] == METHODS

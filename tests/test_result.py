@@ -102,6 +102,23 @@ def test_summary_has_the_keys_of_the_contract_and_is_strict_json(tmp_path: Path)
     json.dumps(summary, allow_nan=False)
 
 
+def test_a_maneuver_is_printed_as_one_paragraph() -> None:
+    maneuver = good_maneuver()
+    name = maneuver.summary()["name"]
+    assert str(maneuver) == f"{name}: solved, 100 % of the path in 10 steps. Not verified yet."
+    assert repr(maneuver) == f"<Maneuver {name!r}: solved, 10 steps, 100 %>"
+    certificate = verify(maneuver)
+    assert str(maneuver.with_certificate(certificate)).endswith(" Verified.")
+    wrong = replace(certificate, tip_error=Measure(0.5, "m", 1e-6))
+    assert str(maneuver.with_certificate(wrong)).endswith(
+        "VERIFICATION FAILED: tip error: 0.5 m  (at most 1e-06)."
+    )
+    nodes, time = swing()
+    stopped = maneuver_of(nodes[:1], time[:1], tripod(), status="blocked", reached=0.25)
+    stopped = replace(stopped, manifest={**stopped.manifest, "blocked_by": ["a / b"]})
+    assert " blocked, 25 % of the path in 0 steps. Stopped by a / b." in str(stopped)
+
+
 def test_summary_of_a_maneuver_without_steps_or_certificate() -> None:
     nodes, time = swing()
     maneuver = maneuver_of(nodes[:1], time[:1], tripod(), status="infeasible", reached=0.0)

@@ -538,6 +538,10 @@ def test_blocked_says_why_and_leaves_the_state(crate_problem):
     assert last is not None
     assert any("crate" in name for name in last.blocked_by), last.blocked_by
     assert any("crate" in name for name in last.active)
+    assert str(last).startswith(f"{last.status}: ")
+    assert f"held by {last.blocked_by[0]}" in str(last)
+    assert "\n" not in repr(last)
+    assert "array" not in repr(last)
     if last.status is StepStatus.BLOCKED:
         assert resolver.state is before
         assert_same(resolver.state, kept)

@@ -98,11 +98,11 @@ def _plain_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def line(message: Warning | str, category: type[Warning], *place: Any) -> None:
+        def line(message: Warning | str, category: type[Warning], *place: Any, **to: Any) -> None:
             if category is UserWarning:
                 note(f"warning: {message}")
             else:
-                show(message, category, *place)
+                show(message, category, *place, **to)
 
         warnings.showwarning = line
         yield

@@ -11,7 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -72,7 +72,7 @@ _UNREADABLE = (
 """What zipfile and numpy raise over a file that is cut, damaged, encrypted or of another kind."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Maneuver:
     """Every accepted state of a maneuver; row 0 is the home pose. The arrays are read-only.
 
@@ -123,7 +123,7 @@ class Maneuver:
     step_time: Array
     phase_names: NDArray[np.str_]
     phase_time: Array
-    manifest: dict[str, Any] = field(repr=False)
+    manifest: dict[str, Any]
     tip_target_rotation: Array | None = None
     tip_target_pointing: Array | None = None
 
@@ -134,6 +134,25 @@ class Maneuver:
         for name, array in arrays.items():
             object.__setattr__(self, name, _frozen(array))
         object.__setattr__(self, "manifest", check_manifest(self.manifest))
+
+    def __str__(self) -> str:
+        """Return one paragraph: name, status, steps, what stopped it, what verification found."""
+        text = f"{self._name}: {self.status}, {100.0 * self.reached:.4g} % of the path in {self.steps} steps."
+        if self.blocked_by:
+            text += f" Stopped by {', '.join(self.blocked_by[:4])}."
+        certificate = self.certificate
+        if certificate is None:
+            return f"{text} Not verified yet."
+        if certificate.ok:
+            return f"{text} Verified."
+        return f"{text} VERIFICATION FAILED: {'; '.join(certificate.failures()[:4])}."
+
+    def __repr__(self) -> str:
+        return f"<Maneuver {self._name!r}: {self.status}, {self.steps} steps, {100.0 * self.reached:.4g} %>"
+
+    @property
+    def _name(self) -> str:
+        return str(self.manifest["problem"].get("name", "unnamed"))
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -69,7 +69,7 @@ class Row:
     rank: int | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Report:
     """What a comparison found.
 
@@ -85,6 +85,13 @@ class Report:
     rows: tuple[Row, ...]
     maneuvers: dict[tuple[str, str], Maneuver]
     machine: dict[str, str]
+
+    def __str__(self) -> str:
+        return self.markdown()
+
+    def __repr__(self) -> str:
+        solved = ", ".join(f"{row.method} {'solved' if row.solved else 'not'}" for row in self.rows)
+        return f"<Report: {solved}>"
 
     def row(self, method: str) -> Row:
         """Return the first row of a method."""

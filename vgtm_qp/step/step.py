@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 
@@ -20,7 +20,7 @@ class StepStatus(StrEnum):
     BLOCKED = "blocked"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Step:
     """What one call of ``Resolver.step`` did.
 
@@ -44,9 +44,18 @@ class Step:
     state: State
     reason: str
     qps: int
-    _actuators: tuple[str, ...] = field(repr=False)
-    _solution: StepSolution | None = field(default=None, repr=False)
-    _rows: ClearanceRows | None = field(default=None, repr=False)
+    _actuators: tuple[str, ...]
+    _solution: StepSolution | None = None
+    _rows: ClearanceRows | None = None
+
+    def __str__(self) -> str:
+        """Return one line: how it ended, how far and when, and what held the arm back where something did."""
+        text = f"{self.status}: {100.0 * self.progress:.4g} % of the way, time {self.state.time:.6g} s"
+        held = "" if self.status is StepStatus.REACHED else ", ".join(self.blocked_by[:4])
+        return f"{text}, held by {held}" if held else text
+
+    def __repr__(self) -> str:
+        return f"<Step {self}>"
 
     @cached_property
     def multipliers(self) -> dict[str, float]:
