@@ -192,15 +192,20 @@ class Maneuver:
     def summary(self, result: str | Path | None = None) -> dict[str, Any]:
         """Return what ``vgtm solve --json`` prints, as strict JSON data; `result` is the path of the file.
 
-        What only a certificate knows is None before there is one.
+        What only a certificate knows is None before there is one. A certificate measures no deeper than the members'
+        radius into an obstacle; there the clearance between states is that at the states, which is never greater.
         """
         certificate = self.certificate
         manifest = self.manifest
         finite = self.clearance[np.isfinite(self.clearance)]
+        least = float(finite.min()) if len(finite) else None
 
         def worst(name: str) -> float | None:
             return None if certificate is None else certificate.measures[name].value
 
+        between = worst("clearance_between")
+        if between is not None and least is not None:
+            between = min(between, least)
         return {
             "name": manifest["problem"].get("name", ""),
             "status": self.status,
@@ -209,8 +214,8 @@ class Maneuver:
             "bays": manifest["arm"].get("bays"),
             "method": manifest.get("method"),
             "solver": manifest.get("solver"),
-            "min_clearance": float(finite.min()) if len(finite) else None,
-            "min_clearance_between": worst("clearance_between"),
+            "min_clearance": least,
+            "min_clearance_between": between,
             "min_self_clearance": worst("self_clearance"),
             "max_member_error": worst("member_error"),
             "max_stroke_violation": worst("stroke_violation"),
