@@ -188,10 +188,11 @@ class Attempt:
                 X = np.where(self.task.base[:, None], target.base, X)
             vertices, torsion = vertices + solution.vertices, torsion + solution.torsion
             progress = min(max(progress + solution.progress, 0.0), 1.0)
-            left = (1.0 - progress) * span * float(np.abs([goal.velocity, goal.spin]).max())
-            if left <= self.tolerances.tip:
-                # Interior-point solvers stop just short of the end, and so would the arm, for one more step.
-                progress = 1.0
+            if progress < 1.0:
+                left = (1.0 - progress) * span * float(np.abs([goal.velocity, goal.spin]).max())
+                if left <= self.tolerances.tip:
+                    # Interior-point solvers stop just short of the end, and so would the arm, for one more step.
+                    progress = 1.0
             moved = float(np.abs(solution.nodes).max())
             if not moved < np.inf:
                 return outcome("singular pose", count)
