@@ -136,7 +136,7 @@ def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
         (["solve", "free.toml", "--steps", "many"], ["--steps", "many"]),
         (["solve", "free.toml", "--steps", "0"], ["--steps", "found 0", "integer"]),
         (["solve", "free.toml", "--method", "magic"], ["magic", '"qp"', '"pseudoinverse"']),
-        (["solve", "free.toml", "--solver", "magic"], ["magic", "daqp", "osqp"]),
+        (["solve", "free.toml", "--solver", "magic"], ['--solver: found "magic"', '"daqp", "', '"osqp"']),
         (["solve", "free.toml", "-o", "result.txt"], ["--output", ".npz"]),
         (["solve", "free.toml", "-o", "/proc/none/result.npz"], ["--output", "/proc"]),
         (["solve", "free.toml", "--figure", "frames.gif"], ["--figure", ".pdf"]),
@@ -177,6 +177,38 @@ def test_mistakes_of_a_file_are_listed_one_a_line_and_as_data(capsys, folder):
     assert err.splitlines() == [
         f"{m['file']}: {m['key']}: found {m['value']}; expected {m['expected']}" for m in mistakes
     ]
+
+
+@pytest.mark.parametrize("command", ["check", "solve"])
+@pytest.mark.parametrize(
+    ("table", "key", "value", "words"),
+    [
+        (
+            '[truss]\nlocked = ["B1-1", "B9-1"]',
+            "truss.locked[1]",
+            '"B9-1"',
+            ["6 actuated members B1-1, ", "did you"],
+        ),
+        ('[truss]\nlocked = ["L1-1"]', "truss.locked[0]", '"L1-1"', ["this one has a fixed length"]),
+        (
+            '[method]\nsolver = "osqq"\n[truss]',
+            "method.solver",
+            '"osqq"',
+            ['"daqp", "', 'did you mean "osqp"?'],
+        ),
+    ],
+)
+def test_mistakes_that_only_the_arm_shows_have_their_place_too(
+    capsys, folder, command, table, key, value, words
+):
+    text = FREE.format(position="[0.1, 0.0, 1.6]").replace("[truss]", table)
+    (folder / "wrong.toml").write_text(text, encoding="utf-8")
+    code, out, err = run(capsys, command, "wrong.toml", "--json")
+    (mistake,) = json.loads(out)["mistakes"]
+    assert code == 2
+    assert (Path(mistake["file"]).name, mistake["key"], mistake["value"]) == ("wrong.toml", key, value)
+    assert all(word in mistake["expected"] for word in words)
+    assert err == f"{mistake['file']}: {key}: found {value}; expected {mistake['expected']}\n"
 
 
 def test_check_describes_the_truss(capsys):

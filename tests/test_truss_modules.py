@@ -285,7 +285,8 @@ def test_locked_members_are_fixed_at_their_length():
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("B9-1", "no member is called"), ("L1-1", "has a fixed length")]
+    ("name", "message"),
+    [("B9-1", r'locked\[0\]: found "B9-1"; .*did you mean "B'), ("L1-1", "this one has a fixed length")],
 )
 def test_wrong_locks_are_refused_with_the_choices(name, message):
     with pytest.raises(TrussError, match=message) as caught:

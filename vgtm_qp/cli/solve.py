@@ -101,7 +101,12 @@ def _changed(problem: Problem, changes: dict[str, Any]) -> Problem:
     if not wanted:
         return problem
     try:
-        return problem.replace(wanted)
+        changed = problem.replace(wanted)
+        if "method.solver" in wanted:
+            from vgtm_qp.step.arm import check_solver
+
+            check_solver(changed)
+        return changed
     except ProblemError as error:
         mistakes = [replace(mistake, key=_KEYS.get(mistake.key, mistake.key)) for mistake in error.mistakes]
         raise ProblemError("command line", mistakes) from None

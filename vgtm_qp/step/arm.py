@@ -9,16 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import ProblemError
+from vgtm_qp.errors import Mistake, ProblemError, nearest
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
+from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
+from vgtm_qp.problem.table import shown
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.solvers import DEFAULT_SOLVER, make_solver
+from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
 from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.curve import home_curve
 from vgtm_qp.step.engine import ElasticEngine, Engine, FusedEngine, PlainEngine
@@ -26,7 +28,7 @@ from vgtm_qp.step.linearise import Linearisation
 from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
-from vgtm_qp.truss.build import build_truss
+from vgtm_qp.truss.build import LockError, build_truss
 from vgtm_qp.truss.kinematics import Kinematics, member_ends
 from vgtm_qp.truss.truss import Truss
 
@@ -131,9 +133,14 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
     """
     check_is_problem(problem)
     _check_supported(problem)
+    check_solver(problem)
     spec = problem.truss
     assert spec is not None
-    truss = build_truss(spec)
+    try:
+        truss = build_truss(spec)
+    except LockError as error:
+        wrong = [Mistake(f"truss.locked[{place}]", shown(name), said) for place, name, said in error.wrong]
+        raise ProblemError(str(problem.source or problem.name), wrong) from None
     kinematics = Kinematics(truss)
     kinematics.evaluate(truss.home)
     task = TipTask(problem.end_effector.track, kinematics)
@@ -221,6 +228,15 @@ def _check_supported(problem: Problem) -> None:
         )
     if mistakes:
         raise ProblemError(str(problem.source or problem.name), mistakes)
+
+
+def check_solver(problem: Problem) -> None:
+    """Raise ProblemError where the problem's QP solver is unknown or not installed."""
+    name = problem.method.solver
+    if name != DEFAULT_SOLVER and name not in (choices := available_solvers()):
+        expected = f"one of the solvers installed here, {quoted(choices)}{nearest(name, choices)}"
+        mistake = problem.mistake(("method", "solver"), expected)
+        raise ProblemError(str(problem.source or problem.name), [mistake])
 
 
 def make_obstacle(spec: Any) -> shapes.Obstacle:

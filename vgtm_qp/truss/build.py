@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -24,6 +24,21 @@ _MODULES = {
 }
 
 
+class LockError(TrussError):
+    """Locked members are not actuated ones; `wrong` has place in the list, name and expectation of each."""
+
+    def __init__(self, wrong: Sequence[tuple[int, str, str]]) -> None:
+        self.wrong = tuple(wrong)
+        super().__init__(
+            "\n".join(
+                f'locked[{place}]: found "{name}"; expected {expected}' for place, name, expected in wrong
+            )
+        )
+
+    def __reduce__(self) -> tuple[type[LockError], tuple[tuple[tuple[int, str, str], ...]]]:
+        return type(self), (self.wrong,)
+
+
 def build_truss(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
     """Build the truss of a problem; members locked from the start are fixed at their home length.
 
@@ -35,7 +50,9 @@ def build_truss(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) 
     Raises
     ------
     TrussError
-        The truss is not statically determinate, or a locked member is not an actuated one.
+        The truss is not statically determinate.
+    LockError
+        A locked member is not an actuated one.
     """
     truss = _unlocked(spec)
     names = [lock.member for lock in spec.locked]
@@ -48,7 +65,7 @@ def lock_members(truss: Truss, names: Iterable[str], X: Array | None = None) -> 
 
     Raises
     ------
-    TrussError
+    LockError
         A name is not that of an actuated member.
     """
     names = list(names)
@@ -86,11 +103,14 @@ def _unlocked(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) ->
 
 def _check_actuated(truss: Truss, names: Iterable[str]) -> None:
     actuated = [truss.member_names[k] for k in truss.actuators]
-    for name in names:
+    some = f"{', '.join(actuated[:6])}{', ...' if len(actuated) > 6 else ''}"
+    wrong = []
+    for place, name in enumerate(names):
         if name not in actuated:
             fixed = name in truss.member_names
-            what = f"member {name} has a fixed length" if fixed else f'no member is called "{name}"'
-            raise TrussError(
-                f"locked: {what}; expected one of the {len(actuated)} actuated members "
-                f"{', '.join(actuated[:6])}{', ...' if len(actuated) > 6 else ''}{nearest(name, actuated)}"
+            hint = "; this one has a fixed length" if fixed else nearest(name, actuated)
+            wrong.append(
+                (place, name, f"the name of one of the {len(actuated)} actuated members {some}{hint}")
             )
+    if wrong:
+        raise LockError(wrong)
