@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from vgtm_qp.maneuver.manifest import arm_record, make_manifest
 from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.truss.truss import Joints, Truss
+from vgtm_qp.truss.joints import Joints
+from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
 from vgtm_qp.step.path import Path as TipPath
 from vgtm_qp.step.state import State
-from vgtm_qp.truss.kinematics import member_ends
+from vgtm_qp.truss.joints import member_ends
 
 SPENT = {"type": "number", "minimum": 0}
 TIMING = {

@@ -11,7 +11,8 @@ from vgtm_qp.errors import TrussError
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.separation import Distances, Separation
-from vgtm_qp.truss.kinematics import EndKinematics, member_ends
+from vgtm_qp.truss.joints import member_ends
+from vgtm_qp.truss.kinematics import EndKinematics
 
 
 @pytest.mark.parametrize("name", TRUSSES)

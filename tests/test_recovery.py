@@ -10,7 +10,7 @@ import vgtm_qp as vq
 from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.truss import modules
-from vgtm_qp.truss.kinematics import member_ends
+from vgtm_qp.truss.joints import member_ends
 
 BASE = {
     "name": "three bays",

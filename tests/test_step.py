@@ -18,7 +18,8 @@ from vgtm_qp.step.linearise import Linearisation, Target, clearance_rows
 from vgtm_qp.step.path import Path, turn_between, vector_from_rotation
 from vgtm_qp.step.resolver import Resolver, StepStatus
 from vgtm_qp.step.task import TipTask
-from vgtm_qp.truss.kinematics import Kinematics, member_ends
+from vgtm_qp.truss.joints import member_ends
+from vgtm_qp.truss.kinematics import Kinematics
 
 FRAMED = [name for name in TRUSSES if name != "graph"]
 

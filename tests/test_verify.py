@@ -15,8 +15,8 @@ from synthetic import LENGTHS, RADIUS, found_clearances, good_maneuver, maneuver
 
 from vgtm_qp.errors import ResultError
 from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.truss.joints import Joints
 from vgtm_qp.truss.modules import octahedral
-from vgtm_qp.truss.truss import Joints
 from vgtm_qp.verify import check, verify, verify_file
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Least, Motion
@@ -291,7 +291,7 @@ def offset_joints() -> Joints:
 
 
 def test_offset_joints_place_ends_and_bound_their_paths() -> None:
-    from vgtm_qp.truss.kinematics import member_ends
+    from vgtm_qp.truss.joints import member_ends
 
     truss = tripod(offset_joints())
     rng = np.random.default_rng(2)

@@ -14,13 +14,12 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import CurveNumbers, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import SLACK_CURVATURE, CurveNumbers, StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 
 UNBOUNDED = 1e30
 FEASIBILITY = 1e-10
-_SLACK_CURVATURE = 1e-6
 
 
 class InfeasibleStepError(SolverError):
@@ -71,9 +70,6 @@ class CondensedSolver:
         coordinates = 3 * vertices + layout.torsion
         self._curve_hessian = weights.curve_rate * np.eye(coordinates)
         self._curve_hessian[: 3 * vertices, : 3 * vertices] = np.kron(layout.vertex_hessian, np.eye(3))
-
-        self.slack = 0.0
-        """How far the last answer leaves the tip's rows in mode elastic, m or rad."""
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Solve one QP.
@@ -128,7 +124,6 @@ class CondensedSolver:
         multipliers = np.asarray(info["lam"])
         check_answer(x, multipliers, flag, hessian, gradient, constraint, lower, upper)
 
-        self.slack = float(np.max(x[size:], initial=0.0))
         displacement = np.zeros((truss.node_count, 3))
         displacement[truss.free] = (response @ x[:count] + particular).reshape(-1, 3)
         moved = curve @ x[count : size - 1] + curve_offset
@@ -143,6 +138,7 @@ class CondensedSolver:
             clearance_multipliers=-multipliers[len(multipliers) - clearance :],
             iterations=int(info["iterations"]),
             torsion=moved[3 * layout.vertices :],
+            tip_slack=float(np.max(x[size:], initial=0.0)),
         )
 
     def _curve_basis(self, numbers: StepNumbers) -> tuple[Array, Array]:
@@ -260,7 +256,7 @@ def _with_slacks(
     wide[:tip, size : size + tip], wide[:tip, size + tip :] = np.eye(tip), -np.eye(tip)
     larger = np.zeros((size + slacks, size + slacks))
     larger[:size, :size] = hessian
-    larger[size:, size:] = _SLACK_CURVATURE * np.eye(slacks)
+    larger[size:, size:] = SLACK_CURVATURE * np.eye(slacks)
 
     def with_bounds(bounds: Array, of_slacks: float) -> Array:
         return np.concatenate([bounds[:size], np.full(slacks, of_slacks), bounds[size:]])

@@ -12,7 +12,7 @@ STAGED_ACTUATORS = 45
 
 
 def chain_solver(layout: Layout) -> StagedSolver | TrackedSolver | None:
-    """Return the solver along the chain of `layout`; None where it is none or cannot track hard."""
+    """Return the solver along the chain of `layout`; None where it is none or its rows are not those of one."""
     chain = _chain(layout)
     if chain is None:
         return None
@@ -30,7 +30,7 @@ def prefers_staged(layout: Layout) -> bool:
 
 
 def _chain(layout: Layout) -> Chain | None:
-    """Return the chain where the QP has only rows that the eliminations know: a curve of constant tables."""
-    if layout.general is not None or layout.hard_turns:
+    """Return the chain where the QP has only rows that the eliminations know: a curve of constant tables, a hard tip."""
+    if layout.general is not None or layout.hard_turns or layout.elastic_tip:
         return None
     return find_chain(layout)

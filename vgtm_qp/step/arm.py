@@ -29,7 +29,8 @@ from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
 from vgtm_qp.truss.build import LockError, build_truss
-from vgtm_qp.truss.kinematics import Kinematics, member_ends
+from vgtm_qp.truss.joints import member_ends
+from vgtm_qp.truss.kinematics import Kinematics
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
 from vgtm_qp.qp.fused_graph import SETTLING_STEPS
 from vgtm_qp.qp.layout import Layout
@@ -162,13 +161,10 @@ class PlainEngine:
 class ElasticEngine(PlainEngine):
     """A tip that may leave its path at an exact penalty: there it is where the QP puts it."""
 
-    def __init__(self, linearisation: Linearisation, solver: CondensedSolver) -> None:
-        super().__init__(linearisation, solver)
-        self._elastic = solver
-
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`; a tip that had to leave its path is not moved."""
-        if self._elastic.slack <= accuracy.tip:
+        assert self._last is not None
+        if self._last[1].tip_slack <= self._on_path:
             return super().settle(X, target, goal, accuracy)
         closed = self._close(X, target, accuracy.member)
         return closed if closed.error <= accuracy.member else None

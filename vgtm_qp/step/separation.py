@@ -16,7 +16,8 @@ from vgtm_qp.geometry.clearance import BetweenReport, Clearance, NearPairs, Pair
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.linearise import clearance_rows
-from vgtm_qp.truss.kinematics import EndKinematics, member_ends
+from vgtm_qp.truss.joints import member_ends
+from vgtm_qp.truss.kinematics import EndKinematics
 from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]

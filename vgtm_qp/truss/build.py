@@ -12,7 +12,7 @@ from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, PlateTruss, Tetrahedr
 from vgtm_qp.truss import modules
 from vgtm_qp.truss.assembly import Limits
 from vgtm_qp.truss.graph import truss_from_graph
-from vgtm_qp.truss.kinematics import member_ends
+from vgtm_qp.truss.joints import member_ends
 from vgtm_qp.truss.plate import plate
 from vgtm_qp.truss.truss import Array, Truss
 

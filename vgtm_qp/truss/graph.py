@@ -14,10 +14,10 @@ from scipy.sparse.linalg import splu
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import GraphTruss, Member
 from vgtm_qp.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.truss.joints import axial_joints, joint_triangles
+from vgtm_qp.truss.joints import Joints, axial_joints, joint_triangles
 from vgtm_qp.truss.mobility import trackable_coordinates
 from vgtm_qp.truss.stages import placement_stages
-from vgtm_qp.truss.truss import Array, Index, Joints, Truss
+from vgtm_qp.truss.truss import Array, Index, Truss
 
 _LENGTH_SLACK = 1e-3
 """Positions this near, as a fraction, to the given lengths are corrected to them: rounded, not mistaken."""

@@ -3,15 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.truss import Array, Index, Joints
+
+if TYPE_CHECKING:
+    from vgtm_qp.truss.truss import Truss
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 _LEAST_SINE = 0.1
 """A triangle with a smaller sine at the node does not orient a joint: its normal would turn too fast."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joints:
+    """Offset joints, eqs. (12)-(13): where each member's two ends stand in the frames of their nodes' joints.
+
+    Attributes
+    ----------
+    triangle : (N, 3) int
+        Joint frame of node i: origin at node ``triangle[i, 0]`` (= i), z along the normal of the three nodes taken
+        counter-clockwise, x along the outward bisector at node i.
+    offset : (M, 2, 3)
+        Constant position of each member's two ends in those frames, m.
+    """
+
+    triangle: Index
+    offset: Array
 
 
 def axial_joints(home: Array, members: Index, triangle: Index, offset: Array) -> Joints:
@@ -34,6 +59,15 @@ def joint_frames(X: Array, triangle: Index) -> Array:
     x = -(first + second)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def member_ends(truss: Truss, X: Array) -> Array:
+    """Return (M, 2, 3) where each member's ends r_ik are, eq. (13), for node positions `X` (N, 3), m."""
+    ends = X[truss.members]
+    if truss.joints is None:
+        return np.asarray(ends)
+    frames = joint_frames(X, truss.joints.triangle)
+    return np.asarray(ends + np.einsum("mexy,mey->mex", frames[truss.members], truss.joints.offset))
 
 
 def joint_triangles(

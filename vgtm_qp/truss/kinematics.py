@@ -9,14 +9,11 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import TrussError
+from vgtm_qp.truss.joints import Array, Index
 from vgtm_qp.truss.truss import Truss
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:
@@ -105,23 +102,6 @@ def member_nodes(truss: Truss) -> Index:
     if truss.joints is None:
         return truss.members
     return truss.joints.triangle[truss.members].reshape(truss.member_count, 6)
-
-
-def member_ends(truss: Truss, X: Array) -> Array:
-    """Return (M, 2, 3) where each member's ends r_ik are, eq. (13), for node positions `X` (N, 3), m."""
-    ends = X[truss.members]
-    if truss.joints is None:
-        return ends
-    corner = X[truss.joints.triangle]
-    first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second /= np.linalg.norm(second, axis=1, keepdims=True)
-    z = np.cross(first, second)
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
-    x = -(first + second)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    frames = np.stack([x, np.cross(z, x), z], axis=-1)
-    return np.asarray(ends + np.einsum("mexy,mey->mex", frames[truss.members], truss.joints.offset))
 
 
 class EndKinematics:

@@ -8,28 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import TrussError
+from vgtm_qp.errors import TrussError, nearest
+from vgtm_qp.truss.joints import Joints, member_ends
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class Joints:
-    """Offset joints, eqs. (12)-(13): where each member's two ends stand in the frames of their nodes' joints.
-
-    Attributes
-    ----------
-    triangle : (N, 3) int
-        Joint frame of node i: origin at node ``triangle[i, 0]`` (= i), z along the normal of the three nodes taken
-        counter-clockwise, x along the outward bisector at node i.
-    offset : (M, 2, 3)
-        Constant position of each member's two ends in those frames, m.
-    """
-
-    triangle: Index
-    offset: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +115,6 @@ class Truss:
     @cached_property
     def home_lengths(self) -> Array:
         """(M,) member lengths at home, m, joint offsets included (nominal: between the nodes less the offsets)."""
-        from vgtm_qp.truss.kinematics import member_ends
-
         ends = member_ends(self, self.home)
         return np.asarray(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
@@ -155,6 +137,4 @@ class Truss:
         try:
             return self.member_names.index(name)
         except ValueError:
-            from vgtm_qp.errors import nearest
-
             raise TrussError(f'no member is called "{name}"{nearest(name, self.member_names)}') from None
