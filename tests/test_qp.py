@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from arms import TRUSSES, make_layout, random_pose
 
+import vgtm_qp as vq
 from vgtm_qp.errors import SolverError, VgtmError
 from vgtm_qp.qp.condensed import InfeasibleStepError
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
-from vgtm_qp.qp.solvers import FullSolver, available_solvers, make_solver
+from vgtm_qp.qp.solvers import _TIGHT, FullSolver, available_solvers, make_solver
 from vgtm_qp.truss.kinematics import Kinematics
 
 FULL_SOLVERS = ["osqp", "piqp", "clarabel"]
@@ -303,6 +304,17 @@ def test_every_solver_on_the_list_solves():
     for name in available_solvers():
         found = make_solver(name, layout).solve(numbers)
         np.testing.assert_allclose(found.nodes, wanted.nodes, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("name", sorted(_TIGHT))
+def test_a_maneuver_takes_no_more_steps_for_its_solver(name):
+    """Answers that fail the residual check would halve the steps, and end the maneuver."""
+    if name not in available_solvers():
+        pytest.skip(f"{name} is not installed")
+    maneuver = vq.solve(vq.load_problem("five_bay_two_cubes").replace({"method.solver": name}))
+    assert (maneuver.status, maneuver.steps) == ("solved", 50)
+    assert maneuver.certificate is not None
+    assert maneuver.certificate.ok
 
 
 def good_answer(layout, numbers):

@@ -6,6 +6,7 @@ qpsolvers answers the full QP.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -209,6 +210,14 @@ class _Piqp:
         return z, y, _column_multipliers(qp, z, y), int(result.info.iter)
 
 
+_TIGHT: Mapping[str, Mapping[str, float]] = {
+    "clarabel": {"tol_feas": 1e-9, "tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9},
+    "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9},
+    "scs": {"eps_abs": 1e-9, "eps_rel": 1e-9},
+}
+"""What solvers are told so that their answers pass the residual check, which their own defaults would not."""
+
+
 class _QpSolvers:
     """Any other solver, by its name in qpsolvers."""
 
@@ -230,7 +239,7 @@ class _QpSolvers:
             qp.column_upper,
         )
         try:
-            answer = qpsolvers.solve_problem(problem, solver=self._name)
+            answer = qpsolvers.solve_problem(problem, solver=self._name, **_TIGHT.get(self._name, {}))
         except (qpsolvers.exceptions.QPError, ValueError) as error:
             raise SolverError(f"{self._name}: {error}") from error
         if not answer.found or answer.x is None:
