@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from vgtm_qp.curve.bernstein import basis, split
@@ -23,6 +23,7 @@ def from_roots(roots, sign=1.0):
     return Pieces(coefficients[None], np.array([0.0]), np.array([1.0]))
 
 
+@example([0, 1, 7, 8], -1.0)
 @settings(max_examples=80, deadline=None)
 @given(st.lists(st.integers(-30, 130), min_size=1, max_size=7, unique=True), st.sampled_from([-1.0, 1.0]))
 def test_simple_roots_are_all_found(hundredths, sign):

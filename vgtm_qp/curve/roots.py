@@ -13,6 +13,7 @@ from vgtm_qp.curve.bernstein import Array, basis, split
 _NEWTON_STEPS = 100
 _CONVERGED = 1e-13
 _HALVINGS = 32
+_NOTHING = 1e-18
 
 
 def increasing_roots(function: Callable[[Array], tuple[Array, Array]], low: Array, high: Array) -> Array:
@@ -137,6 +138,10 @@ def _single_roots(pieces: Pieces, orientation: Array) -> Array:
     """Roots of pieces with one sign change each, rising once multiplied by their orientation (n,)."""
     coefficients = pieces.coefficients * orientation[:, None]
     degree = coefficients.shape[1] - 1
+    # A root at an end of the piece is not the one that is sought: it is moved out by less than rounding.
+    nothing = _NOTHING * np.abs(coefficients).max(axis=1, initial=0.0)
+    coefficients[:, 0] = np.where(coefficients[:, 0] == 0.0, -nothing, coefficients[:, 0])
+    coefficients[:, -1] = np.where(coefficients[:, -1] == 0.0, nothing, coefficients[:, -1])
     low, high = coefficients[:, :-1], coefficients[:, 1:]
 
     def polynomial(u: Array) -> tuple[Array, Array]:
