@@ -1,12 +1,14 @@
 """The end effector's modes: elastic by an exact penalty, hard, and scaled."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import vgtm_qp as vq
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.full import FullBuilder
-from vgtm_qp.qp.solvers import _Piqp
+from vgtm_qp.qp.solvers import _Piqp, make_solver
 from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.linearise import Linearisation, Target
 from vgtm_qp.step.path import Path
@@ -33,7 +35,11 @@ def one_qp(penalty):
     arm.kinematics.evaluate(X)
     start = arm.kinematics.tip_position(X)
     rotation = arm.kinematics.tip_rotation.copy()
-    path = Path(np.array([0.0, 1.0]), np.stack([start, [*start, 0.1, 0.02, -0.03]]), np.stack([rotation] * 2))
+    path = Path(
+        np.array([0.0, 1.0]),
+        np.stack([start, start + np.array([0.1, 0.02, -0.03])]),
+        np.stack([rotation] * 2),
+    )
     lengths = arm.home_lengths[arm.truss.actuators]
     target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
     linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
@@ -44,18 +50,44 @@ def one_qp(penalty):
 
 def test_an_elastic_goal_holds_exactly_while_its_penalty_exceeds_the_multiplier():
     arm, _, numbers = one_qp(1.0)
-    builder = FullBuilder(arm.layout)
-    qp = builder.build(numbers)
+    qp = FullBuilder(replace(arm.layout, elastic_tip=False)).build(numbers)
     _, multipliers, _, _ = _Piqp()(qp, same_structure=False)
     tip = [k for k, label in enumerate(qp.rows) if label.kind == "end effector"]
     greatest = float(np.abs(multipliers[tip]).max())
     assert greatest > 1e-3
     _, above, numbers = one_qp(1.01 * greatest)
-    above.solve(numbers)
-    assert above.slack < 1e-9
+    assert above.solve(numbers).tip_slack < 1e-9
     _, below, numbers = one_qp(0.9 * greatest)
-    below.solve(numbers)
-    assert below.slack > 1e-5
+    assert below.solve(numbers).tip_slack > 1e-5
+
+
+@pytest.mark.parametrize("name", ["piqp", "osqp"])
+@pytest.mark.parametrize("penalty", [1e3, 1e-3])
+def test_the_whole_qp_of_an_elastic_tip_has_the_answer_of_the_condensed_one(name, penalty):
+    arm, condensed, numbers = one_qp(penalty)
+    one, other = condensed.solve(numbers), make_solver(name, arm.layout).solve(numbers)
+    assert (one.tip_slack > 1e-4) == (penalty < 1.0)
+    assert other.tip_slack == pytest.approx(one.tip_slack, abs=1e-6)
+    assert np.abs(other.nodes - one.nodes).max() < 1e-6
+    assert np.abs(other.actuators - one.actuators).max() < 1e-6
+
+
+def test_the_slacks_of_an_elastic_tip_are_columns_with_names_that_a_hard_one_does_not_have():
+    goal = {"position": [0.1, 0.0, 2.4]}
+    elastic = vq.Resolver(three_bays(**{"end_effector.mode": "elastic"})).build(**goal)
+    slacks = [k for k, label in enumerate(elastic.columns) if label.kind == "tip slack"]
+    assert [elastic.columns[k].name for k in slacks] == [f"tip slack {a}{s}" for s in "+-" for a in "xyz"]
+    assert np.all(elastic.column_lower[slacks] == 0.0)
+    assert np.all(elastic.q[slacks] > 0.0)
+    hard = vq.Resolver(three_bays()).build(**goal)
+    assert not any(label.kind == "tip slack" for label in hard.columns)
+
+
+def test_a_long_arm_with_an_elastic_tip_is_condensed_and_says_so():
+    with pytest.warns(UserWarning, match="condensed onto the actuators"):
+        resolver = vq.Resolver(three_bays(**{"end_effector.mode": "elastic", "truss.bays": 16}))
+    tip, _ = resolver.tip()
+    assert resolver.step(position=tip + np.array([0.02, 0.0, -0.01])).status is vq.StepStatus.REACHED
 
 
 def test_an_elastic_tip_stays_on_a_free_path_and_leaves_it_where_it_must():

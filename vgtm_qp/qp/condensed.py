@@ -26,6 +26,14 @@ class InfeasibleStepError(SolverError):
     """No displacement satisfies every hard row of a step's QP."""
 
 
+class AnswerError(SolverError):
+    """A solver gave no answer that is good enough, which says nothing about the step."""
+
+
+class NoAnswerError(AnswerError, InfeasibleStepError):
+    """A solver found no answer, and does not say whether there is one."""
+
+
 class CondensedSolver:
     """Solves the QP of a step in the unknowns (d_a, free curve coordinates, d_alpha) with DAQP.
 
@@ -297,7 +305,7 @@ def check_answer(
     stationarity += y[size:] @ constraint
     dual = _largest(stationarity) / (1.0 + _largest(gradient) + _largest(y))
     if not (primal <= 1e-8 and dual <= 1e-8):
-        raise SolverError(
+        raise AnswerError(
             f"daqp (exit flag {flag}) left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
         )
 

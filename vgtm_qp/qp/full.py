@@ -2,8 +2,9 @@
 
     minimise  1/2 z' P z + q' z   subject to   row_lower <= A z <= row_upper,  column_lower <= z <= column_upper
 
-z holds the displacements over the step of nodes, actuators, control vertices and path progress, and the gaps between
-faces and curve after it; because actuators and gaps are columns of their own, P is constant and only A's values change.
+z holds the displacements over the step of nodes, actuators, control vertices and path progress, and after it the gaps
+between faces and curve and what an elastic tip leaves; because actuators and gaps are columns of their own, P is
+constant and only A's values change.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import SLACK_CURVATURE, StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -129,6 +130,7 @@ class FullBuilder:
             "position": 3 * tracked,
             "tangent": layout.turns * tracked,
             "spacing": layout.spacings,
+            "slack": 2 * len(layout.tip_rows) if layout.elastic_tip else 0,
             "progress": 1,
         }
         ends = np.cumsum(list(sizes.values()))
@@ -149,6 +151,7 @@ class FullBuilder:
                 sparse.diags(np.full(sizes["position"], 0.0 if layout.hard_tracking else weights.tracking)),
                 sparse.diags(0.0 * layout.turn_weights if layout.hard_turns else layout.turn_weights),
                 sparse.diags(np.full(sizes["spacing"], weights.spacing)),
+                sparse.diags(np.full(sizes["slack"], SLACK_CURVATURE)),
                 np.ones((1, 1)),
             ],
             format="csc",
@@ -201,6 +204,7 @@ class FullBuilder:
         q = np.zeros(self.size)
         q[self.column["actuators"]] = numbers.actuator_gradient
         q[self.column["vertices"]] = numbers.vertex_gradient.reshape(-1)
+        q[self.column["slack"]] = layout.weights.end_effector
         q[self.column["progress"]] = numbers.progress_gradient
         self._hessian.data[-1] = numbers.progress_curvature
 
@@ -209,6 +213,7 @@ class FullBuilder:
             numbers.lower,
             numbers.upper,
         )
+        column_lower[self.column["slack"]] = 0.0
         column_lower[-1], column_upper[-1] = numbers.progress_lower, numbers.progress_upper
         if layout.hard_tracking:
             column_lower[self.column["position"]] = column_upper[self.column["position"]] = 0.0
@@ -253,6 +258,7 @@ class FullBuilder:
             clearance_multipliers=-row_multipliers[len(self._row_labels) :],
             iterations=iterations,
             torsion=z[self.column["torsion"]].copy(),
+            tip_slack=float(np.max(z[self.column["slack"]], initial=0.0)),
         )
 
     def _columns(self) -> tuple[Label, ...]:
@@ -277,6 +283,12 @@ class FullBuilder:
             Label(f"tilt: face {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in self._turns
         ]
         labels += [Label(f"stretch: piece {k}", "spacing gap", "m") for k in range(layout.spacings)]
+        if layout.elastic_tip:
+            labels += [
+                Label(f"tip slack {name.removeprefix('tip ')}{sign}", "tip slack", _unit(name))
+                for sign in "+-"
+                for name in layout.tip_rows
+            ]
         return (*labels, Label("progress along the path", "progress", "1"))
 
     def _fixed_pattern(self) -> tuple[Index, Index, tuple[Label, ...]]:
@@ -305,10 +317,9 @@ class FullBuilder:
         flat = (tip_columns[:, None] + np.arange(3)).reshape(-1)[present]
         add(np.repeat(np.arange(tip), len(flat)), np.tile(flat, tip))
         add(np.arange(tip), np.full(tip, column["progress"].start))
-        labels += [
-            Label(name, "end effector", "m" if name[-1] in "xyz" and "rot" not in name else "rad")
-            for name in layout.tip_rows
-        ]
+        if layout.elastic_tip:
+            add(np.tile(np.arange(tip), 2), np.arange(column["slack"].start, column["slack"].stop))
+        labels += [Label(name, "end effector", _unit(name)) for name in layout.tip_rows]
         if not layout.vertices:
             return np.concatenate(rows), np.concatenate(cols), tuple(labels)
 
@@ -368,6 +379,8 @@ class FullBuilder:
             numbers.tip_jacobian[:, present].reshape(-1),
             -numbers.tip_rate,
         ]
+        if layout.elastic_tip:
+            values += [np.repeat([1.0, -1.0], len(layout.tip_rows))]
         if layout.vertices:
             faces = truss.faces[layout.tracked]
             k, slot = np.nonzero(layout.node_column[faces] >= 0)
@@ -396,3 +409,8 @@ class FullBuilder:
             if layout.spacings and given is not None:
                 values += [given.spacing.reshape(-1), np.full(layout.spacings, -1.0)]
         return np.concatenate(values)
+
+
+def _unit(row: str) -> str:
+    """Return the unit of the end effector's row of that name."""
+    return "m" if row[-1] in "xyz" and "rot" not in row else "rad"

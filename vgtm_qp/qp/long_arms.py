@@ -30,7 +30,7 @@ def prefers_staged(layout: Layout) -> bool:
 
 
 def _chain(layout: Layout) -> Chain | None:
-    """Return the chain where the QP has only rows that the eliminations know: a curve of constant tables, a hard tip."""
+    """Return the chain where the QP has only rows that the eliminations know: a curve of tables, a hard tip."""
     if layout.general is not None or layout.hard_turns or layout.elastic_tip:
         return None
     return find_chain(layout)

@@ -164,6 +164,8 @@ class StepSolution:
         Nonnegative.
     iterations : int
         Iterations of the solver.
+    tip_slack : float
+        How far the tip's rows are left at most, m or rad; zero where they are hard.
     """
 
     nodes: Array
@@ -174,7 +176,11 @@ class StepSolution:
     clearance_multipliers: Array
     iterations: int = 0
     torsion: Array = field(default_factory=lambda: np.zeros(0))
+    tip_slack: float = 0.0
 
+
+SLACK_CURVATURE = 1e-6
+"""Curvature of the slacks of an elastic tip, for solvers of strictly convex QPs: their penalty itself is linear."""
 
 _SHORT_WAY = 0.01
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -16,10 +17,10 @@ from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.problem.table import shown
-from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.long_arms import STAGED_ACTUATORS
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
 from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.curve import home_curve
@@ -37,6 +38,11 @@ Array = NDArray[np.float64]
 
 FUSED_ACTUATORS = 45
 """Up to so many actuators the dense condensed QP is the faster one."""
+
+_CONDENSED_ALL_THE_SAME = (
+    "elastic end effector: the elimination along the bays does not know its slacks, so the QP is condensed onto the "
+    "actuators, which takes longer on an arm of this length"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +210,9 @@ def make_engine(
     """
     if layout.elastic_tip:
         linearisation = Linearisation(layout, kinematics, task, layout.truss.home_lengths)
-        return ElasticEngine(linearisation, CondensedSolver(layout))
+        if solver == DEFAULT_SOLVER and len(layout.truss.actuators) >= STAGED_ACTUATORS:
+            warnings.warn(_CONDENSED_ALL_THE_SAME, stacklevel=2)
+        return ElasticEngine(linearisation, make_solver(solver, layout))
     if solver == DEFAULT_SOLVER and compiled:
         stages = elimination_stages(layout)
         if stages is not None and len(layout.truss.actuators) <= FUSED_ACTUATORS:

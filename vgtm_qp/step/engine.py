@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 _SETTLED = 1e-3
 """A tip this much nearer to its goal than it must be gains nothing by another iteration."""
 
+_ON_PATH = 1e-6
+"""Solvers leave slacks of this size, m or rad, where the answer's are zero."""
+
 
 @dataclass(frozen=True)
 class Accuracy:
@@ -163,9 +166,10 @@ class ElasticEngine(PlainEngine):
 
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`; a tip that had to leave its path is not moved."""
-        assert self._last is not None
-        if self._last[1].tip_slack <= self._on_path:
-            return super().settle(X, target, goal, accuracy)
+        slack = 0.0 if self._last is None else self._last[1].tip_slack
+        closed = super().settle(X, target, goal, accuracy) if slack <= _ON_PATH else None
+        if closed is not None or slack <= accuracy.tip:
+            return closed
         closed = self._close(X, target, accuracy.member)
         return closed if closed.error <= accuracy.member else None
 
