@@ -9,6 +9,7 @@ import pytest
 from arms import TRUSSES, arm_problem, central_differences, make_layout, random_pose
 from scipy.spatial.transform import Rotation
 
+import vgtm_qp as vq
 from vgtm_qp.errors import GoalError, ProblemError, VgtmError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
@@ -632,6 +633,39 @@ def test_a_short_way_is_covered_as_surely_as_a_long_one(solver, way):
         goal = resolver.tip()[0] + way * direction
         assert resolver.step(position=goal).status is StepStatus.REACHED
         np.testing.assert_allclose(resolver.tip()[0], goal, atol=2e-8)
+
+
+def test_a_solver_that_fails_is_what_stops_the_maneuver(crate_problem, monkeypatch):
+    import qpsolvers
+
+    solve, calls = qpsolvers.solve_problem, []
+
+    def spoilt(problem, **options):
+        answer = solve(problem, **options)
+        calls.append(None)
+        if len(calls) > 3:
+            answer.x = answer.x + 1e-3
+        return answer
+
+    monkeypatch.setattr(qpsolvers, "solve_problem", spoilt)
+    maneuver = vq.solve(crate_problem.replace({"method.solver": "clarabel", "method.retries": False}))
+    stop = maneuver.manifest["stop"]
+    assert 0.0 < maneuver.reached < 1.0
+    assert (maneuver.status, stop["kind"]) == ("blocked", "solver")
+    assert maneuver.blocked_by == (f"solver: {stop['reason']}",)
+    assert "primal residual of 1." in stop["reason"]
+
+
+def test_a_solver_that_finds_nothing_where_there_is_a_way_is_what_stops_the_maneuver(
+    crate_problem, monkeypatch
+):
+    import qpsolvers
+
+    monkeypatch.setattr(
+        qpsolvers, "solve_problem", lambda problem, **_: qpsolvers.Solution(problem, found=False)
+    )
+    maneuver = vq.solve(crate_problem.replace({"method.solver": "clarabel", "method.retries": False}))
+    assert maneuver.blocked_by == ("solver: clarabel found no solution",)
 
 
 def test_a_solver_that_fails_blocks_the_step_and_leaves_the_state(crate_problem, monkeypatch):

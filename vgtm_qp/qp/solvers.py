@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from vgtm_qp.errors import SolverError, nearest
-from vgtm_qp.qp.condensed import CondensedSolver, InfeasibleStepError
+from vgtm_qp.qp.condensed import AnswerError, CondensedSolver, InfeasibleStepError, NoAnswerError
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long_arms import chain_solver, prefers_staged
@@ -86,7 +86,7 @@ class FullSolver:
         ------
         InfeasibleStepError
             The solver found that the hard rows contradict one another.
-        SolverError
+        AnswerError
             The solver failed, or its answer has residuals above ``PRIMAL_TOLERANCE`` or ``DUAL_TOLERANCE``.
         """
         qp = self.builder.build(numbers)
@@ -95,12 +95,12 @@ class FullSolver:
             raise InfeasibleStepError("a lower bound is above its upper bound")
         z, y, w, iterations = self._answer(qp, same_structure=same)
         if not all(np.all(np.isfinite(values)) for values in (z, y, w)):
-            raise SolverError("the answer holds values that are not finite numbers")
+            raise AnswerError("the answer holds values that are not finite numbers")
         primal = qp.primal_residual(z)
         scale = 1.0 + float(np.max(np.abs(qp.q))) + float(np.max(np.abs(y), initial=0.0))
         dual = max(qp.dual_residual(z, y, w) / scale, qp.complementarity_residual(z, y / scale, w / scale))
         if not (primal <= PRIMAL_TOLERANCE and dual <= DUAL_TOLERANCE):
-            raise SolverError(
+            raise AnswerError(
                 f"the answer has a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
             )
         # Only a good answer is a warm start: one that is not a number would stay in the solver for ever.
@@ -158,7 +158,7 @@ class _Osqp:
         if "primal infeasible" in status:
             raise InfeasibleStepError(f"osqp: {status}")
         if result.x is None or not np.all(np.isfinite(result.x)):
-            raise SolverError(f"osqp: {status}")
+            raise AnswerError(f"osqp: {status}")
         rows = len(qp.row_lower)
         w = np.zeros(size)
         w[bounded] = result.y[rows:]
@@ -241,9 +241,9 @@ class _QpSolvers:
         try:
             answer = qpsolvers.solve_problem(problem, solver=self._name, **_TIGHT.get(self._name, {}))
         except (qpsolvers.exceptions.QPError, ValueError) as error:
-            raise SolverError(f"{self._name}: {error}") from error
+            raise AnswerError(f"{self._name}: {error}") from error
         if not answer.found or answer.x is None:
-            raise InfeasibleStepError(f"{self._name} found no solution")
+            raise NoAnswerError(f"{self._name} found no solution")
         y = np.zeros(len(qp.row_lower))
         y[equal] = answer.y
         y[~equal] = -np.asarray(answer.z)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.condensed import InfeasibleStepError
+from vgtm_qp.qp.condensed import AnswerError, InfeasibleStepError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.engine import Accuracy, Engine
@@ -90,6 +90,8 @@ class Outcome:
         What is still too near in the new configuration; None where that was not looked at.
     torsion : (T,)
         The new torsion coordinates, rad.
+    solver_failed : bool
+        Whether it was refused only because the QP solver gave no good answer.
     """
 
     accepted: bool
@@ -102,6 +104,7 @@ class Outcome:
     iterations: int = 0
     shortfall: Shortfall | None = None
     torsion: Array = field(default_factory=lambda: np.zeros(0))
+    solver_failed: bool = False
 
 
 class Attempt:
@@ -149,7 +152,9 @@ class Attempt:
         guess = share * state.motion
         Y = X + 0.5 * guess
         whole = share >= 1.0
-        reach = _MOTION_MARGIN * self._expected(target, guess) if whole else self.separation.distances.influence
+        reach = (
+            _MOTION_MARGIN * self._expected(target, guess) if whole else self.separation.distances.influence
+        )
         stations: list[float] = []
         first: StepSolution | None = None
         first_rows: ClearanceRows | None = None
@@ -175,6 +180,8 @@ class Attempt:
             try:
                 at = (X, Y if motion else X, vertices, target, goal, progress, rows)
                 solution = self._solve(*at, motion=motion, torsion=torsion)
+            except AnswerError as error:
+                return replace(outcome(str(error), count), solver_failed=True)
             except InfeasibleStepError:
                 return outcome("infeasible", count)
             except SolverError as error:

@@ -305,7 +305,11 @@ class Resolver:
         share, outcome = 1.0, None
         while share >= smallest:
             reach = start + share * whole * (end - start)
-            near = box if share == 1.0 else _within(state.lengths[self.arm.truss.actuators], share * _TRUST, *box)
+            near = (
+                box
+                if share == 1.0
+                else _within(state.lengths[self.arm.truss.actuators], share * _TRUST, *box)
+            )
             outcome = self._attempt.run(state, self._target(path, start, reach, dt, near), share)
             if self.arm.tip_mode != "scaled":
                 # The tip stays on time: no smaller piece of the path and no part of it will do.
@@ -316,7 +320,7 @@ class Resolver:
                 break
             share /= 2
         assert outcome is not None
-        told = (tuple(self._row_names), outcome.solution, outcome.rows)
+        told = (tuple(self._row_names), outcome.solution, outcome.rows, outcome.solver_failed)
         if not outcome.accepted:
             return Step(StepStatus.BLOCKED, 0.0, state, outcome.reason, outcome.iterations, *told)
         progress = share * whole * outcome.progress
@@ -362,7 +366,7 @@ class Resolver:
         Worth asking after a `last` step that was blocked or hardly moved. The state is unchanged.
         """
         dt = self.arm.dt if dt is None else dt
-        told = ("", {}) if last is None else (last.reason, last.multipliers)
+        told = ("", {}, False) if last is None else (last.reason, last.multipliers, last.solver_failed)
         return explain(self.arm, self._separation, self.state, path, start, end, self._limits_now(dt), *told)
 
     def _limits_now(self, dt: float) -> Limits:
@@ -389,7 +393,9 @@ def _hard_tracking(arm: Arm) -> HardTracking | None:
 
 def _within(length: Array, trust: float, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return the part of the boxes (n_a,) that is no further than `trust` from the present lengths, m."""
-    return np.minimum(np.maximum(lower, length - trust), upper), np.maximum(np.minimum(upper, length + trust), lower)
+    return np.minimum(np.maximum(lower, length - trust), upper), np.maximum(
+        np.minimum(upper, length + trust), lower
+    )
 
 
 def _vector(value: ArrayLike, name: str) -> Array:

@@ -37,6 +37,8 @@ class Step:
         Why the step was cut, empty where it was not.
     qps : int
         QPs solved.
+    solver_failed : bool
+        Whether it was blocked only because the QP solver gave no good answer.
     """
 
     status: StepStatus
@@ -47,6 +49,7 @@ class Step:
     _actuators: tuple[str, ...]
     _solution: StepSolution | None = None
     _rows: ClearanceRows | None = None
+    solver_failed: bool = False
 
     def __str__(self) -> str:
         """Return one line: how it ended, how far and when, and what held the arm back where something did."""

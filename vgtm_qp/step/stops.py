@@ -54,6 +54,7 @@ class StopKind(StrEnum):
     SINGULAR = "singular pose"
     OUT_OF_REACH = "out of reach"
     NONLINEAR = "nonlinear"
+    SOLVER = "solver"
     INTERRUPTED = "interrupted"
 
 
@@ -66,7 +67,8 @@ class Stop:
     kind : StopKind
         ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
         where the tip cannot start in that direction whatever the limits; ``out of reach`` where the arm is stretched
-        towards a goal further away; ``nonlinear`` where no row forbids the step to first order.
+        towards a goal further away; ``nonlinear`` where no row forbids the step to first order; ``solver`` where
+        none does and the QP solver gave no good answer.
     multipliers : dict
         Rows of the set, the most decisive first, and the share of the way that each costs per metre (radian).
     obstacles : tuple of str
@@ -82,14 +84,14 @@ class Stop:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the rows of the set, or the kind of the stop where there are none."""
-        return tuple(self.multipliers) or (str(self.kind),)
+        """Names of the rows of the set, or the kind of the stop where there are none, with a solver's reason."""
+        return tuple(self.multipliers) or (str(self if self.kind is StopKind.SOLVER else self.kind),)
 
     def __str__(self) -> str:
         parts = [
             str(self.kind),
             ", ".join(self.multipliers),
-            self.reason if self.kind is StopKind.NONLINEAR else "",
+            self.reason if self.kind in (StopKind.NONLINEAR, StopKind.SOLVER) else "",
         ]
         return ": ".join(part for part in parts if part)
 
@@ -124,6 +126,7 @@ def explain(
     limits: Limits,
     reason: str,
     pressing: Mapping[str, float],
+    solver_failed: bool = False,
 ) -> Stop:
     """Return why the arm does not get on from `state` along `path` from its value `start` towards `end`.
 
@@ -131,6 +134,8 @@ def explain(
     """
     program = _Program(arm, separation, state, path, start, end, limits)
     share, costs = program.solve(np.ones(program.count, dtype=bool))
+    if solver_failed and share > _BLOCKED:
+        return Stop(StopKind.SOLVER, reason=reason)
     bar = min(max(_BLOCKED, _FREER * share), 0.5 * (1.0 + share))
     kept = np.zeros(program.count, dtype=bool)
     kept[np.flatnonzero(costs > _PRESSES)] = True
