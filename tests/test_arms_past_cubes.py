@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
+from vgtm_qp.step.arm import build_arm
 
 SAFE = 0.08
 PAST = [
@@ -58,6 +59,18 @@ def test_nobody_is_warned_of_a_curve_that_is_freer_than_the_arm(case):
     problem, _ = case
     curve, truss = problem.curve, vq.build_truss(problem.truss)
     assert 3 * curve.control_vertices + curve.torsion_vertices - 5 <= len(truss.actuators)
+
+
+def test_ten_bays_go_round_a_cube_that_they_would_enter():
+    problem = vq.load_problem("ten_bay_round_a_cube")
+    heedless = vq.solve(problem.replace({"obstacle": []}), verify=False)
+    arm = build_arm(problem, compiled=False)
+    assert min(arm.least_clearance(nodes, 0.0, "obstacles") for nodes in heedless.nodes) < -0.05
+    for changes in ({}, {"method.solver": "osqp"}, {"method.tracking": "none"}):
+        maneuver = vq.solve(problem.replace({**changes, "method.retries": False}))
+        assert (maneuver.status, maneuver.steps) == ("solved", 50)
+        assert maneuver.certificate.ok, maneuver.certificate.failures()
+        assert SAFE - 1e-9 <= maneuver.certificate.clearance.value <= SAFE + 0.005
 
 
 def test_members_that_jam_half_way_stay_as_they_are():

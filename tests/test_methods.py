@@ -225,10 +225,16 @@ def test_a_faithful_run_is_solved_but_not_verified() -> None:
 @pytest.mark.parametrize("tracking", ["recursive", "parallel"])
 def test_the_curve_qp_keeps_every_limit_up_to_where_it_stops(tracking: str) -> None:
     problem = vq.load_problem("ten_bay_round_a_cube").replace({"method.tracking": tracking})
-    maneuver = vq.solve(problem)
-    assert maneuver.status == "solved"
-    assert maneuver.certificate is not None
-    assert maneuver.certificate.ok, str(maneuver.certificate)
+    at_the_cube = vq.solve(problem)
+    assert at_the_cube.status == "blocked"
+    assert 0.3 < at_the_cube.reached < 0.6
+    assert "/ cube" in at_the_cube.blocked_by[0]
+    (cube,) = problem.to_dict()["obstacle"]
+    out_of_the_way = vq.solve(problem.replace({"obstacle": [{**cube, "center": [1.7, 0.0, 4.5]}]}))
+    assert out_of_the_way.status == "solved"
+    for maneuver in (at_the_cube, out_of_the_way):
+        assert maneuver.certificate is not None
+        assert maneuver.certificate.ok, str(maneuver.certificate)
 
 
 def test_the_potential_gradient_is_that_of_the_potential() -> None:

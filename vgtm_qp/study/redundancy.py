@@ -81,7 +81,7 @@ def text(rows: Sequence[Row]) -> str:
     header = ("path covered; travel [m]", *[f"V = {v} ({degree_of_redundancy(v, 3)})" for v in vertices])
     return (
         "In brackets the free motions of the curve once base and tip are held, 3 V - 5 - 3. A curve with more of them "
-        f"than the arm means nothing to it; one with too few cannot pass.\n\n{markdown_table(header, table)}"
+        f"than the arm means nothing to it; one with too few may not pass.\n\n{markdown_table(header, table)}"
     )
 
 
