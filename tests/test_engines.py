@@ -238,9 +238,7 @@ def test_rows_of_a_curve_are_its_derivatives(shape, family):
             rows.position_rows[:, :, k], (ahead.position - behind.position) / (2 * h), atol=1e-7
         )
         tangent = (ahead.frame - behind.frame)[:, :, 2] / (2 * h)
-        np.testing.assert_allclose(
-            np.cross(rows.spin_rows[:, :, k], rows.frame[:, :, 2]), tangent, atol=1e-7
-        )
+        np.testing.assert_allclose(np.cross(rows.spin_rows[:, :, k], rows.frame[:, :, 2]), tangent, atol=1e-7)
         turned = (
             ahead.frame @ behind.frame.transpose(0, 2, 1) - behind.frame @ ahead.frame.transpose(0, 2, 1)
         ) / 2
