@@ -14,6 +14,9 @@ from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
 
 Array = NDArray[np.float64]
 
+_SMALL_REST = 0.05
+"""A part of the piece between two marks that is not worth a step of its own."""
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -29,6 +32,20 @@ class Plan:
 
     path: Path
     marks: Array
+
+    def next_mark(self, value: float, *, keeps_moving: bool = False) -> tuple[float, float]:
+        """Return where the step from `value` of the path aims, and how long it takes, s.
+
+        It aims at the next mark or, a small rest of a piece before that, at the one after it: marks are but a wish of
+        timing. An arm that `keeps_moving`, since its accelerations are limited, aims a whole piece ahead of itself.
+        """
+        marks = self.marks
+        k = int(np.searchsorted(marks, value, side="right"))
+        dt = float(marks[k] - (marks[k - 1] if k else self.path.start))
+        if marks[k] - value < _SMALL_REST * dt and k + 1 < len(marks):
+            k, dt = k + 1, float(marks[k + 1] - marks[k])
+        aim = float(marks[k])
+        return (max(aim, min(value + dt, float(marks[-1]))) if keeps_moving else aim), dt
 
 
 def make_plan(problem: Problem, position: Array, rotation: Array) -> Plan:

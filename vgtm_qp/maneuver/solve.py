@@ -116,27 +116,23 @@ def _retry(
 def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress | None) -> Stop | None:
     """Step along the plan; return why the arm stopped for good, or None where it came through."""
     value, start, end = plan.path.start, plan.path.start, plan.path.end
-    stalled = 0
-    for k, mark in enumerate(plan.marks):
-        dt = float(mark - (plan.marks[k - 1] if k else start))
-        while value < mark:
-            before, clock = dict(resolver.phases), perf_counter()
-            step = resolver.follow(plan.path, value, float(mark), dt=dt)
-            seconds = perf_counter() - clock
-            if step.status is StepStatus.BLOCKED:
-                return _stop(resolver, plan, value, float(mark), dt, step)
-            value = (
-                float(mark)
-                if step.status is StepStatus.REACHED
-                else value + step.progress * (float(mark) - value)
-            )
-            phases = {name: total - before[name] for name, total in resolver.phases.items()}
-            _add_state(record, resolver, plan, value, seconds, phases)
-            stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
-            if stalled >= _STALLED_STEPS:
-                return _stop(resolver, plan, value, float(mark), dt, step)
-            if progress is not None:
-                progress((value - start) / (end - start), step)
+    stalled, last = 0, float(plan.marks[-1])
+    keeps_moving = bool(np.isfinite(resolver.arm.truss.acceleration[resolver.arm.truss.actuators]).any())
+    while value < last:
+        aim, dt = plan.next_mark(value, keeps_moving=keeps_moving)
+        before, clock = dict(resolver.phases), perf_counter()
+        step = resolver.follow(plan.path, value, aim, dt=dt)
+        seconds = perf_counter() - clock
+        if step.status is StepStatus.BLOCKED:
+            return _stop(resolver, plan, value, aim, dt, step)
+        value = aim if step.status is StepStatus.REACHED else value + step.progress * (aim - value)
+        phases = {name: total - before[name] for name, total in resolver.phases.items()}
+        _add_state(record, resolver, plan, value, seconds, phases)
+        stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
+        if stalled >= _STALLED_STEPS:
+            return _stop(resolver, plan, value, aim, dt, step)
+        if progress is not None:
+            progress((value - start) / (end - start), step)
     return None
 
 

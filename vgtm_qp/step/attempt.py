@@ -16,7 +16,7 @@ from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.engine import Accuracy, Engine
 from vgtm_qp.step.linearise import Target
 from vgtm_qp.step.separation import Separation, Shortfall
-from vgtm_qp.step.state import State
+from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
 from vgtm_qp.step.tracking import HardTracking
 
@@ -92,6 +92,8 @@ class Outcome:
         The new torsion coordinates, rad.
     solver_failed : bool
         Whether it was refused only because the QP solver gave no good answer.
+    time : float
+        At the end of the step, s.
     """
 
     accepted: bool
@@ -105,6 +107,24 @@ class Outcome:
     shortfall: Shortfall | None = None
     torsion: Array = field(default_factory=lambda: np.zeros(0))
     solver_failed: bool = False
+    time: float = 0.0
+
+    def state_after(self, before: State) -> State:
+        """Return the state that an accepted attempt leads to from the state `before`."""
+        assert self.accepted
+        assert self.closed is not None
+        duration = self.time - before.time
+        return State(
+            time=self.time,
+            nodes=frozen(self.closed.X),
+            control_vertices=frozen(self.control_vertices),
+            torsion=frozen(self.torsion),
+            lengths=frozen(self.closed.lengths),
+            length_rates=frozen((self.closed.lengths - before.lengths) / duration),
+            motion=frozen(self.closed.X - before.nodes),
+            duration=duration,
+            shortfall=self.shortfall,
+        )
 
 
 class Attempt:
@@ -129,26 +149,29 @@ class Attempt:
         self.phases = Phases()
         self._accuracy = Accuracy(self.tolerances.member, self.tolerances.tip, self.tolerances.settling)
 
-    def run(self, state: State, target: Target, share: float = 1.0) -> Outcome:
+    def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Outcome:
         """Return the outcome of moving from `state` along the target's piece of path; no state is changed.
 
         `share` is the length of the piece as a part of the step before: what the motion guessed from it is scaled by.
+        `progress` is how much of the piece lies behind the tip at the start.
         """
         self.phases.start()
         short = state.shortfall
         if short is None:
             short = self.separation.shortfall(state.nodes, state.time)
         if short:
-            outcome = self._run(state, target, share, short, self.separation.distances.recovery)
+            outcome = self._run(state, target, share, progress, short, self.separation.distances.recovery)
             if outcome.accepted:
                 return outcome
-        return self._run(state, target, share, short, 0.0)
+        return self._run(state, target, share, progress, short, 0.0)
 
-    def _run(self, state: State, target: Target, share: float, short: Shortfall, gain: float) -> Outcome:
+    def _run(
+        self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
+    ) -> Outcome:
         """Do it, with pairs that are too `short` of their clearance driven apart by `gain`, m."""
         phases, span, separation = self.phases, target.end - target.start, self.separation
         duration = target.time - state.time
-        X, vertices, torsion, progress = state.nodes, state.control_vertices, state.torsion, 0.0
+        X, vertices, torsion = state.nodes, state.control_vertices, state.torsion
         guess = share * state.motion
         Y = X + 0.5 * guess
         whole = share >= 1.0
@@ -163,7 +186,7 @@ class Attempt:
 
         def outcome(reason: str, count: int) -> Outcome:
             told = (first, first_rows, count, after, torsion)
-            return Outcome(not reason, closed, vertices, progress, reason, *told)
+            return Outcome(not reason, closed, vertices, progress, reason, *told, time=target.time)
 
         for count in range(1, self.max_qps + 1):
             motion = count == 1
@@ -196,7 +219,7 @@ class Attempt:
             vertices, torsion = vertices + solution.vertices, torsion + solution.torsion
             progress = min(max(progress + solution.progress, 0.0), 1.0)
             if progress < 1.0:
-                left = (1.0 - progress) * span * float(np.abs([goal.velocity, goal.spin]).max())
+                left = (1.0 - progress) * abs(span) * float(np.abs([goal.velocity, goal.spin]).max())
                 if left <= self.tolerances.tip:
                     # Interior-point solvers stop just short of the end, and so would the arm, for one more step.
                     progress = 1.0

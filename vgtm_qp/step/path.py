@@ -134,6 +134,17 @@ class Path:
             position = self.positions[k] + along * self._velocity[k]
         return PathPoint(position, rotation, self._velocity[k], self._spin[k])
 
+    def continued(self, pieces: float) -> Path:
+        """Return the path that goes on as it ends, for so many times its last piece, but for less than half a turn."""
+        width, turn = float(self.knots[-1] - self.knots[-2]), self._spin[-1]
+        angle = width * float(np.linalg.norm(turn))
+        on = width * min(pieces, 3.0 / angle if angle > 0.0 else np.inf)
+        return Path(
+            np.append(self.knots, self.knots[-1] + on),
+            np.vstack([self.positions, self.positions[-1] + on * self._velocity[-1]]),
+            np.concatenate([self.rotations, (rotation_from_vector(on * turn) @ self.rotations[-1])[None]]),
+        )
+
     def length(self) -> float:
         """Return the length of the path of the position, m."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())

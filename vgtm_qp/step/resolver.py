@@ -16,7 +16,8 @@ from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.step.arm import Arm, build_arm, reshaped
-from vgtm_qp.step.attempt import Attempt
+from vgtm_qp.step.attempt import Attempt, Outcome
+from vgtm_qp.step.braking import Braking, find_braking
 from vgtm_qp.step.checks import excess_of_freedom, unreachable_tip
 from vgtm_qp.step.curve import curve_key, with_curve
 from vgtm_qp.step.limits import length_box
@@ -35,6 +36,12 @@ Array = NDArray[np.float64]
 
 _TRUST = 0.2
 """An actuator moves by no more than this times the part of the step that is tried, m, where the whole one failed."""
+
+_SMALLEST_MOVING = 0.25
+"""The least part of a piece of path that is tried by an arm that can brake instead."""
+
+_BEYOND = 60.0
+"""An arm that is at the end of its path may brake beyond it, within so many times its last piece."""
 
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
@@ -69,6 +76,7 @@ class Resolver:
             truss.acceleration[truss.actuators],
         )
         self._vertex_goals = arm.vertex_goals
+        self._braking: Braking | None = None
         self._arms: dict[tuple[object, ...], Arm] = {}
         self._row_names = [f"stroke: {name}" for name in self._actuator_names]
         self._locked: set[str] = set()
@@ -104,6 +112,7 @@ class Resolver:
         self._limits[0][k] = self.state.lengths[self.arm.truss.actuators[k]]
         self._row_names[k] = f"locked: {name}"
         self._locked.add(name)
+        self._braking = None
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
@@ -302,43 +311,83 @@ class Resolver:
         whole = self._until_jam(dt)
         dt *= whole
         state, box = self.state, self._box(dt)
-        share, outcome = 1.0, None
-        while share >= smallest:
-            reach = start + share * whole * (end - start)
-            near = (
-                box
-                if share == 1.0
-                else _within(state.lengths[self.arm.truss.actuators], share * _TRUST, *box)
-            )
-            outcome = self._attempt.run(state, self._target(path, start, reach, dt, near), share)
-            if self.arm.tip_mode != "scaled":
-                # The tip stays on time: no smaller piece of the path and no part of it will do.
-                if outcome.accepted and outcome.progress < 1.0 - 1e-9:
-                    outcome = replace(outcome, accepted=False, reason="the tip cannot stay on time")
-                break
-            if outcome.accepted:
-                break
+        braking = self._braking if self._braking is not None and self._braking.origin is state else None
+        can_brake = braking is not None and bool(braking.steps) and whole == 1.0
+        if can_brake:
+            smallest = max(smallest, _SMALLEST_MOVING)
+        share, lengths = 1.0, state.lengths[self.arm.truss.actuators]
+        outcome, after = self._try(path, start, start + whole * (end - start), box, dt)
+        while not outcome.accepted and share > smallest and self.arm.tip_mode == "scaled":
             share /= 2
-        assert outcome is not None
+            reach, near = start + share * whole * (end - start), _within(lengths, share * _TRUST, *box)
+            outcome, after = self._try(path, start, reach, near, dt, share)
+        if not outcome.accepted and self._must_brake:
+            slow = _creeping(lengths, self._limits[2] * dt * dt, *box)
+            if slow is not None:
+                share = 1.0
+                outcome, after = self._try(path, start, start + whole * (end - start), slow, dt)
         told = (tuple(self._row_names), outcome.solution, outcome.rows, outcome.solver_failed)
+        if not outcome.accepted and braking is not None and can_brake:
+            self.state, value = braking.steps[0]
+            self._braking = braking.rest
+            progress = (value - start) / (end - start) if path is braking.path else 0.0
+            return Step(
+                StepStatus.SLOWED,
+                progress,
+                self.state,
+                outcome.reason,
+                outcome.iterations,
+                *told,
+                braked=True,
+            )
         if not outcome.accepted:
             return Step(StepStatus.BLOCKED, 0.0, state, outcome.reason, outcome.iterations, *told)
         progress = share * whole * outcome.progress
-        closed = outcome.closed
-        assert closed is not None
-        self.state = State(
-            time=state.time + dt,
-            nodes=frozen(closed.X),
-            control_vertices=frozen(outcome.control_vertices),
-            torsion=frozen(outcome.torsion),
-            lengths=frozen(closed.lengths),
-            length_rates=frozen((closed.lengths - state.lengths) / dt),
-            motion=frozen(closed.X - state.nodes),
-            duration=dt,
-            shortfall=outcome.shortfall,
-        )
+        self.state, self._braking = outcome.state_after(state), None
+        if after is not None:
+            self._braking = replace(after, origin=self.state)
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return Step(status, progress, self.state, "", outcome.iterations, *told)
+
+    def _try(
+        self, path: Path, start: float, reach: float, box: tuple[Array, Array], dt: float, share: float = 1.0
+    ) -> tuple[Outcome, Braking | None]:
+        """Return what comes of a step from `start` to `reach` on a path, and how the arm brakes after it if it must."""
+        state, braking = self.state, None
+        outcome = self._attempt.run(state, self._target(path, start, reach, dt, box), share)
+        if outcome.accepted and outcome.progress < 1.0 - 1e-9 and self.arm.tip_mode != "scaled":
+            # The tip stays on time: no part of the path will do.
+            outcome = replace(outcome, accepted=False, reason="the tip cannot stay on time")
+        if outcome.accepted and self._must_brake:
+            covered = outcome.progress * (reach - start)
+            if start + covered >= path.end - _INSTANT:
+                # Where a path goes on from its end, or whether, is not known yet.
+                path = path.continued(_BEYOND)
+            braking = self._find_braking(outcome.state_after(state), path, start + covered, 2.0 * covered, dt)
+            if braking is None:
+                outcome = replace(outcome, accepted=False, reason="the arm could not brake after it")
+        return outcome, braking
+
+    @property
+    def _must_brake(self) -> bool:
+        """Whether a moving arm cannot simply stay where it is: accelerations are limited, and its base rests."""
+        is_free = bool(np.isinf(self._limits[2]).all())
+        return not is_free and self.arm.base_motion is None and self.arm.tip_mode == "scaled"
+
+    def _find_braking(
+        self, state: State, path: Path, value: float, piece: float, dt: float
+    ) -> Braking | None:
+        """Return how the arm comes to rest from `state`, at `value` of `path`, in steps of `dt`, s."""
+        return find_braking(
+            self._attempt,
+            self.arm.truss.actuators,
+            state,
+            path,
+            value,
+            piece,
+            lambda now: self._box(dt, now),
+            lambda now, *piece_and_box: self._target_from(now, dt, *piece_and_box),
+        )
 
     def _duration(self, dt: float | None) -> float:
         dt = self.arm.dt if dt is None else dt
@@ -348,14 +397,19 @@ class Resolver:
             )
         return dt
 
-    def _box(self, dt: float) -> tuple[Array, Array]:
-        """Return the least and greatest lengths of the actuators at the end of a step of `dt`, s, m."""
-        state, actuators = self.state, self.arm.truss.actuators
+    def _box(self, dt: float, state: State | None = None) -> tuple[Array, Array]:
+        """Return the least and greatest lengths of the actuators, m, after a step of `dt`, s."""
+        state, actuators = state or self.state, self.arm.truss.actuators
         length, rate = state.lengths[actuators], state.length_rates[actuators]
         return length_box(length, rate, *self._limits, dt, state.duration or None)
 
     def _target(self, path: Path, start: float, end: float, dt: float, box: tuple[Array, Array]) -> Target:
-        then = self.state.time + dt
+        return self._target_from(self.state, dt, path, start, end, box)
+
+    def _target_from(
+        self, state: State, dt: float, path: Path, start: float, end: float, box: tuple[Array, Array]
+    ) -> Target:
+        then = state.time + dt
         return Target(path, start, end, *box, then, *self.arm.base_at(then), self._vertex_goals)
 
     def explain(
@@ -396,6 +450,13 @@ def _within(length: Array, trust: float, lower: Array, upper: Array) -> tuple[Ar
     return np.minimum(np.maximum(lower, length - trust), upper), np.maximum(
         np.minimum(upper, length + trust), lower
     )
+
+
+def _creeping(length: Array, reach: Array, lower: Array, upper: Array) -> tuple[Array, Array] | None:
+    """Return the part of the boxes (n_a,) after which an actuator may rest: no further than `reach` (n_a,), m, away."""
+    reach = (1.0 - 1e-9) * reach
+    lower, upper = np.maximum(lower, length - reach), np.minimum(upper, length + reach)
+    return (lower, upper) if np.all(lower <= upper) else None
 
 
 def _vector(value: ArrayLike, name: str) -> Array:

@@ -39,6 +39,9 @@ class Step:
         QPs solved.
     solver_failed : bool
         Whether it was blocked only because the QP solver gave no good answer.
+    braked : bool
+        Whether no other step was found than to brake on the path that the arm was on before: limited accelerations
+        do not let it leave that at once.
     """
 
     status: StepStatus
@@ -50,6 +53,7 @@ class Step:
     _solution: StepSolution | None = None
     _rows: ClearanceRows | None = None
     solver_failed: bool = False
+    braked: bool = False
 
     def __str__(self) -> str:
         """Return one line: how it ended, how far and when, and what held the arm back where something did."""
