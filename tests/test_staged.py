@@ -14,18 +14,18 @@ from hypothesis import strategies as st
 from vgtm_qp.errors import SolverError
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp import lengths as lengths_module
-from vgtm_qp.qp import working_set
-from vgtm_qp.qp.chain import find_chain
 from vgtm_qp.qp.condensed import CondensedSolver, InfeasibleStepError
 from vgtm_qp.qp.lengths import LengthSolver
-from vgtm_qp.qp.long_arms import chain_solver, prefers_staged
+from vgtm_qp.qp.long import working_set
+from vgtm_qp.qp.long.chain import find_chain
+from vgtm_qp.qp.long.select import chain_solver, prefers_staged
+from vgtm_qp.qp.long.sparse_symbols import range_and_null
+from vgtm_qp.qp.long.staged import StagedSolver
+from vgtm_qp.qp.long.sweep import Sweep
+from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import make_solver
-from vgtm_qp.qp.sparse_symbols import range_and_null
-from vgtm_qp.qp.staged import StagedSolver
-from vgtm_qp.qp.sweep import Sweep
-from vgtm_qp.qp.tracked import TrackedSolver
 from vgtm_qp.step.linearise import Linearisation, Target
 from vgtm_qp.step.path import Path, rotation_from_vector
 from vgtm_qp.truss import modules

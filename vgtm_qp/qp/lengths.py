@@ -9,10 +9,10 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.chain import Chain, find_chain
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.sparse_symbols import range_and_null, symbols_of
-from vgtm_qp.qp.sweep import Sweep
+from vgtm_qp.qp.long.chain import Chain, find_chain
+from vgtm_qp.qp.long.sparse_symbols import range_and_null, symbols_of
+from vgtm_qp.qp.long.sweep import Sweep
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from vgtm_qp.errors import SolverError, nearest
 from vgtm_qp.qp.condensed import AnswerError, CondensedSolver, InfeasibleStepError, NoAnswerError
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.long_arms import chain_solver, prefers_staged
+from vgtm_qp.qp.long.select import chain_solver, prefers_staged
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from vgtm_qp.problem.table import shown
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.long_arms import STAGED_ACTUATORS
+from vgtm_qp.qp.long.select import STAGED_ACTUATORS
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
 from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.curve import home_curve

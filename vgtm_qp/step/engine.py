@@ -18,10 +18,10 @@ from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
 from vgtm_qp.qp.fused_graph import SETTLING_STEPS
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import LengthSolver
+from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
 from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
-from vgtm_qp.qp.staged import StagedSolver
 from vgtm_qp.step.linearise import Linearisation, Target, base_frame
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.task import TipTask, worth_closing

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from vgtm_qp.qp.chain import Chain, find_chain
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.staged import StagedSolver
-from vgtm_qp.qp.tracked import TrackedSolver
+from vgtm_qp.qp.long.chain import Chain, find_chain
+from vgtm_qp.qp.long.staged import StagedSolver
+from vgtm_qp.qp.long.tracked import TrackedSolver
 
 STAGED_ACTUATORS = 45
 """From so many actuators on, elimination along the chain is faster than condensing onto the actuators."""

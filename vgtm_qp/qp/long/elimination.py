@@ -13,8 +13,15 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.qp.chain import Chain
-from vgtm_qp.qp.sparse_symbols import inverse_factor, nonzeros, offsets, range_and_null, symbols_of, symmetric
+from vgtm_qp.qp.long.chain import Chain
+from vgtm_qp.qp.long.sparse_symbols import (
+    inverse_factor,
+    nonzeros,
+    offsets,
+    range_and_null,
+    symbols_of,
+    symmetric,
+)
 
 
 @dataclass(frozen=True)

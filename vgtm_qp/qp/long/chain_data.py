@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.qp.chain import Chain
+from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.numbers import StepNumbers
 
 Array = NDArray[np.float64]

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.chain import Chain
-from vgtm_qp.qp.chain_data import ChainData
-from vgtm_qp.qp.elimination import Elimination
+from vgtm_qp.qp.long.chain import Chain
+from vgtm_qp.qp.long.chain_data import ChainData
+from vgtm_qp.qp.long.elimination import Elimination
+from vgtm_qp.qp.long.sweep import Sweep
+from vgtm_qp.qp.long.working_set import Point, RowTable, solve_rows
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
-from vgtm_qp.qp.sweep import Sweep
-from vgtm_qp.qp.working_set import Point, RowTable, solve_rows
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
