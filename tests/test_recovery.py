@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import numpy as np
 import pytest
 from arms import mast
 
 import vgtm_qp as vq
+from vgtm_qp.cli import main
 from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.truss import modules
@@ -63,7 +67,63 @@ def test_a_maneuver_from_a_start_that_is_too_near_is_solved_and_its_verification
     assert maneuver.status == "solved"
     assert np.all(np.diff(np.minimum(maneuver.clearance, 0.08)) >= -1e-9)
     assert maneuver.clearance[-1] >= 0.08 - 1e-9
-    assert any("clearance" in line for line in maneuver.certificate.failures())
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    record = maneuver.manifest["recovered"]
+    assert all(entry["pair"].endswith(" / crate") for entry in record)
+    assert min(entry["distance"] for entry in record) == pytest.approx(0.05, abs=1e-9)
+    assert any(line.startswith("recovered: ") for line in maneuver.certificate.notes)
+
+
+def recovered():
+    return vq.solve(problem(obstacle=[beside(0.05)]))
+
+
+def test_a_pair_that_is_too_near_without_being_on_record_is_a_failure():
+    maneuver = recovered()
+    maneuver.manifest["recovered"] = maneuver.manifest["recovered"][1:]
+    assert any(line.startswith("clearance: ") for line in vq.verify(maneuver).failures())
+
+
+def test_a_record_of_another_distance_or_of_no_pair_is_a_failure():
+    maneuver = recovered()
+    maneuver.manifest["recovered"][0]["distance"] += 1e-3
+    assert any("apart at home" in line for line in vq.verify(maneuver).failures())
+    maneuver = recovered()
+    maneuver.manifest["recovered"].append({"pair": "nothing / crate", "distance": 0.01})
+    assert any("none of this arm" in line for line in vq.verify(maneuver).failures())
+    maneuver.manifest["recovered"] = [{"distance": 0.01}]
+    with pytest.raises(vq.ResultError, match="recovered"):
+        vq.verify(maneuver)
+
+
+def test_a_recovering_pair_that_comes_nearer_again_is_a_failure():
+    maneuver = recovered()
+    nodes = maneuver.nodes.copy()
+    nodes[2] = nodes[0]
+    lines = vq.verify(dataclasses.replace(maneuver, nodes=nodes)).failures()
+    assert any(line.startswith("recovered: ") and "at state 2" in line for line in lines)
+    nodes = maneuver.nodes.copy()
+    nodes[-1] = nodes[0]
+    lines = vq.verify(dataclasses.replace(maneuver, nodes=nodes)).failures()
+    assert any(line.startswith("clearance: ") for line in lines)
+
+
+def test_a_recovery_is_solved_and_verified_from_the_command_line(tmp_path, capsys):
+    file, result = tmp_path / "near.toml", tmp_path / "near.npz"
+    crate = beside(0.05)
+    tables = [
+        *(
+            f"[{key}]\n" + "".join(f"{k} = {json.dumps(v)}\n" for k, v in BASE[key].items())
+            for key in ("truss", "curve", "clearance", "method")
+        ),
+        "[maneuver]\nsteps = 20\n[[maneuver.waypoint]]\ntime = 4.0\nposition = [0.0, 0.5, 2.2]\n",
+        "[[obstacle]]\n" + "".join(f"{k} = {json.dumps(v)}\n" for k, v in crate.items()),
+    ]
+    file.write_text('schema_version = 1\nname = "near"\n' + "\n".join(tables))
+    assert main(["solve", str(file), "--output", str(result)]) == 0
+    capsys.readouterr()
+    assert main(["verify", str(result)]) == 0
+    assert "note  recovered: pairs too near at home" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("speed", [0.08, 0.1])

@@ -37,6 +37,7 @@ def make_manifest(
     blocked_by: Iterable[str] = (),
     stop: Mapping[str, Any] | None = None,
     way_out: str = "",
+    recovered: Mapping[str, float] | None = None,
     method: str,
     solver: str | None,
     setup_time: float,
@@ -62,6 +63,9 @@ def make_manifest(
         What ``Stop.to_dict`` returns.
     way_out : str
         How the redundancy was resolved where the problem's own way came to a dead end earlier.
+    recovered : mapping, optional
+        Pairs that were nearer at home than they may be, ``member / obstacle`` or ``member / member``, and their
+        distances there, m.
     method : str
         As in the problem's ``[method]``.
     solver : str or None
@@ -84,6 +88,9 @@ def make_manifest(
         "blocked_by": list(blocked_by),
         "stop": None if stop is None else dict(stop),
         "way_out": way_out,
+        "recovered": [
+            {"pair": pair, "distance": float(apart)} for pair, apart in sorted((recovered or {}).items())
+        ],
         "method": method,
         "solver": solver,
         "setup_time": float(setup_time),

@@ -18,9 +18,10 @@ from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.maneuver.ways_out import ways_out
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
-from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
+from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.stops import Stop, StopKind
 
 if TYPE_CHECKING:
@@ -188,6 +189,9 @@ def _assemble(
         blocked_by=() if stop is None else stop.names,
         stop=None if stop is None else stop.to_dict(),
         way_out=way,
+        recovered=_too_near(resolver.arm, record.rows["nodes"][0])
+        if isinstance(resolver, Resolver)
+        else None,
         method=problem.method.name,
         solver=resolver.arm.solver if isinstance(resolver, Resolver) else resolver.solver,
         setup_time=setup_time,
@@ -219,3 +223,13 @@ def _assemble(
         tip_target_rotation=rotation if task.turns == "orientation" else None,
         tip_target_pointing=rotation[:, :, 2] if task.turns == "pointing" else None,
     )
+
+
+def _too_near(arm: Arm, X: Array) -> dict[str, float]:
+    """Return the pairs that are nearer than they may be at home, at `X` (N, 3), and their distances, m."""
+    kept = Separation(arm.truss, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence))
+    found: dict[str, float] = {}
+    for pair, distance in kept.shortfall(X, 0.0).items():
+        name = arm.monitor.names.clearance(pair).removeprefix("clearance: member ").replace("/ member ", "/ ")
+        found[name] = min(found.get(name, np.inf), distance)
+    return found

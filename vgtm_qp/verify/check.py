@@ -16,6 +16,7 @@ from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Encounters, Least, Motion
 from vgtm_qp.verify.obstacles import read_obstacles, rotation_matrix
 from vgtm_qp.verify.path import check_path
+from vgtm_qp.verify.recovery import excuse_recovering
 
 Array = NDArray[np.float64]
 
@@ -82,8 +83,16 @@ def verify(maneuver: Maneuver) -> Certificate:
     self_safe = _SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
     if not rules.get("self_collision", True):
         self_safe = -np.inf
-    at, between, clearance = _clearances(motion, [AgainstBody(motion, body) for body in bodies])
-    self_at, self_between, self_clearance = _clearances(motion, [AgainstMembers(motion)])
+    against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]
+    at, between, clearance = _clearances(motion, against)
+    self_at, self_between, self_clearance = _clearances(motion, members)
+    recovered = manifest.get("recovered") or []
+    if recovered:
+        kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
+        nearer, told = excuse_recovering(recovered, kept, CLEARANCE_TOLERANCE, BETWEEN_TOLERANCE)
+        wrong, notes = [*wrong, *nearer], [*notes, *told]
+        at, between, _ = _clearances(motion, against)
+        self_at, self_between, _ = _clearances(motion, members)
 
     tip = arm.tip_position(maneuver.nodes)
     rotation = np.stack([arm.tip_rotation(state) for state in maneuver.nodes])

@@ -128,6 +128,20 @@ class Encounters(ABC):
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
+        self.held_from: dict[tuple[int, int], int] = {}
+        """States from which pairs count; all others do from the first on."""
+
+    @abstractmethod
+    def pairs_named(self, name: str) -> list[tuple[int, int]]:
+        """Return the pairs of that name, none where there is no such pair."""
+
+    def _held(self, pairs: tuple[Index, Index], state: int) -> tuple[Index, Index]:
+        """Return those of the pairs (P,), (P,) that count at a state and on the way from it."""
+        if not self.held_from:
+            return pairs
+        each = zip(pairs[0].tolist(), pairs[1].tolist(), strict=True)
+        kept = np.array([self.held_from.get(pair, 0) <= state for pair in each], dtype=bool)
+        return pairs[0][kept], pairs[1][kept]
 
     @abstractmethod
     def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> tuple[Index, Index]:
@@ -166,7 +180,7 @@ class Encounters(ABC):
         step = max(min(state, len(self.motion.nodes) - 2), 0)
         share = 1.0 if step < state else 0.0
         limit, least = self._first_limit(low, high, state, step, share), Least()
-        first, second = self.near(low, high, state, state, limit)
+        first, second = self._held(self.near(low, high, state, state, limit), state)
         for part in _parts(len(first)):
             pair = (first[part], second[part])
             distance, _ = self.separation(self.place(step, pair, np.full(len(pair[0]), share)), pair)
@@ -180,7 +194,7 @@ class Encounters(ABC):
         """Return an upper bound of the least clearance, from the pairs that a growing limit meets first."""
         reach = 0.05 * float(self.motion.arm.length.max())
         for _ in range(40):
-            pair = self.near(low, high, state, state, reach)
+            pair = self._held(self.near(low, high, state, state, reach), state)
             if len(pair[0]):
                 pair = (pair[0][:_CHUNK], pair[1][:_CHUNK])
                 distance, _ = self.separation(self.place(step, pair, np.full(len(pair[0]), share)), pair)
@@ -198,14 +212,13 @@ class Encounters(ABC):
         ends = self.motion.ends[step : step + 2]
         low, high = ends.min(axis=(0, 2)), ends.max(axis=(0, 2))
         slack = self.motion.bend(step, np.arange(len(low)))[:, None] / 8.0
-        pairs = self.near(low - slack, high + slack, step, step + 1, limit.value)
+        pairs = self._held(self.near(low - slack, high + slack, step, step + 1, limit.value), step)
         for part in _parts(len(pairs[0])):
-            limit, bound = self._divide(step, (pairs[0][part], pairs[1][part]), limit, bound)
+            limit, bound = self.divide(step, (pairs[0][part], pairs[1][part]), limit, bound)
         return limit, bound
 
-    def _divide(
-        self, step: int, pair: tuple[Index, Index], limit: Least, bound: Least
-    ) -> tuple[Least, Least]:
+    def divide(self, step: int, pair: tuple[Index, Index], limit: Least, bound: Least) -> tuple[Least, Least]:
+        """Return `limit` and `bound` brought down by pairs (P,), (P,) on the way from state `step` to the next."""
         count = len(pair[0])
         start, width = np.zeros(count), 1.0
         bend = self.bend(step, pair)
@@ -251,6 +264,15 @@ class AgainstBody(Encounters):
         corners = body.corners
         self._low, self._high = corners.min(axis=1), corners.max(axis=1)
         self._centers = np.stack([body.at(float(time)) for time in motion.time])
+
+    def pairs_named(self, name: str) -> list[tuple[int, int]]:
+        """Return all pieces of the body with the member of ``member / obstacle``."""
+        return [
+            (member, piece)
+            for member in range(len(self.motion.arm.member_names))
+            if self.name((member, 0)) == name
+            for piece in range(len(self._low))
+        ]
 
     def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> tuple[Index, Index]:
         """Return the pairs (member, piece) whose bounding boxes are nearer than `limit`."""
@@ -306,6 +328,16 @@ class AgainstBody(Encounters):
 
 class AgainstMembers(Encounters):
     """Members against members that they share no node with."""
+
+    def pairs_named(self, name: str) -> list[tuple[int, int]]:
+        """Return the two members of ``member / member`` in either order."""
+        names, members = self.motion.arm.member_names, self.motion.arm.members
+        apart = [k for k, first in enumerate(names) if name.startswith(f"{first} / ")]
+        found = [(a, b) for a in apart for b in range(len(names)) if self.name((a, b)) == name]
+        found = [
+            pair for pair in found if not set(members[pair[0]].tolist()) & set(members[pair[1]].tolist())
+        ]
+        return [*found, *((b, a) for a, b in found)]
 
     def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> tuple[Index, Index]:  # noqa: ARG002
         """Return the pairs whose bounding boxes are nearer than `limit`, swept along the longest axis."""

@@ -1,0 +1,112 @@
+"""Pairs that were nearer at home than they may be: held to come no nearer, and to their distance once they have it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import ResultError
+from vgtm_qp.verify.clearance import Encounters, Least
+
+Array = NDArray[np.float64]
+
+
+def excuse_recovering(
+    record: Any, encounters: Iterable[tuple[Encounters, float]], tolerance: float, tolerance_between: float
+) -> tuple[list[str], list[str]]:
+    """Return what is wrong with pairs that recover, one line each, and a note of what they did.
+
+    The encounters no longer count these pairs at states, and on the ways from states, before they have reached their
+    distance. Until then a pair may not be nearer than at the state before.
+
+    Parameters
+    ----------
+    record
+        Of the manifest: entries with ``pair``, as encounters name it, and ``distance`` at home, m.
+    encounters
+        Each with the distance that its pairs keep, m.
+    tolerance, tolerance_between
+        Of distances at states and between them, m.
+
+    Raises
+    ------
+    ResultError
+        The record is malformed.
+    """
+    try:
+        wanted = {str(entry["pair"]): float(entry["distance"]) for entry in record}
+    except (TypeError, KeyError, ValueError) as error:
+        raise ResultError(f"manifest.recovered is malformed: {error}") from None
+    wrong: list[str] = []
+    until, states, found = 0, 0, 0
+    for group, floor in encounters:
+        for name in sorted(wanted):
+            pairs = group.pairs_named(name)
+            if not pairs:
+                continue
+            found += 1
+            distance = _distances(group, pairs)
+            kept = np.flatnonzero(distance >= floor - tolerance)
+            since = int(kept[0]) if len(kept) else len(distance)
+            if since == 0 or abs(distance[0] - wanted[name]) > tolerance:
+                wrong.append(
+                    f"recovered: {name} is {distance[0]:.9g} m apart at home, not {wanted[name]:.9g} m"
+                )
+                continue
+            wrong += _nearer(group, pairs, name, distance[: since + 1], floor, tolerance, tolerance_between)
+            group.held_from.update(dict.fromkeys(pairs, since))
+            until, states = max(until, since), len(distance)
+    if found < len(wanted):
+        wrong.append("manifest.recovered names pairs that are none of this arm and its obstacles")
+    return wrong, [_note(wanted, until, states)] if wanted else []
+
+
+def _note(distance: Mapping[str, float], until: int, states: int) -> str:
+    nearest = min(distance, key=lambda name: distance[name])
+    end = f"all keep their distances from state {until} on" if until < states else "some still are at the end"
+    return (
+        f"recovered: pairs too near at home: {len(distance)}, the nearest {distance[nearest]:.6g} m apart "
+        f"({nearest}); they came no nearer, and {end}"
+    )
+
+
+def _distances(group: Encounters, pairs: Sequence[tuple[int, int]]) -> Array:
+    """Return (T,) the least distance of the pairs at each state, m."""
+    index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
+    states = len(group.motion.nodes)
+    found = np.empty(states)
+    for state in range(states):
+        step = max(min(state, states - 2), 0)
+        share = np.full(len(pairs), 1.0 if step < state else 0.0)
+        found[state] = group.separation(group.place(step, index, share), index)[0].min()
+    return found
+
+
+def _nearer(
+    group: Encounters,
+    pairs: Sequence[tuple[int, int]],
+    name: str,
+    distance: Array,
+    floor: float,
+    tolerance: float,
+    tolerance_between: float,
+) -> list[str]:
+    """Return where a pair comes nearer than at the state before, up to the last of `distance` (K,)."""
+    index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
+    wrong = []
+    for state in range(len(distance) - 1):
+        least = min(float(distance[state]), floor)
+        if distance[state + 1] < least - tolerance:
+            wrong.append(
+                f"recovered: {name} is {distance[state + 1]:.9g} m apart at state {state + 1} after {least:.9g} m"
+            )
+        limit, bound = group.divide(state, index, Least(), Least())
+        way = min(limit.value, bound.value)
+        if way < least - tolerance_between:
+            wrong.append(
+                f"recovered: {name} comes as near as {way:.9g} m in step {state + 1} from {least:.9g} m"
+            )
+    return wrong
