@@ -83,11 +83,12 @@ class Separation:
     def holds(self, X: Array, time: float, before: Shortfall, *, proven: bool = False) -> Shortfall | None:
         """Return what is too near at `X`, or None where a pair is that was not `before`, or comes nearer.
 
-        `proven` is whether :meth:`between` was certified for the way there, which then holds for its end too.
+        `proven` is whether :meth:`between` was certified for the way there, which then holds for its end too; but not
+        for offset joints, whose members may come a little nearer on the way than at its end.
         """
         if not self._angles_hold(X):
             return None
-        if proven and not before:
+        if proven and not before and self._truss.joints is None:
             return {}
         after = self.shortfall(X, time)
         if all(
