@@ -227,8 +227,8 @@ def test_the_curve_qp_keeps_every_limit_up_to_where_it_stops(tracking: str) -> N
     problem = vq.load_problem("ten_bay_round_a_cube").replace({"method.tracking": tracking})
     at_the_cube = vq.solve(problem)
     assert at_the_cube.status == "blocked"
-    assert 0.3 < at_the_cube.reached < 1.0
-    assert at_the_cube.blocked_by[0].startswith("step ")
+    assert 0.3 < at_the_cube.reached < 0.7
+    assert any(word in at_the_cube.blocked_by[0] for word in ("/ cube", "stroke"))
     (cube,) = problem.to_dict()["obstacle"]
     out_of_the_way = vq.solve(problem.replace({"obstacle": [{**cube, "center": [1.7, 0.0, 4.5]}]}))
     assert out_of_the_way.status == "solved"
