@@ -60,12 +60,15 @@ def test_the_yardstick_keeps_lengths_strokes_and_clearance_and_meets_the_path():
 
 def test_the_study_tells_what_was_solved_and_what_stopped_the_rest():
     assert tasks(False, scenes=3, seed=5) == [
-        {"seed": 5, "number": k, "steps": 30, "ipopt": False} for k in range(3)
+        {"seed": 5, "number": k, "steps": 30, "solver": "vgtm"} for k in range(3)
     ]
+    assert [task["solver"] for task in tasks(False, scenes=2, seed=5, ipopt=True)] == ["vgtm", "ipopt"] * 2
     rows = [{**task, **run(**task)} for task in tasks(True, scenes=2, seed=0)]
     assert all(not row["failures"] for row in rows)
     assert all((row["status"] == "solved") != bool(row["stop"]) for row in rows)
     study = Study.named("robustness")
     assert "scenes 0 to 1" in study.text(rows)
     assert study.draw(rows).axes
+    yardstick = [{**row, "solver": "ipopt", "reached": 1.0} for row in rows]
+    assert "IPOPT step by step comes through in 2 of 2" in study.text([*rows, *yardstick])
     assert text([]) == "No scene was run."
