@@ -139,6 +139,15 @@ class Clearance:
         self._tire(candidates, X, time, wasted)
         return self._with_enclosed(join(parts, self.names), X, time)
 
+    @property
+    def ends_at_nodes(self) -> bool:
+        """Whether members end at nodes: joints have no extent."""
+        return self._ends is None
+
+    def candidates(self, X: Array, time: float, reach: float, self_reach: float) -> Candidates:
+        """Return a list with every pair that is nearer than `reach`, or `self_reach` between members, m, at `X` (N, 3)."""
+        return self._covering(self._points(X), time, reach, self_reach)[0]
+
     def _points(self, X: Array) -> Array:
         """Return the points that members end at, from node positions (N, 3)."""
         return X if self._ends is None else self._ends(X).reshape(-1, 3)

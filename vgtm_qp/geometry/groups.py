@@ -10,15 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.exact import distance_function, sweep_function
+from vgtm_qp.geometry.exact import SECOND_CONTACT, distance_function, sweep_function
 from vgtm_qp.geometry.shapes import Pieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-SECOND_CONTACT = 0.2
-"""Two contacts of a member with one piece are apart by this fraction of its length, at least."""
-
 
 class Motion(NamedTuple):
     """How far each member (M,) is from where it was, at most, the greatest of that, and the time since."""
@@ -151,6 +147,11 @@ class Group:
         elif self.moving:
             bound -= self.speed[:count] * motion.elapsed
         return bound, float(self.distance[count] - shrink) if count < len(self) else np.inf
+
+    def moved(self, X: Array, reference: Array) -> Array:
+        """Return how much nearer each pair may be at `X` (N, 3) than at `reference`, (C,) m, if obstacles rest."""
+        moved = self._members.moved(X, reference)
+        return moved[self.member] + moved[self.other] if self.is_self else moved[self.member]
 
     def segments(self, X: Array, rows: Index) -> Array:
         """Return the members' ends (k, 6)."""

@@ -23,7 +23,7 @@ from vgtm_qp.step.tracking import HardTracking
 Array = NDArray[np.float64]
 
 
-_MOTION_MARGIN = 3.0
+_MOTION_MARGIN = 2.0
 """A member may move by so many times what is expected of it before a pair that matters can be missed."""
 
 _DEVIATION = 0.1
