@@ -145,7 +145,7 @@ class Clearance:
         return self._ends is None
 
     def candidates(self, X: Array, time: float, reach: float, self_reach: float) -> Candidates:
-        """Return a list with every pair that is nearer than `reach`, or `self_reach` between members, m, at `X` (N, 3)."""
+        """Return a list with every pair nearer than `reach`, or `self_reach` between members, m, at `X` (N, 3)."""
         return self._covering(self._points(X), time, reach, self_reach)[0]
 
     def _points(self, X: Array) -> Array:

@@ -16,6 +16,7 @@ from vgtm_qp.geometry.shapes import Pieces
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+
 class Motion(NamedTuple):
     """How far each member (M,) is from where it was, at most, the greatest of that, and the time since."""
 

@@ -142,9 +142,7 @@ class Watch:
             which = Pair(int(members[k]), int(others[k]), bool(is_self[k]))
             return self._monitor.names.clearance(which)
 
-        contacts = Contacts(
-            pair, found[:, 0], found[:, 1:5], found[:, 5:8], self._nodes[pair], is_self, name
-        )
+        contacts = Contacts(pair, found[:, 0], found[:, 1:5], found[:, 5:8], self._nodes[pair], is_self, name)
         if len(rows):
             if contacts.distance.min() <= 0.0:
                 return None

@@ -14,11 +14,10 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import SLACK_CURVATURE, CurveNumbers, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import SLACK_CURVATURE, UNBOUNDED, CurveNumbers, StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 
-UNBOUNDED = 1e30
 FEASIBILITY = 1e-10
 
 

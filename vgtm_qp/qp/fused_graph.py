@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from vgtm_qp.qp.graph import Constants, Frames, Stage, TrussGraph
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.numbers import CLOSED, SHORT_WAY, UNBOUNDED
+from vgtm_qp.qp.settle import AT_BOUND, WORST_CONDITION
 
 Array = NDArray[np.float64]
 
-NEWTON_STEPS = 2
 SETTLING_STEPS = 3
 
 _AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
@@ -45,46 +46,86 @@ class _Symbols:
 def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
     """Return the function that closes the lengths of an arm and brings its tip to its goal.
 
-    Arguments: X (3, N); lower, upper (n_a); goal position (3) and rotation (3, 3); gain (3 N, n_e), node
-    displacements per unit of tip error.
+    Arguments: X (3, N); lower, upper (n_a); goal position (3) and rotation (3, 3); and of the QP before: least and
+    greatest change of the actuators (n_a, and more that is not read) and the change chosen (n_a); R of `row_function`;
+    (n_a, n_a) Gram matrix of the weighted node displacements in it; tip rows (n_a + q + 1, n_e).
 
-    Results: X, whose fixed members have their home lengths and whose actuators are in their boxes; lengths there;
-    their worst error; tip position; tip rotation; tip errors (n_e, 2) before the gain was first used and at the end.
+    Results: X, whose fixed members have their home lengths and whose actuators are in their boxes; lengths there; tip
+    position; tip rotation; worst error of the lengths, and of the tip before the gain of :mod:`vgtm_qp.qp.settle` was
+    first used and at the end (3).
     """
     symbols, truss = _Symbols(layout), layout.truss
     graph = TrussGraph(layout, stages, symbols.constants)
     frames = _tip_frames(layout, symbols.constants) if layout.has_tip_frame else None
     goal, turned = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
-    gain = ca.MX.sym("gain", 3 * truss.node_count, len(layout.tip_rows))
-    actuators = truss.actuators.tolist()
+    actuators, count = truss.actuators.tolist(), len(truss.actuators)
+    size, tip_rows = count + layout.free_curve + 1, len(layout.tip_rows)
+    low, high = (ca.MX.sym(name, size + tip_rows) for name in ("low", "high"))
+    chosen, gram = ca.MX.sym("chosen", count), ca.MX.sym("gram", count, count)
+    rows = ca.MX.sym("R", layout.least_squares, size)
+    across = ca.MX.sym("tip", size, tip_rows)
+    weights = layout.weights
+    scale = symbols.constants.add(
+        "scale", np.array([weights.actuator_rate + weights.stroke_centring, 1.0 / np.sqrt(weights.node_rate)])
+    )
 
     def aims(lengths: ca.MX) -> ca.MX:
         aim = symbols.home_lengths * 1.0
         aim[actuators] = ca.fmax(symbols.lower, ca.fmin(symbols.upper, lengths[actuators]))
         return aim
 
-    def closed(X: ca.MX, steps: int) -> ca.MX:
-        for _ in range(steps):
-            lengths, gradients = graph.lengths(X)
-            X = graph.newton(X, aims(lengths), lengths, gradients)
-        return X
+    def closed(X: ca.MX) -> ca.MX:
+        lengths, gradients = graph.lengths(X)
+        return graph.newton(X, aims(lengths), lengths, gradients)
 
     def tip(X: ca.MX) -> tuple[ca.MX, ca.MX]:
         position = X[:, truss.tip.tolist()] @ ca.DM(truss.tip_weights)
         return position, ca.MX.eye(3) if frames is None else frames.at(X)[0]
 
-    X = closed(symbols.X, NEWTON_STEPS)
+    X = closed(closed(symbols.X))
     first = error = _tip_error(layout.tip_rows, *tip(X), goal, turned)
-    for step in range(SETTLING_STEPS):
-        X = X + ca.reshape(gain @ error, 3, truss.node_count)
-        X = closed(X, NEWTON_STEPS if step == SETTLING_STEPS - 1 else 1)
+    if not layout.hard_rows:
+        free = ca.logic_and(chosen > low[:count] + AT_BOUND, chosen < high[:count] - AT_BOUND)
+        stretch = _gain(gram, scale[0], across[:count, :], free)
+        response = scale[1] * (rows[: layout.node_columns, :count] @ stretch)
+        place = {int(node): 3 * k for k, node in enumerate(truss.free)}
+    for _ in range(SETTLING_STEPS):
+        if not layout.hard_rows:
+            moved = response @ error
+            X = X + ca.horzcat(
+                *(
+                    moved[place[n] : place[n] + 3] if n in place else ca.DM.zeros(3)
+                    for n in range(truss.node_count)
+                )
+            )
+        X = closed(X)
         position, rotation = tip(X)
         error = _tip_error(layout.tip_rows, position, rotation, goal, turned)
     lengths, _ = graph.lengths(X)
-    worst = ca.norm_inf(aims(lengths) - lengths)
-    outputs = [X, lengths, worst, position, ca.densify(rotation), ca.horzcat(first, error)]
-    inputs = [symbols.X, symbols.lower, symbols.upper, goal, turned, gain, *symbols.constants.symbols]
-    return Bound(ca.Function("settle", inputs, outputs), symbols.constants.values)
+    worst = ca.vertcat(ca.norm_inf(aims(lengths) - lengths), ca.norm_inf(first), ca.norm_inf(error))
+    inputs = [symbols.X, symbols.lower, symbols.upper, goal, turned, low, high, chosen, rows, gram, across]
+    outputs = [X, lengths, position, ca.densify(rotation), worst]
+    return Bound(
+        ca.Function("settle", [*inputs, *symbols.constants.symbols], outputs), symbols.constants.values
+    )
+
+
+def _gain(gram: ca.MX, stiffness: ca.MX, tip: ca.MX, free: ca.MX) -> ca.MX:
+    """Return (n_a, n_e) actuator displacements per unit of tip error as `settling_gain` does; zeros where it has none.
+
+    An actuator that is not `free` (n_a) stands in the system as an equation of its own.
+    """
+    count, rows = tip.shape
+    mask = ca.if_else(free, 1.0, 0.0)
+    hessian = gram * (mask @ mask.T) + ca.diag(mask * (stiffness - 1.0) + 1.0)
+    reached = tip * ca.repmat(mask, 1, rows)
+    answer = ca.solve(hessian, reached, "ldl")
+    normal = reached.T @ answer
+    shares = ca.inv(normal)
+    usable = ca.logic_and(
+        ca.norm_inf(ca.vec(shares)) * ca.norm_inf(ca.vec(normal)) < WORST_CONDITION, ca.sum1(mask) >= rows
+    )
+    return ca.if_else(usable, answer @ shares, ca.DM.zeros(count, rows))
 
 
 def _tip_error(names: tuple[str, ...], position: ca.MX, rotation: ca.MX, goal: ca.MX, turned: ca.MX) -> ca.MX:
@@ -109,11 +150,13 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
     """Return the function that linearises and condenses the QP of a step.
 
     Arguments: X, Y (3, N), where residuals and where Jacobians are evaluated; base (3, N), positions that base nodes
-    take; p (3, V); lower, upper (n_a); motion, 1 for the QP that moves the arm and 0 for corrections.
+    take; p (3, V); lower, upper (n_a); motion, 1 for the QP that moves the arm and 0 for corrections; progress; goal
+    position (3) and rotation (3, 3) there; velocity and spin (3) of the goal per unit of progress.
 
-    Results: R (3 (N - N_c) + 5 K, n_a + q + 1), whose Gram matrix is the objective's; tip spin and position rows
-    (6, n_a + 1); actuator box and gradient (n_a, 3); tip position (3); tip rotation (3, 3); gradient of the curve's
-    own objectives (q); offsets (3, V) of the control vertices; base normal (3).
+    Results: R (3 (N - N_c) + 5 K, n_a + q + 1), whose Gram matrix is the objective's, the last row and column but for
+    the progress its gradient; tip rows (n_a + q + 1, n_e); lower and upper bounds (n_a + q + 1 + n_e) of the unknowns
+    and tip rows; what else there is of the gradient (n_a + q + 1); curvature of the progress; offsets (3, V) of the
+    control vertices; base normal (3).
 
     Where the curve is more than its tables, ``CurveRows`` are arguments too, after `motion`, transposed as CasADi reads
     them; then there are R rows of turns for each of the K faces and S rows of spacing.
@@ -124,8 +167,10 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
     X, Y = symbols.X, ca.MX.sym("Y", 3, truss.node_count)
     base, motion = ca.MX.sym("base", 3, truss.node_count), ca.MX.sym("motion")
     vertices = ca.MX.sym("p", 3, layout.vertices)
+    progress, goal, turned = ca.MX.sym("progress"), ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
+    velocity, spin_rate = ca.MX.sym("velocity", 3), ca.MX.sym("spin", 3)
     weights = layout.weights
-    node_rate, centring, tracking, tangent, roll, curve_rate, smoothness, spacing = ca.vertsplit(
+    node_rate, centring, tracking, tangent, roll, curve_rate, smoothness, spacing, eager = ca.vertsplit(
         constants.add(
             "weights",
             np.array(
@@ -138,6 +183,7 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
                     weights.curve_rate,
                     weights.smoothness,
                     weights.spacing,
+                    weights.progress,
                 ]
             ),
         )
@@ -155,11 +201,6 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
 
     actuators = truss.actuators.tolist()
     strokes = lengths[actuators]
-    box = ca.horzcat(
-        symbols.lower - strokes,
-        symbols.upper - strokes,
-        motion * centring * (strokes - symbols.home_lengths[actuators]),
-    )
     place = {int(node): 3 * k for k, node in enumerate(truss.free)}
 
     def displacement(nodes: list[int]) -> ca.MX:
@@ -181,6 +222,16 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
         tip_rows = ca.vertcat(tip_rows, spin @ tip)
     else:
         tip_rows = ca.vertcat(tip_rows, ca.MX.zeros(3, len(actuators) + 1))
+
+    tip_value = X[:, truss.tip.tolist()] @ ca.DM(truss.tip_weights)
+    error = _tip_error(layout.tip_rows, tip_value, rotation, goal, turned)
+    error = ca.if_else(
+        ca.logic_and(motion > 0, ca.norm_inf(error) <= CLOSED), ca.DM.zeros(*error.shape), error
+    )
+    tip_rows = _tracked(layout.tip_rows, tip_rows[:3, :], tip_rows[3:, :], rotation)
+    rate = _tracked(layout.tip_rows, velocity, spin_rate, rotation)
+    way = ca.norm_2(rate)
+    curvature = eager * ca.if_else(way > 1e-6, way * ca.fmax(way, SHORT_WAY), 1.0)
 
     top = ca.sqrt(node_rate) * response
     curve_gradient, offset, normal = ca.MX.zeros(0, 1), ca.MX.zeros(3, 0), ca.MX.zeros(3)
@@ -236,18 +287,51 @@ def row_function(layout: Layout, stages: list[Stage]) -> Bound:
         curve_gradient = ca.vertcat(
             ca.dot(pull[:, 1], normal), ca.vec(pull[:, 2:]), ca.MX.zeros(layout.torsion)
         )
-    inputs = [X, Y, base, vertices, symbols.lower, symbols.upper, motion, *told, *constants.symbols]
+    free = layout.free_curve
+    unbounded = ca.DM.ones(free) * UNBOUNDED
+    value = error - tip_rows[:, -1]
     results = [
         ca.vertcat(top, *gaps, *tilts),
-        tip_rows,
-        box,
-        X[:, truss.tip.tolist()] @ ca.DM(truss.tip_weights),
-        rotation,
-        curve_gradient,
+        ca.horzcat(tip_rows[:, :-1], ca.MX.zeros(len(layout.tip_rows), free), -rate).T,
+        ca.vertcat(symbols.lower - strokes, -unbounded, -progress, value),
+        ca.vertcat(symbols.upper - strokes, unbounded, 1.0 - progress, value),
+        ca.vertcat(
+            motion * centring * (strokes - symbols.home_lengths[actuators]),
+            curve_gradient,
+            curvature * (progress - 2.0),
+        ),
+        curvature,
         offset,
         normal,
     ]
-    return Bound(ca.Function("rows", inputs, [ca.densify(result) for result in results]), constants.values)
+    inputs = [
+        X,
+        Y,
+        base,
+        vertices,
+        symbols.lower,
+        symbols.upper,
+        motion,
+        progress,
+        goal,
+        turned,
+        velocity,
+        spin_rate,
+    ]
+    function = ca.Function(
+        "rows", [*inputs, *told, *constants.symbols], [ca.densify(result) for result in results]
+    )
+    return Bound(function, constants.values)
+
+
+def _tracked(names: tuple[str, ...], position: ca.MX, spin: ca.MX, rotation: ca.MX) -> ca.MX:
+    """Return the tracked rows (n_e, n) from those of the tip's position and spin (3, n), see ``TipTask.residual``."""
+    parts = [position[[_AXES[name] for name in names if name in _AXES], :]]
+    if "tip direction 1" in names:
+        parts.append(rotation[:, :2].T @ spin)
+    elif "tip rotation x" in names:
+        parts.append(spin)
+    return ca.vertcat(*parts)
 
 
 def _tip_frames(layout: Layout, constants: Constants) -> Frames:

@@ -216,7 +216,7 @@ def make_engine(
     if solver == DEFAULT_SOLVER and compiled:
         stages = elimination_stages(layout)
         if stages is not None and len(layout.truss.actuators) <= FUSED_ACTUATORS:
-            return FusedEngine(FusedSolver(layout, stages, task.axes), task)
+            return FusedEngine(FusedSolver(layout, stages))
     linearisation = Linearisation(layout, kinematics, task, layout.truss.home_lengths)
     return PlainEngine(linearisation, make_solver(solver, layout))
 

@@ -24,7 +24,6 @@ from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.step.linearise import Linearisation, Target, base_frame
 from vgtm_qp.step.path import PathPoint
-from vgtm_qp.step.task import TipTask, worth_closing
 
 Array = NDArray[np.float64]
 
@@ -177,13 +176,12 @@ class ElasticEngine(PlainEngine):
 class FusedEngine:
     """One compiled call from positions to QP, for trusses whose bays can be eliminated one after another."""
 
-    def __init__(self, solver: FusedSolver, task: TipTask) -> None:
+    def __init__(self, solver: FusedSolver) -> None:
         self._solver = solver
-        self._task = task
 
     def drawn(self, layout: Layout) -> FusedEngine:
         """Return the engine for a layout that differs in the control vertices with goals alone."""
-        return FusedEngine(self._solver.drawn(layout), self._task)
+        return FusedEngine(self._solver.drawn(layout))
 
     def solve(
         self,
@@ -200,30 +198,30 @@ class FusedEngine:
     ) -> StepSolution:
         """See :class:`Engine`."""
         solver, shape = self._solver, self._solver.layout.general
-        curve = None
+        curve, span = None, target.end - target.start
         if shape is not None:
             frame = base_frame(solver.layout.truss, target.base_rotation)
             curve = shape.rows(vertices, np.zeros(0) if torsion is None else torsion, frame)
         solver.load(
             X,
             Y,
-            X if target.base is None else target.base,
             vertices,
             target.lower,
             target.upper,
+            TipGoal(goal.position, goal.rotation, goal.velocity * span, goal.spin * span),
+            progress,
             motion=motion,
+            base=target.base,
             curve=curve,
             goals=target.vertex_goals,
         )
-        error, rate, across = self._task.residual(solver.tip_position, solver.tip_rotation, goal)
-        if motion:
-            error = worth_closing(error)
-        return solver.solve(TipGoal(rate * (target.end - target.start), error, across), progress, rows)
+        return solver.solve(rows)
 
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
-        closed, errors = self._solver.settle(X, target.lower, target.upper, goal.position, goal.rotation)
-        before, after = np.abs(errors).max(axis=1).tolist()
+        closed, before, after = self._solver.settle(
+            X, target.lower, target.upper, goal.position, goal.rotation
+        )
         if closed.error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip:
             return closed
         return None
