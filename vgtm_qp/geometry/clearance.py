@@ -144,9 +144,11 @@ class Clearance:
         """Whether members end at nodes: joints have no extent."""
         return self._ends is None
 
-    def candidates(self, X: Array, time: float, reach: float, self_reach: float) -> Candidates:
-        """Return a list with every pair nearer than `reach`, or `self_reach` between members, m, at `X` (N, 3)."""
-        return self._covering(self._points(X), time, reach, self_reach)[0]
+    def every_pair(self, X: Array) -> Candidates:
+        """Return the list of all pairs, with their distances at node positions `X` (N, 3) and time 0."""
+        horizon = np.inf if self.self_collision else None
+        arm = (self._members, self.pieces, self._kernels)
+        return Candidates(*arm, self._points(X), 0.0, np.inf, horizon)
 
     def _points(self, X: Array) -> Array:
         """Return the points that members end at, from node positions (N, 3)."""

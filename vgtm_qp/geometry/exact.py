@@ -19,15 +19,18 @@ from vgtm_qp.geometry.symbolic import Vector, add, at, between, dot, norm, ratio
 SHAPES = ("box", "sphere", "cylinder", "triangle", "segment")
 """Kinds of pieces; a segment is the axis of another member."""
 
-WIDTH = 15
-"""Numbers that describe an obstacle piece, see :func:`parameters_of`."""
-
 
 _LEAST_SQUARE = 0.1
 """Least |n|^2 of a normal between two others that still gives a plane."""
 
+WIDTH = 15
+"""Numbers that describe an obstacle piece, see :func:`parameters_of`."""
+
 CONTACT = 13
 """Numbers that describe a contact, see :func:`follow_function`."""
+
+KNOWN = WIDTH + 4
+"""Numbers that a pair is known by before, see :func:`follow_function`."""
 
 SECOND_CONTACT = 0.2
 """Two contacts of a member with one piece are apart by this fraction of its length, at least."""
@@ -181,7 +184,8 @@ def _turning_gap(
         # (m - c w) / sqrt(1 - k w) falls up to this w and rises after it.
         lowest = ratio(2.0 * bend - square * gap, bend * square, 1.0)
         w = ca.fmin(ca.fmax(lowest, 0.0), 0.25)
-        bound = ca.fmin(bound, (gap - bend * w) / ca.sqrt(ca.fmax(1.0 - square * w, _LEAST_SQUARE)))
+        along = (gap - bend * w) / ca.sqrt(ca.fmax(1.0 - square * w, _LEAST_SQUARE))
+        bound = ca.fmin(bound, ca.fmin(gap, along))
     # Normals that are further apart may be opposite: between them there is no plane.
     return ca.if_else(square <= 4.0 * (1.0 - _LEAST_SQUARE), bound, -FAR)
 
@@ -194,20 +198,21 @@ def _halves(ends: Vector) -> tuple[Vector, Vector]:
 def follow_function(shape: str) -> ca.Function:
     """Return the contacts of a pair after a straight motion, and a lower bound of its distance meanwhile.
 
-    Inputs ``before`` and ``after`` (12,), the ends of the member and those of the other member (ignored for an
-    obstacle, which rests); ``piece (15,)`` (ignored for two members); ``normal (3,)``, unit, best that of the contact
-    before; ``radius``, what surfaces are nearer than axes.
+    Inputs ``ends (24,)``, before and after it for each end of the member, then of the other member (ignored for an
+    obstacle, which rests); and ``known (19,)``: the piece (15; ignored for two members), what surfaces are nearer than
+    axes, and a unit normal (3), best that of the contact before.
 
     Output ``contacts (26,)``: ``CONTACT`` numbers for each of two contacts after the motion: surface distance, weights
     (4,) of the four ends in the normal velocity, normal (3,), t, witness point (3,), and the bound over the motion of
     :func:`_turning_gap`. The second distance is ``FAR`` where there is none worth a row of its own, as is the second
     bound. Where axis and piece intersect the distance is minus `radius` and the rest of no use.
     """
-    before, after = ca.SX.sym("before", 12), ca.SX.sym("after", 12)
-    piece, normal, radius = ca.SX.sym("piece", WIDTH), ca.SX.sym("normal", 3), ca.SX.sym("radius")
-    starts, ends = ca.vertsplit(before), ca.vertsplit(after)
+    both, known = ca.SX.sym("ends", 24), ca.SX.sym("known", KNOWN)
+    points = [ca.vertsplit(both[k : k + 3]) for k in range(0, 24, 3)]
+    starts, ends = sum(points[::2], []), sum(points[1::2], [])
+    piece, radius, normal = ca.vertsplit(known[:WIDTH]), known[WIDTH], ca.vertsplit(known[WIDTH + 1 :])
     mutual = shape == "segment"
-    others = (starts[6:], ends[6:]) if mutual else (ca.vertsplit(piece), ca.vertsplit(piece))
+    others = (starts[6:], ends[6:]) if mutual else (piece, piece)
     c = FORMULAS[shape](ends[:6], others[1], apart=True)
     share = 1.0 if mutual else 0.0
 
@@ -217,11 +222,11 @@ def follow_function(shape: str) -> ca.Function:
 
     second = contact(c.distance_second, c.t_second, c.s_second, c.normal_second)
     second[0] = ca.if_else(ca.fabs(c.t_second - c.t) >= SECOND_CONTACT, second[0], FAR)
-    bound = _turning_gap(shape, (starts[:6], ends[:6]), others, (ca.vertsplit(normal), c.normal))
-    both = ca.vertcat(*contact(c.distance, c.t, c.s, c.normal), bound - radius, *second, FAR)
-    inputs = [before, after, piece, normal, radius]
-    names = ["before", "after", "piece", "normal", "radius"]
-    return ca.Function(f"follow_{shape}", inputs, [ca.densify(ca.cse(both))], names, ["contacts"])
+    bound = _turning_gap(shape, (starts[:6], ends[:6]), others, (normal, c.normal))
+    contacts = ca.vertcat(*contact(c.distance, c.t, c.s, c.normal), bound - radius, *second, FAR)
+    return ca.Function(
+        f"follow_{shape}", [both, known], [ca.densify(ca.cse(contacts))], ["ends", "known"], ["contacts"]
+    )
 
 
 def _travel(a: Vector, b: Vector) -> Any:

@@ -149,11 +149,6 @@ class Group:
             bound -= self.speed[:count] * motion.elapsed
         return bound, float(self.distance[count] - shrink) if count < len(self) else np.inf
 
-    def moved(self, X: Array, reference: Array) -> Array:
-        """Return how much nearer each pair may be at `X` (N, 3) than at `reference`, (C,) m, if obstacles rest."""
-        moved = self._members.moved(X, reference)
-        return moved[self.member] + moved[self.other] if self.is_self else moved[self.member]
-
     def segments(self, X: Array, rows: Index) -> Array:
         """Return the members' ends (k, 6)."""
         return X[self.nodes[rows]].reshape(-1, 6)

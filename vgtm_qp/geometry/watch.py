@@ -1,23 +1,23 @@
-"""The nearest pairs of a scene at rest, followed from state to state by one compiled call.
+"""All pairs of a scene at rest, evaluated only when they may have come near.
 
-A few pairs of each shape, those that may be nearest, are evaluated exactly in every state; the call that does it bounds
-their distances on the way there as well. All the others cannot have come near as long as the arm has moved by less
-than what kept them apart when the few were chosen. Where that does not suffice, :class:`Clearance` is asked.
+Each pair keeps a lower bound of its distance: what it was when it was evaluated last, less what its members have
+travelled since. Where that falls below the distance that matters, one compiled call evaluates the pair and bounds its
+distance on the way from the state before. Far pairs are looked at seldom, near ones in every state, and all of them
+are covered in a dozen array operations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from itertools import accumulate
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.compiled import Kernel, compile_function
-from vgtm_qp.geometry.candidates import Candidates
+from vgtm_qp.compiled import Kernel
+from vgtm_qp.geometry.batch import Batch
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
 from vgtm_qp.geometry.fcl_queries import FclQueries
@@ -28,11 +28,10 @@ from vgtm_qp.geometry.pairs import Pair
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_AHEAD = 1.3
-"""Bounds that keep the pairs that are not watched from less than so many times the limit are renewed."""
-
-_NEVER = -1e9
-"""The radius of a pair that only fills a place, m: it is never near."""
+_MOST_PAIRS = 8000
+_AT_ONCE = 128
+_AHEAD = 1.2
+"""Pairs are evaluated from so many times the distance on that mattered last: it may be larger in the next state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +40,6 @@ class Contacts:
 
     Attributes
     ----------
-    pair : (R,) int
-        Which of the watched pairs each belongs to.
     distance : (R,)
         From surface to surface, m.
     weights : (R, 4)
@@ -56,7 +53,6 @@ class Contacts:
         From a row to the name of its clearance.
     """
 
-    pair: Index
     distance: Array
     weights: Array
     normal: Array
@@ -65,8 +61,65 @@ class Contacts:
     name: Callable[[int], str]
 
 
+class _Pairs:
+    """The pairs of one shape, and what is known of them."""
+
+    def __init__(self, group: Group, parameters: Array, members: int) -> None:
+        self.group, self.is_self = group, group.is_self
+        self.asks_fcl = group.shape in FclQueries.SHAPES
+        self.nodes = np.concatenate([group.nodes, group.other_nodes], axis=1)
+        # Obstacles travel as much as the member behind the last one does: not at all.
+        self.first = group.member
+        self.second = group.other if group.is_self else np.full(len(group), members)
+        piece = np.zeros((len(group), WIDTH)) if group.is_self else parameters[group.other]
+        normal = np.tile([0.0, 0.0, 1.0], (len(group), 1))
+        self.known = np.concatenate([piece, group.radius[:, None], normal], axis=1)
+        self.reach = np.zeros(0)
+        """(C,) distance when evaluated last, plus what both members had travelled by then, m."""
+        self._contacts = Batch(follow_function(group.shape))
+        for count in (1, _AT_ONCE):
+            self._contacts.prepare(count)
+        self.near = np.zeros(0, dtype=np.int64)
+        """Pairs that were evaluated in the present state,"""
+        self.contacts = np.zeros((0, CONTACT))
+        """and their contacts, two for each."""
+        self.lowest = np.inf
+        """Least lower bound of their distances on the way there, m."""
+
+    def look(self, places: Array, lower: Array, limit: float) -> None:
+        """Evaluate the pairs that may be nearer than `limit`, m, in the present state.
+
+        Parameters
+        ----------
+        places : (N, 6)
+            Node positions in the state before and in the present one, m.
+        lower : (C,)
+            Bounds of the distances by what has been travelled, m.
+        """
+        self.near = near = (lower < limit).nonzero()[0]
+        size, lowest, reach = len(near), lower.take(near), self.reach
+        arguments = (
+            places.take(self.nodes.take(near, axis=0), axis=0).reshape(size, 24),
+            self.known.take(near, axis=0),
+        )
+        if size <= _AT_ONCE:
+            found = self._contacts(*arguments)
+        else:
+            parts = [slice(k, k + _AT_ONCE) for k in range(0, size, _AT_ONCE)]
+            found = np.concatenate([self._contacts(*(a[part] for a in arguments)) for part in parts])
+        self.contacts = found.reshape(2 * size, CONTACT)
+        self.known[near, WIDTH + 1 :] = found[:, 5:8]
+        reach[near] = found[:, 0] + (reach.take(near) - lowest)
+        # What it had been proven to be without looking holds as well.
+        self.lowest = float(np.maximum(found[:, CONTACT - 1], lowest).min())
+
+    def pass_over(self) -> None:
+        """Note that no pair is near."""
+        self.near, self.lowest = self.near[:0], np.inf
+
+
 class Watch:
-    """Keeps the pairs that are nearest; one thread at a time.
+    """Keeps all pairs of a small scene at rest; one thread at a time.
 
     Parameters
     ----------
@@ -76,208 +129,154 @@ class Watch:
 
     def __init__(self, monitor: Clearance) -> None:
         self._monitor = monitor
-        shapes = sorted(set(monitor.pieces.shape.tolist()))
-        self._shapes = (*shapes, "segment") if monitor.self_collision else tuple(shapes)
-        sizes = [_capacity(shape) for shape in self._shapes]
-        self._places = dict(zip(self._shapes, accumulate([0, *sizes]), strict=False))
-        count = sum(sizes)
-        self._kernel = Kernel(_followed(self._shapes), compiled=False)
-        self._before, self._after, self._piece, self._normal, self._radius = (
-            array.reshape(count, -1) for array in self._kernel.inputs
-        )
-        self._after_flat = self._kernel.inputs[1]
-        self._contacts = self._kernel.outputs[0].reshape(2 * count, CONTACT)
-        self._distance = self._contacts[:, 0]
-        self._first_normals = self._contacts[::2, 5:8]
-        self._bound = self._contacts[:, CONTACT - 1]
-        rows = 2 * np.array(sizes)
-        self._is_self = np.repeat([shape == "segment" for shape in self._shapes], rows)
-        self._asked = np.repeat([shape in FclQueries.SHAPES for shape in self._shapes], rows)
-        self._limits: tuple[float, float] | None = None
-        self._limit = np.zeros(2 * count)
-        self._floors: tuple[float, float] | None = None
-        self._floor = np.zeros(2 * count)
-        self._nodes = np.zeros((count, 4), dtype=np.int64)
-        self._gather = np.zeros(12 * count, dtype=np.int64)
-        self._member = np.zeros(count, dtype=np.int64)
-        self._other = np.zeros(count, dtype=np.int64)
-        self._listed: Candidates | None = None
-        self._bounds: list[_Bounds] = []
-        self._reference: Array | None = None
-        self._rest, self._rest_self = -np.inf, -np.inf
-        self._at: Array | None = None
-        self._moved = 0.0
+        self._pairs: list[_Pairs] = []
+        self._parts: list[slice] = []
+        self._bounds: Kernel | None = None
+        self._at, self._places = np.zeros((0, 3)), np.zeros((0, 6))
+        self._limits = self._wanted = (-np.inf, -np.inf)
 
     @staticmethod
     def serves(monitor: Clearance) -> bool:
-        """Whether nothing moves but the arm, members end at their nodes, and obstacles are not meshes."""
-        shapes = set(monitor.pieces.shape.tolist())
-        simple = not monitor.pieces.moving and monitor.ends_at_nodes and "triangle" not in shapes
-        return simple and bool(shapes or monitor.self_collision)
+        """Whether nothing moves but the arm, members end at their nodes, there are no meshes and not too many pairs."""
+        members, pieces = len(monitor.members), monitor.pieces
+        simple = not pieces.moving and monitor.ends_at_nodes and "triangle" not in pieces.shape
+        count = members * len(pieces) + (members * (members - 1) // 2 if monitor.self_collision else 0)
+        return simple and 0 < count <= _MOST_PAIRS
 
     def near(self, X: Array, limit: float, self_limit: float, fcl_reach: float) -> Contacts | None:
-        """Return all contacts nearer than `limit`, or `self_limit` between members, m.
-
-        None where they are too many, or surfaces overlap.
+        """Return all contacts nearer than `limit`, or `self_limit` between members, m; None where surfaces overlap.
 
         Parameters
         ----------
         X : (N, 3)
             Node positions, m. Not to be written to afterwards: a state is known by its array.
         fcl_reach : float
-            Surface distance from which on obstacles are asked of FCL too, m.
+            Surface distance below which obstacles are asked of FCL too, m.
         """
-        if not self._covers(X, limit, self_limit):
-            self._choose(X, limit, self_limit)
-            if not self._covers(X, limit, self_limit):
-                return None
-        if self._limits != (limit, self_limit):
-            self._limits = limit, self_limit
-            self._limit[:] = np.where(self._is_self, self_limit, limit)
-        rows = (self._distance < self._limit).nonzero()[0]
-        found, pair = self._contacts[rows], rows >> 1
-        members, others, is_self = self._member[pair], self._other[pair], self._is_self[rows]
-
-        def name(k: int) -> str:
-            which = Pair(int(members[k]), int(others[k]), bool(is_self[k]))
-            return self._monitor.names.clearance(which)
-
-        contacts = Contacts(pair, found[:, 0], found[:, 1:5], found[:, 5:8], self._nodes[pair], is_self, name)
-        if len(rows):
-            if contacts.distance.min() <= 0.0:
-                return None
-            self._ask_fcl(rows, contacts, fcl_reach)
-        return contacts
+        if X is not self._at or limit > self._limits[0] or self_limit > self._limits[1]:
+            self._look(X, limit, self_limit)
+        self._wanted = _AHEAD * limit, _AHEAD * self_limit
+        parts = []
+        for pairs in self._pairs:
+            if len(pairs.near):
+                limit_here = self_limit if pairs.is_self else limit
+                rows = (pairs.contacts[:, 0] < limit_here).nonzero()[0]
+                if len(rows):
+                    parts.append(self._contacts(pairs, rows, fcl_reach))
+        if not parts:
+            return _NONE
+        found = parts[0] if len(parts) == 1 else _join(*parts)
+        return found if found.distance.min() > 0.0 else None
 
     def follow(self, start: Array, end: Array, floor: float, self_floor: float) -> bool:
         """Return whether no surface distance falls below its floor, m, while nodes move straight from `start` to `end`.
 
         False may also mean that this was not proven. Arrays (N, 3) as in :meth:`near`.
         """
+        limits = max(self._wanted[0], floor), max(self._wanted[1], self_floor)
         if start is not self._at:
-            if self._reference is None:
-                return False
-            self._look(start)
-        moved = self._moved
-        self._look(end)
-        moved = max(moved, self._moved)
-        if self._floors != (floor, self_floor):
-            self._floors = floor, self_floor
-            self._floor[:] = np.where(self._is_self, self_floor, floor)
+            self._look(start, *limits)
+        self._look(end, *limits)
         # Negated comparisons also catch what is not a number.
-        return bool(
-            (self._bound >= self._floor).all()
-            and self._rest - moved >= floor
-            and self._rest_self - 2.0 * moved >= self_floor
-        )
+        floors = {False: floor, True: self_floor}
+        return all(pairs.lowest >= floors[pairs.is_self] for pairs in self._pairs)
 
-    def _covers(self, X: Array, limit: float, self_limit: float) -> bool:
-        """Evaluate the watched pairs at `X`; whether all others are further than the limits."""
-        if X is not self._at:
-            if self._reference is None:
-                return False
-            self._look(X)
-        return self._rest - self._moved >= limit and self._rest_self - 2.0 * self._moved >= self_limit
+    def _look(self, X: Array, limit: float, self_limit: float) -> None:
+        """Evaluate what may be nearer than the limits, m, at `X` and go on from there."""
+        bounds = self._bounds if self._bounds is not None else self._start(X)
+        inputs, (travel, lower, lowest) = bounds.inputs, bounds.outputs
+        inputs[0][:] = X.reshape(-1)
+        self._places[:, :3] = self._at
+        self._places[:, 3:] = X
+        bounds()
+        least = lowest.tolist()
+        for k, pairs in enumerate(self._pairs):
+            nearer_than = self_limit if pairs.is_self else limit
+            # A negated comparison also catches what is not a number.
+            if least[k] >= nearer_than:
+                pairs.pass_over()
+            else:
+                pairs.look(self._places, lower[self._parts[k]], nearer_than)
+        inputs[1][:] = inputs[0]
+        inputs[2][:] = travel
+        self._at, self._limits = X, (limit, self_limit)
 
-    def _look(self, X: Array) -> None:
-        """Evaluate the watched pairs at `X`, and their bounds on the way there from where they were."""
-        self._before[:] = self._after
-        self._normal[:] = self._first_normals
-        X.take(self._gather, out=self._after_flat, mode="clip")
-        self._kernel()
-        shift = X - self._reference
-        self._moved = float(np.einsum("nc,nc->n", shift, shift).max()) ** 0.5
-        self._at = X
+    def _start(self, X: Array) -> Kernel:
+        """List all pairs, with their distances at `X`."""
+        monitor = self._monitor
+        groups = monitor.every_pair(X).groups
+        parameters, members = monitor.pieces.parameters, len(monitor.members)
+        self._pairs = [_Pairs(group, parameters, members) for group in groups]
+        ends = np.cumsum([0, *map(len, groups)])
+        self._parts = [slice(a, b) for a, b in pairwise(ends.tolist())]
+        self._bounds = kernel = Kernel(_bound_function(monitor.members, self._pairs, len(X)), compiled=False)
+        kernel.inputs[1][:] = X.reshape(-1)
+        kernel.inputs[3][:] = np.concatenate([group.distance for group in groups])
+        for pairs, part in zip(self._pairs, self._parts, strict=True):
+            pairs.reach = kernel.inputs[3][part]
+        self._at, self._places = X, np.zeros((len(X), 6))
+        return kernel
 
-    def _choose(self, X: Array, limit: float, self_limit: float) -> None:
-        """Watch the pairs that may be nearest at `X` from now on."""
-        candidates = self._monitor.candidates(X, 0.0, limit, self_limit)
-        if candidates is not self._listed:
-            self._listed = candidates
-            self._bounds = [_Bounds(group, candidates.reference) for group in candidates.groups]
-        rests = list(candidates.beyond(candidates.motion(X, 0.0)))
-        self._radius[:] = _NEVER
-        self._gather[:] = 0
-        for bounds in self._bounds:
-            group = bounds.group
-            place, count = self._places[group.shape], _capacity(group.shape)
-            chosen, rest = bounds.nearest(X, count, _AHEAD * (self_limit if group.is_self else limit))
-            rests[group.is_self] = min(rests[group.is_self], rest)
-            self._fill(slice(place, place + len(chosen)), group, chosen)
-        self._rest, self._rest_self = rests
-        self._reference = X
-        self._look(X)
+    def _contacts(self, pairs: _Pairs, rows: Index, fcl_reach: float) -> Contacts:
+        found, pair = pairs.contacts.take(rows, axis=0), pairs.near.take(rows >> 1)
+        group = pairs.group
 
-    def _fill(self, rows: slice, group: Group, chosen: Index) -> None:
-        """Let the watched pairs `rows` be those of a group that are `chosen`."""
-        nodes = np.concatenate([group.nodes[chosen], group.other_nodes[chosen]], axis=1)
-        self._gather.reshape(-1, 4, 3)[rows] = 3 * nodes[..., None] + np.arange(3)
-        self._radius[rows, 0] = group.radius[chosen]
-        self._member[rows], self._other[rows] = group.member[chosen], group.other[chosen]
-        self._nodes[rows] = nodes
-        if not group.is_self:
-            self._piece[rows] = self._monitor.pieces.parameters[group.other[chosen]]
+        def name(k: int) -> str:
+            which = Pair(int(group.member[pair[k]]), int(group.other[pair[k]]), group.is_self)
+            return self._monitor.names.clearance(which)
 
-    def _ask_fcl(self, rows: Index, contacts: Contacts, reach: float) -> None:
-        """Take FCL's witness points for obstacles nearer than `reach`, where a nearest point is unique."""
-        near = (contacts.distance < reach) & self._asked[rows]
-        if not near.any():
-            return
-        for k in near.nonzero()[0].tolist():
-            row, pair = int(rows[k]), int(contacts.pair[k])
-            if row % 2 or self._distance[row + 1] < FAR:
-                continue
-            axis_distance = float(contacts.distance[k] + self._radius[pair, 0])
-            ends = self._after[pair, :6].tolist()
-            found = self._monitor.fcl.witness(int(self._other[pair]), ends, axis_distance)
-            if found is not None:
-                t, contacts.normal[k], _ = found
-                contacts.weights[k, :2] = 1.0 - t, t
+        is_self = np.full(len(rows), group.is_self)
+        distance, normal, weights = found[:, 0], found[:, 5:8], found[:, 1:5]
+        if pairs.asks_fcl:
+            for k in (distance < fcl_reach).nonzero()[0].tolist():
+                # Where the nearest point is not unique, FCL may give one between the two ends of the contact.
+                if rows[k] % 2 == 0 and pairs.contacts[rows[k] + 1, 0] >= FAR:
+                    member = int(pair[k])
+                    ends = self._at[group.nodes[member]].reshape(-1).tolist()
+                    apart = float(distance[k] + group.radius[member])
+                    answer = self._monitor.fcl.witness(int(group.other[member]), ends, apart)
+                    if answer is not None:
+                        t, normal[k], _ = answer
+                        weights[k, :2] = 1.0 - t, t
+        return Contacts(distance, weights, normal, pairs.nodes.take(pair, axis=0), is_self, name)
 
 
-def _capacity(shape: str) -> int:
-    """Return how many pairs of a shape are watched: two members that share no node are seldom near."""
-    return 24 if shape == "segment" else 40
+_NONE = Contacts(
+    np.zeros(0),
+    np.zeros((0, 4)),
+    np.zeros((0, 3)),
+    np.zeros((0, 4), dtype=np.int64),
+    np.zeros(0, dtype=bool),
+    str,
+)
 
 
-class _Bounds:
-    """Lower bounds of the distances of all pairs of a shape: exact at some state, less by what has moved since."""
+def _bound_function(members: Index, every: list[_Pairs], nodes: int) -> ca.Function:
+    """Return the function that bounds the distances of all pairs after a motion.
 
-    def __init__(self, group: Group, reference: Array) -> None:
-        self.group, self._reference, self._distance = group, reference, group.distance
+    Arguments: node positions after and before it (3, N); what members had travelled before, m, and a zero (M + 1);
+    reaches (C). Results: what they have travelled; lower bounds of the distances (C); the least one of each shape.
 
-    def nearest(self, X: Array, count: int, enough: float) -> tuple[Index, float]:
-        """Return the `count` pairs with the lowest bounds at `X` (N, 3), and what the others are apart at least, m.
-
-        Where that is not `enough`, m, the distances are evaluated anew.
-        """
-        group = self.group
-        if len(group) <= count:
-            return np.arange(len(group)), np.inf
-        for lower in (self._distance - group.moved(X, self._reference), None):
-            if lower is None:
-                self._reference = X
-                lower = self._distance = group.contacts(X, 0.0, np.arange(len(group))).distance
-            order = np.argpartition(lower, count)
-            rest = float(lower[order[count]])
-            if rest >= enough:
-                break
-        return order[:count], rest
-
-
-@cache
-def _followed(shapes: tuple[str, ...]) -> ca.Function:
-    """Return ``follow_function`` over the watched pairs of all shapes, compiled; once for all of a process.
-
-    Arguments: before, after (12, K), piece (15, K), normal (3, K), radius (1, K). Result: contacts (26, K).
+    It is a dozen operations on whole arrays, which the virtual machine does as fast as machine code.
     """
-    count = sum(map(_capacity, shapes))
-    widths = {"before": 12, "after": 12, "piece": WIDTH, "normal": 3, "radius": 1}
-    arguments = [ca.MX.sym(name, width, count) for name, width in widths.items()]
-    parts, place = [], 0
-    for shape in shapes:
-        size = _capacity(shape)
-        parts.append(follow_function(shape).map(size)(*(a[:, place : place + size] for a in arguments)))
-        place += size
-    name = "follow_" + "_".join(shapes)
-    return compile_function(ca.Function(name, arguments, [ca.horzcat(*parts)], list(widths), ["contacts"]))
+    X, before = ca.MX.sym("X", 3, nodes), ca.MX.sym("before", 3, nodes)
+    travel = ca.MX.sym("travel", len(members) + 1)
+    reach = ca.MX.sym("reach", sum(len(pairs.group) for pairs in every))
+    moved = ca.sqrt(ca.sum1((X - before) ** 2))
+    further = ca.fmax(*(moved[members[:, end].tolist()] for end in (0, 1)))
+    travelled = travel + ca.vertcat(ca.vec(further), 0.0)
+    first, second = (
+        np.concatenate(ends).tolist() for ends in zip(*((p.first, p.second) for p in every), strict=True)
+    )
+    lower = reach - travelled[first] - travelled[second]
+    parts = ca.vertsplit(lower, [0, *np.cumsum([len(pairs.group) for pairs in every]).tolist()])
+    least = ca.vertcat(*map(ca.mmin, parts))
+    return ca.Function("bounds", [X, before, travel, reach], [travelled, lower, least])
+
+
+def _join(*parts: Contacts) -> Contacts:
+    """Return the contacts of two or more shapes, one after the other."""
+    names = [(part.name, k) for part in parts for k in range(len(part.distance))]
+    arrays = ("distance", "weights", "normal", "nodes", "is_self")
+    joined = {array: np.concatenate([getattr(part, array) for part in parts]) for array in arrays}
+    return Contacts(**joined, name=lambda k: names[k][0](names[k][1]))

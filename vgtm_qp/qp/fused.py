@@ -299,7 +299,7 @@ class FusedSolver:
         flat += self._row_start[:near]
         # Sums what stands at one place: a row may name a node twice.
         spread = np.bincount(flat.reshape(-1), clearance.coefficients.reshape(-1), near * width)
-        return spread.reshape(near, width)[:, :-3]
+        return np.asarray(spread.reshape(near, width)[:, :-3], dtype=float)
 
 
 def _as_slice(nodes: NDArray[np.int64]) -> slice | NDArray[np.int64]:

@@ -16,7 +16,7 @@ from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.step.engine import Accuracy, Engine
 from vgtm_qp.step.linearise import Target
 from vgtm_qp.step.separation import Separation, Shortfall
-from vgtm_qp.step.state import State, frozen
+from vgtm_qp.step.state import State, sealed
 from vgtm_qp.step.task import TipTask
 from vgtm_qp.step.tracking import HardTracking
 
@@ -116,12 +116,12 @@ class Outcome:
         duration = self.time - before.time
         return State(
             time=self.time,
-            nodes=frozen(self.closed.X),
-            control_vertices=frozen(self.control_vertices),
-            torsion=frozen(self.torsion),
-            lengths=frozen(self.closed.lengths),
-            length_rates=frozen((self.closed.lengths - before.lengths) / duration),
-            motion=frozen(self.closed.X - before.nodes),
+            nodes=sealed(self.closed.X),
+            control_vertices=sealed(self.control_vertices),
+            torsion=sealed(self.torsion),
+            lengths=sealed(self.closed.lengths),
+            length_rates=sealed((self.closed.lengths - before.lengths) / duration),
+            motion=sealed(self.closed.X - before.nodes),
             duration=duration,
             shortfall=self.shortfall,
         )

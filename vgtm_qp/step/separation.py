@@ -28,7 +28,7 @@ Index = NDArray[np.int64]
 Shortfall = Mapping[Pair, float]
 """Pairs that are nearer than they may be, with their distances, m."""
 
-_BINDING = 0.01
+_BINDING = 0.002
 """Pairs that are nearer than this to their floor, m, are asked of FCL too."""
 
 _MOST_PIECES = 16

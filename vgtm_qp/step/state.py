@@ -20,6 +20,13 @@ def frozen(array: Array) -> Array:
     return copy
 
 
+def sealed(array: Array) -> Array:
+    """Return `array` itself, contiguous and read-only from now on: for one that nobody else writes to."""
+    array = np.ascontiguousarray(array)
+    array.flags.writeable = False
+    return array
+
+
 @dataclass(frozen=True, eq=False)
 class State:
     """Where the arm is.
