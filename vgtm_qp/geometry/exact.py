@@ -208,8 +208,8 @@ def follow_function(shape: str) -> ca.Function:
     bound. Where axis and piece intersect the distance is minus `radius` and the rest of no use.
     """
     both, known = ca.SX.sym("ends", 24), ca.SX.sym("known", KNOWN)
-    points = [ca.vertsplit(both[k : k + 3]) for k in range(0, 24, 3)]
-    starts, ends = sum(points[::2], []), sum(points[1::2], [])
+    points = ca.reshape(both, 3, 8)
+    starts, ends = (ca.vertsplit(ca.vec(points[:, k::2])) for k in (0, 1))
     piece, radius, normal = ca.vertsplit(known[:WIDTH]), known[WIDTH], ca.vertsplit(known[WIDTH + 1 :])
     mutual = shape == "segment"
     others = (starts[6:], ends[6:]) if mutual else (piece, piece)

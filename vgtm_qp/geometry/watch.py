@@ -270,7 +270,8 @@ def _bound_function(members: Index, every: list[_Pairs], nodes: int) -> ca.Funct
     )
     lower = reach - travelled[first] - travelled[second]
     parts = ca.vertsplit(lower, [0, *np.cumsum([len(pairs.group) for pairs in every]).tolist()])
-    least = ca.vertcat(*map(ca.mmin, parts))
+    # What is not a number must not be passed over: a least of numbers would leave it out.
+    least = ca.vertcat(*map(ca.mmin, parts)) + 0.0 * ca.sumsqr(X - before)
     return ca.Function("bounds", [X, before, travel, reach], [travelled, lower, least])
 
 

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.condensed import FEASIBILITY, InfeasibleStepError, check_answer
-from vgtm_qp.qp.fused_graph import Bound, row_function, settle_function
+from vgtm_qp.qp.condensed import FEASIBILITY, InfeasibleStepError, check_answer, refuse_large
+from vgtm_qp.qp.fused_graph import NEAR, Bound, row_function, settle_function
 from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepSolution
@@ -67,6 +67,32 @@ def _bound_kernel(bound: Bound) -> Kernel:
     return kernel
 
 
+class Taken(NamedTuple):
+    """Where the answer of a QP leads.
+
+    Attributes
+    ----------
+    solution : StepSolution
+        Whose ``nodes`` are positions, not displacements, m.
+    closed : Closed
+        With the tip at its goal.
+    vertices : (V, 3)
+        The curve, m.
+    progress, moved : float
+        Progress along the path, and the greatest displacement of a coordinate by the answer, m.
+    before, after : float
+        The tip's errors before and after it was settled, m and rad.
+    """
+
+    solution: StepSolution
+    closed: Closed
+    vertices: Array
+    progress: float
+    moved: float
+    before: float
+    after: float
+
+
 class FusedSolver:
     """Linearises, condenses and solves; for arms with `elimination_stages`."""
 
@@ -91,12 +117,17 @@ class FusedSolver:
         self._scale = 1.0 / np.sqrt(layout.weights.node_rate)
         self._width = nodes + 3
         self._place = 3 * np.where(truss.base, len(truss.free), layout.node_column // 3)
-        self._free = _as_slice(truss.free)
-
         self._settled = settled = _bound_kernel(settle_function(layout, stages))
-        self._chosen, self._gram = settled.inputs[7], settled.inputs[9].reshape(actuators, actuators)
-        settled.bind_input(8, out[0])
-        self._reserve(size + 64)
+        for argument, shared in enumerate((0, 4, 5, 8, 9, 10, 11, 7)):
+            settled.bind_input(argument, self._rows.inputs[shared])
+        for argument, result in ((8, 0), (12, 6), (13, 7)):
+            settled.bind_input(argument, out[result])
+        settled.bind_input(14, self._rows.inputs[3])
+        settled.bind_input(15, self._hessian)
+        settled.bind_input(16, self._gradient)
+        self._answer, self._multipliers = settled.inputs[17], settled.inputs[18]
+        self._gram, self._taken = settled.inputs[19].reshape(actuators, actuators), settled.inputs[20]
+        self._reserve(size + self._tip + self._hard + NEAR)
         self._draw(layout)
         if self._hard:
             self._soft = np.ones(self._stack.shape[1])
@@ -166,50 +197,29 @@ class FusedSolver:
         InfeasibleStepError, SolverError
             As ``CondensedSolver.solve``.
         """
-        size, count, hard, near = self._size, self._actuators, self._hard, len(clearance)
-        hessian, gradient = self._assemble()
-        first = self._tip + hard
-        rows = first + near
-        if size + rows > len(self._lower):
-            self._reserve(2 * (size + rows))
-        constraint = self._constraint[:rows]
-        lower, upper, sense = (
-            self._lower[: size + rows],
-            self._upper[: size + rows],
-            self._sense[: size + rows],
-        )
-        if hard:
-            block = self._stack[:, self.layout.node_columns : self.layout.node_columns + hard]
-            constraint[self._tip : first, :-1] = block[:-1].T
-            upper[size + self._tip : size + first] = lower[size + self._tip : size + first] = -block[-1]
-        if near:
-            spread = self._spread_rows(clearance)
-            answer = np.dot(spread, self._response.T)
-            answer *= self._scale
-            constraint[first:, :count] = answer[:, :count]
-            np.subtract(clearance.lower, answer[:, -1], out=lower[size + first :])
-        x, _, flag, info = daqp.solve(
-            hessian, gradient, constraint, upper, lower, sense, primal_tol=FEASIBILITY, eps_prox=0.0
-        )
-        if flag == -1:
-            raise InfeasibleStepError("the hard rows of the step contradict one another")
-        multipliers = info["lam"]
-        check_answer(x, multipliers, flag, hessian, gradient, constraint, lower, upper)
-        chosen = x[:count]
-        self._chosen[:] = chosen
-
+        x, flag, info = self.ask(clearance)
+        multipliers, rows = info["lam"], self._tip + self._hard + len(clearance)
+        bounds = self._lower[: self._size + rows], self._upper[: self._size + rows]
+        check_answer(x, multipliers, flag, self._hessian, self._gradient, self._constraint[:rows], *bounds)
+        count = self._actuators
         nodes = np.zeros((self.layout.truss.node_count, 3))
-        moved = np.dot(chosen, self._response[:count])
+        moved = np.dot(x[:count], self._response[:count])
         moved += self._response[-1]
         moved *= self._scale
-        nodes[self._free] = moved.reshape(-1, 3)
+        nodes[self.layout.truss.free] = moved.reshape(-1, 3)
         vertices = self._offset.copy()
         if self._free_curve:
             vertices[1] += self._normal * x[count]
             vertices[2:] += x[count + 1 : self._torsion].reshape(-1, 3)
+        return self._solution(x, info, len(clearance), nodes, vertices)
+
+    def _solution(
+        self, x: Array, info: dict[str, Any], near: int, nodes: Array, vertices: Array
+    ) -> StepSolution:
+        multipliers, count = info["lam"], self._actuators
         return StepSolution(
             nodes=nodes,
-            actuators=chosen,
+            actuators=x[:count],
             vertices=vertices,
             progress=float(x[-1]),
             actuator_multipliers=multipliers[:count],
@@ -218,29 +228,98 @@ class FusedSolver:
             torsion=x[self._torsion : -1],
         )
 
+    def ask(self, clearance: ClearanceRows) -> tuple[Array, int, dict[str, Any]]:
+        """Return DAQP's answer to the QP at the configuration loaded last, not checked yet, exit flag and details.
+
+        Raises
+        ------
+        InfeasibleStepError
+            The hard rows contradict one another.
+        """
+        size, count, hard, near = self._size, self._actuators, self._hard, len(clearance.lower)
+        hessian, gradient = self._assemble()
+        first = self._tip + hard
+        rows = first + near
+        if size + rows > len(self._lower):
+            self._reserve(2 * (size + rows))
+        constraint, lower, upper = self._constraint[:rows], self._lower, self._upper
+        if hard:
+            block = self._stack[:, self.layout.node_columns : self.layout.node_columns + hard]
+            constraint[self._tip : first, :-1] = block[:-1].T
+            upper[size + self._tip : size + first] = lower[size + self._tip : size + first] = -block[-1]
+        if near:
+            answer = np.dot(self._spread_rows(clearance), self._response.T)
+            answer *= self._scale
+            constraint[first:, :count] = answer[:, :count]
+            np.subtract(clearance.lower, answer[:, -1], out=lower[size + first : size + rows])
+        self._used, before = size + rows, self._used
+        if before > size + rows:
+            lower[size + rows : before] = -UNBOUNDED
+        x, _, flag, info = daqp.solve(
+            hessian,
+            gradient,
+            constraint,
+            upper[: size + rows],
+            lower[: size + rows],
+            self._sense[: size + rows],
+            primal_tol=FEASIBILITY,
+            eps_prox=0.0,
+        )
+        if flag == -1:
+            raise InfeasibleStepError("the hard rows of the step contradict one another")
+        self._answer[:] = x
+        return x, flag, info
+
+    def take(self, answer: tuple[Array, int, dict[str, Any]], near: int) -> Taken:
+        """Return where an answer of :meth:`ask` leads that had so many clearance rows, at most ``NEAR``.
+
+        Raises
+        ------
+        AnswerError
+            The answer's residuals are too large.
+        """
+        x, flag, info = answer
+        multipliers, count = info["lam"], len(info["lam"])
+        self._multipliers[:count] = multipliers
+        self._multipliers[count:] = 0.0
+        self._settle(1.0)
+        out = self._settled.outputs
+        error, before, after, progress, moved, primal, dual = out[5].tolist()
+        refuse_large(primal, dual, flag)
+        closed = self._closed(error)
+        vertices = out[4].reshape(-1, 3).copy()
+        solution = self._solution(x, info, near, out[6].reshape(-1, 3).copy(), vertices)
+        return Taken(solution, closed, vertices, progress, moved, before, after)
+
     def settle(
         self, X: Array, lower: Array, upper: Array, position: Array, rotation: Array
     ) -> tuple[Closed, float, float]:
         """Return `X` (N, 3) with its lengths closed, actuators in their boxes (n_a,), m, and its tip at a pose.
 
-        Beside it stand the tip's greatest errors before and after settling, m or rad.
+        Beside it stand the tip's errors before and after settling, m and rad.
         """
-        kernel = self._settled
-        inputs, out = kernel.inputs, kernel.outputs
+        inputs = self._settled.inputs
         inputs[0][:] = X.reshape(-1)
         inputs[1][:] = lower
         inputs[2][:] = upper
         inputs[3][:] = position
         inputs[4][:] = rotation.T.reshape(-1)
+        self._settle(0.0)
+        error, before, after = self._settled.outputs[5].tolist()[:3]
+        return self._closed(error), before, after
+
+    def _settle(self, taken: float) -> None:
         if not self._hard:
             response = self._response[: self._actuators]
             np.dot(response, response.T, out=self._gram)
-        kernel()
-        error, before, after = out[4].tolist()
-        closed = Closed(
-            out[0].reshape(-1, 3).copy(), out[1].copy(), error, out[2].copy(), out[3].reshape(3, 3).T.copy()
+        self._taken[0] = taken
+        self._settled()
+
+    def _closed(self, error: float) -> Closed:
+        X, lengths, position, rotation = self._settled.outputs[:4]
+        return Closed(
+            X.reshape(-1, 3).copy(), lengths.copy(), error, position.copy(), rotation.reshape(3, 3).T.copy()
         )
-        return closed, before, after
 
     def _reserve(self, rows: int) -> None:
         """Make room for bounds of all unknowns and `rows` less so many constraints; kernels write the first of them."""
@@ -255,8 +334,14 @@ class FusedSolver:
         for result, array in enumerate((tip_rows, *bounds), start=1):
             array[:] = self._rows.outputs[result]
             self._rows.bind_output(result, array)
-        for argument, result in ((5, 2), (6, 3), (10, 1)):
-            self._settled.bind_input(argument, self._rows.outputs[result])
+        checked = equal + NEAR
+        self._used = checked
+        for argument, array in (
+            (9, self._constraint[: checked - size]),
+            (10, self._lower),
+            (11, self._upper),
+        ):
+            self._settled.bind_input(argument, array.reshape(-1)[: self._settled.inputs[argument].size])
 
     def _assemble(self) -> tuple[Array, Array]:
         """Return Hessian and gradient of the objective."""
@@ -300,9 +385,3 @@ class FusedSolver:
         # Sums what stands at one place: a row may name a node twice.
         spread = np.bincount(flat.reshape(-1), clearance.coefficients.reshape(-1), near * width)
         return np.asarray(spread.reshape(near, width)[:, :-3], dtype=float)
-
-
-def _as_slice(nodes: NDArray[np.int64]) -> slice | NDArray[np.int64]:
-    """Return indices (K,) as a slice where they follow one another: assigned to in half the time."""
-    first, last = int(nodes[0]), int(nodes[-1])
-    return slice(first, last + 1) if np.array_equal(nodes, np.arange(first, last + 1)) else nodes

@@ -6,6 +6,7 @@ serves every truss and every solver by name, and is what the fused one is tested
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
-from vgtm_qp.qp.fused_graph import SETTLING_STEPS
+from vgtm_qp.qp.fused import Closed, FusedSolver, Taken, TipGoal
+from vgtm_qp.qp.fused_graph import NEAR, SETTLING_STEPS
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.qp.long.staged import StagedSolver
@@ -197,6 +198,21 @@ class FusedEngine:
         torsion: Array | None = None,
     ) -> StepSolution:
         """See :class:`Engine`."""
+        self._load(X, Y, vertices, target, goal, progress, torsion, motion=motion)
+        return self._solver.solve(rows)
+
+    def _load(
+        self,
+        X: Array,
+        Y: Array,
+        vertices: Array,
+        target: Target,
+        goal: PathPoint,
+        progress: float,
+        torsion: Array | None,
+        *,
+        motion: bool,
+    ) -> None:
         solver, shape = self._solver, self._solver.layout.general
         curve, span = None, target.end - target.start
         if shape is not None:
@@ -215,7 +231,30 @@ class FusedEngine:
             curve=curve,
             goals=target.vertex_goals,
         )
-        return solver.solve(rows)
+
+    def ask(
+        self,
+        X: Array,
+        Y: Array,
+        vertices: Array,
+        target: Target,
+        goal: PathPoint,
+        progress: float,
+        rows: ClearanceRows,
+        *,
+        motion: bool,
+        torsion: Array | None = None,
+    ) -> Callable[[], Taken] | None:
+        """Solve the QP as :meth:`solve` does; return what checks the answer and settles where it leads.
+
+        None where that is not one call: the path turns within the step, the base moves, or too many rows are near.
+        """
+        near = len(rows)
+        if near > NEAR or target.base is not None or not target.path.is_straight(target.start, target.end):
+            return None
+        self._load(X, Y, vertices, target, goal, progress, torsion, motion=motion)
+        answer = self._solver.ask(rows)
+        return lambda: self._solver.take(answer, near)
 
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
