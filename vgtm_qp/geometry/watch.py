@@ -1,9 +1,9 @@
 """All pairs of a scene at rest, evaluated only when they may have come near.
 
-Each pair keeps a lower bound of its distance: what it was when it was evaluated last, less what its members have
-travelled since. Where that falls below the distance that matters, one compiled call evaluates the pair and bounds its
-distance on the way from the state before. Far pairs are looked at seldom, near ones in every state, and all of them
-are covered in a dozen array operations.
+Each pair keeps a lower bound of its distance: what it was when it was evaluated last, less what its members have moved
+towards each other since, at most. Where that falls below the distance that matters, one compiled call evaluates the
+pair and bounds its distance on the way from the state before. Far pairs are looked at seldom, near ones in every state,
+and all of them are covered in a dozen array operations.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ _MOST_PAIRS = 8000
 _AT_ONCE = 128
 _AHEAD = 1.2
 """Pairs are evaluated from so many times the distance on that mattered last: it may be larger in the next state."""
+
+_NEXT = 2.0
+"""Pairs whose bounds are below so many times the distance that matters are due before long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,18 +67,13 @@ class Contacts:
 class _Pairs:
     """The pairs of one shape, and what is known of them."""
 
-    def __init__(self, group: Group, parameters: Array, members: int) -> None:
+    def __init__(self, group: Group, parameters: Array) -> None:
         self.group, self.is_self = group, group.is_self
         self.asks_fcl = group.shape in FclQueries.SHAPES
         self.nodes = np.concatenate([group.nodes, group.other_nodes], axis=1)
-        # Obstacles travel as much as the member behind the last one does: not at all.
-        self.first = group.member
-        self.second = group.other if group.is_self else np.full(len(group), members)
         piece = np.zeros((len(group), WIDTH)) if group.is_self else parameters[group.other]
         normal = np.tile([0.0, 0.0, 1.0], (len(group), 1))
         self.known = np.concatenate([piece, group.radius[:, None], normal], axis=1)
-        self.reach = np.zeros(0)
-        """(C,) distance when evaluated last, plus what both members had travelled by then, m."""
         self._contacts = Batch(follow_function(group.shape))
         for count in (1, _AT_ONCE):
             self._contacts.prepare(count)
@@ -83,6 +81,8 @@ class _Pairs:
         """Pairs that were evaluated in the present state,"""
         self.contacts = np.zeros((0, CONTACT))
         """and their contacts, two for each."""
+        self.is_close = False
+        """Whether one of them was as near as to matter."""
         self.lowest = np.inf
         """Least lower bound of their distances on the way there, m."""
 
@@ -94,10 +94,11 @@ class _Pairs:
         places : (N, 6)
             Node positions in the state before and in the present one, m.
         lower : (C,)
-            Bounds of the distances by what has been travelled, m.
+            Bounds of the distances, m; those of the pairs that are evaluated are written anew.
         """
-        self.near = near = (lower < limit).nonzero()[0]
-        size, lowest, reach = len(near), lower.take(near), self.reach
+        # Where none is near yet, those that are due next are looked at in one go.
+        self.near = near = (lower < (limit if self.is_close else _NEXT * limit)).nonzero()[0]
+        size, lowest = len(near), lower.take(near)
         arguments = (
             places.take(self.nodes.take(near, axis=0), axis=0).reshape(size, 24),
             self.known.take(near, axis=0),
@@ -107,15 +108,16 @@ class _Pairs:
         else:
             parts = [slice(k, k + _AT_ONCE) for k in range(0, size, _AT_ONCE)]
             found = np.concatenate([self._contacts(*(a[part] for a in arguments)) for part in parts])
+        self.is_close = bool(found[:, 0].min() < limit)
         self.contacts = found.reshape(2 * size, CONTACT)
         self.known[near, WIDTH + 1 :] = found[:, 5:8]
-        reach[near] = found[:, 0] + (reach.take(near) - lowest)
+        lower[near] = found[:, 0]
         # What it had been proven to be without looking holds as well.
         self.lowest = float(np.maximum(found[:, CONTACT - 1], lowest).min())
 
     def pass_over(self) -> None:
         """Note that no pair is near."""
-        self.near, self.lowest = self.near[:0], np.inf
+        self.near, self.is_close, self.lowest = self.near[:0], False, np.inf
 
 
 class Watch:
@@ -184,7 +186,7 @@ class Watch:
     def _look(self, X: Array, limit: float, self_limit: float) -> None:
         """Evaluate what may be nearer than the limits, m, at `X` and go on from there."""
         bounds = self._bounds if self._bounds is not None else self._start(X)
-        inputs, (travel, lower, lowest) = bounds.inputs, bounds.outputs
+        inputs, (lower, lowest) = bounds.inputs, bounds.outputs
         inputs[0][:] = X.reshape(-1)
         self._places[:, :3] = self._at
         self._places[:, 3:] = X
@@ -198,22 +200,19 @@ class Watch:
             else:
                 pairs.look(self._places, lower[self._parts[k]], nearer_than)
         inputs[1][:] = inputs[0]
-        inputs[2][:] = travel
+        inputs[2][:] = lower
         self._at, self._limits = X, (limit, self_limit)
 
     def _start(self, X: Array) -> Kernel:
         """List all pairs, with their distances at `X`."""
         monitor = self._monitor
         groups = monitor.every_pair(X).groups
-        parameters, members = monitor.pieces.parameters, len(monitor.members)
-        self._pairs = [_Pairs(group, parameters, members) for group in groups]
+        self._pairs = [_Pairs(group, monitor.pieces.parameters) for group in groups]
         ends = np.cumsum([0, *map(len, groups)])
         self._parts = [slice(a, b) for a, b in pairwise(ends.tolist())]
         self._bounds = kernel = Kernel(_bound_function(monitor.members, self._pairs, len(X)), compiled=False)
         kernel.inputs[1][:] = X.reshape(-1)
-        kernel.inputs[3][:] = np.concatenate([group.distance for group in groups])
-        for pairs, part in zip(self._pairs, self._parts, strict=True):
-            pairs.reach = kernel.inputs[3][part]
+        kernel.inputs[2][:] = np.concatenate([group.distance for group in groups])
         self._at, self._places = X, np.zeros((len(X), 6))
         return kernel
 
@@ -254,25 +253,35 @@ _NONE = Contacts(
 def _bound_function(members: Index, every: list[_Pairs], nodes: int) -> ca.Function:
     """Return the function that bounds the distances of all pairs after a motion.
 
-    Arguments: node positions after and before it (3, N); what members had travelled before, m, and a zero (M + 1);
-    reaches (C). Results: what they have travelled; lower bounds of the distances (C); the least one of each shape.
+    Arguments: node positions after and before it (3, N); bounds before it (C), m. Results: bounds after it (C); the
+    least one of each shape.
 
+    A distance from an obstacle changes by no more than an end of the member moves. That of two members changes by no
+    more than an end of one moves relative to an end of the other: than their middles do, and both turn about those.
     It is a dozen operations on whole arrays, which the virtual machine does as fast as machine code.
     """
     X, before = ca.MX.sym("X", 3, nodes), ca.MX.sym("before", 3, nodes)
-    travel = ca.MX.sym("travel", len(members) + 1)
-    reach = ca.MX.sym("reach", sum(len(pairs.group) for pairs in every))
-    moved = ca.sqrt(ca.sum1((X - before) ** 2))
-    further = ca.fmax(*(moved[members[:, end].tolist()] for end in (0, 1)))
-    travelled = travel + ca.vertcat(ca.vec(further), 0.0)
-    first, second = (
-        np.concatenate(ends).tolist() for ends in zip(*((p.first, p.second) for p in every), strict=True)
-    )
-    lower = reach - travelled[first] - travelled[second]
-    parts = ca.vertsplit(lower, [0, *np.cumsum([len(pairs.group) for pairs in every]).tolist()])
+    lower = ca.MX.sym("lower", sum(len(pairs.group) for pairs in every))
+    moved = X - before
+    first, second = (moved[:, members[:, end].tolist()] for end in (0, 1))
+    middle, turned = (first + second) / 2, _norms(second - first) / 2
+    furthest = ca.fmax(_norms(first), _norms(second))
+    nearer = []
+    for pairs in every:
+        a, b = pairs.group.member.tolist(), pairs.group.other.tolist()
+        nearer.append(
+            _norms(middle[:, a] - middle[:, b]) + turned[a] + turned[b] if pairs.is_self else furthest[a]
+        )
+    after = lower - ca.vertcat(*nearer)
+    parts = ca.vertsplit(after, [0, *np.cumsum([len(pairs.group) for pairs in every]).tolist()])
     # What is not a number must not be passed over: a least of numbers would leave it out.
-    least = ca.vertcat(*map(ca.mmin, parts)) + 0.0 * ca.sumsqr(X - before)
-    return ca.Function("bounds", [X, before, travel, reach], [travelled, lower, least])
+    least = ca.vertcat(*map(ca.mmin, parts)) + 0.0 * ca.sumsqr(moved)
+    return ca.Function("bounds", [X, before, lower], [after, least])
+
+
+def _norms(vectors: ca.MX) -> ca.MX:
+    """Return the norms (K, 1) of columns (3, K)."""
+    return ca.sqrt(ca.sum1(vectors**2)).T
 
 
 def _join(*parts: Contacts) -> Contacts:

@@ -16,7 +16,10 @@ from vgtm_qp.qp.settle import AT_BOUND, WORST_CONDITION
 
 Array = NDArray[np.float64]
 
-SETTLING_STEPS = 3
+SETTLING_STEPS = 6
+SETTLED = 1e-11
+"""A tip this near to its goal gains nothing by being settled once more, m or rad."""
+
 NEAR = 24
 """Clearance rows of a QP whose answer is checked by the compiled function; those of more are checked without it."""
 
@@ -121,12 +124,25 @@ def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
     if not layout.hard_rows:
         free = ca.logic_and(chosen > low[:count] + AT_BOUND, chosen < high[:count] - AT_BOUND)
         settling = scale * (response @ _gain(gram, stiffness, constraint[:count, :tip_rows], free))
-    for _ in range(SETTLING_STEPS):
-        if not layout.hard_rows:
-            X = X + spread(settling @ error)
-        X = closed(X)
-        position, rotation = tip(X)
-        error = _tip_error(layout.tip_rows, position, rotation, goal_position, goal_rotation)
+        at, off, by = symbols.X, ca.MX.sym("off", tip_rows), ca.MX.sym("by", layout.node_columns, tip_rows)
+        nearer = closed(at + spread(by @ off))
+        rest = [symbols.lower, symbols.upper, by, goal, turned, *symbols.constants.symbols]
+        again = ca.Function(
+            "again", [at, off, *rest], [nearer, _tip_error(layout.tip_rows, *tip(nearer), goal, turned)]
+        )
+        enough = ca.Function("enough", [at, off, *rest], [at, off])
+        either = ca.Function.if_else("either", again, enough)
+        given = [
+            symbols.lower,
+            symbols.upper,
+            settling,
+            goal_position,
+            goal_rotation,
+            *symbols.constants.symbols,
+        ]
+        for _ in range(SETTLING_STEPS):
+            X, error = either(ca.norm_2(error) > SETTLED, X, error, *given)
+    position, rotation = tip(X)
     lengths, _ = graph.lengths(X)
 
     if layout.vertices:
