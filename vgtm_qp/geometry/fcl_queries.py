@@ -91,33 +91,30 @@ class FclQueries:
             if found is not None and unique[k]:
                 contacts.t[k], contacts.normal[k], contacts.point[k] = found
 
-    def witness(self, piece: int, ends: list[float], distance: float) -> tuple[float, Array, Array] | None:
-        """Return the parameter on a segment, normal (3,) and point (3,) on the piece where FCL finds the two nearest.
+    def witness(
+        self, piece: int, ends: list[float], distance: float
+    ) -> tuple[float, tuple[float, float, float], Array] | None:
+        """Return the parameter on a segment, normal (3) and point (3,) on the piece where FCL finds the two nearest.
 
         None where its distance is not the `distance`, m, of the closed form: its answer is refused.
         """
-        start, end = ends[:3], ends[3:]
-        found, point, witness = self._ask(piece, start, end)
+        other = self._object(piece)
+        ax, ay, az, bx, by, bz = ends
+        x, y, z = bx - ax, by - ay, bz - az
+        length = sqrt(x * x + y * y + z * z)
+        self._capsule.lz = length
+        self._member.setQuatRotation(_quaternion(x, y, z, length))
+        self._member.setTranslation(np.array((0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz))))
+        result = self._fcl.DistanceResult()
+        found = self._fcl.distance(self._member, other, self._request, result)
         self.asked += 1
         if not (found > 0.0 and abs(found - distance) <= _AGREEMENT):
             self.replaced += 1
             return None
-        axis = [b - a for a, b in zip(start, end, strict=True)]
-        along = sum(u * (x - a) for u, x, a in zip(axis, point.tolist(), start, strict=True))
-        t = min(max(along / sum(u * u for u in axis), 0.0), 1.0)
-        return t, (point - witness) / found, witness
-
-    def _ask(self, piece: int, start: list[float], end: list[float]) -> tuple[float, Array, Array]:
-        """Return FCL's distance and its witness points on the segment and on the piece."""
-        x, y, z = (b - a for a, b in zip(start, end, strict=True))
-        length = sqrt(x * x + y * y + z * z)
-        other = self._object(piece)
-        self._capsule.lz = length
-        self._member.setQuatRotation(_quaternion(x, y, z, length))
-        self._member.setTranslation(np.array([0.5 * (a + b) for a, b in zip(start, end, strict=True)]))
-        result = self._fcl.DistanceResult()
-        distance = self._fcl.distance(self._member, other, self._request, result)
-        return distance, *result.nearest_points
+        point, witness = result.nearest_points
+        (px, py, pz), (wx, wy, wz) = point.tolist(), witness.tolist()
+        along = (x * (px - ax) + y * (py - ay) + z * (pz - az)) / (length * length)
+        return min(max(along, 0.0), 1.0), ((px - wx) / found, (py - wy) / found, (pz - wz) / found), witness
 
 
 def _quaternion(x: float, y: float, z: float, length: float) -> list[float]:

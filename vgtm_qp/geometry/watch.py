@@ -69,6 +69,7 @@ class _Pairs:
 
     def __init__(self, group: Group, parameters: Array) -> None:
         self.group, self.is_self = group, group.is_self
+        self.flags = np.full(2 * len(group), group.is_self)
         self.asks_fcl = group.shape in FclQueries.SHAPES
         self.nodes = np.concatenate([group.nodes, group.other_nodes], axis=1)
         piece = np.zeros((len(group), WIDTH)) if group.is_self else parameters[group.other]
@@ -224,7 +225,7 @@ class Watch:
             which = Pair(int(group.member[pair[k]]), int(group.other[pair[k]]), group.is_self)
             return self._monitor.names.clearance(which)
 
-        is_self = np.full(len(rows), group.is_self)
+        is_self = pairs.flags[: len(rows)]
         distance, normal, weights = found[:, 0], found[:, 5:8], found[:, 1:5]
         if pairs.asks_fcl:
             for k in (distance < fcl_reach).nonzero()[0].tolist():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -75,6 +76,7 @@ class Resolver:
             truss.rate[truss.actuators],
             truss.acceleration[truss.actuators],
         )
+        self._starts_at_once = bool(np.isinf(self._limits[2]).all())
         self._vertex_goals = arm.vertex_goals
         self._braking: Braking | None = None
         self._arms: dict[tuple[object, ...], Arm] = {}
@@ -371,8 +373,7 @@ class Resolver:
     @property
     def _must_brake(self) -> bool:
         """Whether a moving arm cannot simply stay where it is: accelerations are limited, and its base rests."""
-        is_free = bool(np.isinf(self._limits[2]).all())
-        return not is_free and self.arm.base_motion is None and self.arm.tip_mode == "scaled"
+        return not self._starts_at_once and self.arm.base_motion is None and self.arm.tip_mode == "scaled"
 
     def _find_braking(
         self, state: State, path: Path, value: float, piece: float, dt: float
@@ -391,7 +392,7 @@ class Resolver:
 
     def _duration(self, dt: float | None) -> float:
         dt = self.arm.dt if dt is None else dt
-        if not (np.isfinite(dt) and dt > 0.0):
+        if not (math.isfinite(dt) and dt > 0.0):
             raise GoalError(
                 f"dt must be a positive number of seconds, not {dt!r}; the state of the arm is unchanged"
             )

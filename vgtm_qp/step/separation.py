@@ -182,6 +182,8 @@ class Separation:
     def _watched_rows(self, contacts: Contacts, *, motion: bool) -> ClearanceRows:
         """Return the rows n . d(witness) >= floor - distance of contacts in a scene at rest."""
         kept = self.distances
+        if not len(contacts.distance):
+            return ClearanceRows(name=contacts.name)
         coefficients = contacts.weights[:, :, None] * contacts.normal[:, None, :]
         lower = kept.safe + kept.margin - contacts.distance
         lower += (kept.self_safe - kept.safe) * contacts.is_self

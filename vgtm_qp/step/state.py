@@ -21,9 +21,8 @@ def frozen(array: Array) -> Array:
 
 
 def sealed(array: Array) -> Array:
-    """Return `array` itself, contiguous and read-only from now on: for one that nobody else writes to."""
-    array = np.ascontiguousarray(array)
-    array.flags.writeable = False
+    """Return `array` itself, read-only from now on: for one that nobody else writes to."""
+    array.setflags(write=False)
     return array
 
 
