@@ -34,6 +34,7 @@ class ChainData:
             for (name, size), end in zip(sizes.items(), ends, strict=True)
         }
         self._faces = chain.faces.reshape(-1)
+        self._order = chain.face_order.reshape(-1, 1, 3, 1)
         self._weights, self._slopes = layout.curve_weights[self._faces], layout.curve_slopes[self._faces]
         self._slope_products = (self._slopes[:, :, None] * self._slopes[:, None, :]).reshape(
             len(self._faces), layout.vertices**2
@@ -70,7 +71,8 @@ class ChainData:
         )
         self._vertex_gradient = numbers.vertex_gradient
         gap, tilt = self._misfit(self.offset)
-        part["tangent_face"][:] = numbers.tangent_face[self._faces].reshape(periods, -1)
+        turns = numbers.tangent_face[self._faces].reshape(-1, 2, 3, 3)
+        part["tangent_face"][:] = np.take_along_axis(turns, self._order, axis=2).reshape(periods, -1)
         part["tangent_curve"][:] = self._tangent_curve.reshape(periods, -1)
         part["gap"][:], part["tilt"][:] = gap.reshape(periods, -1), tilt.reshape(periods, -1)
         part["normal"][:] = self.normal
