@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,7 +14,7 @@ from scipy.linalg.lapack import dpstrf
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.condensed import FEASIBILITY, UNBOUNDED, InfeasibleStepError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -24,6 +25,46 @@ _VIOLATED = 1e-10
 _REFINEMENTS = 4
 
 
+MemberRows = Callable[[Index], tuple[Index, Array]]
+"""Nodes (R, Q) and coefficients (R, Q, 3) of the lengths of members (R,); base nodes may have any coefficients."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowNumbers:
+    """What the rows with bounds, and the progress, need of a QP; see :class:`StepNumbers`."""
+
+    lower: Array
+    upper: Array
+    tip_jacobian: Array
+    tip_rate: Array
+    tip_rhs: Array
+    progress_lower: float
+    progress_upper: float
+    progress_gradient: float
+    progress_curvature: float
+    clearance: ClearanceRows
+    actuator_gradient: Array
+    member_rows: MemberRows
+
+    @classmethod
+    def of(cls, layout: Layout, numbers: StepNumbers) -> RowNumbers:
+        """Return those of `numbers`."""
+        return cls(
+            lower=numbers.lower,
+            upper=numbers.upper,
+            tip_jacobian=numbers.tip_jacobian,
+            tip_rate=numbers.tip_rate,
+            tip_rhs=numbers.tip_rhs,
+            progress_lower=numbers.progress_lower,
+            progress_upper=numbers.progress_upper,
+            progress_gradient=numbers.progress_gradient,
+            progress_curvature=numbers.progress_curvature,
+            clearance=numbers.clearance,
+            actuator_gradient=numbers.actuator_gradient,
+            member_rows=lambda members: (layout.member_nodes[members], numbers.gradient[members]),
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class RowTable:
     """All rows with bounds of one QP: tip, locked members, progress, actuators, clearance, in this order.
@@ -31,7 +72,7 @@ class RowTable:
     Attributes
     ----------
     layout : Layout
-    numbers : StepNumbers
+    numbers : RowNumbers
     locked : (l,) int
         Fixed members that are held by a row of their own.
     lower, upper : (total,)
@@ -42,7 +83,7 @@ class RowTable:
     """
 
     layout: Layout
-    numbers: StepNumbers
+    numbers: RowNumbers
     locked: Index
     lower: Array
     upper: Array
@@ -51,7 +92,7 @@ class RowTable:
     clearance: slice
 
     @classmethod
-    def of(cls, layout: Layout, numbers: StepNumbers, locked: Index) -> RowTable:
+    def of(cls, layout: Layout, numbers: RowNumbers, locked: Index) -> RowTable:
         """Return the table of `numbers`."""
         held = np.zeros(len(locked))
         clearance = numbers.clearance.lower
@@ -76,15 +117,18 @@ class RowTable:
             slice(first_clearance, first_clearance + len(clearance)),
         )
 
-    def values(self, nodes: Array, lengths: Array, progress: float) -> Array:
-        """Return (total,) row values at displacements of the nodes (N, 3) and changes of the lengths (M,)."""
+    def values(self, nodes: Array, strokes: Array, held: Array, progress: float) -> Array:
+        """Return (total,) row values at displacements of the nodes (N, 3).
+
+        `strokes` (n_a,) and `held` (l,) are the changes of the actuated and of the locked members' lengths.
+        """
         numbers, truss, clearance = self.numbers, self.layout.truss, self.numbers.clearance
         return np.concatenate(
             [
                 numbers.tip_jacobian @ nodes[truss.tip].reshape(-1) - numbers.tip_rate * progress,
-                lengths[self.locked],
+                held,
                 [progress],
-                lengths[truss.actuators],
+                strokes,
                 np.einsum("rsc,rsc->r", clearance.coefficients, nodes[clearance.nodes]),
             ]
         )
@@ -95,8 +139,16 @@ class RowTable:
 
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
         """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
-        numbers, truss, members = self.numbers, self.layout.truss, self.layout.member_nodes
-        width = max(len(truss.tip), members.shape[1], numbers.clearance.nodes.shape[1])
+        numbers, truss = self.numbers, self.layout.truss
+        tip = len(numbers.tip_rhs)
+        is_stroke = (rows >= self.actuators.start) & (rows < self.clearance.start)
+        is_held = (rows >= tip) & (rows < self.equal)
+        members = np.empty(len(rows), dtype=np.int64)
+        members[is_stroke] = truss.actuators[rows[is_stroke] - self.actuators.start]
+        members[is_held] = self.locked[rows[is_held] - tip]
+        along = np.flatnonzero(is_stroke | is_held)
+        member_nodes, gradients = numbers.member_rows(members[along])
+        width = max(len(truss.tip), member_nodes.shape[1], numbers.clearance.nodes.shape[1])
         nodes, coefficients = np.zeros((len(rows), width), dtype=np.int64), np.zeros((len(rows), width, 3))
         progress = np.zeros(len(rows))
 
@@ -104,17 +156,11 @@ class RowTable:
             nodes[where, : named.shape[-1]] = named
             coefficients[where, : named.shape[-1]] = values
 
-        tip = len(numbers.tip_rhs)
+        put(along, member_nodes, gradients)
         where = np.flatnonzero(rows < tip)
         put(where, truss.tip, numbers.tip_jacobian[rows[where]].reshape(len(where), len(truss.tip), 3))
         progress[where] = -numbers.tip_rate[rows[where]]
         progress[rows == self.equal] = 1.0
-        where = np.flatnonzero((rows >= self.actuators.start) & (rows < self.clearance.start))
-        strokes = truss.actuators[rows[where] - self.actuators.start]
-        put(where, members[strokes], numbers.gradient[strokes])
-        where = np.flatnonzero((rows >= tip) & (rows < self.equal))
-        held = self.locked[rows[where] - tip]
-        put(where, members[held], numbers.gradient[held])
         where = np.flatnonzero(rows >= self.clearance.start)
         near = rows[where] - self.clearance.start
         put(where, numbers.clearance.nodes[near], numbers.clearance.coefficients[near])
@@ -201,15 +247,12 @@ class Point:
     Attributes
     ----------
     nodes : (N, 3)
-    lengths : (M,)
-        Changes of the lengths beyond ``length_rhs``: d_a of actuated members, the residual of fixed ones, m.
     vertices : (V, 3)
     progress : float
     values : (total,)
     """
 
     nodes: Array
-    lengths: Array
     vertices: Array
     progress: float
     values: Array
@@ -239,12 +282,19 @@ class Answer:
         Positive at upper and negative at lower bounds.
     iterations : int
         Of the dual QPs.
+    rows : list of int
+        Those that were in the dual QP, equalities first.
+    columns, gram : (size, R), (R, R)
+        Their columns, and what these are multiplied with each other.
     """
 
     table: RowTable
     point: Point
     multipliers: Array
     iterations: int
+    rows: list[int]
+    columns: Array
+    gram: Array
 
     @property
     def active(self) -> set[tuple[object, ...]]:
@@ -324,4 +374,4 @@ def solve_rows(
         point = problem.point(table, columns @ multipliers)
     every = np.zeros(len(table.lower))
     every[rows] = multipliers
-    return Answer(table, point, every, iterations)
+    return Answer(table, point, every, iterations, rows, columns, gram)
