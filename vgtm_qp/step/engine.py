@@ -81,17 +81,20 @@ class LengthCloser:
         self._layout, self._kinematics, self._home_lengths = layout, kinematics, home_lengths
         self._solver = LengthSolver(layout)
 
+    def strokes(self, X: Array) -> Array:
+        """Return the lengths (n_a,) of the actuated members at `X` (N, 3), m."""
+        self._kinematics.evaluate_members(X)
+        return np.array(self._kinematics.lengths[self._layout.truss.actuators])
+
     def close(self, X: Array, lower: Array, upper: Array, tolerance: float) -> Closed:
         """Return the configuration near `X` (N, 3) with actuators where they are, but between bounds (n_a,), m."""
         layout, kinematics = self._layout, self._kinematics
         actuators, free = layout.truss.actuators, layout.truss.free
-        wanted: Array | None = None
+        wanted = self._home_lengths.copy()
         X, worst, enough = X.copy(), np.inf, enough_length(X, tolerance)
         for _ in range(5):
             kinematics.evaluate_members(X)
-            if wanted is None:
-                wanted = self._home_lengths.copy()
-                wanted[actuators] = np.clip(kinematics.lengths[actuators], lower, upper)
+            wanted[actuators] = np.clip(kinematics.lengths[actuators], lower, upper)
             error = wanted - kinematics.lengths
             worst = float(np.max(np.abs(error)))
             if worst <= enough or not worst < 1e-2:
@@ -257,7 +260,8 @@ class PlainEngine:
             assert last is not None
             at_bound = held(last[1].actuators, last[0].lower, last[0].upper)
             actuators = self._linearisation.layout.truss.actuators
-            first = close(X, *bounds)
+            strokes = np.clip(self._lengths.strokes(X), *bounds)
+            first = close(X, strokes, strokes)
             return settle_strokes(
                 first, actuators, close, tip_error, lambda: solver.gain(at_bound), bounds, accuracy
             )
