@@ -303,8 +303,8 @@ def test_a_wrong_answer_is_refused(hard, monkeypatch):
     monkeypatch.setattr(
         type(solver),
         "point",
-        lambda self, table, combined: replace(
-            unchanged(self, table, combined), nodes=unchanged(self, table, combined).nodes * (1 + 1e-4)
+        lambda self, values: replace(
+            unchanged(self, values), nodes=unchanged(self, values).nodes * (1 + 1e-4)
         ),
     )
     with pytest.raises(SolverError, match="residual"):

@@ -72,9 +72,11 @@ class ChainEngine:
         self._kinematics = kinematics
         self._members = chain.members.reshape(-1)
         self._members_at = np.argsort(self._members)
-        self._nodes = chain.nodes.reshape(-1)
+        self._nodes, self._base = chain.nodes.reshape(-1), np.flatnonzero(truss.base)
+        self._at = np.argsort(np.concatenate([self._nodes, self._base]))
         self._tip = np.array([np.flatnonzero(self._nodes == node)[0] for node in truss.tip])
         self._aims = home_lengths.copy()
+        self._strokes = home_lengths[truss.actuators]
         self._held: NDArray[np.bool_] = np.zeros(len(truss.actuators), dtype=bool)
         self._vertices: Array = np.zeros((layout.vertices, 3))
         self._curve_weights = layout.curve_weights[chain.faces.reshape(-1)]
@@ -141,6 +143,7 @@ class ChainEngine:
         )
         solution = self._solver.solve_filled(numbers)
         self._held = held(solution.actuators, numbers.lower, numbers.upper)
+        self._strokes = length + solution.actuators
         self._vertices = vertices + solution.vertices
         return solution
 
@@ -181,17 +184,17 @@ class ChainEngine:
     ) -> Closed | None:
         """Return what ``engine.settle_strokes`` does: each step corrects the lengths, and what it leaves of the tip.
 
-        The actuated lengths are those at `X`, but between the bounds (n_a,), and what brings the tip to its goal.
+        The actuated lengths are those of the QP's answer and what brings the tip to its goal, between bounds (n_a,).
         """
-        closing, actuators = self._closing, self._layout.truss.actuators
+        closing = self._closing
         enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)
-        least, greatest = closing.aims
+        (aims,) = closing.aims
         closing.start(X)
-        self._aim(least, lower)
-        self._aim(greatest, upper)
-        own, gain, is_given_up = X[self._nodes], None, False
+        wanted = np.clip(self._strokes, lower, upper)
+        self._aim(aims, wanted)
+        own: Array = X.take(self._nodes, axis=0)
+        gain, is_given_up = None, False
         closer, worst = closing.step(own)
-        wanted = np.clip(closing.lengths.reshape(-1)[self._members_at[actuators]], lower, upper)
         off = np.inf
         for _ in range(MOST_STEPS):
             settled = off <= enough_tip or is_given_up
@@ -207,8 +210,7 @@ class ChainEngine:
                 is_given_up = gain is None
             if gain is not None and off > enough_tip:
                 wanted = wanted + gain @ error
-            self._aim(least, np.clip(wanted, lower, upper))
-            greatest[:] = least
+                self._aim(aims, np.clip(wanted, lower, upper))
             closer, worst = closing.step(own)
         closed = self._closed(X, own, worst)
         is_there = float(np.abs(tip_error(closed.tip_position, closed.tip_rotation)).max()) <= accuracy.tip
@@ -224,16 +226,15 @@ class ChainEngine:
         closing, enough = self._closing, enough_length(X, tolerance)
         closing.start(X)
         np.matmul(self._curve_weights, self._vertices, out=closing.aims[1].reshape(-1, 3))
-        own, worst = closing.run(X[self._nodes], enough)
+        own, worst = closing.run(X.take(self._nodes, axis=0), enough)
         closed = self._closed(X, own, worst)
         actuated = closed.lengths[self._layout.truss.actuators]
         return closed if within(actuated, lower, upper, enough) else replace(closed, error=np.inf)
 
     def _closed(self, X: Array, own: Array, worst: float) -> Closed:
         """Return the configuration whose free nodes are at `own`, in the order of the chain; base nodes as in `X`."""
-        nodes = X.copy()
-        nodes[self._nodes] = own
-        lengths = self._closing.lengths.reshape(-1)[self._members_at]
+        nodes = np.concatenate([own, X[self._base]]).take(self._at, axis=0)
+        lengths = self._closing.lengths.reshape(-1).take(self._members_at)
         return Closed(nodes, lengths, worst, *self._tip_of(own, turned=True))
 
     def _tip_of(self, own: Array, *, turned: bool) -> tuple[Array, Array]:

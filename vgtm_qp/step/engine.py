@@ -81,11 +81,6 @@ class LengthCloser:
         self._layout, self._kinematics, self._home_lengths = layout, kinematics, home_lengths
         self._solver = LengthSolver(layout)
 
-    def strokes(self, X: Array) -> Array:
-        """Return the lengths (n_a,) of the actuated members at `X` (N, 3), m."""
-        self._kinematics.evaluate_members(X)
-        return np.array(self._kinematics.lengths[self._layout.truss.actuators])
-
     def close(self, X: Array, lower: Array, upper: Array, tolerance: float) -> Closed:
         """Return the configuration near `X` (N, 3) with actuators where they are, but between bounds (n_a,), m."""
         layout, kinematics = self._layout, self._kinematics
@@ -215,6 +210,7 @@ class PlainEngine:
         self._faces = CurveCloser(*arm) if isinstance(solver, TrackedSolver) else None
         self._last: tuple[StepNumbers, StepSolution] | None = None
         self._vertices: Array = np.zeros((0, 3))
+        self._strokes: Array = np.zeros(0)
 
     def solve(
         self,
@@ -235,6 +231,8 @@ class PlainEngine:
             X, vertices, target, progress, rows, motion=motion, at=at, torsion=torsion
         )
         solution = self._solver.solve(numbers)
+        lengths = self._linearisation.kinematics.lengths[self._linearisation.layout.truss.actuators]
+        self._strokes = lengths + solution.actuators
         # The kinematics overwrites its gradients at the next configuration.
         self._last = replace(numbers, gradient=numbers.gradient.copy()), solution
         self._vertices = vertices + solution.vertices
@@ -260,7 +258,7 @@ class PlainEngine:
             assert last is not None
             at_bound = held(last[1].actuators, last[0].lower, last[0].upper)
             actuators = self._linearisation.layout.truss.actuators
-            strokes = np.clip(self._lengths.strokes(X), *bounds)
+            strokes = np.clip(self._strokes, *bounds)
             first = close(X, strokes, strokes)
             return settle_strokes(
                 first, actuators, close, tip_error, lambda: solver.gain(at_bound), bounds, accuracy

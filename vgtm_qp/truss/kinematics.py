@@ -42,11 +42,11 @@ def face_frame(nodes: ca.SX, cosines: ca.SX, sines: ca.SX, sense: ca.SX | float 
     area, x = ca.SX.zeros(3), ca.SX.zeros(3)
     for j in range(count):
         area += ca.cross(centred[:, j], centred[:, (j + 1) % count])
-    z = sense * area / ca.norm_2(area)
+    z = area * (sense / ca.norm_2(area))
     for j in range(count):
         x += cosines[j] * centred[:, j] + sines[j] * ca.cross(centred[:, j], z)
     x -= z * ca.dot(z, x)
-    x /= ca.norm_2(x)
+    x *= 1.0 / ca.norm_2(x)
     return ca.horzcat(x, ca.cross(z, x), z)
 
 

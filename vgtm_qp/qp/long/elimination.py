@@ -295,23 +295,22 @@ class Elimination:
         return ca.Function("strokes", [carry, self.inputs.head, vector, rows], outputs)
 
     def close(self) -> ca.Function:
-        """Return (carry, head, gains, X, least, greatest) -> (carry, X, lengths): one step towards right lengths.
+        """Return (carry, head, gains, X, aim) -> (carry, X, lengths): one step towards the lengths `aim` (3m,).
 
         Newton's with the Jacobian in `head`. The carry holds the live nodes' positions, their displacements and the
-        greatest error so far; X (3m,) are the positions of a period's own nodes, and lengths are aimed at the nearest
-        value between the `least` and the `greatest` (3m,).
+        greatest error so far; X (3m,) are the positions of a period's own nodes.
         """
         vector, gains = self._gains()
         at = Positions(self)
-        least, greatest = ca.SX.sym("least", self.chain.own), ca.SX.sym("greatest", self.chain.own)
-        error = ca.fmax(least, ca.fmin(greatest, at.lengths)) - at.lengths
+        aim = ca.SX.sym("aim", self.chain.own)
+        error = aim - at.lengths
         J, u = self.inputs.jacobian, at.moved
         for stage, (free, G, _, _, S) in zip(self.stages, gains, strict=True):
             soft = [i for i in self.soft if self.chain.before + i in stage.own]
             placed = G @ (error[stage.hard] + self.transfer(stage) @ u)
             missing = error[soft] - J[soft, stage.before] @ u - J[soft, stage.own] @ placed
             u = ca.vertcat(u, placed + free @ (S @ missing))
-        return at.function("close", [self.inputs.head, vector], [least, greatest], u, error)
+        return at.function("close", [self.inputs.head, vector], [aim], u, error)
 
     def changes(self) -> ca.Function:
         """Return (carry, head, u (3m,)) -> (carry, J u - rhs, centres and angles of the faces) of displacements u."""
@@ -384,13 +383,25 @@ class Positions:
         self, name: str, before: list[ca.SX], after: list[ca.SX], u: ca.SX, error: ca.SX
     ) -> ca.Function:
         """Return (carry, *before, X, *after) -> (carry, X, lengths) of a step `u` (3w + 3m,) on an `error`."""
-        worst = self._worst
-        for i in range(error.numel()):
-            worst = ca.fmax(worst, ca.fabs(error[i]))
+        worst = _greater(self._worst, _greatest([ca.fabs(error[i]) for i in range(error.numel())]))
         X = self._all + u
         carry = ca.vertcat(self._all[self._live], u[self._live], worst)
         outputs = [ca.densify(output) for output in (carry, X[self._chain.before :], self.lengths)]
         return ca.Function(name, [self._carry, *before, self._own, *after], outputs)
+
+
+def _greatest(values: list[ca.SX]) -> ca.SX:
+    """Return the greatest of one or more numbers, pair by pair."""
+    while len(values) > 1:
+        values = [_greater(a, b) for a, b in zip(values[::2], values[1::2], strict=False)] + (
+            values[-1:] if len(values) % 2 else []
+        )
+    return values[0]
+
+
+def _greater(a: ca.SX, b: ca.SX) -> ca.SX:
+    """Return the greater of two numbers, or NaN where one is; ``fmax`` would pass over it."""
+    return (a + b + ca.fabs(a - b)) / 2
 
 
 def member_lengths(chain: Chain, points: ca.SX) -> ca.SX:

@@ -70,11 +70,18 @@ class StagedSolver:
             (periods - 1 - chain.node_period) * _BLOCK * own + chain.node_place,
             periods * _BLOCK * own,
         )
+        # A row of zeros behind those of the free nodes: base nodes do not move.
+        self._moved = np.zeros((chain.nodes.size + 1, 3))
+        self._forward.bind_output(1, self._moved[:-1])
+        self._at = np.where(chain.node_period >= 0, chain.node_period * own + chain.node_place, -1)
+        self._free, self._progress = np.zeros(self._curve), 0.0
         self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
         truss = self.layout.truss
         at = np.empty(truss.member_count, dtype=np.int64)
         at[chain.members.reshape(-1)] = np.arange(truss.member_count)
         self._strokes, self._held, self._fixed = at[truss.actuators], at[chain.locked], at[self.layout.fixed]
+        self._reversed_nodes = chain.nodes[::-1].reshape(-1)
+        self._reversed_soft = chain.members[::-1][:, chain.soft].reshape(-1)
         self._active: set[tuple[object, ...]] = set()
         self._answer: Answer | None = None
 
@@ -177,23 +184,29 @@ class StagedSolver:
             columns[rest] = -dtrtrs(self._curve_factor, through, lower=1)[0]
         return columns
 
-    def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
-        chain = self.chain
+    def values(self, table: RowTable, combined: Array) -> Array:
+        """Return (total,) the row values where the Lagrangian is least, given columns times multipliers (size,)."""
         freedom, curve = self._freedom, self._curve
-        free = np.zeros(0)
+        motions = self._outer[:, -1] + combined[:freedom]
         if curve:
             known = self._curve_rhs + combined[freedom : freedom + curve]
-            free = -dtrtrs(self._curve_factor, known, lower=1, trans=1)[0]
-        progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
-        motions = self._outer[:, -1] + self._outer[:, :-1] @ free + combined[:freedom]
-        self._motions[:] = motions.reshape(chain.periods, -1)[::-1]
+            self._free = -dtrtrs(self._curve_factor, known, lower=1, trans=1)[0]
+            motions += self._outer[:, :-1] @ self._free
+        self._progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
+        self._motions[:] = motions.reshape(self.chain.periods, -1)[::-1]
         self._forward()
-        _, moved, changed, _ = self._forward.outputs
-        nodes = np.zeros((self.layout.truss.node_count, 3))
-        nodes[chain.nodes] = moved.reshape(*chain.nodes.shape, 3)
-        values = table.values(nodes, changed[self._strokes], changed[self._held], progress)
-        return Point(nodes, self.data.vertices(free), progress, values)
+        changed = self._forward.outputs[2]
+        return table.values(
+            lambda nodes: self._moved[self._at[nodes]],
+            changed.take(self._strokes),
+            changed[self._held],
+            self._progress,
+        )
+
+    def point(self, values: Array) -> Point:
+        """Return the point whose `values` were asked for last."""
+        nodes = self._moved.take(self._at, axis=0)
+        return Point(nodes, self.data.vertices(self._free), self._progress, values)
 
     def _eliminate(self, numbers: RowNumbers) -> None:
         """Run the recursion and factorise what is left, in the curve's coordinates."""
@@ -228,8 +241,8 @@ class StagedSolver:
             + multipliers[table.actuators]
         )
         actuator[chain.locked] = multipliers[len(numbers.tip_rhs) : table.equal]
-        nodal[:] = gradient[chain.nodes[::-1]].reshape(-1)
-        force[:] = actuator[chain.members[::-1][:, chain.soft]].reshape(-1)
+        gradient.take(self._reversed_nodes, axis=0, out=nodal.reshape(-1, 3), mode="clip")
+        actuator.take(self._reversed_soft, out=force, mode="clip")
         residual = 0.0
         if self._curve:
             parts = self._forward.outputs[3].reshape(chain.periods, -1)[::-1].reshape(-1, 5)

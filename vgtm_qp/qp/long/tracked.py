@@ -141,8 +141,10 @@ class TrackedSolver:
         self._place = np.where(
             chain.node_period >= 0, chain.node_period * chain.nodes.shape[1] + chain.node_place, -1
         )
+        self._nodes = chain.nodes.reshape(-1)
         soft = chain.members[:, chain.soft].reshape(-1)
         self._soft = np.argsort(soft)
+        self._free, self._progress = np.ones(self._curve + 1), 0.0
         self._active: set[tuple[object, ...]] = set()
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
@@ -181,17 +183,21 @@ class TrackedSolver:
         columns[:-1] = dtrtrs(self._factor, columns[:-1], lower=1)[0]
         return columns
 
-    def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
-        truss, chain = self.layout.truss, self.chain
-        free = -dtrtrs(self._factor, self._rhs + combined[:-1], lower=1, trans=1)[0]
-        progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
-        unknowns = np.append(free, 1.0)
-        nodes = np.zeros((truss.node_count, 3))
-        nodes[chain.nodes] = (self._moved @ unknowns).reshape(*chain.nodes.shape, 3)
-        strokes = (self._strokes @ unknowns)[self._soft]
-        values = table.values(nodes, strokes, np.zeros(0), progress)
-        return Point(nodes, self.data.vertices(free), progress, values)
+    def values(self, table: RowTable, combined: Array) -> Array:
+        """Return (total,) the row values where the Lagrangian is least, given columns times multipliers (size,)."""
+        self._free[:-1] = -dtrtrs(self._factor, self._rhs + combined[:-1], lower=1, trans=1)[0]
+        self._progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
+        strokes = (self._strokes @ self._free).take(self._soft)
+        return table.values(
+            lambda nodes: self._moving[self._place[nodes]] @ self._free, strokes, np.zeros(0), self._progress
+        )
+
+    def point(self, values: Array) -> Point:
+        """Return the point whose `values` were asked for last."""
+        nodes = (
+            (self._moving.reshape(-1, self._curve + 1) @ self._free).reshape(-1, 3).take(self._place, axis=0)
+        )
+        return Point(nodes, self.data.vertices(self._free[:-1]), self._progress, values)
 
     def _eliminate(self, numbers: RowNumbers) -> None:
         """Follow the curve from the base to the tip and factorise the Hessian in its coordinates."""
@@ -217,8 +223,8 @@ class TrackedSolver:
     def _check(self, table: RowTable, point: Point, multipliers: Array) -> None:
         """Refuse an answer whose primal or dual residual is too large."""
         weights, chain, sweep = self.layout.weights, self.chain, self._changes
-        moved = point.nodes[chain.nodes].reshape(chain.periods, -1)
-        sweep.inputs[2].reshape(chain.periods, -1)[:] = moved
+        moved = sweep.inputs[2].reshape(-1, 3)
+        point.nodes.take(self._nodes, axis=0, out=moved, mode="clip")
         sweep()
         changed = sweep.outputs[1].reshape(chain.periods, -1)
         strokes = changed[:, chain.soft].reshape(-1)
@@ -229,7 +235,7 @@ class TrackedSolver:
             float(np.max(np.abs(gap))),
             float(np.max(table.violation(point.values))),
         )
-        nodal = weights.node_rate * moved + table.nodal_forces(multipliers)[chain.nodes].reshape(moved.shape)
+        nodal = weights.node_rate * moved + table.nodal_forces(multipliers).take(self._nodes, axis=0)
         force = (weights.actuator_rate + weights.stroke_centring) * strokes
         force += self.data.actuator_gradient.reshape(-1)
         force[self._soft] += multipliers[table.actuators]

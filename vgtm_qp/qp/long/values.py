@@ -37,7 +37,7 @@ def period_values(chain: Chain) -> ca.Function:
     jacobian = ca.SX(chain.own, 3 * size)
     for row, (first, second) in enumerate(chain.member_places.tolist()):
         along = Y[:, second] - Y[:, first]
-        along = (along / ca.norm_2(along)).T
+        along = along.T * (1.0 / ca.norm_2(along))
         jacobian[row, 3 * first : 3 * first + 3] = -along
         jacobian[row, 3 * second : 3 * second + 3] = along
     soft = np.flatnonzero(chain.soft).tolist()
@@ -54,10 +54,10 @@ def period_values(chain: Chain) -> ca.Function:
         frame = (angles[:3], angles[3:6], angles[6])
         x, moved, slope, slope_moved = ca.vertsplit(curve[12 * k : 12 * k + 12], 3)
         axes = (face_frame(X[:, places], *frame) @ alignment[:, 3 * k : 3 * k + 3])[:, :2]
-        speed = ca.norm_2(slope)
-        tangent = slope / speed
+        slowness = 1.0 / ca.norm_2(slope)
+        tangent = slope * slowness
         along = axes.T @ tangent
-        lean = (axes.T - along @ tangent.T) / speed
+        lean = (axes.T - along @ tangent.T) * slowness
         turn = ca.vertcat(*[_turning(Y[:, places], frame, ca.cross(axes[:, a], tangent)) for a in range(2)])
         tangent_faces.append(ca.vec(turn.T))
         tangent_curves.append(ca.vec(lean.T))

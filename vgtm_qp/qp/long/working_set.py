@@ -28,6 +28,9 @@ _REFINEMENTS = 4
 MemberRows = Callable[[Index], tuple[Index, Array]]
 """Nodes (R, Q) and coefficients (R, Q, 3) of the lengths of members (R,); base nodes may have any coefficients."""
 
+Moved = Callable[[Index], Array]
+"""Displacements (..., 3), m, of nodes (...,)."""
+
 
 @dataclass(frozen=True, eq=False)
 class RowNumbers:
@@ -117,19 +120,20 @@ class RowTable:
             slice(first_clearance, first_clearance + len(clearance)),
         )
 
-    def values(self, nodes: Array, strokes: Array, held: Array, progress: float) -> Array:
-        """Return (total,) row values at displacements of the nodes (N, 3).
+    def values(self, moved: Moved, strokes: Array, held: Array, progress: float) -> Array:
+        """Return (total,) row values at displacements of the nodes.
 
         `strokes` (n_a,) and `held` (l,) are the changes of the actuated and of the locked members' lengths.
         """
-        numbers, truss, clearance = self.numbers, self.layout.truss, self.numbers.clearance
+        numbers, clearance = self.numbers, self.numbers.clearance
+        tip = moved(self.layout.truss.tip).reshape(-1)
         return np.concatenate(
             [
-                numbers.tip_jacobian @ nodes[truss.tip].reshape(-1) - numbers.tip_rate * progress,
+                numbers.tip_jacobian @ tip - numbers.tip_rate * progress,
                 held,
                 [progress],
                 strokes,
-                np.einsum("rsc,rsc->r", clearance.coefficients, nodes[clearance.nodes]),
+                np.einsum("rsc,rsc->r", clearance.coefficients, moved(clearance.nodes)),
             ]
         )
 
@@ -265,8 +269,12 @@ class Eliminated(Protocol):
         """Return (size, len(rows)) L^-1 A' of the given rows A."""
         ...
 
-    def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
+    def values(self, table: RowTable, combined: Array) -> Array:
+        """Return (total,) the row values where the Lagrangian is least, given columns times multipliers (size,)."""
+        ...
+
+    def point(self, values: Array) -> Point:
+        """Return the point whose `values` were asked for last."""
         ...
 
 
@@ -335,9 +343,9 @@ def solve_rows(
     multipliers = np.zeros(0)
     iterations, refined = 0, 0
     new = [*range(table.equal), *table.remembered(remembered)]
-    point = problem.point(table, np.zeros(size))
+    values = problem.values(table, np.zeros(size))
     while True:
-        violation = table.violation(point.values)
+        violation = table.violation(values)
         violated = np.flatnonzero(violation > _VIOLATED)
         known = {*rows, *new}
         outside = np.array([k for k in violated.tolist() if k not in known], dtype=np.int64)
@@ -365,13 +373,13 @@ def solve_rows(
         index = np.array(rows, dtype=np.int64)
         multipliers, count = dual_solution(
             gram,
-            point.values[index] + gram @ multipliers,
+            values[index] + gram @ multipliers,
             table.lower[index],
             table.upper[index],
             index < table.equal,
         )
         iterations += count
-        point = problem.point(table, columns @ multipliers)
+        values = problem.values(table, columns @ multipliers)
     every = np.zeros(len(table.lower))
     every[rows] = multipliers
-    return Answer(table, point, every, iterations, rows, columns, gram)
+    return Answer(table, problem.point(values), every, iterations, rows, columns, gram)
