@@ -188,7 +188,7 @@ class Kinematics:
 
     def face_centres(self, X: Array) -> Array:
         """Return (F, 3) the points of the arm's axis that the faces stand for, m."""
-        return np.asarray(np.einsum("fk,fkc->fc", self.truss.face_weights, X[self.truss.faces]))
+        return np.asarray(np.einsum("fk,fkc->fc", self.truss.face_weights, X.take(self.truss.faces, axis=0)))
 
     def tip_position(self, X: Array) -> Array:
         """Return (3,) the position of the end effector, m."""

@@ -80,6 +80,8 @@ class StagedSolver:
         at = np.empty(truss.member_count, dtype=np.int64)
         at[chain.members.reshape(-1)] = np.arange(truss.member_count)
         self._strokes, self._held, self._fixed = at[truss.actuators], at[chain.locked], at[self.layout.fixed]
+        soft = chain.members[:, chain.soft].reshape(-1)
+        self._soft = np.argsort(soft)[np.isin(np.sort(soft), truss.actuators)]
         self._reversed_nodes = chain.nodes[::-1].reshape(-1)
         self._reversed_soft = chain.members[::-1][:, chain.soft].reshape(-1)
         self._active: set[tuple[object, ...]] = set()
@@ -153,12 +155,10 @@ class StagedSolver:
 
     def _strokes_of(self, motions: Array) -> Array:
         """Return (n_a, n_e) the changes of the actuated lengths in free motions (freedom, n_e) of the bays."""
-        sweep, soft = self._strokes_sweep, self.chain.soft
-        sweep.inputs[3].reshape(self.chain.periods, -1)[:] = motions.reshape(self.chain.periods, -1)[::-1]
+        sweep, periods = self._strokes_sweep, self.chain.periods
+        sweep.inputs[3].reshape(periods, -1)[:] = motions.reshape(periods, -1)[::-1]
         sweep()
-        changed = np.empty((*self.chain.members.shape, motions.shape[1]))
-        changed[:, soft] = sweep.outputs[1].reshape(self.chain.periods, -1, motions.shape[1])
-        return changed.reshape(-1, motions.shape[1])[self._strokes]
+        return sweep.outputs[1].reshape(-1, motions.shape[1]).take(self._soft, axis=0)
 
     def closing(self) -> Closing:
         """Return what brings members to their lengths with the Jacobian of the QP solved last."""

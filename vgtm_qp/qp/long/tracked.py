@@ -53,14 +53,15 @@ class Following:
         return moved + gains[-1] @ (gap - self._centre @ moved)
 
     def response(self) -> ca.Function:
-        """Return (carry, head, tail, table) -> (carry, U, D, R, gains): what follows from the curve.
+        """Return (carry, head, tail, table) -> (carry, gains, D, R, U): what follows from the curve.
 
-        U (3m, 3V - 5 + 1), displacements, D (soft, ...), strokes, and R (2f, ...), angles, are stored row by row;
-        their last columns are constants. The gains are those of :meth:`hold`.
+        D (soft, 3V - 5 + 1), strokes, R (2f, ...), angles, and U (3m, ...), displacements, are stored row by row, as
+        is the carry, the displacements of the live nodes; their last columns are constants. U is left out where the
+        next period uses all nodes of this one in order. The gains are those of :meth:`hold`.
         """
         elimination, inputs = self._elimination, self._elimination.inputs
         columns = elimination.curve + 1
-        carry = ca.SX.sym("carry", len(elimination.live), columns)
+        before = ca.SX.sym("carry", columns, len(elimination.live))
         rhs = []
         for stage in elimination.stages:
             wanted = ca.SX(len(stage.hard), columns)
@@ -72,7 +73,7 @@ class Following:
                 for k in self._faces
             ]
         )
-        moved = self._placed(carry, rhs, self._gains, gap)
+        moved = self._placed(before.T, rhs, self._gains, gap)
         strokes = inputs.jacobian[elimination.soft, :] @ moved
         strokes[:, -1] -= inputs.rhs[elimination.soft]
         angles = ca.vertcat(
@@ -85,12 +86,15 @@ class Following:
                 for k in self._faces
             ]
         )
-        outputs = [moved[elimination.live, :], moved[elimination.chain.before :, :].T, strokes.T, angles.T]
+        own = list(range(elimination.chain.before, elimination.size))
+        outputs = [moved[elimination.live, :].T, strokes.T, angles.T]
+        if elimination.live != own:
+            outputs.append(moved[own, :].T)
         gains = ca.vertcat(*[nonzeros(part) for part in self._gains])
         return ca.Function(
             "following",
-            [carry, inputs.head, inputs.tail, inputs.table],
-            [*(ca.densify(output) for output in outputs), gains],
+            [before, inputs.head, inputs.tail, inputs.table],
+            [ca.densify(outputs[0]), gains, *(ca.densify(output) for output in outputs[1:])],
         )
 
     def hold(self) -> ca.Function:
@@ -132,15 +136,16 @@ class TrackedSolver:
         self._changes = Sweep(elimination.changes(), chain.periods)
         self._changes.bind_input(1, self.data.head)
         self._curve = elimination.curve
-        outputs = [output.reshape(-1, self._curve + 1) for output in self._following.outputs[1:4]]
-        self._moved, self._strokes, self._angles = outputs
-        # The rows of base nodes, which do not move, are behind those of the others.
-        self._moving = np.zeros((len(chain.nodes.reshape(-1)) + 1, 3, self._curve + 1))
-        self._following.bind_output(1, self._moving[:-1].reshape(-1))
-        self._moved = self._moving[:-1].reshape(-1, self._curve + 1)
-        self._place = np.where(
-            chain.node_period >= 0, chain.node_period * chain.nodes.shape[1] + chain.node_place, -1
-        )
+        columns, own = self._curve + 1, chain.nodes.shape[1]
+        self._strokes, self._angles = (output.reshape(-1, columns) for output in self._following.outputs[2:4])
+        # The first rows are those of the base, whose nodes do not move; then come the nodes in order.
+        self._moving = np.zeros(((chain.periods + 1) * own, 3, columns))
+        if len(self._following.outputs) > 4:
+            self._following.bind_output(4, self._moving[own:])
+        else:
+            self._moving = self._following.carry.reshape(self._moving.shape)
+        self._moved = self._moving[own:].reshape(-1, columns)
+        self._place = np.where(chain.node_period >= 0, (chain.node_period + 1) * own + chain.node_place, 0)
         self._nodes = chain.nodes.reshape(-1)
         soft = chain.members[:, chain.soft].reshape(-1)
         self._soft = np.argsort(soft)
@@ -171,12 +176,12 @@ class TrackedSolver:
 
     def closing(self) -> Closing:
         """Return what brings fixed members to their lengths and keeps the faces on the curve, as the QP solved last."""
-        return Closing(self.chain, self._graphs.hold(), [self.data.head, self._following.outputs[4]])
+        return Closing(self.chain, self._graphs.hold(), [self.data.head, self._following.outputs[1]])
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
         nodes, coefficients, progress = table.coefficients(rows)
-        moved = self._moving[self._place[nodes]]
+        moved = self._moving.take(self._place[nodes], axis=0)
         columns = np.empty((self._curve + 1, len(rows)))
         columns[:-1] = np.einsum("rqc,rqcn->nr", coefficients, moved[..., :-1])
         columns[-1] = progress * self._progress_scale
@@ -189,7 +194,10 @@ class TrackedSolver:
         self._progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
         strokes = (self._strokes @ self._free).take(self._soft)
         return table.values(
-            lambda nodes: self._moving[self._place[nodes]] @ self._free, strokes, np.zeros(0), self._progress
+            lambda nodes: self._moving.take(self._place[nodes], axis=0) @ self._free,
+            strokes,
+            np.zeros(0),
+            self._progress,
         )
 
     def point(self, values: Array) -> Point:
