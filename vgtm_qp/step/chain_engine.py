@@ -36,7 +36,7 @@ class _Frame:
 
     def __init__(self, home: Array, rotation: Array) -> None:
         cosines, sines, alignment = frame_constants(home, rotation)
-        self._kernel = Kernel(frame_function(len(home)), compiled=False)
+        self._kernel = Kernel(frame_function(len(home)))
         for k, constant in enumerate((cosines, sines, alignment.T)):
             self._kernel.inputs[1 + k][:] = constant.reshape(-1)
 
@@ -77,7 +77,7 @@ class ChainEngine:
         self._tip = np.array([np.flatnonzero(self._nodes == node)[0] for node in truss.tip])
         self._aims = home_lengths.copy()
         self._strokes = home_lengths[truss.actuators]
-        self._held: NDArray[np.bool_] = np.zeros(len(truss.actuators), dtype=bool)
+        self._answer = (self._strokes, self._strokes, self._strokes)
         self._vertices: Array = np.zeros((layout.vertices, 3))
         self._curve_weights = layout.curve_weights[chain.faces.reshape(-1)]
         if isinstance(solver, TrackedSolver):
@@ -142,7 +142,7 @@ class ChainEngine:
             member_rows=self._values.member_rows,
         )
         solution = self._solver.solve_filled(numbers)
-        self._held = held(solution.actuators, numbers.lower, numbers.upper)
+        self._answer = solution.actuators, numbers.lower, numbers.upper
         self._strokes = length + solution.actuators
         self._vertices = vertices + solution.vertices
         return solution
@@ -206,7 +206,7 @@ class ChainEngine:
             if off > accuracy.start:
                 return None
             if off > enough_tip and not is_given_up:
-                gain = solver.gain(self._held) if gain is None else gain
+                gain = solver.gain(held(*self._answer)) if gain is None else gain
                 is_given_up = gain is None
             if gain is not None and off > enough_tip:
                 wanted = wanted + gain @ error

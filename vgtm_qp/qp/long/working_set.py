@@ -9,7 +9,7 @@ from typing import Protocol
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpstrf
+from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.condensed import FEASIBILITY, UNBOUNDED, InfeasibleStepError
@@ -21,6 +21,8 @@ Index = NDArray[np.int64]
 
 _NO_ROW = 1e-11
 _DEPENDENT = 1e-14
+_INDEPENDENT = 1e-4
+"""Rows whose Cholesky pivots differ by less than this are far from dependent."""
 _VIOLATED = 1e-10
 _REFINEMENTS = 4
 
@@ -145,6 +147,10 @@ class RowTable:
         """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
         numbers, truss = self.numbers, self.layout.truss
         tip = len(numbers.tip_rhs)
+        if rows.max() < tip + (not len(self.locked)):
+            every = np.vstack([numbers.tip_jacobian, np.zeros_like(numbers.tip_jacobian[:1])])
+            on_tip = every[rows].reshape(len(rows), -1, 3)
+            return np.tile(truss.tip, (len(rows), 1)), on_tip, np.append(-numbers.tip_rate, 1.0)[rows]
         is_stroke = (rows >= self.actuators.start) & (rows < self.clearance.start)
         is_held = (rows >= tip) & (rows < self.equal)
         members = np.empty(len(rows), dtype=np.int64)
@@ -196,6 +202,22 @@ class RowTable:
         return sorted(rows)
 
 
+def _all_active(
+    gram: Array, values: Array, lower: Array, upper: Array, equal: NDArray[np.bool_]
+) -> Array | None:
+    """Return the multipliers where all rows are active at the bounds they violate; None where they may not be."""
+    above = equal | (values > upper)
+    if not np.all(above | (values < lower)):
+        return None
+    factor, failed = dpotrf(gram, lower=1)
+    pivots = factor.diagonal()
+    if failed or not pivots.min() > _INDEPENDENT * pivots.max():
+        return None
+    found: Array = dpotrs(factor, values - np.where(above, upper, lower), lower=1)[0]
+    right = np.where(above, found, -found)[~equal] >= 0.0
+    return found if right.all() and np.isfinite(found).all() else None
+
+
 def dual_solution(
     gram: Array, values: Array, lower: Array, upper: Array, equal: NDArray[np.bool_]
 ) -> tuple[Array, int]:
@@ -210,6 +232,9 @@ def dual_solution(
     SolverError
         The dual QP was not solved.
     """
+    guessed = _all_active(gram, values, lower, upper, equal)
+    if guessed is not None:
+        return guessed, 1
     norm = np.sqrt(np.maximum(np.diag(gram), 0.0))
     multipliers = np.zeros(len(norm))
     if not np.all(np.isfinite(norm)):
