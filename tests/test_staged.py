@@ -303,8 +303,8 @@ def test_a_wrong_answer_is_refused(hard, monkeypatch):
     monkeypatch.setattr(
         type(solver),
         "point",
-        lambda self, table, combined: replace(
-            unchanged(self, table, combined), nodes=unchanged(self, table, combined).nodes * (1 + 1e-4)
+        lambda self, values: replace(
+            unchanged(self, values), nodes=unchanged(self, values).nodes * (1 + 1e-4)
         ),
     )
     with pytest.raises(SolverError, match="residual"):
@@ -381,14 +381,15 @@ def test_memory_is_linear_in_the_bays():
     assert size(60) < 3.1 * size(20)
 
 
+@pytest.mark.parametrize("joint_offset", [0.0, 0.02])
 @pytest.mark.parametrize("path", ["chain", "sparse", "dense"])
 @pytest.mark.parametrize("name", [*MODULES, "graph"])
-def test_lengths_by_every_path(name, path, monkeypatch):
+def test_lengths_by_every_path(name, path, joint_offset, monkeypatch):
     if path != "dense":
         monkeypatch.setattr(lengths_module, "_DENSE", 0)
     if path == "sparse":
         monkeypatch.setattr(lengths_module, "find_chain", lambda _: None)
-    truss = mast() if name == "graph" else MODULES[name](joint_offset=0.02)
+    truss = mast() if name == "graph" else MODULES[name](joint_offset=joint_offset)
     layout, kinematics, _ = make(truss, vertices=0)
     rng = np.random.default_rng(1)
     kinematics.evaluate(random_pose(truss, rng, 0.02))
@@ -417,11 +418,8 @@ def test_the_gain_is_the_least_motion_of_the_tip():
         response = np.linalg.inv(layout.length_jacobian(numbers.gradient))[:, truss.actuators]
         tip = numbers.tip_jacobian @ response[(layout.node_column[truss.tip][:, None] + np.arange(3)).ravel()]
         stiffness = weights.actuator_rate + weights.stroke_centring
-        wanted = response @ settling_gain(response, tip, ~at_bound, weights.node_rate, stiffness)
-        np.testing.assert_allclose(
-            gain[truss.free].reshape(wanted.shape), wanted, atol=1e-9 * np.abs(wanted).max()
-        )
-        assert not gain[truss.base].any()
+        wanted = settling_gain(response, tip, ~at_bound, weights.node_rate, stiffness)
+        np.testing.assert_allclose(gain, wanted, atol=1e-9 * np.abs(wanted).max())
     assert stopped > 0
     assert solver.gain(np.ones(len(truss.actuators), dtype=bool)) is None
 

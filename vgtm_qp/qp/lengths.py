@@ -70,19 +70,71 @@ class LengthSolver:
             raise SolverError(_SINGULAR) from reason
 
 
+class FaceSolver:
+    """Newton's step on the lengths of the fixed members and the places of the faces, where they determine the nodes."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        truss = layout.truss
+        member, self._flat, column = layout.length_scatter
+        row = np.full(truss.member_count, -1, dtype=np.int64)
+        row[layout.fixed] = np.arange(len(layout.fixed))
+        self._kept = np.flatnonzero(row[member] >= 0)
+        nodes = truss.faces[layout.tracked]
+        face, corner = np.nonzero(layout.node_column[nodes] >= 0)
+        axis = np.arange(3)
+        first = layout.node_column[nodes[face, corner]]
+        self._rows = np.concatenate(
+            [row[member[self._kept]], (len(layout.fixed) + 3 * face[:, None] + axis).ravel()]
+        )
+        self._columns = np.concatenate([column[self._kept], (first[:, None] + axis).ravel()])
+        self._weights = np.repeat(truss.face_weights[layout.tracked[face], corner], 3)
+
+    def solve(self, gradient: Array, error: Array, gap: Array) -> Array:
+        """Return displacements of the free nodes (N - N_c, 3), m.
+
+        Parameters
+        ----------
+        gradient : (M, Q, 3)
+            d length / d (positions of ``layout.member_nodes``).
+        error : (n_l,)
+            Wanted changes of the fixed members' lengths, m.
+        gap : (K, 3)
+            Wanted displacements of the tracked faces' centres, m.
+
+        Raises
+        ------
+        SolverError
+            The truss is in a pose where these do not determine the nodes.
+        """
+        values = np.concatenate([gradient.reshape(-1)[self._flat[self._kept]], self._weights])
+        shape = (len(error) + gap.size, self._layout.node_columns)
+        matrix = sparse.csc_matrix((values, (self._rows, self._columns)), shape=shape)
+        try:
+            step = np.asarray(splu(matrix).solve(np.concatenate([error, gap.reshape(-1)])))
+        except RuntimeError as reason:
+            raise SolverError(_SINGULAR) from reason
+        if not np.all(np.isfinite(step)):
+            raise SolverError(_SINGULAR)
+        return step.reshape(-1, 3)
+
+
 class _ChainSubstitution:
     """Bay after bay: each stage's members place its nodes on those before."""
 
     def __init__(self, chain: Chain) -> None:
         self._chain = chain
         self._sweep = Sweep(_substitution(chain), chain.periods)
+        place = np.empty(chain.layout.truss.node_count, dtype=np.int64)
+        place[chain.nodes.reshape(-1)] = np.arange(chain.nodes.size)
+        self._order = place[chain.layout.truss.free]
 
     def solve(self, gradient: Array, error: Array) -> Array:
         chain, sweep = self._chain, self._sweep
         sweep.inputs[1][:] = chain.gather @ gradient.reshape(-1)
         sweep.inputs[2][:] = error[chain.members].reshape(-1)
         sweep()
-        return sweep.outputs[1].copy()
+        return sweep.outputs[1].reshape(-1, 3)[self._order]
 
 
 def _substitution(chain: Chain) -> ca.Function:

@@ -21,8 +21,11 @@ from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS
+from vgtm_qp.qp.long.staged import StagedSolver
+from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
 from vgtm_qp.step.base import BaseMotion
+from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.curve import home_curve
 from vgtm_qp.step.engine import ElasticEngine, Engine, FusedEngine, PlainEngine
 from vgtm_qp.step.linearise import Linearisation
@@ -217,8 +220,11 @@ def make_engine(
         stages = elimination_stages(layout)
         if stages is not None and len(layout.truss.actuators) <= FUSED_ACTUATORS:
             return FusedEngine(FusedSolver(layout, stages))
+    chosen = make_solver(solver, layout)
+    if isinstance(chosen, (StagedSolver, TrackedSolver)) and compiled and ChainEngine.serves(chosen):
+        return ChainEngine(chosen, kinematics, task, layout.truss.home_lengths)
     linearisation = Linearisation(layout, kinematics, task, layout.truss.home_lengths)
-    return PlainEngine(linearisation, make_solver(solver, layout))
+    return PlainEngine(linearisation, chosen)
 
 
 def _check_supported(problem: Problem) -> None:

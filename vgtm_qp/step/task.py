@@ -99,7 +99,10 @@ class TipTask:
         """
         kinematics = self._kinematics
         error, rate, across = self.residual(kinematics.tip_position(X), kinematics.tip_rotation, goal)
-        jacobian = self._position_jacobian
-        if across is not None:
-            jacobian = np.concatenate([jacobian, across @ (kinematics.tip_spin if spin is None else spin)])
-        return TipRows(np.asarray(jacobian), rate, error)
+        return TipRows(self.jacobian(across, kinematics.tip_spin if spin is None else spin), rate, error)
+
+    def jacobian(self, across: Array | None, spin: Array | None) -> Array:
+        """Return (n_e, 3 K_tip) the rows' Jacobian, from `residual`'s combination of the tip's `spin` (3, 3 K_tip)."""
+        if across is None or spin is None:
+            return np.asarray(self._position_jacobian)
+        return np.concatenate([self._position_jacobian, across @ spin])

@@ -31,7 +31,8 @@ class HardTracking:
         """
         layout, kinematics = self._layout, self._kinematics
         faces, shape = layout.tracked, layout.general
-        kinematics.evaluate(X)
+        if layout.hard_turns:
+            kinematics.evaluate(X)
         centres = kinematics.face_centres(X)[faces]
         if shape is None:
             worst = float(np.abs(centres - layout.curve_weights @ vertices).max(initial=0.0))

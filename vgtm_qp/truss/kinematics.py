@@ -30,22 +30,23 @@ def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:
     return ca.horzcat(x, ca.cross(z, x), z)
 
 
-def face_frame(nodes: ca.SX, cosines: ca.SX, sines: ca.SX) -> ca.SX:
+def face_frame(nodes: ca.SX, cosines: ca.SX, sines: ca.SX, sense: ca.SX | float = 1.0) -> ca.SX:
     """Return the rotation (3, 3) that fits the reference polygon with the given polar angles best to (3, K) `nodes`.
 
     z is the unit area vector; x is the closed solution of the two-dimensional orthogonal Procrustes problem in the
     plane normal to it. No node is preferred, so a variable triangle gains no false authority over roll.
+    `sense` is -1 where the nodes are named the other way round.
     """
     count = nodes.shape[1]
     centred = nodes - ca.repmat(ca.sum2(nodes) / count, 1, count)
     area, x = ca.SX.zeros(3), ca.SX.zeros(3)
     for j in range(count):
         area += ca.cross(centred[:, j], centred[:, (j + 1) % count])
-    z = area / ca.norm_2(area)
+    z = area * (sense / ca.norm_2(area))
     for j in range(count):
         x += cosines[j] * centred[:, j] + sines[j] * ca.cross(centred[:, j], z)
     x -= z * ca.dot(z, x)
-    x /= ca.norm_2(x)
+    x *= 1.0 / ca.norm_2(x)
     return ca.horzcat(x, ca.cross(z, x), z)
 
 
@@ -187,7 +188,7 @@ class Kinematics:
 
     def face_centres(self, X: Array) -> Array:
         """Return (F, 3) the points of the arm's axis that the faces stand for, m."""
-        return np.asarray(np.einsum("fk,fkc->fc", self.truss.face_weights, X[self.truss.faces]))
+        return np.asarray(np.einsum("fk,fkc->fc", self.truss.face_weights, X.take(self.truss.faces, axis=0)))
 
     def tip_position(self, X: Array) -> Array:
         """Return (3,) the position of the end effector, m."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +19,15 @@ Mask = NDArray[np.bool_]
 _LONGEST_PERIOD = 6
 _MOST_NODES = 12
 _MOST_LOCKED = 24
+_MOST_BASE_NODES = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
     """Periods of p stages; its members and tracked faces use nodes of it and of the period before.
 
-    Places within a period: first the w nodes that it uses of the one before, then its own m by stage.
+    Places within a period: first the w nodes that it uses of the one before, then its own m by stage. Where the truss
+    allows it, the nodes and members of every period are put in the order in which all periods are alike.
 
     Attributes
     ----------
@@ -45,9 +48,15 @@ class Chain:
         Positions in ``layout.tracked`` of the faces that each period completes.
     face_places : (f, 3) int
         Places of those faces' nodes.
+    face_order : (n, f, 3) int
+        Which of a face's nodes stand at those places.
     face_weights : (f, 3)
     locked : (l,) int
         Fixed members that stand where other periods have an actuated one.
+    window : (n, w + m) int or None
+        The node at each place, base nodes included, where every place means the same in all periods; else None.
+    member_places : (3m, 2) int
+        The places that a period's members join; empty without a window.
     """
 
     layout: Layout
@@ -59,8 +68,11 @@ class Chain:
     soft: Mask
     faces: Index
     face_places: Index
+    face_order: Index
     face_weights: Array
     locked: Index
+    window: Index | None
+    member_places: Index
 
     @property
     def periods(self) -> int:
@@ -126,6 +138,7 @@ class Chain:
         )
 
 
+@lru_cache(maxsize=4)
 def find_chain(layout: Layout) -> Chain | None:
     """Return the chain of `layout`, with the shortest period; None where the truss is none."""
     stages = int(layout.truss.stage.max(initial=-1)) + 1
@@ -158,7 +171,94 @@ def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
         return None
     nodes = truss.free.reshape(periods, -1)
     members = np.argsort(member_stage, kind="stable").reshape(periods, -1)
+    sizes = tuple(node_counts[:length].tolist())
+    alike = _alike(layout, nodes, members, sizes) if truss.joints is None else None
+    if alike is not None:
+        chain = _of_ordered(layout, alike.nodes, alike.members, sizes, alike)
+        if chain is not None:
+            return chain
+    return _of_ordered(layout, nodes, members, sizes, None)
 
+
+@dataclass(frozen=True, eq=False)
+class _Alike:
+    """Nodes (n, m) and members (n, 3m) in the order in which all periods are alike.
+
+    `base` are the nodes before the first one; `pairs` (3m, 2) what the members join: places among the nodes of the
+    period before, then from m on among a period's own.
+    """
+
+    nodes: Index
+    members: Index
+    base: Index
+    pairs: list[tuple[int, int]]
+
+
+def _alike(layout: Layout, nodes: Index, members: Index, sizes: tuple[int, ...]) -> _Alike | None:
+    """Return the order in which all periods of a chain of pin-jointed members are alike; None where there is none.
+
+    Nodes of a stage are told apart by what they hang on, so that a bay that is the mirror image of the one before
+    comes in another order of its nodes.
+    """
+    base = np.flatnonzero(layout.truss.base).tolist()
+    if len(nodes) < 2 or len(base) > min(int(nodes.shape[1]), _MOST_BASE_NODES):
+        return None
+    ends = layout.member_nodes.tolist()
+    for order in permutations(base):
+        before: list[int] | None = list(order)
+        wanted: list[tuple[int, int]] | None = None
+        ordered, listed = [before], []
+        for names, own in zip(nodes.tolist(), members.tolist(), strict=True):
+            assert before is not None
+            before, found, pairs = _ordered_period(
+                before, names, {member: ends[member] for member in own}, sizes
+            )
+            wanted = pairs if wanted is None else wanted
+            if before is None or pairs != wanted:
+                break
+            ordered.append(before)
+            listed.append(found)
+        else:
+            assert wanted is not None
+            return _Alike(np.array(ordered[1:]), np.array(listed), np.array(ordered[0]), wanted)
+    return None
+
+
+def _ordered_period(
+    before: list[int], names: list[int], ends: dict[int, list[int]], sizes: tuple[int, ...]
+) -> tuple[list[int] | None, list[int], list[tuple[int, int]]]:
+    """Return a period's nodes and members in order and the places that those join; None where they go further back.
+
+    Places are those of the nodes `before`, then from len(names) on the period's own.
+    """
+    own = len(names)
+    place = {node: k for k, node in enumerate(before)}
+    hangs: dict[int, list[int]] = {node: [] for node in names}
+    for first, second in ends.values():
+        for here, there in ((first, second), (second, first)):
+            if here in hangs:
+                hangs[here].append(there)
+    order: list[int] = []
+    for count in sizes:
+        stage = names[len(order) : len(order) + count]
+        keys = {
+            node: (sorted(place[other] for other in hangs[node] if other in place), node) for node in stage
+        }
+        for node in sorted(stage, key=keys.__getitem__):
+            place[node] = own + len(order)
+            order.append(node)
+    if any(node not in place for pair in ends.values() for node in pair):
+        return None, [], []
+    joined = {member: sorted(place[node] for node in pair) for member, pair in ends.items()}
+    listed = sorted(ends, key=lambda member: (joined[member][1], joined[member][0]))
+    return order, listed, [(joined[member][0], joined[member][1]) for member in listed]
+
+
+def _of_ordered(
+    layout: Layout, nodes: Index, members: Index, sizes: tuple[int, ...], alike: _Alike | None
+) -> Chain | None:
+    """Return the chain of these periods, None where they are none."""
+    truss, periods = layout.truss, len(nodes)
     period = np.full(truss.node_count, -2, dtype=np.int64)
     place = np.zeros(truss.node_count, dtype=np.int64)
     period[nodes], place[nodes] = np.arange(periods)[:, None], np.arange(nodes.shape[1])
@@ -176,6 +276,11 @@ def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
             return None
         faces = order.reshape(periods, -1)
         face_used = face_nodes[faces]
+    face_order = np.broadcast_to(np.arange(3), face_used.shape)
+    if alike is not None:
+        rank = place[face_used] + np.where(period[face_used] == here, nodes.shape[1], 0)
+        face_order = np.argsort(rank, axis=2)
+        face_used = np.take_along_axis(face_used, face_order, axis=2)
     for nodes_used in (used, face_used):
         if ((period[nodes_used] >= 0) & (period[nodes_used] < here - 1)).any():
             return None
@@ -185,7 +290,7 @@ def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
         )
     )
     face_places = _places(period[face_used], place[face_used], here, carried)
-    weights = truss.face_weights[layout.tracked[faces]]
+    weights = np.take_along_axis(truss.face_weights[layout.tracked[faces]], face_order, axis=2)
     if (
         (face_places != face_places[:1]).any()
         or (face_places < 0).any()
@@ -201,16 +306,27 @@ def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
     locked = members[~actuated & soft]
     if (actuated & ~soft).any() or len(locked) > _MOST_LOCKED:
         return None
+    window, member_places = None, np.zeros((0, 2), dtype=np.int64)
+    if alike is not None and carried.max(initial=-1) < len(alike.base):
+        before = np.concatenate([alike.base[carried][None], nodes[:-1][:, carried]])
+        window = np.concatenate([before, nodes], axis=1)
+        number = np.full(2 * nodes.shape[1], -1, dtype=np.int64)
+        number[carried] = np.arange(len(carried))
+        number[nodes.shape[1] :] = len(carried) + np.arange(nodes.shape[1])
+        member_places = number[np.array(alike.pairs)]
     return Chain(
         layout=layout,
         nodes=nodes,
         members=members,
-        stage_sizes=tuple(node_counts[:length].tolist()),
+        stage_sizes=sizes,
         carried=carried,
         pattern=pattern,
         soft=soft,
         faces=faces,
         face_places=face_places[0],
+        face_order=face_order,
         face_weights=weights[0],
         locked=locked,
+        window=window,
+        member_places=member_places,
     )

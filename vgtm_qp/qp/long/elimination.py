@@ -19,6 +19,7 @@ from vgtm_qp.qp.long.sparse_symbols import (
     nonzeros,
     offsets,
     range_and_null,
+    small_inverse,
     symbols_of,
     symmetric,
 )
@@ -35,10 +36,12 @@ class Stage:
 
 
 class Inputs:
-    """A period's numbers as one vector `data` of symbols, in the order in which the solver fills them.
+    """A period's numbers as three vectors of symbols, in the order in which they are filled.
 
     Attributes
     ----------
+    head, tail, table : vector
+        What all sweeps read, what the factorisation alone reads, and what depends on the curve's base alone.
     jacobian : (3m, 3w + 3m), rhs : (3m,), actuator_gradient : (soft,)
     weights, slopes : (f, V - 1)
         Of the control vertices that move; the first one stays with the base.
@@ -47,27 +50,29 @@ class Inputs:
         Gap and angles as they are where no unknown moves.
     normal : (3,)
         The direction of the second control vertex.
-    sizes : dict
-        Length of each part.
+    sizes : dict of dicts
+        Length of each part of each vector.
     """
 
     def __init__(self, chain: Chain) -> None:
         faces, vertices = chain.faces.shape[1], max(chain.layout.vertices - 1, 0)
         pattern = chain.coordinate_pattern
         self.sizes = {
-            "jacobian": int(pattern.sum()),
-            "rhs": chain.own,
-            "actuator_gradient": int(chain.soft.sum()),
-            "weights": faces * vertices,
-            "slopes": faces * vertices,
-            "tangent_face": 18 * faces,
-            "tangent_curve": 6 * faces,
-            "gap": 3 * faces,
-            "tilt": 2 * faces,
-            "normal": 3,
+            "head": {"jacobian": int(pattern.sum()), "rhs": chain.own, "tangent_face": 18 * faces},
+            "tail": {
+                "actuator_gradient": int(chain.soft.sum()),
+                "tangent_curve": 6 * faces,
+                "gap": 3 * faces,
+                "tilt": 2 * faces,
+            },
+            "table": {"weights": faces * vertices, "slopes": faces * vertices, "normal": 3},
         }
-        self.data = ca.SX.sym("data", sum(self.sizes.values()))
-        parts = dict(zip(self.sizes, ca.vertsplit(self.data, offsets(self.sizes.values())), strict=True))
+        parts: dict[str, ca.SX] = {}
+        vectors = []
+        for name, sizes in self.sizes.items():
+            vectors.append(ca.SX.sym(name, sum(sizes.values())))
+            parts |= dict(zip(sizes, ca.vertsplit(vectors[-1], offsets(sizes.values())), strict=True))
+        self.head, self.tail, self.table = vectors
         self.jacobian = symbols_of(pattern, parts["jacobian"])
         self.rhs, self.actuator_gradient, self.normal = (
             parts["rhs"],
@@ -160,7 +165,7 @@ class Elimination:
         return -self.inputs.jacobian[stage.hard, stage.before]
 
     def factor(self) -> ca.Function:
-        """Return (carry, data) -> (carry, gains, Y): one period of the recursion.
+        """Return (carry, head, tail, table) -> (carry, gains, Y): one period of the recursion.
 
         The carry holds the upper half of the Hessian in the live coordinates, their linear terms for every
         curve coordinate and for 1, and the gradient of the curve coordinates. Y (freedom, 3V - 5 + 1) is
@@ -208,13 +213,14 @@ class Elimination:
             V = rest + T.T @ (G.T @ total - W.T @ Y) - Wb.T @ Y
             H = ca.sparsify(symmetric(H[before, before] + T.T @ (M @ T) + cross + cross.T - Wb.T @ Wb))
             curve_gradient += total[:, :-1].T @ placed - Y[:, :-1].T @ Y[:, -1]
-            gains = [free, G, W, Wb, *gains]
+            soft = [i for i in self.soft if self.chain.before + i in u]
+            gains = [free, G, W, Wb, small_inverse(inputs.jacobian[soft, u] @ free), *gains]
             outer = [Y, *outer]
         self._gain_parts = gains
         handed = ca.vertcat(nonzeros(ca.project(H, upper)), ca.densify(ca.vec(V)), curve_gradient)
         return ca.Function(
             "factor",
-            [carry, inputs.data],
+            [carry, inputs.head, inputs.tail, inputs.table],
             [
                 ca.densify(handed),
                 ca.vertcat(*[nonzeros(part) for part in gains]),
@@ -223,58 +229,103 @@ class Elimination:
         )
 
     def _gains(self) -> tuple[ca.SX, list[list[ca.SX]]]:
-        """Return the symbols of the gains and, per stage, (free, G, W, Wb); `factor` fixes their sparsity."""
+        """Return the symbols of the gains and, per stage, (free, G, W, Wb, S); `factor` fixes their sparsity.
+
+        S takes changes of a stage's actuated lengths to its scaled free motions.
+        """
         parts = self._gain_parts
         ends = offsets(part.nnz() for part in parts)
         vector = ca.SX.sym("gains", ends[-1])
         pieces = [
             ca.SX(part.sparsity(), v) for part, v in zip(parts, ca.vertsplit(vector, ends), strict=True)
         ]
-        return vector, [pieces[4 * k : 4 * k + 4] for k in range(len(self.stages))]
+        return vector, [pieces[5 * k : 5 * k + 5] for k in range(len(self.stages))]
 
     def columns(self, count: int) -> ca.Function:
-        """Return (carry, data, gains, rows (3m, count)) -> (carry, Z): rows through the elimination."""
+        """Return (carry, head, gains, rows (3m, count)) -> (carry, Z): rows through the elimination."""
         vector, gains = self._gains()
         carry, rows = ca.SX.sym("carry", len(self.live), count), ca.SX.sym("rows", self.chain.own, count)
         V = ca.vertcat(ca.SX(self.chain.before, count), rows)
         V[self.live, :] += carry
         outer: list[ca.SX] = []
-        for stage, (free, G, W, Wb) in reversed(list(zip(self.stages, gains, strict=True))):
+        for stage, (free, G, W, Wb, _) in reversed(list(zip(self.stages, gains, strict=True))):
             Vu = V[stage.own, :]
             Z = free.T @ Vu
             V = V[stage.before, :] + self.transfer(stage).T @ (G.T @ Vu - W.T @ Z) - Wb.T @ Z
             outer = [Z, *outer]
         return ca.Function(
             "columns",
-            [carry, self.inputs.data, vector, rows],
+            [carry, self.inputs.head, vector, rows],
             [ca.densify(V), ca.densify(ca.vertcat(*outer).T)],
         )
 
     def forward(self) -> ca.Function:
-        """Return (carry, data, gains, z) -> (carry, u, J u - rhs, centres and angles of the faces)."""
+        """Return (carry, head, gains, z) -> (carry, u, J u - rhs, centres and angles of the faces)."""
         vector, gains = self._gains()
         carry, z = ca.SX.sym("carry", len(self.live)), ca.SX.sym("z", self.freedom)
         u, done = carry, 0
-        for stage, (free, G, W, Wb) in zip(self.stages, gains, strict=True):
+        for stage, (free, G, W, Wb, _) in zip(self.stages, gains, strict=True):
             followed = self.transfer(stage) @ u
             motion = z[done : done + stage.freedom] + W @ followed + Wb @ u
             u = ca.vertcat(u, G @ (self.hard_rhs(stage) + followed) - free @ motion)
             done += stage.freedom
-        faces = [
-            row(k) @ u
-            for k in range(self.chain.faces.shape[1])
-            for row in (self.centre_row, self.tangent_row)
-        ]
         outputs = [
             u[self.live],
             u[self.chain.before :],
             self.inputs.jacobian @ u - self.inputs.rhs,
-            ca.vertcat(*faces),
+            self._faces(u),
         ]
-        return ca.Function("forward", [carry, self.inputs.data, vector, z], [ca.densify(x) for x in outputs])
+        return ca.Function("forward", [carry, self.inputs.head, vector, z], [ca.densify(x) for x in outputs])
+
+    def strokes(self, count: int) -> ca.Function:
+        """Return (carry, head, gains, z (freedom, count)) -> (carry, J u of the actuated members), all without rhs.
+
+        Each column of `z` is a motion of its own; z and J u are stored row by row.
+        """
+        vector, gains = self._gains()
+        carry, rows = ca.SX.sym("carry", len(self.live), count), ca.SX.sym("z", count, self.freedom)
+        u, z, done = carry, rows.T, 0
+        for stage, (free, G, W, Wb, _) in zip(self.stages, gains, strict=True):
+            followed = self.transfer(stage) @ u
+            motion = z[done : done + stage.freedom, :] + W @ followed + Wb @ u
+            u = ca.vertcat(u, G @ followed - free @ motion)
+            done += stage.freedom
+        changed = self.inputs.jacobian[self.soft, :] @ u
+        outputs = [ca.densify(u[self.live, :]), ca.densify(changed.T)]
+        return ca.Function("strokes", [carry, self.inputs.head, vector, rows], outputs)
+
+    def close(self) -> ca.Function:
+        """Return (carry, head, gains, X, aim) -> (carry, X, lengths): one step towards the lengths `aim` (3m,).
+
+        Newton's with the Jacobian in `head`. The carry holds the live nodes' positions, their displacements and the
+        greatest error so far; X (3m,) are the positions of a period's own nodes.
+        """
+        vector, gains = self._gains()
+        at = Positions(self)
+        aim = ca.SX.sym("aim", self.chain.own)
+        error = aim - at.lengths
+        J, u = self.inputs.jacobian, at.moved
+        for stage, (free, G, _, _, S) in zip(self.stages, gains, strict=True):
+            soft = [i for i in self.soft if self.chain.before + i in stage.own]
+            placed = G @ (error[stage.hard] + self.transfer(stage) @ u)
+            missing = error[soft] - J[soft, stage.before] @ u - J[soft, stage.own] @ placed
+            u = ca.vertcat(u, placed + free @ (S @ missing))
+        return at.function("close", [self.inputs.head, vector], [aim], u, error)
+
+    def changes(self) -> ca.Function:
+        """Return (carry, head, u (3m,)) -> (carry, J u - rhs, centres and angles of the faces) of displacements u."""
+        carry, own = ca.SX.sym("carry", len(self.live)), ca.SX.sym("u", self.chain.own)
+        u = ca.vertcat(carry, own)
+        outputs = [u[self.live], self.inputs.jacobian @ u - self.inputs.rhs, self._faces(u)]
+        return ca.Function("changes", [carry, self.inputs.head, own], [ca.densify(x) for x in outputs])
+
+    def _faces(self, u: ca.SX) -> ca.SX:
+        """Return (5f,) the centres' motions and the angles of a period's faces at displacements u (3w + 3m,)."""
+        rows = (self.centre_row, self.tangent_row)
+        return ca.vertcat(*[row(k) @ u for k in range(self.chain.faces.shape[1]) for row in rows])
 
     def balance(self) -> ca.Function:
-        """Return (carry, data, gains, nodal (3m,), actuator (soft,), faces (5f,)) -> (carry, residual).
+        """Return (carry, head, gains, nodal (3m,), actuator (soft,), faces (5f,)) -> (carry, residual).
 
         The costates of given gradients; the residual (freedom,) is what is left of stationarity.
         """
@@ -291,12 +342,69 @@ class Elimination:
                 + self.tangent_row(k).T @ face[5 * k + 3 : 5 * k + 5]
             )
         outer: list[ca.SX] = []
-        for stage, (free, G, _, _) in reversed(list(zip(self.stages, gains, strict=True))):
+        for stage, (free, G, _, _, _) in reversed(list(zip(self.stages, gains, strict=True))):
             Vu = V[stage.own]
             outer = [free.T @ Vu, *outer]
             V = V[stage.before] + self.transfer(stage).T @ (G.T @ Vu)
         return ca.Function(
             "balance",
-            [carry, self.inputs.data, vector, nodal, actuator, face],
+            [carry, self.inputs.head, vector, nodal, actuator, face],
             [ca.densify(V), ca.densify(ca.vertcat(*outer))],
         )
+
+
+class Positions:
+    """Where the nodes of a period are, as symbols: the live ones of the period before, then its own.
+
+    Attributes
+    ----------
+    points : (3, w + m)
+    moved : (3w,)
+        Displacements of the former in the step that is being taken.
+    lengths : (3m,)
+    """
+
+    def __init__(self, elimination: Elimination) -> None:
+        chain = self._chain = elimination.chain
+        self._live = elimination.live
+        self._carry = ca.SX.sym("carry", 2 * chain.before + 1)
+        before, self.moved, self._worst = ca.vertsplit(self._carry, offsets([chain.before, chain.before, 1]))
+        self._own = ca.SX.sym("X", chain.own)
+        self._all = ca.vertcat(before, self._own)
+        self.points = ca.reshape(self._all, 3, elimination.size // 3)
+        self.lengths = member_lengths(chain, self.points)
+
+    def centre(self, k: int) -> ca.SX:
+        """Return (3,) the centre of the period's face `k`."""
+        places, weights = self._chain.face_places[k].tolist(), self._chain.face_weights[k]
+        return self.points[:, places] @ ca.DM(weights)
+
+    def function(
+        self, name: str, before: list[ca.SX], after: list[ca.SX], u: ca.SX, error: ca.SX
+    ) -> ca.Function:
+        """Return (carry, *before, X, *after) -> (carry, X, lengths) of a step `u` (3w + 3m,) on an `error`."""
+        worst = _greater(self._worst, _greatest([ca.fabs(error[i]) for i in range(error.numel())]))
+        X = self._all + u
+        carry = ca.vertcat(self._all[self._live], u[self._live], worst)
+        outputs = [ca.densify(output) for output in (carry, X[self._chain.before :], self.lengths)]
+        return ca.Function(name, [self._carry, *before, self._own, *after], outputs)
+
+
+def _greatest(values: list[ca.SX]) -> ca.SX:
+    """Return the greatest of one or more numbers, pair by pair."""
+    while len(values) > 1:
+        values = [_greater(a, b) for a, b in zip(values[::2], values[1::2], strict=False)] + (
+            values[-1:] if len(values) % 2 else []
+        )
+    return values[0]
+
+
+def _greater(a: ca.SX, b: ca.SX) -> ca.SX:
+    """Return the greater of two numbers, or NaN where one is; ``fmax`` would pass over it."""
+    return (a + b + ca.fabs(a - b)) / 2
+
+
+def member_lengths(chain: Chain, points: ca.SX) -> ca.SX:
+    """Return (3m,) the lengths of a period's members where its nodes are at `points` (3, w + m)."""
+    first, second = (points[:, chain.member_places[:, e].tolist()] for e in range(2))
+    return ca.vertcat(*[ca.norm_2(first[:, i] - second[:, i]) for i in range(chain.own)])

@@ -91,6 +91,11 @@ def inverse_factor(A: ca.SX) -> ca.SX:
     return inverse
 
 
+def small_inverse(A: ca.SX) -> ca.SX:
+    """Return the inverse of a square `A` of a few rows, by reflections as in :func:`range_and_null`."""
+    return range_and_null(ca.sparsify(A))[0] if A.shape[0] else ca.SX(0, 0)
+
+
 def offsets(sizes: Iterable[int]) -> list[int]:
     """Return where pieces of these sizes begin, and where the last one ends."""
     return [0, *np.cumsum(list(sizes)).tolist()]

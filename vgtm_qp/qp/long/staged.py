@@ -6,6 +6,8 @@ are global unknowns beside them; rows with bounds meet in a small dense QP of th
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
@@ -13,9 +15,10 @@ from scipy.linalg.lapack import dtrtrs
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
+from vgtm_qp.qp.long.closing import Closing
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import Sweep
-from vgtm_qp.qp.long.working_set import Point, RowTable, solve_rows
+from vgtm_qp.qp.long.working_set import Answer, Point, RowNumbers, RowTable, solve_rows
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
@@ -41,21 +44,23 @@ class StagedSolver:
         elimination = Elimination(chain)
         periods = chain.periods
         self._freedom, self._curve = periods * elimination.freedom, elimination.curve
-        self._numbers = ChainData(chain, elimination.inputs.sizes)
-        self._reversed = np.zeros_like(self._numbers.data)
+        # The recursion runs from the tip to the base.
+        self.data = ChainData(chain, elimination.inputs.sizes, reverse=True)
         self._factor = Sweep(elimination.factor(), periods)
         self._columns = Sweep(elimination.columns(_BLOCK), periods)
         self._forward = Sweep(elimination.forward(), periods)
         self._balance = Sweep(elimination.balance(), periods)
+        self._elimination = elimination
         gains = self._factor.outputs[1]
-        for sweep in (self._factor, self._columns, self._balance):
-            sweep.bind_input(1, self._reversed)
+        for k, array in enumerate((self.data.head, self.data.tail, self.data.table)):
+            self._factor.bind_input(1 + k, array)
         for sweep in (self._columns, self._balance):
+            sweep.bind_input(1, self.data.head)
             sweep.bind_input(2, gains)
-        self._forward.bind_input(1, self._numbers.data)
         self._gains = gains.reshape(periods, -1)
-        self._forward_gains = self._forward.inputs[2].reshape(periods, -1)
-        self._motions = self._forward.inputs[3].reshape(periods, -1)
+        self._forward_head, self._forward_gains, self._motions = (
+            array.reshape(periods, -1) for array in self._forward.inputs[1:]
+        )
         own = chain.nodes.shape[1]
         # Rows of base nodes, which answer to no displacement, go to places behind the last one that is read.
         self._rows = np.zeros(((periods + 1) * _BLOCK * own, 3))
@@ -65,9 +70,22 @@ class StagedSolver:
             (periods - 1 - chain.node_period) * _BLOCK * own + chain.node_place,
             periods * _BLOCK * own,
         )
+        # A row of zeros behind those of the free nodes: base nodes do not move.
+        self._moved = np.zeros((chain.nodes.size + 1, 3))
+        self._forward.bind_output(1, self._moved[:-1])
+        self._at = np.where(chain.node_period >= 0, chain.node_period * own + chain.node_place, -1)
+        self._free, self._progress = np.zeros(self._curve), 0.0
         self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
+        truss = self.layout.truss
+        at = np.empty(truss.member_count, dtype=np.int64)
+        at[chain.members.reshape(-1)] = np.arange(truss.member_count)
+        self._strokes, self._held, self._fixed = at[truss.actuators], at[chain.locked], at[self.layout.fixed]
+        soft = chain.members[:, chain.soft].reshape(-1)
+        self._soft = np.argsort(soft)[np.isin(np.sort(soft), truss.actuators)]
+        self._reversed_nodes = chain.nodes[::-1].reshape(-1)
+        self._reversed_soft = chain.members[::-1][:, chain.soft].reshape(-1)
         self._active: set[tuple[object, ...]] = set()
-        self._table: RowTable | None = None
+        self._answer: Answer | None = None
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Solve one QP.
@@ -79,27 +97,38 @@ class StagedSolver:
         SolverError
             The QP is singular, or the answer failed the residual check.
         """
+        self.data.fill(numbers)
+        return self.solve_filled(RowNumbers.of(self.layout, numbers))
+
+    def solve_filled(self, numbers: RowNumbers) -> StepSolution:
+        """Solve the QP whose other numbers were written to `data`; see :meth:`solve`."""
         self._eliminate(numbers)
         table = RowTable.of(self.layout, numbers, self.chain.locked)
         size = self._freedom + self._curve + 1
-        self._table = table
+        self._answer = None
         answer = solve_rows(self, size, table, self._active, _BLOCK)
         self._check(table, answer.point, answer.multipliers)
-        self._active = answer.active
+        self._answer, self._active = answer, answer.active
         return answer.solution()
 
     def gain(self, held: NDArray[np.bool_]) -> Array | None:
-        """Return the least motions (N, 3, n_e) of the nodes that move the tip by one unit of each row.
+        """Return the changes (n_a, n_e) of the actuated lengths that move the tip by one unit of each of its rows.
 
-        In the metric of the QP solved last; its progress and the `held` actuators (n_a,) stay as they are.
-        None where they leave no such motion.
+        Those of the least motion in the metric of the QP solved last; its progress and the `held` actuators (n_a,)
+        stay as they are. None where they leave no such motion.
         """
-        table = self._table
-        if table is None:
+        answer = self._answer
+        if answer is None:
             return None
+        table, known = answer.table, {row: k for k, row in enumerate(answer.rows)}
         tip = len(table.numbers.tip_rhs)
-        rows = np.concatenate([np.arange(table.equal), table.actuators.start + np.flatnonzero(held)])
-        columns = self.columns(table, rows)
+        rows = [*range(table.equal), *(table.actuators.start + np.flatnonzero(held)).tolist()]
+        missing = [row for row in rows if row not in known]
+        columns = answer.columns
+        if missing:
+            columns = np.hstack([columns, self.columns(table, np.array(missing, dtype=np.int64))])
+            known |= {row: len(known) + k for k, row in enumerate(missing)}
+        columns = columns[:, [known[row] for row in rows]]
         columns[-1] = 0.0
         gram = columns.T @ columns
         try:
@@ -108,8 +137,32 @@ class StagedSolver:
             return None
         if not np.abs(shares).max(initial=0.0) * np.abs(gram).max(initial=0.0) < _WORST_CONDITION:
             return None
-        rest = self.point(table, np.zeros(len(columns))).nodes
-        return np.stack([self.point(table, -columns @ share).nodes - rest for share in shares.T], axis=-1)
+        combined = -columns @ shares
+        motions = combined[: self._freedom]
+        if self._curve:
+            known_curve = combined[self._freedom : self._freedom + self._curve]
+            motions = (
+                motions - self._outer[:, :-1] @ dtrtrs(self._curve_factor, known_curve, lower=1, trans=1)[0]
+            )
+        return self._strokes_of(motions)
+
+    @cached_property
+    def _strokes_sweep(self) -> Sweep:
+        sweep = Sweep(self._elimination.strokes(len(self.layout.tip_rows)), self.chain.periods)
+        for k, array in enumerate((self._forward_head, self._forward_gains)):
+            sweep.bind_input(1 + k, array)
+        return sweep
+
+    def _strokes_of(self, motions: Array) -> Array:
+        """Return (n_a, n_e) the changes of the actuated lengths in free motions (freedom, n_e) of the bays."""
+        sweep, periods = self._strokes_sweep, self.chain.periods
+        sweep.inputs[3].reshape(periods, -1)[:] = motions.reshape(periods, -1)[::-1]
+        sweep()
+        return sweep.outputs[1].reshape(-1, motions.shape[1]).take(self._soft, axis=0)
+
+    def closing(self) -> Closing:
+        """Return what brings members to their lengths with the Jacobian of the QP solved last."""
+        return Closing(self.chain, self._elimination.close(), [self._forward_head, self._forward_gains])
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
@@ -131,33 +184,37 @@ class StagedSolver:
             columns[rest] = -dtrtrs(self._curve_factor, through, lower=1)[0]
         return columns
 
-    def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
-        chain, truss = self.chain, self.layout.truss
+    def values(self, table: RowTable, combined: Array) -> Array:
+        """Return (total,) the row values where the Lagrangian is least, given columns times multipliers (size,)."""
         freedom, curve = self._freedom, self._curve
-        free = np.zeros(0)
+        motions = self._outer[:, -1] + combined[:freedom]
         if curve:
             known = self._curve_rhs + combined[freedom : freedom + curve]
-            free = -dtrtrs(self._curve_factor, known, lower=1, trans=1)[0]
-        progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
-        motions = self._outer[:, -1] + self._outer[:, :-1] @ free + combined[:freedom]
-        self._motions[:] = motions.reshape(chain.periods, -1)[::-1]
+            self._free = -dtrtrs(self._curve_factor, known, lower=1, trans=1)[0]
+            motions += self._outer[:, :-1] @ self._free
+        self._progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
+        self._motions[:] = motions.reshape(self.chain.periods, -1)[::-1]
         self._forward()
-        _, moved, changed, _ = self._forward.outputs
-        nodes, lengths = np.zeros((truss.node_count, 3)), np.empty(truss.member_count)
-        nodes[chain.nodes] = moved.reshape(*chain.nodes.shape, 3)
-        lengths[chain.members] = changed.reshape(chain.members.shape)
-        values = table.values(nodes, lengths, progress)
-        return Point(nodes, lengths, self._numbers.vertices(free), progress, values)
+        changed = self._forward.outputs[2]
+        return table.values(
+            lambda nodes: self._moved[self._at[nodes]],
+            changed.take(self._strokes),
+            changed[self._held],
+            self._progress,
+        )
 
-    def _eliminate(self, numbers: StepNumbers) -> None:
+    def point(self, values: Array) -> Point:
+        """Return the point whose `values` were asked for last."""
+        nodes = self._moved.take(self._at, axis=0)
+        return Point(nodes, self.data.vertices(self._free), self._progress, values)
+
+    def _eliminate(self, numbers: RowNumbers) -> None:
         """Run the recursion and factorise what is left, in the curve's coordinates."""
-        data = self._numbers
-        data.fill(numbers)
-        self._reversed[:] = data.data[::-1]
+        data = self.data
         self._factor()
         if not np.all(np.isfinite(self._outer[-1])) or not numbers.progress_curvature > 0.0:
             raise SolverError(SINGULAR)
+        self._forward_head[:] = data.head[::-1]
         self._forward_gains[:] = self._gains[::-1]
         self._progress_scale = 1.0 / np.sqrt(numbers.progress_curvature)
         self._progress_rhs = self._progress_scale * numbers.progress_gradient
@@ -184,18 +241,19 @@ class StagedSolver:
             + multipliers[table.actuators]
         )
         actuator[chain.locked] = multipliers[len(numbers.tip_rhs) : table.equal]
-        nodal[:] = gradient[chain.nodes[::-1]].reshape(-1)
-        force[:] = actuator[chain.members[::-1][:, chain.soft]].reshape(-1)
+        gradient.take(self._reversed_nodes, axis=0, out=nodal.reshape(-1, 3), mode="clip")
+        actuator.take(self._reversed_soft, out=force, mode="clip")
         residual = 0.0
         if self._curve:
-            gap, tilt = self._numbers.misfit(point.vertices, self._forward.outputs[3].reshape(-1, 5))
-            pulled = np.hstack([weights.tracking * gap, weights.tangent * tilt])
-            face[:] = pulled.reshape(chain.periods, -1)[::-1].reshape(-1)
-            residual = float(np.max(np.abs(self._numbers.curve_gradient(point.vertices, gap, tilt))))
+            parts = self._forward.outputs[3].reshape(chain.periods, -1)[::-1].reshape(-1, 5)
+            gap, tilt = self.data.misfit(point.vertices, parts)
+            pulled = face.reshape(-1, 5)
+            pulled[:, :3], pulled[:, 3:] = weights.tracking * gap, weights.tangent * tilt
+            residual = float(np.max(np.abs(self.data.curve_gradient(point.vertices, gap, tilt))))
         self._balance()
         residual = max(residual, float(np.max(np.abs(self._balance.outputs[1]), initial=0.0)))
         scale = 1.0 + float(np.max(np.abs(force), initial=0.0)) + float(np.max(np.abs(multipliers)))
-        fixed = point.lengths[self.layout.fixed]
+        fixed = self._forward.outputs[2][self._fixed]
         primal = max(float(np.max(table.violation(point.values))), float(np.max(np.abs(fixed), initial=0.0)))
         dual = residual / scale
         if not (primal <= RESIDUAL and dual <= RESIDUAL):

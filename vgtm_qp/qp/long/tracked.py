@@ -14,52 +14,106 @@ from scipy.linalg.lapack import dtrtrs
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
-from vgtm_qp.qp.long.elimination import Elimination
-from vgtm_qp.qp.long.sparse_symbols import range_and_null
+from vgtm_qp.qp.long.closing import Closing
+from vgtm_qp.qp.long.elimination import Elimination, Positions
+from vgtm_qp.qp.long.sparse_symbols import nonzeros, offsets, small_inverse
 from vgtm_qp.qp.long.staged import RESIDUAL, SINGULAR
 from vgtm_qp.qp.long.sweep import Sweep
-from vgtm_qp.qp.long.working_set import Point, RowTable, solve_rows
+from vgtm_qp.qp.long.working_set import Point, RowNumbers, RowTable, solve_rows
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-def following(elimination: Elimination) -> ca.Function:
-    """Return (carry, data) -> (carry, U, D, R): displacements, strokes and angles as functions of the curve.
+class Following:
+    """The graphs of a period that follows the curve.
 
-    U (3m, 3V - 5 + 1), D (soft, ...) and R (2f, ...) are stored row by row; their last columns are constants.
+    Where its faces are to be somewhere, a period's displacements are u = placed + B (gap - C placed): `placed` by its
+    fixed members alone, C the Jacobian of the faces' centres, B of the free motions that shift them.
     """
-    inputs, chain = elimination.inputs, elimination.chain
-    columns, faces = elimination.curve + 1, range(chain.faces.shape[1])
-    carry = ca.SX.sym("carry", len(elimination.live), columns)
-    moved, motions = carry, ca.SX(len(elimination.live), 0)
-    for stage, (G, N) in zip(elimination.stages, elimination.split, strict=True):
-        T = elimination.transfer(stage)
-        followed = T @ moved
-        followed[:, -1] += elimination.hard_rhs(stage)
-        moved = ca.vertcat(moved, G @ followed)
-        free = ca.SX(motions.shape[0], stage.freedom)
-        motions = ca.vertcat(ca.horzcat(motions, free), ca.horzcat(G @ (T @ motions), N))
-    centre = ca.vertcat(*[elimination.centre_row(k) for k in faces])
-    wanted = ca.vertcat(
-        *[ca.horzcat(elimination.curve_columns(inputs.weights[k, :]), -inputs.gap[k, :].T) for k in faces]
-    )
-    inverse, _ = range_and_null(ca.sparsify(centre @ motions))
-    moved += motions @ (inverse @ (wanted - centre @ moved))
-    strokes = inputs.jacobian[elimination.soft, :] @ moved
-    strokes[:, -1] -= inputs.rhs[elimination.soft]
-    angles = ca.vertcat(
-        *[
-            elimination.tangent_row(k) @ moved
-            + ca.horzcat(
-                inputs.tangent_curve[k] @ elimination.curve_columns(inputs.slopes[k, :]), inputs.tilt[k, :].T
-            )
-            for k in faces
-        ]
-    )
-    outputs = [moved[elimination.live, :], moved[chain.before :, :].T, strokes.T, angles.T]
-    return ca.Function("following", [carry, inputs.data], [ca.densify(output) for output in outputs])
+
+    def __init__(self, elimination: Elimination) -> None:
+        self._elimination, chain = elimination, elimination.chain
+        motions = ca.SX(len(elimination.live), 0)
+        for stage, (G, N) in zip(elimination.stages, elimination.split, strict=True):
+            free = ca.SX(motions.shape[0], stage.freedom)
+            followed = G @ (elimination.transfer(stage) @ motions)
+            motions = ca.vertcat(ca.horzcat(motions, free), ca.horzcat(followed, N))
+        self._faces = range(chain.faces.shape[1])
+        self._centre = ca.vertcat(*[elimination.centre_row(k) for k in self._faces])
+        inverse = small_inverse(self._centre @ motions)
+        self._gains = [*(G for G, _ in elimination.split), ca.sparsify(motions @ inverse)]
+
+    def _placed(self, before: ca.SX, rhs: list[ca.SX], gains: list[ca.SX], gap: ca.SX) -> ca.SX:
+        """Return (3w + 3m, c) displacements behind those `before` (3w, c), for each stage's `rhs` and for `gap`."""
+        moved = before
+        for stage, G, wanted in zip(self._elimination.stages, gains[:-1], rhs, strict=True):
+            moved = ca.vertcat(moved, G @ (self._elimination.transfer(stage) @ moved + wanted))
+        return moved + gains[-1] @ (gap - self._centre @ moved)
+
+    def response(self) -> ca.Function:
+        """Return (carry, head, tail, table) -> (carry, gains, D, R, U): what follows from the curve.
+
+        D (soft, 3V - 5 + 1), strokes, R (2f, ...), angles, and U (3m, ...), displacements, are stored row by row, as
+        is the carry, the displacements of the live nodes; their last columns are constants. U is left out where the
+        next period uses all nodes of this one in order. The gains are those of :meth:`hold`.
+        """
+        elimination, inputs = self._elimination, self._elimination.inputs
+        columns = elimination.curve + 1
+        before = ca.SX.sym("carry", columns, len(elimination.live))
+        rhs = []
+        for stage in elimination.stages:
+            wanted = ca.SX(len(stage.hard), columns)
+            wanted[:, -1] = elimination.hard_rhs(stage)
+            rhs.append(wanted)
+        gap = ca.vertcat(
+            *[
+                ca.horzcat(elimination.curve_columns(inputs.weights[k, :]), -inputs.gap[k, :].T)
+                for k in self._faces
+            ]
+        )
+        moved = self._placed(before.T, rhs, self._gains, gap)
+        strokes = inputs.jacobian[elimination.soft, :] @ moved
+        strokes[:, -1] -= inputs.rhs[elimination.soft]
+        angles = ca.vertcat(
+            *[
+                elimination.tangent_row(k) @ moved
+                + ca.horzcat(
+                    inputs.tangent_curve[k] @ elimination.curve_columns(inputs.slopes[k, :]),
+                    inputs.tilt[k, :].T,
+                )
+                for k in self._faces
+            ]
+        )
+        own = list(range(elimination.chain.before, elimination.size))
+        outputs = [moved[elimination.live, :].T, strokes.T, angles.T]
+        if elimination.live != own:
+            outputs.append(moved[own, :].T)
+        gains = ca.vertcat(*[nonzeros(part) for part in self._gains])
+        return ca.Function(
+            "following",
+            [before, inputs.head, inputs.tail, inputs.table],
+            [ca.densify(outputs[0]), gains, *(ca.densify(output) for output in outputs[1:])],
+        )
+
+    def hold(self) -> ca.Function:
+        """Return (carry, head, gains, X, aim, curve) -> (carry, X, lengths): one step towards right lengths and faces.
+
+        As ``Elimination.close``, but that fixed members are aimed at their lengths `aim` (3m,) and the faces' centres
+        at their points (3f,) of the curve; actuated members take the lengths that follow.
+        """
+        elimination = self._elimination
+        ends = offsets(part.nnz() for part in self._gains)
+        vector, at = ca.SX.sym("gains", ends[-1]), Positions(elimination)
+        pieces = ca.vertsplit(vector, ends)
+        gains = [ca.SX(part.sparsity(), v) for part, v in zip(self._gains, pieces, strict=True)]
+        aim = ca.SX.sym("aim", elimination.chain.own)
+        curve = ca.SX.sym("curve", 3 * len(self._faces))
+        rhs = [aim[stage.hard] - at.lengths[stage.hard] for stage in elimination.stages]
+        gap = curve - ca.vertcat(*[at.centre(k) for k in self._faces])
+        u = self._placed(at.moved, rhs, gains, gap)
+        return at.function("hold", [elimination.inputs.head, vector], [aim, curve], u, ca.vertcat(*rhs, gap))
 
 
 class TrackedSolver:
@@ -74,14 +128,28 @@ class TrackedSolver:
     def __init__(self, chain: Chain) -> None:
         self.layout, self.chain = chain.layout, chain
         elimination = Elimination(chain)
-        self._numbers = ChainData(chain, elimination.inputs.sizes)
-        self._following = Sweep(following(elimination), chain.periods)
-        self._following.bind_input(1, self._numbers.data)
+        self.data = ChainData(chain, elimination.inputs.sizes)
+        self._graphs = Following(elimination)
+        self._following = Sweep(self._graphs.response(), chain.periods)
+        for k, array in enumerate((self.data.head, self.data.tail, self.data.table)):
+            self._following.bind_input(1 + k, array)
+        self._changes = Sweep(elimination.changes(), chain.periods)
+        self._changes.bind_input(1, self.data.head)
         self._curve = elimination.curve
-        outputs = [output.reshape(-1, self._curve + 1) for output in self._following.outputs[1:]]
-        self._moved, self._strokes, self._angles = outputs
-        self._place = chain.node_period * chain.nodes.shape[1] + chain.node_place
-        self._soft = chain.members[:, chain.soft].reshape(-1)
+        columns, own = self._curve + 1, chain.nodes.shape[1]
+        self._strokes, self._angles = (output.reshape(-1, columns) for output in self._following.outputs[2:4])
+        # The first rows are those of the base, whose nodes do not move; then come the nodes in order.
+        self._moving = np.zeros(((chain.periods + 1) * own, 3, columns))
+        if len(self._following.outputs) > 4:
+            self._following.bind_output(4, self._moving[own:])
+        else:
+            self._moving = self._following.carry.reshape(self._moving.shape)
+        self._moved = self._moving[own:].reshape(-1, columns)
+        self._place = np.where(chain.node_period >= 0, (chain.node_period + 1) * own + chain.node_place, 0)
+        self._nodes = chain.nodes.reshape(-1)
+        soft = chain.members[:, chain.soft].reshape(-1)
+        self._soft = np.argsort(soft)
+        self._free, self._progress = np.ones(self._curve + 1), 0.0
         self._active: set[tuple[object, ...]] = set()
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
@@ -94,6 +162,11 @@ class TrackedSolver:
         SolverError
             The QP is singular, or the answer failed the residual check.
         """
+        self.data.fill(numbers)
+        return self.solve_filled(RowNumbers.of(self.layout, numbers))
+
+    def solve_filled(self, numbers: RowNumbers) -> StepSolution:
+        """Solve the QP whose other numbers were written to `data`; see :meth:`solve`."""
         self._eliminate(numbers)
         table = RowTable.of(self.layout, numbers, self.chain.locked)
         answer = solve_rows(self, self._curve + 1, table, self._active)
@@ -101,39 +174,48 @@ class TrackedSolver:
         self._active = answer.active
         return answer.solution()
 
+    def closing(self) -> Closing:
+        """Return what brings fixed members to their lengths and keeps the faces on the curve, as the QP solved last."""
+        return Closing(self.chain, self._graphs.hold(), [self.data.head, self._following.outputs[1]])
+
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
         nodes, coefficients, progress = table.coefficients(rows)
-        coefficients[self.chain.node_period[nodes] < 0] = 0.0
-        moved = self._moved.reshape(-1, 3, self._curve + 1)[self._place[nodes]]
+        moved = self._moving.take(self._place[nodes], axis=0)
         columns = np.empty((self._curve + 1, len(rows)))
         columns[:-1] = np.einsum("rqc,rqcn->nr", coefficients, moved[..., :-1])
         columns[-1] = progress * self._progress_scale
         columns[:-1] = dtrtrs(self._factor, columns[:-1], lower=1)[0]
         return columns
 
-    def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
-        truss, chain = self.layout.truss, self.chain
-        free = -dtrtrs(self._factor, self._rhs + combined[:-1], lower=1, trans=1)[0]
-        progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
-        unknowns = np.append(free, 1.0)
-        nodes, lengths = np.zeros((truss.node_count, 3)), np.zeros(truss.member_count)
-        nodes[chain.nodes] = (self._moved @ unknowns).reshape(*chain.nodes.shape, 3)
-        lengths[self._soft] = self._strokes @ unknowns
-        values = table.values(nodes, lengths, progress)
-        return Point(nodes, lengths, self._numbers.vertices(free), progress, values)
+    def values(self, table: RowTable, combined: Array) -> Array:
+        """Return (total,) the row values where the Lagrangian is least, given columns times multipliers (size,)."""
+        self._free[:-1] = -dtrtrs(self._factor, self._rhs + combined[:-1], lower=1, trans=1)[0]
+        self._progress = -self._progress_scale * (self._progress_rhs + float(combined[-1]))
+        strokes = (self._strokes @ self._free).take(self._soft)
+        return table.values(
+            lambda nodes: self._moving.take(self._place[nodes], axis=0) @ self._free,
+            strokes,
+            np.zeros(0),
+            self._progress,
+        )
 
-    def _eliminate(self, numbers: StepNumbers) -> None:
+    def point(self, values: Array) -> Point:
+        """Return the point whose `values` were asked for last."""
+        nodes = (
+            (self._moving.reshape(-1, self._curve + 1) @ self._free).reshape(-1, 3).take(self._place, axis=0)
+        )
+        return Point(nodes, self.data.vertices(self._free[:-1]), self._progress, values)
+
+    def _eliminate(self, numbers: RowNumbers) -> None:
         """Follow the curve from the base to the tip and factorise the Hessian in its coordinates."""
-        self._numbers.fill(numbers)
         self._following()
         if not np.all(np.isfinite(self._moved[-1])) or not numbers.progress_curvature > 0.0:
             raise SolverError(SINGULAR)
         self._progress_scale = 1.0 / np.sqrt(numbers.progress_curvature)
         self._progress_rhs = self._progress_scale * numbers.progress_gradient
         weights = self.layout.weights
-        hessian, gradient = self._numbers.polygon_terms()
+        hessian, gradient = self.data.polygon_terms()
         stiffness = weights.actuator_rate + weights.stroke_centring
         whole = weights.node_rate * (self._moved.T @ self._moved) + stiffness * (
             self._strokes.T @ self._strokes
@@ -143,30 +225,32 @@ class TrackedSolver:
             self._factor = np.linalg.cholesky(hessian + whole[:-1, :-1])
         except np.linalg.LinAlgError as error:
             raise SolverError(SINGULAR) from error
-        gradient += whole[:-1, -1] + self._numbers.actuator_gradient @ self._strokes[:, :-1]
+        gradient += whole[:-1, -1] + self.data.actuator_gradient.reshape(-1) @ self._strokes[:, :-1]
         self._rhs = dtrtrs(self._factor, gradient, lower=1)[0]
 
     def _check(self, table: RowTable, point: Point, multipliers: Array) -> None:
         """Refuse an answer whose primal or dual residual is too large."""
-        numbers, weights, layout = table.numbers, self.layout.weights, self.layout
-        changed = (
-            np.einsum("mqc,mqc->m", numbers.gradient, point.nodes[layout.member_nodes]) - numbers.length_rhs
-        )
-        gap, tilt = self._numbers.misfit(point.vertices, self._numbers.face_parts(point.nodes, numbers))
+        weights, chain, sweep = self.layout.weights, self.chain, self._changes
+        moved = sweep.inputs[2].reshape(-1, 3)
+        point.nodes.take(self._nodes, axis=0, out=moved, mode="clip")
+        sweep()
+        changed = sweep.outputs[1].reshape(chain.periods, -1)
+        strokes = changed[:, chain.soft].reshape(-1)
+        gap, tilt = self.data.misfit(point.vertices, sweep.outputs[2].reshape(-1, 5))
         primal = max(
-            float(np.max(np.abs(changed - point.lengths))),
+            float(np.max(np.abs(changed[:, ~chain.soft]), initial=0.0)),
+            float(np.max(np.abs(strokes[self._soft] - point.values[table.actuators]))),
             float(np.max(np.abs(gap))),
             float(np.max(table.violation(point.values))),
         )
-        nodal = weights.node_rate * point.nodes + table.nodal_forces(multipliers)
-        actuator = (weights.actuator_rate + weights.stroke_centring) * point.lengths[layout.truss.actuators]
-        actuator += numbers.actuator_gradient + multipliers[table.actuators]
-        force = np.zeros(len(point.lengths))
-        force[layout.truss.actuators] = actuator
-        residual = nodal[self.chain.nodes].reshape(-1) @ self._moved[:, :-1]
-        residual += force[self._soft] @ self._strokes[:, :-1]
+        nodal = weights.node_rate * moved + table.nodal_forces(multipliers).take(self._nodes, axis=0)
+        force = (weights.actuator_rate + weights.stroke_centring) * strokes
+        force += self.data.actuator_gradient.reshape(-1)
+        force[self._soft] += multipliers[table.actuators]
+        residual = nodal.reshape(-1) @ self._moved[:, :-1]
+        residual += force @ self._strokes[:, :-1]
         residual += weights.tangent * tilt.reshape(-1) @ self._angles[:, :-1]
-        residual += self._numbers.polygon_gradient(point.vertices)
+        residual += self.data.polygon_gradient(point.vertices)
         scale = 1.0 + float(np.max(np.abs(force))) + float(np.max(np.abs(multipliers)))
         dual = float(np.max(np.abs(residual))) / scale
         if not (primal <= RESIDUAL and dual <= RESIDUAL):

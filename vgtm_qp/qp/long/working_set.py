@@ -2,26 +2,72 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpstrf
+from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.condensed import FEASIBILITY, InfeasibleStepError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _NO_ROW = 1e-11
 _DEPENDENT = 1e-14
+_INDEPENDENT = 1e-4
+"""Rows whose Cholesky pivots differ by less than this are far from dependent."""
 _VIOLATED = 1e-10
 _REFINEMENTS = 4
+
+
+MemberRows = Callable[[Index], tuple[Index, Array]]
+"""Nodes (R, Q) and coefficients (R, Q, 3) of the lengths of members (R,); base nodes may have any coefficients."""
+
+Moved = Callable[[Index], Array]
+"""Displacements (..., 3), m, of nodes (...,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowNumbers:
+    """What the rows with bounds, and the progress, need of a QP; see :class:`StepNumbers`."""
+
+    lower: Array
+    upper: Array
+    tip_jacobian: Array
+    tip_rate: Array
+    tip_rhs: Array
+    progress_lower: float
+    progress_upper: float
+    progress_gradient: float
+    progress_curvature: float
+    clearance: ClearanceRows
+    actuator_gradient: Array
+    member_rows: MemberRows
+
+    @classmethod
+    def of(cls, layout: Layout, numbers: StepNumbers) -> RowNumbers:
+        """Return those of `numbers`."""
+        return cls(
+            lower=numbers.lower,
+            upper=numbers.upper,
+            tip_jacobian=numbers.tip_jacobian,
+            tip_rate=numbers.tip_rate,
+            tip_rhs=numbers.tip_rhs,
+            progress_lower=numbers.progress_lower,
+            progress_upper=numbers.progress_upper,
+            progress_gradient=numbers.progress_gradient,
+            progress_curvature=numbers.progress_curvature,
+            clearance=numbers.clearance,
+            actuator_gradient=numbers.actuator_gradient,
+            member_rows=lambda members: (layout.member_nodes[members], numbers.gradient[members]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +77,7 @@ class RowTable:
     Attributes
     ----------
     layout : Layout
-    numbers : StepNumbers
+    numbers : RowNumbers
     locked : (l,) int
         Fixed members that are held by a row of their own.
     lower, upper : (total,)
@@ -42,7 +88,7 @@ class RowTable:
     """
 
     layout: Layout
-    numbers: StepNumbers
+    numbers: RowNumbers
     locked: Index
     lower: Array
     upper: Array
@@ -51,7 +97,7 @@ class RowTable:
     clearance: slice
 
     @classmethod
-    def of(cls, layout: Layout, numbers: StepNumbers, locked: Index) -> RowTable:
+    def of(cls, layout: Layout, numbers: RowNumbers, locked: Index) -> RowTable:
         """Return the table of `numbers`."""
         held = np.zeros(len(locked))
         clearance = numbers.clearance.lower
@@ -76,16 +122,20 @@ class RowTable:
             slice(first_clearance, first_clearance + len(clearance)),
         )
 
-    def values(self, nodes: Array, lengths: Array, progress: float) -> Array:
-        """Return (total,) row values at displacements of the nodes (N, 3) and changes of the lengths (M,)."""
-        numbers, truss, clearance = self.numbers, self.layout.truss, self.numbers.clearance
+    def values(self, moved: Moved, strokes: Array, held: Array, progress: float) -> Array:
+        """Return (total,) row values at displacements of the nodes.
+
+        `strokes` (n_a,) and `held` (l,) are the changes of the actuated and of the locked members' lengths.
+        """
+        numbers, clearance = self.numbers, self.numbers.clearance
+        tip = moved(self.layout.truss.tip).reshape(-1)
         return np.concatenate(
             [
-                numbers.tip_jacobian @ nodes[truss.tip].reshape(-1) - numbers.tip_rate * progress,
-                lengths[self.locked],
+                numbers.tip_jacobian @ tip - numbers.tip_rate * progress,
+                held,
                 [progress],
-                lengths[truss.actuators],
-                np.einsum("rsc,rsc->r", clearance.coefficients, nodes[clearance.nodes]),
+                strokes,
+                np.einsum("rsc,rsc->r", clearance.coefficients, moved(clearance.nodes)),
             ]
         )
 
@@ -95,8 +145,20 @@ class RowTable:
 
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
         """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
-        numbers, truss, members = self.numbers, self.layout.truss, self.layout.member_nodes
-        width = max(len(truss.tip), members.shape[1], numbers.clearance.nodes.shape[1])
+        numbers, truss = self.numbers, self.layout.truss
+        tip = len(numbers.tip_rhs)
+        if rows.max() < tip + (not len(self.locked)):
+            every = np.vstack([numbers.tip_jacobian, np.zeros_like(numbers.tip_jacobian[:1])])
+            on_tip = every[rows].reshape(len(rows), -1, 3)
+            return np.tile(truss.tip, (len(rows), 1)), on_tip, np.append(-numbers.tip_rate, 1.0)[rows]
+        is_stroke = (rows >= self.actuators.start) & (rows < self.clearance.start)
+        is_held = (rows >= tip) & (rows < self.equal)
+        members = np.empty(len(rows), dtype=np.int64)
+        members[is_stroke] = truss.actuators[rows[is_stroke] - self.actuators.start]
+        members[is_held] = self.locked[rows[is_held] - tip]
+        along = np.flatnonzero(is_stroke | is_held)
+        member_nodes, gradients = numbers.member_rows(members[along])
+        width = max(len(truss.tip), member_nodes.shape[1], numbers.clearance.nodes.shape[1])
         nodes, coefficients = np.zeros((len(rows), width), dtype=np.int64), np.zeros((len(rows), width, 3))
         progress = np.zeros(len(rows))
 
@@ -104,17 +166,11 @@ class RowTable:
             nodes[where, : named.shape[-1]] = named
             coefficients[where, : named.shape[-1]] = values
 
-        tip = len(numbers.tip_rhs)
+        put(along, member_nodes, gradients)
         where = np.flatnonzero(rows < tip)
         put(where, truss.tip, numbers.tip_jacobian[rows[where]].reshape(len(where), len(truss.tip), 3))
         progress[where] = -numbers.tip_rate[rows[where]]
         progress[rows == self.equal] = 1.0
-        where = np.flatnonzero((rows >= self.actuators.start) & (rows < self.clearance.start))
-        strokes = truss.actuators[rows[where] - self.actuators.start]
-        put(where, members[strokes], numbers.gradient[strokes])
-        where = np.flatnonzero((rows >= tip) & (rows < self.equal))
-        held = self.locked[rows[where] - tip]
-        put(where, members[held], numbers.gradient[held])
         where = np.flatnonzero(rows >= self.clearance.start)
         near = rows[where] - self.clearance.start
         put(where, numbers.clearance.nodes[near], numbers.clearance.coefficients[near])
@@ -146,6 +202,22 @@ class RowTable:
         return sorted(rows)
 
 
+def _all_active(
+    gram: Array, values: Array, lower: Array, upper: Array, equal: NDArray[np.bool_]
+) -> Array | None:
+    """Return the multipliers where all rows are active at the bounds they violate; None where they may not be."""
+    above = equal | (values > upper)
+    if not np.all(above | (values < lower)):
+        return None
+    factor, failed = dpotrf(gram, lower=1)
+    pivots = factor.diagonal()
+    if failed or not pivots.min() > _INDEPENDENT * pivots.max():
+        return None
+    found: Array = dpotrs(factor, values - np.where(above, upper, lower), lower=1)[0]
+    right = np.where(above, found, -found)[~equal] >= 0.0
+    return found if right.all() and np.isfinite(found).all() else None
+
+
 def dual_solution(
     gram: Array, values: Array, lower: Array, upper: Array, equal: NDArray[np.bool_]
 ) -> tuple[Array, int]:
@@ -160,6 +232,9 @@ def dual_solution(
     SolverError
         The dual QP was not solved.
     """
+    guessed = _all_active(gram, values, lower, upper, equal)
+    if guessed is not None:
+        return guessed, 1
     norm = np.sqrt(np.maximum(np.diag(gram), 0.0))
     multipliers = np.zeros(len(norm))
     if not np.all(np.isfinite(norm)):
@@ -201,15 +276,12 @@ class Point:
     Attributes
     ----------
     nodes : (N, 3)
-    lengths : (M,)
-        Changes of the lengths beyond ``length_rhs``: d_a of actuated members, the residual of fixed ones, m.
     vertices : (V, 3)
     progress : float
     values : (total,)
     """
 
     nodes: Array
-    lengths: Array
     vertices: Array
     progress: float
     values: Array
@@ -222,8 +294,12 @@ class Eliminated(Protocol):
         """Return (size, len(rows)) L^-1 A' of the given rows A."""
         ...
 
-    def point(self, table: RowTable, combined: Array) -> Point:
-        """Return the point that minimises the Lagrangian, given columns times multipliers (size,)."""
+    def values(self, table: RowTable, combined: Array) -> Array:
+        """Return (total,) the row values where the Lagrangian is least, given columns times multipliers (size,)."""
+        ...
+
+    def point(self, values: Array) -> Point:
+        """Return the point whose `values` were asked for last."""
         ...
 
 
@@ -239,12 +315,19 @@ class Answer:
         Positive at upper and negative at lower bounds.
     iterations : int
         Of the dual QPs.
+    rows : list of int
+        Those that were in the dual QP, equalities first.
+    columns, gram : (size, R), (R, R)
+        Their columns, and what these are multiplied with each other.
     """
 
     table: RowTable
     point: Point
     multipliers: Array
     iterations: int
+    rows: list[int]
+    columns: Array
+    gram: Array
 
     @property
     def active(self) -> set[tuple[object, ...]]:
@@ -285,9 +368,9 @@ def solve_rows(
     multipliers = np.zeros(0)
     iterations, refined = 0, 0
     new = [*range(table.equal), *table.remembered(remembered)]
-    point = problem.point(table, np.zeros(size))
+    values = problem.values(table, np.zeros(size))
     while True:
-        violation = table.violation(point.values)
+        violation = table.violation(values)
         violated = np.flatnonzero(violation > _VIOLATED)
         known = {*rows, *new}
         outside = np.array([k for k in violated.tolist() if k not in known], dtype=np.int64)
@@ -315,13 +398,13 @@ def solve_rows(
         index = np.array(rows, dtype=np.int64)
         multipliers, count = dual_solution(
             gram,
-            point.values[index] + gram @ multipliers,
+            values[index] + gram @ multipliers,
             table.lower[index],
             table.upper[index],
             index < table.equal,
         )
         iterations += count
-        point = problem.point(table, columns @ multipliers)
+        values = problem.values(table, columns @ multipliers)
     every = np.zeros(len(table.lower))
     every[rows] = multipliers
-    return Answer(table, point, every, iterations)
+    return Answer(table, problem.point(values), every, iterations, rows, columns, gram)

@@ -1,0 +1,244 @@
+"""The engine of long arms: from the positions of the nodes to the step and back by sweeps along the bays.
+
+Its QP is that of the plain engine with the solvers of ``qp.long``; but the numbers of the QP are written where the
+sweeps read them, and lengths are closed with what the QP has factorised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.compiled import Kernel
+from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.long.closing import MOST_STEPS, TOO_FAR
+from vgtm_qp.qp.long.staged import StagedSolver
+from vgtm_qp.qp.long.tracked import TrackedSolver
+from vgtm_qp.qp.long.values import PeriodValues
+from vgtm_qp.qp.long.working_set import RowNumbers
+from vgtm_qp.qp.numbers import ClearanceRows, StepSolution, progress_scale
+from vgtm_qp.qp.settle import held
+from vgtm_qp.step.engine import Accuracy, LengthCloser, enough_length, enough_tip_error, within
+from vgtm_qp.step.linearise import Target
+from vgtm_qp.step.path import PathPoint
+from vgtm_qp.step.task import TipTask, worth_closing
+from vgtm_qp.truss.kinematics import Kinematics, frame_constants, frame_function
+
+Array = NDArray[np.float64]
+
+
+class _Frame:
+    """The frame of a few nodes, evaluated anew where they moved."""
+
+    def __init__(self, home: Array, rotation: Array) -> None:
+        cosines, sines, alignment = frame_constants(home, rotation)
+        self._kernel = Kernel(frame_function(len(home)))
+        for k, constant in enumerate((cosines, sines, alignment.T)):
+            self._kernel.inputs[1 + k][:] = constant.reshape(-1)
+
+    def at(self, nodes: Array) -> tuple[Array, Array]:
+        """Return rotation (3, 3) and spin (3, 3K) where the nodes are at `nodes` (K, 3)."""
+        corners = nodes.reshape(-1)
+        if not np.array_equal(corners, self._kernel.inputs[0]):
+            self._kernel.inputs[0][:] = corners
+            self._kernel()
+        rotation, spin = self._kernel.outputs
+        return rotation.reshape(3, 3).T, spin.reshape(-1, 3).T
+
+
+class ChainEngine:
+    """See ``engine.Engine``; for arms of `serves`."""
+
+    def __init__(
+        self, solver: StagedSolver | TrackedSolver, kinematics: Kinematics, task: TipTask, home_lengths: Array
+    ) -> None:
+        layout = self._layout = solver.layout
+        truss = layout.truss
+        self._solver, self._task, self._data = solver, task, solver.data
+        self._values = PeriodValues(solver.chain, solver.data, home_lengths)
+        self._home_lengths = home_lengths
+        frames = range(2) if layout.has_tip_frame else ()
+        self._tip_frames = [_Frame(truss.home[truss.tip], truss.tip_frame) for _ in frames]
+        if layout.vertices:
+            face = truss.faces[0]
+            self._base_frame = _Frame(truss.home[face], truss.face_frames[0])
+        self._polygon = layout.weights.smoothness * layout.polygon_bending
+        self._closing = solver.closing()
+        chain = solver.chain
+        self._kinematics = kinematics
+        self._members = chain.members.reshape(-1)
+        self._members_at = np.argsort(self._members)
+        self._nodes, self._base = chain.nodes.reshape(-1), np.flatnonzero(truss.base)
+        self._at = np.argsort(np.concatenate([self._nodes, self._base]))
+        self._tip = np.array([np.flatnonzero(self._nodes == node)[0] for node in truss.tip])
+        self._aims = home_lengths.copy()
+        self._strokes = home_lengths[truss.actuators]
+        self._answer = (self._strokes, self._strokes, self._strokes)
+        self._vertices: Array = np.zeros((layout.vertices, 3))
+        self._curve_weights = layout.curve_weights[chain.faces.reshape(-1)]
+        if isinstance(solver, TrackedSolver):
+            self._closing.aims[0][:] = home_lengths[chain.members]
+
+    @staticmethod
+    def serves(solver: StagedSolver | TrackedSolver) -> bool:
+        """Whether the arm with that solver is one whose bays are all alike, with a base face that does not bend."""
+        if solver.chain.window is None:
+            return False
+        layout, truss = solver.layout, solver.layout.truss
+        return not truss.base[truss.tip].any() and (
+            not layout.vertices or bool(truss.base[truss.faces[0]].all())
+        )
+
+    def solve(
+        self,
+        X: Array,
+        Y: Array,
+        vertices: Array,
+        target: Target,
+        goal: PathPoint,
+        progress: float,
+        rows: ClearanceRows,
+        *,
+        motion: bool,
+        torsion: Array | None = None,  # noqa: ARG002
+    ) -> StepSolution:
+        """See ``engine.Engine``."""
+        layout, truss, weights = self._layout, self._layout.truss, self._layout.weights
+        moved = None if target.base is None else np.where(truss.base[:, None], target.base - X, 0.0)
+        if layout.vertices:
+            base = X if moved is None else X + moved
+            self._hold_base(base, vertices)
+            if motion:
+                pull = self._polygon @ vertices + layout.goal_pull(vertices, target.vertex_goals)
+                self._data.pull(pull)
+            else:
+                self._data.pull(np.zeros_like(vertices))
+        self._values.fill(X, Y, vertices, moved, motion=motion)
+        rotation, spin = np.eye(3), None
+        if self._task.turns is not None:
+            rotation, spin = self._tip_frames[0].at(X[truss.tip])[0], self._tip_frames[1].at(Y[truss.tip])[1]
+        error, tip_rate, across = self._task.residual(truss.tip_weights @ X[truss.tip], rotation, goal)
+        length = self._values.lengths[truss.actuators]
+        rate = tip_rate * (target.end - target.start)
+        curvature = weights.progress * progress_scale(rate)
+        numbers = RowNumbers(
+            lower=target.lower - length,
+            upper=target.upper - length,
+            tip_jacobian=self._task.jacobian(across, spin),
+            tip_rate=rate,
+            tip_rhs=worth_closing(error) if motion else error,
+            progress_lower=-progress,
+            progress_upper=1.0 - progress,
+            progress_gradient=curvature * (progress - 2.0),
+            progress_curvature=curvature,
+            clearance=rows,
+            actuator_gradient=weights.stroke_centring * (length - self._home_lengths[truss.actuators])
+            if motion
+            else np.zeros_like(length),
+            member_rows=self._values.member_rows,
+        )
+        solution = self._solver.solve_filled(numbers)
+        self._answer = solution.actuators, numbers.lower, numbers.upper
+        self._strokes = length + solution.actuators
+        self._vertices = vertices + solution.vertices
+        return solution
+
+    def _hold_base(self, base: Array, vertices: Array) -> None:
+        """Let the curve begin at the base face of node positions `base` (N, 3), at a right angle."""
+        truss = self._layout.truss
+        axes = self._base_frame.at(base[truss.faces[0]])[0][:, :2].T
+        centre = truss.face_weights[0] @ base[truss.faces[0]]
+        self._data.hold_base(centre - vertices[0], axes, -axes @ (vertices[1] - vertices[0]))
+
+    def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
+        """See ``engine.Engine``."""
+        bounds = target.lower, target.upper
+
+        def tip_error(position: Array, rotation: Array) -> Array:
+            return self._task.residual(position, rotation, goal)[0]
+
+        if isinstance(self._solver, StagedSolver):
+            return self._by_strokes(X, *bounds, tip_error, self._solver, accuracy)
+        closed = self._on_curve(X, *bounds, accuracy.member)
+        if not closed.error <= accuracy.member:
+            closed = self._lengths.close(X, *bounds, accuracy.member)
+        is_there = float(np.abs(tip_error(closed.tip_position, closed.tip_rotation)).max()) <= accuracy.tip
+        return closed if is_there and closed.error <= accuracy.member else None
+
+    @cached_property
+    def _lengths(self) -> LengthCloser:
+        return LengthCloser(self._layout, self._kinematics, self._home_lengths)
+
+    def _by_strokes(
+        self,
+        X: Array,
+        lower: Array,
+        upper: Array,
+        tip_error: Callable[[Array, Array], Array],
+        solver: StagedSolver,
+        accuracy: Accuracy,
+    ) -> Closed | None:
+        """Return what ``engine.settle_strokes`` does: each step corrects the lengths, and what it leaves of the tip.
+
+        The actuated lengths are those of the QP's answer and what brings the tip to its goal, between bounds (n_a,).
+        """
+        closing = self._closing
+        enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)
+        (aims,) = closing.aims
+        closing.start(X)
+        wanted = np.clip(self._strokes, lower, upper)
+        self._aim(aims, wanted)
+        own: Array = X.take(self._nodes, axis=0)
+        gain, is_given_up = None, False
+        closer, worst = closing.step(own)
+        off = np.inf
+        for _ in range(MOST_STEPS):
+            settled = off <= enough_tip or is_given_up
+            if (worst <= enough and settled) or not worst < TOO_FAR:
+                break
+            own = closer.copy()
+            error = tip_error(*self._tip_of(own, turned=self._task.turns is not None))
+            off = float(np.abs(error).max())
+            if off > accuracy.start:
+                return None
+            if off > enough_tip and not is_given_up:
+                gain = solver.gain(held(*self._answer)) if gain is None else gain
+                is_given_up = gain is None
+            if gain is not None and off > enough_tip:
+                wanted = wanted + gain @ error
+                self._aim(aims, np.clip(wanted, lower, upper))
+            closer, worst = closing.step(own)
+        closed = self._closed(X, own, worst)
+        is_there = float(np.abs(tip_error(closed.tip_position, closed.tip_rotation)).max()) <= accuracy.tip
+        return closed if is_there and worst <= accuracy.member else None
+
+    def _aim(self, aims: Array, strokes: Array) -> None:
+        """Let actuated members aim at `strokes` (n_a,), m, and the others at their home lengths."""
+        self._aims[self._layout.truss.actuators] = strokes
+        np.take(self._aims, self._members, out=aims.reshape(-1), mode="clip")
+
+    def _on_curve(self, X: Array, lower: Array, upper: Array, tolerance: float) -> Closed:
+        """Return the configuration near `X` with the faces on the curve; of infinite error where actuators cannot."""
+        closing, enough = self._closing, enough_length(X, tolerance)
+        closing.start(X)
+        np.matmul(self._curve_weights, self._vertices, out=closing.aims[1].reshape(-1, 3))
+        own, worst = closing.run(X.take(self._nodes, axis=0), enough)
+        closed = self._closed(X, own, worst)
+        actuated = closed.lengths[self._layout.truss.actuators]
+        return closed if within(actuated, lower, upper, enough) else replace(closed, error=np.inf)
+
+    def _closed(self, X: Array, own: Array, worst: float) -> Closed:
+        """Return the configuration whose free nodes are at `own`, in the order of the chain; base nodes as in `X`."""
+        nodes = np.concatenate([own, X[self._base]]).take(self._at, axis=0)
+        lengths = self._closing.lengths.reshape(-1).take(self._members_at)
+        return Closed(nodes, lengths, worst, *self._tip_of(own, turned=True))
+
+    def _tip_of(self, own: Array, *, turned: bool) -> tuple[Array, Array]:
+        """Return position (3,) of the tip where the free nodes are at `own`, and its rotation where it `turned`."""
+        corners = own[self._tip]
+        rotation = self._tip_frames[0].at(corners)[0].copy() if turned and self._tip_frames else np.eye(3)
+        return self._layout.truss.tip_weights @ corners, rotation
