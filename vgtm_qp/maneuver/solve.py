@@ -22,6 +22,7 @@ from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
 from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.state import State
 from vgtm_qp.step.stops import Stop, StopKind
 
 if TYPE_CHECKING:
@@ -121,20 +122,55 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
     keeps_moving = bool(np.isfinite(resolver.arm.truss.acceleration[resolver.arm.truss.actuators]).any())
     while value < last:
         aim, dt = plan.next_mark(value, keeps_moving=keeps_moving)
-        before, clock = dict(resolver.phases), perf_counter()
+        before, known, clock = resolver.state, dict(resolver.phases), perf_counter()
         step = resolver.follow(plan.path, value, aim, dt=dt)
         seconds = perf_counter() - clock
         if step.status is StepStatus.BLOCKED:
             return _stop(resolver, plan, value, aim, dt, step)
+        stop = _given_up(resolver, plan, value, aim, dt, step, before)
+        if stop is not None and step.left_path:
+            # The arm would brake from here off the path, which is no part of the maneuver.
+            return stop
         value = aim if step.status is StepStatus.REACHED else value + step.progress * (aim - value)
-        phases = {name: total - before[name] for name, total in resolver.phases.items()}
+        phases = {name: total - known[name] for name, total in resolver.phases.items()}
         _add_state(record, resolver, plan, value, seconds, phases)
+        if stop is not None:
+            _come_to_rest(resolver, plan, record, value)
+            return stop
         stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
         if stalled >= _STALLED_STEPS:
             return _stop(resolver, plan, value, aim, dt, step)
         if progress is not None:
             progress((value - start) / (end - start), step)
     return None
+
+
+def _given_up(
+    resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step, before: State
+) -> Stop | None:
+    """Return why the maneuver ends with a step in which the arm braked; None where it goes on afterwards.
+
+    A hard tip that had to brake is no longer on time, and one that had to leave its path is no longer on that.
+    """
+    mode = resolver.arm.tip_mode
+    if not step.braked or not isinstance(resolver, Resolver) or mode == "elastic":
+        return None
+    if mode != "hard" and not step.left_path:
+        return None
+    return resolver.explain(plan.path, value, mark, dt=dt, last=step, state=before)
+
+
+def _come_to_rest(resolver: AnyResolver, plan: Plan, record: _Record, value: float) -> None:
+    """Record the steps in which the arm comes to rest on its path."""
+    end = plan.path.end
+    while isinstance(resolver, Resolver) and value < end:
+        known, clock = dict(resolver.phases), perf_counter()
+        step = resolver.brake(plan.path, value, end)
+        if step is None or step.left_path:
+            return
+        value += step.progress * (end - value)
+        phases = {name: total - known[name] for name, total in resolver.phases.items()}
+        _add_state(record, resolver, plan, value, perf_counter() - clock, phases)
 
 
 def _stop(resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step) -> Stop:

@@ -40,6 +40,11 @@ _SINGULAR = 0.1
 """A share below which the tip moves far less than the actuators do."""
 _PRESSES = 1e-7
 
+CANNOT_BRAKE = "the arm could not brake after it"
+"""The reason of a step that is refused since no way was found to come to rest after it."""
+BASE_MOVES_ON = "its base moves on, and the tip cannot stay on its path with accelerations as limited"
+"""The reason of a step in which the tip leaves its path."""
+
 
 class StopKind(StrEnum):
     """What stops an arm."""
@@ -67,8 +72,9 @@ class Stop:
     kind : StopKind
         ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
         where the tip cannot start in that direction whatever the limits; ``out of reach`` where the arm is stretched
-        towards a goal further away; ``nonlinear`` where no row forbids the step to first order; ``solver`` where
-        none does and the QP solver gave no good answer.
+        towards a goal further away; ``nonlinear`` where no row forbids the step to first order, and ``acceleration``
+        if it is one after which the arm could not brake; ``solver`` where none does and the QP solver gave no good
+        answer.
     multipliers : dict
         Rows of the set, the most decisive first, and the share of the way that each costs per metre (radian).
     obstacles : tuple of str
@@ -91,7 +97,10 @@ class Stop:
         parts = [
             str(self.kind),
             ", ".join(self.multipliers),
-            self.reason if self.kind in (StopKind.NONLINEAR, StopKind.SOLVER) else "",
+            self.reason
+            if self.kind in (StopKind.NONLINEAR, StopKind.SOLVER)
+            or self.reason in (CANNOT_BRAKE, BASE_MOVES_ON)
+            else "",
         ]
         return ": ".join(part for part in parts if part)
 
@@ -144,7 +153,8 @@ def explain(
         if share <= _SINGULAR:
             return Stop(kind, reason=reason)
         kinds = [_kind(name) for name in pressing]
-        kind = next((kind for kind in StopKind if kind in kinds), StopKind.NONLINEAR)
+        other = StopKind.ACCELERATION if reason in (CANNOT_BRAKE, BASE_MOVES_ON) else StopKind.NONLINEAR
+        kind = next((kind for kind in StopKind if kind in kinds), other)
         return Stop(kind, pressing, _obstacles(arm, pressing), reason)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
         kept[k] = False
