@@ -15,7 +15,7 @@ from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.manifest import arm_record, make_manifest, mesh_record
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.maneuver.ways_out import ways_out
+from vgtm_qp.maneuver.ways_out import DeadEnd, ways_out
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.step.arm import Arm, build_arm
@@ -85,7 +85,14 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     try:
         stop = _run(resolver, plan, record, progress)
         if stop is not None and isinstance(resolver, Resolver):
-            way, record, stop = _retry(problem, record, stop, progress)
+            value = plan.path.start + record.rows["progress"][-1] * (plan.path.end - plan.path.start)
+            dead_end = DeadEnd(
+                stop,
+                resolver.state.control_vertices,
+                resolver.arm.truss.height,
+                plan.path.at(value).velocity,
+            )
+            way, record, stop = _retry(problem, record, dead_end, progress)
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
     maneuver = _assemble(problem, resolver, record, stop, setup_time, way)
@@ -97,11 +104,11 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
 
 
 def _retry(
-    problem: Problem, record: _Record, stop: Stop, progress: Progress | None
+    problem: Problem, record: _Record, dead_end: DeadEnd, progress: Progress | None
 ) -> tuple[str, _Record, Stop | None]:
     """Return what comes furthest of the maneuver that stopped and of other ways to do it, by name."""
-    best: tuple[str, _Record, Stop | None] = ("", record, stop)
-    for name, other in ways_out(problem, stop):
+    best: tuple[str, _Record, Stop | None] = ("", record, dead_end.stop)
+    for name, other in ways_out(problem, dead_end):
         # A kernel takes longer to compile than a maneuver to solve without it.
         resolver = Resolver(build_arm(other, compiled=False))
         plan = make_plan(other, *resolver.tip())

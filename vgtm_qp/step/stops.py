@@ -81,12 +81,15 @@ class Stop:
         Names of the obstacles in the set.
     reason : str
         What the last attempt said.
+    away : tuple of float
+        (3,) where the obstacles in the set push the arm, each as much as it costs; zero without any.
     """
 
     kind: StopKind
     multipliers: Mapping[str, float] = field(default_factory=dict)
     obstacles: tuple[str, ...] = ()
     reason: str = ""
+    away: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -171,10 +174,13 @@ def explain(
     ):
         kind = StopKind.OUT_OF_REACH
     multipliers: dict[str, float] = {}
+    away = np.zeros(3)
     for k in chosen:
         name = program.name(k)
         multipliers[name] = max(multipliers.get(name, 0.0), float(costs[k]))
-    return Stop(kind, multipliers, _obstacles(arm, multipliers), reason)
+        if program.kind(k) is StopKind.OBSTACLE:
+            away += float(costs[k]) * program.normal(k)
+    return Stop(kind, multipliers, _obstacles(arm, multipliers), reason, tuple(away.tolist()))
 
 
 def _obstacles(arm: Arm, names: Iterable[str]) -> tuple[str, ...]:
@@ -269,6 +275,10 @@ class _Program:
         if k < near:
             return self._rows.name(k)
         return f"{self.kind(k)}: {self._limits.names[(k - near) % actuators]}"
+
+    def normal(self, k: int) -> Array:
+        """Return (3,) the direction in which the arm as a whole leaves the obstacle of row `k`."""
+        return np.asarray(self._rows.coefficients[k].sum(axis=0))
 
     def kind(self, k: int) -> StopKind:
         """Return what row `k` is about."""
