@@ -23,13 +23,14 @@ Array = NDArray[np.float64]
 
 _HOPELESS = (StopKind.INTERRUPTED, StopKind.SINGULAR, StopKind.OUT_OF_REACH, StopKind.LOCKED)
 
-_BULGE = 0.3
+_BULGE, _SLIGHT_BULGE = 0.3, 0.1
 """How far the middle of a bulged curve is drawn sideways, as a part of the arm's height."""
 _FIRM_TRACKING = 1.0
 """The least weight of tracking with which the arm takes the shape of a bulged curve."""
 _MORE_VERTICES = 3
 
-_SIDES = ("away from what blocks it", "to its left", "towards it", "to its right")
+_SIDES = {"to its left": 1, "to its right": 3, "away from what blocks it": 0, "towards it": 2}
+"""Quarters of a turn about the arm, as seen along it, from the direction away from what blocks it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +96,14 @@ def _more_vertices(problem: Problem, dead_end: DeadEnd) -> Changes:
     return {"curve.control_vertices": problem.curve.control_vertices + _MORE_VERTICES}
 
 
-def _bulged(quarter: int) -> Callable[[Problem, DeadEnd], Changes]:
-    """Return the way that bulges the curve to one of the four `_SIDES`."""
+def _bulged(quarter: int, size: float = _BULGE) -> Callable[[Problem, DeadEnd], Changes]:
+    """Return the way that bulges the curve to one of its four sides."""
 
     def change(problem: Problem, dead_end: DeadEnd) -> Changes:
         vertices = len(dead_end.control_vertices)
         if problem.curve is None or problem.curve.control_vertex_goals or vertices < 4:
             return {}
-        goals = bulge(dead_end, quarter)
+        goals = bulge(dead_end, quarter, size)
         return {
             "curve.control_vertex_goals": [
                 {"index": i, "position": goals[i].tolist()} for i in range(2, vertices - 1)
@@ -113,11 +114,11 @@ def _bulged(quarter: int) -> Callable[[Problem, DeadEnd], Changes]:
     return change
 
 
-def bulge(dead_end: DeadEnd, quarter: int) -> Array:
+def bulge(dead_end: DeadEnd, quarter: int, size: float = _BULGE) -> Array:
     """Return (V, 3) the control vertices where the arm stopped, drawn sideways like half a wave, m.
 
-    `quarter` counts right angles about the chord from the direction away from what blocks the arm; where no obstacle
-    does, from the one in which its path goes on.
+    The middle moves by about `size` times the arm's height. `quarter` counts right angles about the chord from the
+    direction away from what blocks the arm; where no obstacle does, from the one in which its path goes on.
     """
     vertices = dead_end.control_vertices
     chord = vertices[-1] - vertices[0]
@@ -125,7 +126,7 @@ def bulge(dead_end: DeadEnd, quarter: int) -> Array:
     aside = _across(chord, np.array(dead_end.stop.away), dead_end.heading)
     sides = (aside, np.cross(chord, aside), -aside, -np.cross(chord, aside))
     wave = np.sin(np.pi * np.arange(len(vertices)) / (len(vertices) - 1))
-    return np.asarray(vertices + _BULGE * dead_end.height * wave[:, None] * sides[quarter])
+    return np.asarray(vertices + size * dead_end.height * wave[:, None] * sides[quarter])
 
 
 def _across(axis: Array, *wanted: Array) -> Array:
@@ -140,7 +141,8 @@ def _across(axis: Array, *wanted: Array) -> Array:
 
 _WAYS: dict[str, Callable[[Problem, DeadEnd], Changes]] = {
     "actuators drawn to their home lengths": _drawn_home,
-    **{f"curve bulged {side}": _bulged(quarter) for quarter, side in enumerate(_SIDES)},
+    **{f"curve bulged {side}": _bulged(quarter) for side, quarter in _SIDES.items()},
+    "curve bulged a little away from what blocks it": _bulged(0, _SLIGHT_BULGE),
     "shorter steps": _shorter_steps,
     "actuator rates as the metric": _actuator_rates,
     "no curve": _no_curve,
