@@ -8,6 +8,7 @@ and all of them are covered in a dozen array operations.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -24,6 +25,7 @@ from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.formulas import FAR
 from vgtm_qp.geometry.groups import Group
 from vgtm_qp.geometry.pairs import Pair
+from vgtm_qp.geometry.shapes import GeometryError
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -180,22 +182,28 @@ class Watch:
         if start is not self._at:
             self._look(start, *limits)
         self._look(end, *limits)
-        # Negated comparisons also catch what is not a number.
         floors = {False: floor, True: self_floor}
         return all(pairs.lowest >= floors[pairs.is_self] for pairs in self._pairs)
 
     def _look(self, X: Array, limit: float, self_limit: float) -> None:
-        """Evaluate what may be nearer than the limits, m, at `X` and go on from there."""
+        """Evaluate what may be nearer than the limits, m, at `X` and go on from there.
+
+        Raises
+        ------
+        GeometryError
+            A position is not finite; nothing has changed.
+        """
         bounds = self._bounds if self._bounds is not None else self._start(X)
         inputs, (lower, lowest) = bounds.inputs, bounds.outputs
         inputs[0][:] = X.reshape(-1)
         self._places[:, :3] = self._at
         self._places[:, 3:] = X
         bounds()
-        least = lowest.tolist()
+        *least, motion = lowest.tolist()
+        if not motion < math.inf:
+            raise GeometryError("node positions must be finite numbers")
         for k, pairs in enumerate(self._pairs):
             nearer_than = self_limit if pairs.is_self else limit
-            # A negated comparison also catches what is not a number.
             if least[k] >= nearer_than:
                 pairs.pass_over()
             else:
@@ -255,7 +263,7 @@ def _bound_function(members: Index, every: list[_Pairs], nodes: int) -> ca.Funct
     """Return the function that bounds the distances of all pairs after a motion.
 
     Arguments: node positions after and before it (3, N); bounds before it (C), m. Results: bounds after it (C); the
-    least one of each shape.
+    least one of each shape, and the sum of the squares of the displacements.
 
     A distance from an obstacle changes by no more than an end of the member moves. That of two members changes by no
     more than an end of one moves relative to an end of the other: than their middles do, and both turn about those.
@@ -275,8 +283,8 @@ def _bound_function(members: Index, every: list[_Pairs], nodes: int) -> ca.Funct
         )
     after = lower - ca.vertcat(*nearer)
     parts = ca.vertsplit(after, [0, *np.cumsum([len(pairs.group) for pairs in every]).tolist()])
-    # What is not a number must not be passed over: a least of numbers would leave it out.
-    least = ca.vertcat(*map(ca.mmin, parts)) + 0.0 * ca.sumsqr(moved)
+    # A least of numbers leaves out what is none; the sum does not.
+    least = ca.vertcat(*map(ca.mmin, parts), ca.sumsqr(moved))
     return ca.Function("bounds", [X, before, lower], [after, least])
 
 
