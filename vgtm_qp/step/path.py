@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,17 +98,22 @@ class Path:
     _spin: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        numbers = np.concatenate([np.ravel(self.knots), np.ravel(self.positions), np.ravel(self.rotations)])
-        if not np.all(np.isfinite(numbers)):
+        knots, positions, rotations = self.knots, self.positions, self.rotations
+        # One number that is not finite makes the sum so.
+        if not math.isfinite(knots.sum() + positions.sum() + rotations.sum()):
             raise GoalError("a goal must be made of finite numbers; the state of the arm is unchanged")
-        if np.any(np.diff(self.knots) <= 0):
+        widths = (knots[1:] - knots[:-1])[:, None]
+        if not (widths > 0.0).all():
             raise GoalError("the times of a path must increase strictly")
-        turns = [vector_from_rotation(b @ a.T) for a, b in pairwise(self.rotations)]
-        widths = np.diff(self.knots)[:, None]
-        object.__setattr__(self, "_knots", self.knots.tolist())
-        object.__setattr__(self, "_turned", [bool(np.any(turn)) for turn in turns])
-        object.__setattr__(self, "_velocity", np.diff(self.positions, axis=0) / widths)
-        object.__setattr__(self, "_spin", np.stack(turns) / widths)
+        turned = (rotations[1:] != rotations[:-1]).any(axis=(1, 2)).tolist()
+        spin = np.zeros((len(widths), 3))
+        for k, turns in enumerate(turned):
+            if turns:
+                spin[k] = vector_from_rotation(rotations[k + 1] @ rotations[k].T) / widths[k]
+        object.__setattr__(self, "_knots", knots.tolist())
+        object.__setattr__(self, "_turned", turned)
+        object.__setattr__(self, "_velocity", (positions[1:] - positions[:-1]) / widths)
+        object.__setattr__(self, "_spin", spin)
 
     @property
     def start(self) -> float:
