@@ -37,13 +37,13 @@ class Tolerances:
     """What an accepted state is held against: lengths, tip and, where faces track hard, tracking in m (rad).
 
     They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. A tip
-    that is further off than `settling` after a QP calls for another one.
+    that is further off than `settling` of the arm's length after a QP calls for another one.
     """
 
     member: float = 1e-10
     stroke: float = 1e-10
     tip: float = 1e-8
-    settling: float = 1e-3
+    settling: float = 5e-3
     tracking: float = 1e-7
 
 
@@ -172,7 +172,8 @@ class Attempt:
         self.tolerances = tolerances or Tolerances()
         self.max_qps = max_qps
         self.phases = Phases()
-        self._accuracy = Accuracy(self.tolerances.member, self.tolerances.tip, self.tolerances.settling)
+        kept = self.tolerances
+        self._accuracy = Accuracy(kept.member, kept.tip, kept.settling * separation.truss.height)
 
     def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Outcome:
         """Return the outcome of moving from `state` along the target's piece of path; no state is changed.

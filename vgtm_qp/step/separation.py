@@ -63,7 +63,7 @@ class Separation:
     def __init__(self, truss: Truss, monitor: Clearance, distances: Distances) -> None:
         self.monitor = monitor
         self.distances = distances
-        self._truss = truss
+        self.truss = truss
         self._ends = None if truss.joints is None else EndKinematics(truss)
         self._watch = Watch(monitor) if Watch.serves(monitor) else None
         self._corners = (
@@ -91,7 +91,7 @@ class Separation:
         """
         if not self._angles_hold(X):
             return None
-        if proven and not before and self._truss.joints is None:
+        if proven and not before and self.truss.joints is None:
             return {}
         after = self.shortfall(X, time)
         if all(
@@ -109,7 +109,7 @@ class Separation:
             min([least, *(distance for pair, distance in before.items() if pair.is_self == is_self)])
             for least, is_self in ((kept.safe, False), (kept.self_safe, True))
         )
-        if self._truss.joints is None:
+        if self.truss.joints is None:
             floors = floor - kept.rounding, max(self_floor - kept.rounding, 0.0)
             if self._watch is not None and self._watch.follow(start, end, *floors):
                 return certified(min(floors), self.monitor.names)
@@ -133,7 +133,7 @@ class Separation:
 
     def deviation(self, start: Array, end: Array) -> float:
         """Return how far members' ends leave their chords at most, m: offset joints turn on the way."""
-        return 2.0 * chord_deviation(self._truss, start, end)
+        return 2.0 * chord_deviation(self.truss, start, end)
 
     def rows(
         self, X: Array, time: float, duration: float, reach: float, short: Shortfall, gain: float
@@ -224,7 +224,7 @@ class Separation:
 
     def _angles(self, X: Array) -> tuple[Array, Array, Array]:
         """Return angles (K,), rad, and the two members' vectors (K, 3) away from the node they share, m."""
-        ends = member_ends(self._truss, X)
+        ends = member_ends(self.truss, X)
         along = ends[:, 1] - ends[:, 0]
         first, second = (
             np.where(self._corners[:, e, 1, None] == 0, 1.0, -1.0) * along[self._corners[:, e, 0]]
@@ -247,13 +247,13 @@ class Separation:
         sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
         turn_u = -(v - cosine * u) / (lengths[0] * np.maximum(sine, 1e-6))
         turn_v = -(u - cosine * v) / (lengths[1] * np.maximum(sine, 1e-6))
-        corners, members = self._corners[chosen], self._truss.members
+        corners, members = self._corners[chosen], self.truss.members
         node = members[corners[:, 0, 0], corners[:, 0, 1]]
         others = [members[corners[:, e, 0], 1 - corners[:, e, 1]] for e in range(2)]
         nodes = np.stack([node, *others, others[1]], axis=1)
         coefficients = np.stack([-turn_u - turn_v, turn_u, turn_v, np.zeros_like(turn_u)], axis=1)
         lower = self.distances.minimum_angle + self.distances.margin - angle
-        names = self._truss.member_names
+        names = self.truss.member_names
         return ClearanceRows(
             nodes,
             coefficients,
