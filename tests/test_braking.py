@@ -78,6 +78,182 @@ def test_random_goals_in_a_control_loop_never_trap_a_moving_arm(seed, obstacles)
     assert max(np.abs(state.length_rates).max() for state in steps) > 0.03
 
 
+def keeps_accelerations(truss, before, after, slack=1e-9):
+    """Return whether no actuator changed its speed in a step by more than it may."""
+    change = np.abs(after.length_rates - before.length_rates)[truss.actuators]
+    interval = 0.5 * (after.duration + (before.duration or after.duration))
+    return bool(np.all(change <= (truss.acceleration[truss.actuators] + slack) * interval))
+
+
+def drive(resolver, goals, dt=0.2):
+    """Send an arm to one goal after another; return its steps, none of which may break a limit or trap it."""
+    truss, steps, before = resolver.arm.truss, [], None
+    for goal in goals:
+        here = resolver.state
+        step = resolver.step(position=goal(resolver), dt=dt)
+        steps.append(step)
+        if step.status is vq.StepStatus.BLOCKED:
+            assert before is None or may_rest(truss, before, here)
+            assert here.time >= (resolver.arm.base_motion.end if resolver.arm.base_motion else 0.0) - 1e-9
+            continue
+        assert keeps_accelerations(truss, here, step.state)
+        assert (
+            resolver.arm.monitor.least(step.state.nodes, step.state.time, among="obstacles")[0] >= 0.05 - 1e-9
+        )
+        before = here
+    return steps
+
+
+def random_goals(seed, count=40, base=None):
+    """Yield goals, as functions of the resolver, that jump every eight steps; they go with a base that moves."""
+    random = np.random.default_rng(seed)
+    for k in range(count):
+        if k % 8 == 0:
+            goal = np.array([0.0, 0.0, 2.0]) + random.uniform([-0.9, -0.9, -0.5], [0.9, 0.9, 0.5])
+        yield (
+            lambda resolver, goal=goal: (
+                goal
+                + (0.0 if base is None else np.interp(resolver.state.time, [0.0, base["time"]], [0.0, 1.0]))
+                * np.array([0.0, 0.0, 0.0] if base is None else base["position"])
+            )
+        )
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("obstacles", [[], [CRATE]])
+def test_an_elastic_tip_leaves_its_goal_to_brake_and_never_traps_a_moving_arm(seed, obstacles):
+    resolver = vq.Resolver(problem(0.1, obstacle=obstacles, **{"end_effector.mode": "elastic"}))
+    steps = drive(resolver, random_goals(seed))
+    assert max(np.abs(step.state.length_rates).max() for step in steps) > 0.1
+    assert any(step.braked and step.left_path for step in steps)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_hard_tip_that_is_turned_round_brakes_along_its_path(seed):
+    resolver = vq.Resolver(problem(0.1, **{"end_effector.mode": "hard"}))
+    random, speed, steps = np.random.default_rng(seed), np.zeros(3), []
+    for k in range(60):
+        if k % 12 == 0:
+            wanted = random.uniform(-0.08, 0.08, 3)
+        speed = speed + np.clip(wanted - speed, -0.006, 0.006)
+        if k % 20 == 19:
+            speed = -speed
+        steps += drive(resolver, [lambda resolver, speed=speed: resolver.tip()[0] + 0.2 * speed])
+        if steps[-1].braked or steps[-1].status is vq.StepStatus.BLOCKED:
+            speed = resolver.arm.truss.tip_weights @ resolver.state.motion[resolver.arm.truss.tip] / 0.2
+    braked = [step for step in steps if step.braked]
+    assert braked
+    assert not any(step.left_path for step in braked)
+    assert sum(step.status is vq.StepStatus.REACHED for step in steps) > 40
+
+
+SLOW = {"time": 10.0, "position": [0.1, 0.0, 0.05], "rotation_vector": [0.0, 0.02, 0.02]}
+SIDEWAYS = {"time": 10.0, "position": [0.12, 0.02, 0.0]}
+IN_THE_WAY = {**CRATE, "center": [0.92, 0.3, 1.8]}
+
+
+@pytest.mark.parametrize("mode", ["scaled", "elastic"])
+@pytest.mark.parametrize(("base", "obstacles"), [(SLOW, [CRATE]), (SIDEWAYS, [IN_THE_WAY])])
+def test_a_moving_base_never_traps_a_moving_arm(mode, base, obstacles):
+    changes = {"truss.base_motion": [base], "end_effector.mode": mode}
+    steps = drive(vq.Resolver(problem(0.1, obstacle=obstacles, **changes)), random_goals(1, 60, base))
+    assert sum(step.braked for step in steps) > 3
+    assert mode == "elastic" or not any(step.left_path for step in steps)
+    assert max(np.abs(step.state.length_rates).max() for step in steps) > 0.1
+
+
+@pytest.mark.parametrize("mode", ["scaled", "elastic"])
+def test_a_maneuver_on_a_base_that_carries_the_arm_towards_a_crate_comes_through(mode):
+    changes = {"truss.base_motion": [SIDEWAYS], "obstacle": [IN_THE_WAY], "maneuver.steps": 30}
+    maneuver = vq.solve(problem(0.1, **changes, **{"end_effector.mode": mode}))
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+
+
+def test_a_base_that_starts_faster_than_actuators_can_is_no_motion_with_the_tip_on_its_path():
+    abrupt = [{"time": 4.0, "position": [0.2, 0.0, 0.1]}]
+    maneuver = vq.solve(problem(0.1, **{"truss.base_motion": abrupt}))
+    assert (maneuver.status, len(maneuver.time)) == ("blocked", 1)
+    assert maneuver.manifest["stop"]["kind"] == "acceleration"
+
+
+LURCH = [{"time": 4.0, "position": [0.04, 0.0, 0.0]}, {"time": 8.0, "position": [1.5, 0.0, 0.0]}]
+
+
+def test_an_arm_whose_base_lurches_leaves_its_path_and_rides_with_the_base():
+    resolver = vq.Resolver(problem(0.1, **{"truss.base_motion": LURCH}))
+    goal = resolver.tip()[0] + np.array([0.1, 0.0, -0.05])
+    steps = drive(resolver, [lambda _: goal] * 40)
+    left = [step for step in steps if step.left_path]
+    assert left
+    assert all(step.braked for step in left)
+    assert left[0].state.time >= 4.0
+    assert resolver.state.time >= 8.0 - 1e-9
+
+
+def test_a_maneuver_ends_on_its_path_before_the_base_lurches():
+    goal = [{"time": 8.0, "position": [0.1, 0.0, 2.3]}]
+    maneuver = vq.solve(problem(0.1, **{"truss.base_motion": LURCH, "maneuver.waypoint": goal}))
+    assert maneuver.status == "blocked"
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    assert 0.3 < maneuver.reached < 0.7
+    assert maneuver.manifest["stop"]["kind"] == "acceleration"
+
+
+def smoothly(goal, time=6.0, count=60):
+    """Return waypoints along a straight way that is started and ended slowly."""
+    tip = vq.Resolver(problem()).tip()[0]
+    shares = np.arange(1, count + 1) / count
+    return [
+        {"time": time * u, "position": (tip + u * u * (3 - 2 * u) * (np.array(goal) - tip)).tolist()}
+        for u in shares.tolist()
+    ]
+
+
+def test_a_hard_tip_keeps_a_timing_that_its_actuators_can_follow():
+    changes = {"end_effector.mode": "hard", "maneuver.waypoint": smoothly([0.6, 0.0, 2.0])}
+    maneuver = vq.solve(problem(0.3, **changes))
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    np.testing.assert_allclose(maneuver.time, np.linspace(0.0, 6.0, 61), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "waypoints", "obstacles"),
+    [
+        (0.2, smoothly([0.6, 0.0, 2.0]), []),
+        (0.3, smoothly([1.2, 0.0, 2.0]), [WALL]),
+        (0.5, [*smoothly([0.6, 0.0, 2.0])[:30], {"time": 6.0, "position": [0.0, 0.3, 2.2]}], []),
+    ],
+)
+def test_a_hard_tip_that_cannot_stay_on_time_comes_to_rest_on_its_path(acceleration, waypoints, obstacles):
+    changes = {"end_effector.mode": "hard", "maneuver.waypoint": waypoints, "obstacle": obstacles}
+    maneuver = vq.solve(problem(acceleration, **changes))
+    assert maneuver.status == "blocked"
+    assert 0.1 < maneuver.reached < 0.9
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    assert maneuver.manifest["stop"]["kind"] in ("acceleration", "obstacle", "stroke")
+    rate = np.diff(maneuver.member_lengths, axis=0) / np.diff(maneuver.time)[:, None]
+    assert np.abs(rate).max() > acceleration * 0.1
+    assert np.abs(rate[-1]).max() <= acceleration * np.diff(maneuver.time[-2:]) + 1e-9
+
+
+@pytest.mark.parametrize("mode", ["scaled", "hard", "elastic"])
+def test_a_control_loop_may_bring_its_arm_to_rest_at_any_time(mode):
+    resolver = vq.Resolver(problem(0.2, **{"end_effector.mode": mode}))
+    assert resolver.brake() is None
+    for waypoint in smoothly([0.6, 0.0, 2.0])[:20]:
+        last = resolver.step(position=waypoint["position"], dt=0.1)
+    assert last.status is not vq.StepStatus.BLOCKED
+    before, count = resolver.state, 0
+    while (step := resolver.brake()) is not None:
+        assert step.braked
+        assert keeps_accelerations(resolver.arm.truss, before, step.state)
+        last, before, count = before, step.state, count + 1
+    assert count >= 1
+    assert may_rest(resolver.arm.truss, last, resolver.state)
+
+
 def test_an_arm_that_is_sent_back_brakes_first_and_says_so():
     resolver = vq.Resolver(problem(0.1))
     tip, _ = resolver.tip()

@@ -69,7 +69,7 @@ def engines(name, *, joint_offset=0.0, track=None, vertices=5, **options):
     plain = PlainEngine(
         Linearisation(layout, kinematics, task, truss.home_lengths), make_solver("daqp", layout)
     )
-    return layout, kinematics, plain, FusedEngine(FusedSolver(layout, stages, task.axes), task)
+    return layout, kinematics, plain, FusedEngine(FusedSolver(layout, stages))
 
 
 def make_step(layout, kinematics, rng, *, base=False):

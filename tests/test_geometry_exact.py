@@ -6,7 +6,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.exact import SHAPES, distance_function, plane_function, sweep_function, width
+from vgtm_qp.geometry.exact import (
+    CONTACT,
+    SECOND_CONTACT,
+    SHAPES,
+    distance_function,
+    follow_function,
+    sweep_function,
+    width,
+)
 
 FIELDS = distance_function("box").name_out()
 SIZES = [distance_function("box").nnz_out(i) for i in range(len(FIELDS))]
@@ -181,16 +189,6 @@ def test_degenerate_segments(other, distance):
 
 
 @settings(max_examples=300, deadline=None)
-@given(cases, vectors(3))
-def test_a_plane_never_gives_more_than_the_distance(case, direction):
-    shape, ends, piece = case
-    assume(np.linalg.norm(direction) > 1e-3)
-    normal = direction / np.linalg.norm(direction)
-    gap = float(plane_function(shape)(ends, piece, normal))
-    assert gap <= max(segment_distance(shape, ends, piece), 0.0 if shape != "sphere" else -np.inf) + 1e-12
-
-
-@settings(max_examples=300, deadline=None)
 @given(cases, vectors(6), vectors(6), st.floats(0.01, 1.0))
 def test_sweep_bound_holds_at_every_instant(case, motion, other_motion, size):
     shape, ends, piece = case
@@ -205,6 +203,37 @@ def test_sweep_bound_holds_at_every_instant(case, motion, other_motion, size):
     sampled = BATCH[shape](ends + s * (end - ends), piece + s * (moved - piece))[:, 0]
     assert bound <= sampled.min() + 1e-12
     assert (at_start, at_end) == pytest.approx((sampled[0], sampled[-1]), abs=1e-12)
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases, vectors(6), vectors(6), vectors(3), st.floats(0.01, 1.0), st.floats(0.0, 0.2))
+def test_a_pair_that_is_followed_has_its_contacts_and_a_bound_whatever_normal_it_comes_with(
+    case, motion, other_motion, direction, size, radius
+):
+    shape, ends, piece = case
+    assume(np.linalg.norm(direction) > 1e-3)
+    normal = direction / np.linalg.norm(direction)
+    end, mutual = ends + size * motion, shape == "segment"
+    moved = piece + size * other_motion if mutual else piece
+    before = np.concatenate([ends, piece if mutual else np.zeros(6)]).reshape(4, 3)
+    after = np.concatenate([end, moved if mutual else np.zeros(6)]).reshape(4, 3)
+    known = np.concatenate([np.zeros(15) if mutual else piece, [radius], normal])
+    both = np.concatenate([before, after], axis=1).reshape(-1)
+    first, second = np.asarray(follow_function(shape)(both, known)).reshape(2, CONTACT)
+    s = np.linspace(0.0, 1.0, 41)[:, None]
+    sampled = BATCH[shape](ends + s * (end - ends), piece + s * (moved - piece))[:, 0]
+    assert first[12] <= max(sampled.min(), 0.0 if shape != "sphere" else -np.inf) - radius + 1e-12
+    wanted = contact(shape, end, moved)
+    assume(wanted["distance"] > 1e-6)
+    assert first[0] + radius == pytest.approx(wanted["distance"], abs=1e-12)
+    np.testing.assert_allclose(first[5:8], wanted["normal"], atol=1e-9)
+    np.testing.assert_allclose(first[9:12], wanted["point"], atol=1e-9)
+    witness = first[1:3] @ after[:2]
+    other = -first[3:5] @ after[2:] if mutual else wanted["point"]
+    np.testing.assert_allclose(witness - other, first[5:8] * wanted["distance"], atol=1e-9)
+    if second[0] < 1e9:
+        assert second[0] + radius == pytest.approx(wanted["distance_second"], abs=1e-12)
+        assert abs(second[8] - first[8]) >= SECOND_CONTACT
 
 
 @pytest.mark.parametrize("count", [1, 16, 17, 65, 300, 1500])

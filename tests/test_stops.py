@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
-from vgtm_qp.step.stops import StopKind
+from vgtm_qp.maneuver.ways_out import DeadEnd, bulge, ways_out
+from vgtm_qp.step.stops import Stop, StopKind
 
 BASE = {
     "name": "three bays",
@@ -120,13 +121,60 @@ def test_another_way_out_is_tried_before_giving_up_and_can_be_turned_off():
     assert patient.reached >= hasty.reached
 
 
+def dead_end(kind=StopKind.OBSTACLE, vertices=6, away=(-2.0, 0.0, -1.0)):
+    curve = np.column_stack([np.zeros((vertices, 2)), np.linspace(0.0, 2.5, vertices)])
+    return DeadEnd(Stop(kind, away=away), curve, 2.5, np.array([0.0, 1.0, 0.0]))
+
+
+def test_a_bulge_is_drawn_across_the_arm_to_four_sides_and_keeps_base_and_tip():
+    end = dead_end()
+    drawn = [bulge(end, quarter) - end.control_vertices for quarter in range(4)]
+    for quarter, (x, y) in enumerate([(-1.0, 0.0), (0.0, -1.0), (1.0, 0.0), (0.0, 1.0)]):
+        np.testing.assert_allclose(drawn[quarter][[0, -1]], 0.0, atol=1e-12)
+        middle = drawn[quarter][2:4]
+        assert np.linalg.norm(middle, axis=1).min() > 0.2 * 2.5
+        np.testing.assert_allclose(
+            middle / np.linalg.norm(middle, axis=1)[:, None], [[x, y, 0.0]] * 2, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("away", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_an_arm_that_no_obstacle_pushes_aside_is_bulged_the_way_its_path_goes_on(away):
+    end = dead_end(away=away)
+    moved = bulge(end, 0) - end.control_vertices
+    assert moved[2, 1] > 0.5
+    np.testing.assert_allclose(moved[:, [0, 2]], 0.0, atol=1e-12)
+
+
+def test_the_ways_out_are_those_that_a_problem_has():
+    patient = problem(**{"method.retries": True})
+    names = [name for name, _ in ways_out(patient, dead_end(vertices=4))]
+    assert names[0] == "actuators drawn to their home lengths"
+    assert [name.startswith("curve bulged") for name in names] == [False] + 5 * [True] + 4 * [False]
+    assert len(set(names)) == len(names)
+    for name, other in ways_out(patient, dead_end(vertices=4)):
+        assert other != patient, name
+    assert not list(ways_out(problem(), dead_end()))
+    for kind in (StopKind.SINGULAR, StopKind.OUT_OF_REACH, StopKind.LOCKED, StopKind.INTERRUPTED):
+        assert not list(ways_out(patient, dead_end(kind)))
+    bare = patient.replace({"method.tracking": "none"})
+    found = [name for name, _ in ways_out(bare, dead_end(vertices=0))]
+    assert not any("curve" in name or "vertices" in name for name in found)
+    drawn = patient.replace({"curve.control_vertex_goals": [{"index": 2, "position": [0.1, 0.0, 1.5]}]})
+    assert not any("bulged" in name for name, _ in ways_out(drawn, dead_end(vertices=4)))
+
+
 @pytest.mark.slow
-def test_a_dead_end_of_one_shape_is_passed_in_another():
+@pytest.mark.parametrize(
+    ("seed", "number", "way"), [(0, 9, ""), (1991, 119, "curve bulged"), (1991, 83, "curve bulged")]
+)
+def test_a_dead_end_of_one_shape_is_passed_in_another(seed, number, way):
     from vgtm_qp.study.scenes import random_scene
 
-    scene = random_scene(0, 9).problem
+    scene = random_scene(seed, number).problem
     assert vq.solve(scene.replace({"method.retries": False}), verify=False).status == "blocked"
     maneuver = vq.solve(scene)
     assert maneuver.status == "solved"
+    assert maneuver.manifest["way_out"].startswith(way)
     assert maneuver.manifest["way_out"]
     assert maneuver.certificate.ok, maneuver.certificate.failures()

@@ -139,6 +139,17 @@ class Clearance:
         self._tire(candidates, X, time, wasted)
         return self._with_enclosed(join(parts, self.names), X, time)
 
+    @property
+    def ends_at_nodes(self) -> bool:
+        """Whether members end at nodes: joints have no extent."""
+        return self._ends is None
+
+    def every_pair(self, X: Array) -> Candidates:
+        """Return the list of all pairs, with their distances at node positions `X` (N, 3) and time 0."""
+        horizon = np.inf if self.self_collision else None
+        arm = (self._members, self.pieces, self._kernels)
+        return Candidates(*arm, self._points(X), 0.0, np.inf, horizon)
+
     def _points(self, X: Array) -> Array:
         """Return the points that members end at, from node positions (N, 3)."""
         return X if self._ends is None else self._ends(X).reshape(-1, 3)

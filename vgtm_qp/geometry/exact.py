@@ -13,14 +13,27 @@ from typing import Any
 
 import casadi as ca
 
-from vgtm_qp.geometry.formulas import FORMULAS
-from vgtm_qp.geometry.symbolic import Vector, add, at, between, dot, norm, rotate_back
+from vgtm_qp.geometry.formulas import FAR, FORMULAS
+from vgtm_qp.geometry.symbolic import Vector, add, at, between, dot, norm, ratio, rotate_back
 
 SHAPES = ("box", "sphere", "cylinder", "triangle", "segment")
 """Kinds of pieces; a segment is the axis of another member."""
 
+
+_LEAST_SQUARE = 0.1
+"""Least |n|^2 of a normal between two others that still gives a plane."""
+
 WIDTH = 15
 """Numbers that describe an obstacle piece, see :func:`parameters_of`."""
+
+CONTACT = 13
+"""Numbers that describe a contact, see :func:`follow_function`."""
+
+KNOWN = WIDTH + 4
+"""Numbers that a pair is known by before, see :func:`follow_function`."""
+
+SECOND_CONTACT = 0.2
+"""Two contacts of a member with one piece are apart by this fraction of its length, at least."""
 
 
 def parameters_of(shape: str) -> str:
@@ -108,51 +121,112 @@ def distance_function(shape: str) -> ca.Function:
 
 
 @cache
-def plane_function(shape: str) -> ca.Function:
-    """Return a lower bound of the distance from a segment to a piece: their gap along a unit normal.
-
-    Inputs ``segment (6,)``, ``piece``, ``normal (3,)``; output ``gap``. It holds for any unit normal.
-    """
-    segment, piece, normal = ca.SX.sym("segment", 6), ca.SX.sym("piece", width(shape)), ca.SX.sym("normal", 3)
-    gap = _gap(shape, ca.vertsplit(segment), ca.vertsplit(piece), ca.vertsplit(normal))
-    return ca.Function(
-        f"plane_{shape}", [segment, piece, normal], [gap], ["segment", "piece", "normal"], ["gap"]
-    )
-
-
-def _gap(shape: str, ends: Vector, piece: Vector, normal: Vector) -> Any:
-    return ca.fmin(dot(normal, ends[0:3]), dot(normal, ends[3:6])) - _support(shape, piece, normal)
-
-
-@cache
 def sweep_function(shape: str) -> ca.Function:
     """Return a lower bound of the distance while the segment's ends move on straight lines, both at once.
 
     Inputs ``segment_a``, ``segment_b`` (6,), and the piece, which rests, or ``piece_a`` and ``piece_b`` for
     another segment that moves likewise. Outputs ``bound`` and the exact distances ``at_a`` and ``at_b``.
 
-    With a fixed normal the gap is a least of functions linear in time, hence concave: its least value over
-    the motion stands at one end. The normals are those at both ends; beside them stands the motion bound: a
+    The bound is the best of two: the planes of :func:`_turning_gap` between the contacts at both ends, and that a
     distance changes by no more than the ends of the segments move.
     """
     other = shape == "segment"
     a, b = ca.SX.sym("segment_a", 6), ca.SX.sym("segment_b", 6)
     piece_a = ca.SX.sym("piece_a", width(shape))
     piece_b = ca.SX.sym("piece_b", 6) if other else piece_a
-    segments, pieces = [ca.vertsplit(a), ca.vertsplit(b)], [ca.vertsplit(piece_a), ca.vertsplit(piece_b)]
+    segments, pieces = (ca.vertsplit(a), ca.vertsplit(b)), (ca.vertsplit(piece_a), ca.vertsplit(piece_b))
     contacts = [FORMULAS[shape](s, p) for s, p in zip(segments, pieces, strict=True)]
     motion = _travel(*segments)
     if other:
         motion += _travel(*pieces)
     bound = 0.5 * (contacts[0].distance + contacts[1].distance - motion)
-    for contact in contacts:
-        gaps = [_gap(shape, s, p, contact.normal) for s, p in zip(segments, pieces, strict=True)]
-        bound = ca.fmax(bound, ca.fmin(*gaps))
+    bound = ca.fmax(bound, _turning_gap(shape, segments, pieces, (contacts[0].normal, contacts[1].normal)))
     inputs, names = [a, b, piece_a], ["segment_a", "segment_b", "piece"]
     if other:
         inputs, names = [a, b, piece_a, piece_b], ["segment_a", "segment_b", "piece_a", "piece_b"]
     outputs = [ca.densify(x) for x in (bound, *(contact.distance for contact in contacts))]
     return ca.Function(f"sweep_{shape}", inputs, outputs, names, ["bound", "at_a", "at_b"])
+
+
+def _turning_gap(
+    shape: str,
+    segments: tuple[Vector, Vector],
+    pieces: tuple[Vector, Vector],
+    normals: tuple[Vector, Vector],
+) -> Any:
+    """Return a lower bound of the distance over a straight motion, by a plane that turns with it.
+
+    With n(s) = (1 - s) n_0 + s n_1 between two unit normals, the gap of a point x(s) = (1 - s) x_0 + s x_1 to a convex
+    piece of support function S is
+
+        n.x - S(n) >= (1 - s) (n_0.x_0 - S(n_0)) + s (n_1.x_1 - S(n_1)) - w (n_1 - n_0).(x_1 - x_0),   w = s (1 - s),
+
+    since S is convex, and |n|^2 = 1 - w |n_1 - n_0|^2. With m the lesser of both gaps and c the last product where it
+    is positive, the distance along n/|n| is at least the least of (m - c w) / |n| over 0 <= w <= 1/4. Where the normals
+    are those of the contacts at both ends, m is the lesser of the two distances.
+    """
+    turn = between(*normals)
+    square = dot(turn, turn)
+    if shape == "segment":
+        points = [
+            (between(y0, x0), between(y1, x1))
+            for x0, x1 in zip(_halves(segments[0]), _halves(segments[1]), strict=True)
+            for y0, y1 in zip(_halves(pieces[0]), _halves(pieces[1]), strict=True)
+        ]
+        supports: tuple[Any, Any] = (0.0, 0.0)
+    else:
+        points = list(zip(_halves(segments[0]), _halves(segments[1]), strict=True))
+        supports = (_support(shape, pieces[0], normals[0]), _support(shape, pieces[1], normals[1]))
+    bound: Any = FAR
+    for start, end in points:
+        gap = ca.fmin(dot(normals[0], start) - supports[0], dot(normals[1], end) - supports[1])
+        bend = ca.fmax(dot(turn, between(start, end)), 0.0)
+        # (m - c w) / sqrt(1 - k w) falls up to this w and rises after it.
+        lowest = ratio(2.0 * bend - square * gap, bend * square, 1.0)
+        w = ca.fmin(ca.fmax(lowest, 0.0), 0.25)
+        along = (gap - bend * w) / ca.sqrt(ca.fmax(1.0 - square * w, _LEAST_SQUARE))
+        bound = ca.fmin(bound, ca.fmin(gap, along))
+    # Normals that are further apart may be opposite: between them there is no plane.
+    return ca.if_else(square <= 4.0 * (1.0 - _LEAST_SQUARE), bound, -FAR)
+
+
+def _halves(ends: Vector) -> tuple[Vector, Vector]:
+    return ends[0:3], ends[3:6]
+
+
+@cache
+def follow_function(shape: str) -> ca.Function:
+    """Return the contacts of a pair after a straight motion, and a lower bound of its distance meanwhile.
+
+    Inputs ``ends (24,)``, before and after it for each end of the member, then of the other member (ignored for an
+    obstacle, which rests); and ``known (19,)``: the piece (15; ignored for two members), what surfaces are nearer than
+    axes, and a unit normal (3), best that of the contact before.
+
+    Output ``contacts (26,)``: ``CONTACT`` numbers for each of two contacts after the motion: surface distance, weights
+    (4,) of the four ends in the normal velocity, normal (3,), t, witness point (3,), and the bound over the motion of
+    :func:`_turning_gap`. The second distance is ``FAR`` where there is none worth a row of its own, as is the second
+    bound. Where axis and piece intersect the distance is minus `radius` and the rest of no use.
+    """
+    both, known = ca.SX.sym("ends", 24), ca.SX.sym("known", KNOWN)
+    points = ca.reshape(both, 3, 8)
+    starts, ends = (ca.vertsplit(ca.vec(points[:, k::2])) for k in (0, 1))
+    piece, radius, normal = ca.vertsplit(known[:WIDTH]), known[WIDTH], ca.vertsplit(known[WIDTH + 1 :])
+    mutual = shape == "segment"
+    others = (starts[6:], ends[6:]) if mutual else (piece, piece)
+    c = FORMULAS[shape](ends[:6], others[1], apart=True)
+    share = 1.0 if mutual else 0.0
+
+    def contact(distance: Any, t: Any, s: Any, n: Vector) -> list[Any]:
+        weights = [1.0 - t, t, share * (s - 1.0), -share * s]
+        return [distance - radius, *weights, *n, t, *add(at(ends[:6], t), n, -distance)]
+
+    second = contact(c.distance_second, c.t_second, c.s_second, c.normal_second)
+    second[0] = ca.if_else(ca.fabs(c.t_second - c.t) >= SECOND_CONTACT, second[0], FAR)
+    bound = _turning_gap(shape, (starts[:6], ends[:6]), others, (normal, c.normal))
+    contacts = ca.vertcat(*contact(c.distance, c.t, c.s, c.normal), bound - radius, *second, FAR)
+    return ca.Function(
+        f"follow_{shape}", [both, known], [ca.densify(ca.cse(contacts))], ["ends", "known"], ["contacts"]
+    )
 
 
 def _travel(a: Vector, b: Vector) -> Any:

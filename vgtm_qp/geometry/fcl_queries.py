@@ -50,6 +50,8 @@ class FclQueries:
         self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
 
     def _object(self, piece: int) -> Any:
+        if self._member is None:
+            self._start()
         if piece not in self._objects:
             fcl, shape, row = self._fcl, self._pieces.shape[piece], self._pieces.parameters[piece]
             if shape == "sphere":
@@ -79,34 +81,40 @@ class FclQueries:
         contacts
             Exact, from surface to surface; they stay where FCL's answer is refused.
         """
-        if len(rows) and self._member is None:
-            self._start()
         # Where the nearest point is not unique, FCL may give one between the two ends of the contact.
         unique = ~contacts.two()
         for k in rows.tolist():
-            start, end = segments[k, :3].tolist(), segments[k, 3:].tolist()
+            piece = int(pieces[k])
             if self._pieces.moving:
-                self._object(int(pieces[k])).setTranslation(parameters[k, :3])
-            distance, point, witness = self._ask(int(pieces[k]), start, end)
-            self.asked += 1
-            if not (distance > 0.0 and abs(distance - radius[k] - contacts.distance[k]) <= _AGREEMENT):
-                self.replaced += 1
-            elif unique[k]:
-                axis = segments[k, 3:] - segments[k, :3]
-                contacts.t[k] = min(max(float(axis @ (point - start)) / float(axis @ axis), 0.0), 1.0)
-                contacts.normal[k] = (point - witness) / distance
-                contacts.point[k] = witness
+                self._object(piece).setTranslation(parameters[k, :3])
+            found = self.witness(piece, segments[k].tolist(), float(contacts.distance[k] + radius[k]))
+            if found is not None and unique[k]:
+                contacts.t[k], contacts.normal[k], contacts.point[k] = found
 
-    def _ask(self, piece: int, start: list[float], end: list[float]) -> tuple[float, Array, Array]:
-        """Return FCL's distance and its witness points on the segment and on the piece."""
-        x, y, z = (b - a for a, b in zip(start, end, strict=True))
+    def witness(
+        self, piece: int, ends: list[float], distance: float
+    ) -> tuple[float, tuple[float, float, float], Array] | None:
+        """Return the parameter on a segment, normal (3) and point (3,) on the piece where FCL finds the two nearest.
+
+        None where its distance is not the `distance`, m, of the closed form: its answer is refused.
+        """
+        other = self._object(piece)
+        ax, ay, az, bx, by, bz = ends
+        x, y, z = bx - ax, by - ay, bz - az
         length = sqrt(x * x + y * y + z * z)
         self._capsule.lz = length
         self._member.setQuatRotation(_quaternion(x, y, z, length))
-        self._member.setTranslation(np.array([0.5 * (a + b) for a, b in zip(start, end, strict=True)]))
+        self._member.setTranslation(np.array((0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz))))
         result = self._fcl.DistanceResult()
-        distance = self._fcl.distance(self._member, self._object(piece), self._request, result)
-        return distance, *result.nearest_points
+        found = self._fcl.distance(self._member, other, self._request, result)
+        self.asked += 1
+        if not (found > 0.0 and abs(found - distance) <= _AGREEMENT):
+            self.replaced += 1
+            return None
+        point, witness = result.nearest_points
+        (px, py, pz), (wx, wy, wz) = point.tolist(), witness.tolist()
+        along = (x * (px - ax) + y * (py - ay) + z * (pz - az)) / (length * length)
+        return min(max(along, 0.0), 1.0), ((px - wx) / found, (py - wy) / found, (pz - wz) / found), witness
 
 
 def _quaternion(x: float, y: float, z: float, length: float) -> list[float]:

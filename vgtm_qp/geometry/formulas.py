@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import casadi as ca
 
@@ -119,7 +119,7 @@ def _box_depth(a: Vector, u: Vector, half: Vector) -> list[Any]:
     return least(candidates)
 
 
-def _segment_box(ends: Vector, piece: Vector) -> Contact:
+def _segment_box(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:
     """Return the contact for a box.
 
     The squared distance is piecewise quadratic with at most six break points, where a coordinate crosses a
@@ -139,7 +139,8 @@ def _segment_box(ends: Vector, piece: Vector) -> Contact:
     breaks += [clip(ratio(side * half[c] - a[c], u[c])) for c in range(3) for side in (-1.0, 1.0)]
     low, high = _bracket([(t, slope(t)) for t in breaks])
     t_outside = _secant(low, high, slope(low), slope(high))
-    return _solid_contact(a, b, rotation, excess, t_outside, _box_depth(a, u, half), breaks)
+    depth = None if apart else _box_depth(a, u, half)
+    return _solid_contact(a, b, rotation, excess, t_outside, depth, breaks)
 
 
 def _solid_contact(
@@ -148,7 +149,7 @@ def _solid_contact(
     rotation: Vector,
     excess: Callable[[Any], Vector],
     t_outside: Any,
-    depth: list[Any],
+    depth: list[Any] | None,
     breaks: list[Any],
 ) -> Contact:
     """Return the contact of a segment a-b given in the frame of a solid piece.
@@ -160,13 +161,15 @@ def _solid_contact(
     t_outside
         Parameter of the nearest point where the two do not intersect.
     depth
-        Depth, parameter and exit normal (3) where they do.
+        Depth, parameter and exit normal (3) where they do; None where that is not wanted.
     breaks
         Parameters where a contact interval may end.
     """
     gap = excess(t_outside)
     outside = norm(gap)
     cut = outside <= TINY
+    if depth is None:
+        depth = [0.0, t_outside, 0.0, 0.0, 1.0]
     distance = ca.if_else(cut, -ca.fmax(depth[0], 0.0), outside)
     t = ca.if_else(cut, depth[1], t_outside)
     normal = pick(cut, depth[2:5], [x / ca.if_else(cut, 1.0, outside) for x in gap])
@@ -183,7 +186,7 @@ def _solid_contact(
     )
 
 
-def _segment_sphere(ends: Vector, piece: Vector) -> Contact:
+def _segment_sphere(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:  # noqa: ARG001
     a, u = ends[0:3], between(ends[0:3], ends[3:6])
     t = clip(ratio(dot(between(a, piece[0:3]), u), dot(u, u)))
     gap = between(piece[0:3], at(ends, t))
@@ -199,7 +202,7 @@ def _cylinder_excess(x: Vector, radius: Any, half: Any) -> Vector:
     return [scale * x[0], scale * x[1], along]
 
 
-def _segment_cylinder(ends: Vector, piece: Vector) -> Contact:
+def _segment_cylinder(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:
     """Return the contact for a solid cylinder with flat ends.
 
     Only over the rim is the derivative not linear or of known sign; there Newton's iteration runs inside the
@@ -239,6 +242,8 @@ def _segment_cylinder(ends: Vector, piece: Vector) -> Contact:
         newton = t - ratio(value, curvature, FAR)
         inside = ca.logic_and(newton >= low, newton <= high)
         t = ca.if_else(settled, t, ca.if_else(inside, newton, 0.5 * (low + high)))
+    if apart:
+        return _solid_contact(a, b, rotation, excess, t, None, breaks)
     first = ca.if_else(a[2] <= b[2], 0.0, 1.0)
     x = blend(a, b, t_axis)
     rho = ca.sqrt(x[0] ** 2 + x[1] ** 2)
@@ -276,7 +281,7 @@ def _segment_pair(a: Vector, b: Vector, c: Vector, d: Vector) -> list[list[Any]]
     return [[norm(between(blend(c, d, s), blend(a, b, t))), t, s] for t, s in pairs]
 
 
-def _segment_segment(ends: Vector, piece: Vector) -> Contact:
+def _segment_segment(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:  # noqa: ARG001
     a, b, c, d = ends[0:3], ends[3:6], piece[0:3], piece[3:6]
     u, v = between(a, b), between(c, d)
     candidates = _segment_pair(a, b, c, d)
@@ -288,7 +293,7 @@ def _segment_segment(ends: Vector, piece: Vector) -> Contact:
     return Contact(distance, norm(gap), t, t_second, normal, unit(gap, normal), s, s_second)
 
 
-def _segment_triangle(ends: Vector, piece: Vector) -> Contact:
+def _segment_triangle(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:  # noqa: ARG001
     """Return the contact for a triangle.
 
     The nearest pair is an end over the face, or a point of an edge, or a piercing point.
@@ -346,7 +351,15 @@ def _segment_triangle(ends: Vector, piece: Vector) -> Contact:
     )
 
 
-FORMULAS: dict[str, Callable[[Vector, Vector], Contact]] = {
+class Formula(Protocol):
+    """From a segment (6) and a piece to what is known of them; `apart`, nothing of use where the two intersect."""
+
+    def __call__(self, ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:
+        """Return the contact."""
+        ...
+
+
+FORMULAS: dict[str, Formula] = {
     "box": _segment_box,
     "sphere": _segment_sphere,
     "cylinder": _segment_cylinder,

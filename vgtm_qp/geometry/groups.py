@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.exact import distance_function, sweep_function
+from vgtm_qp.geometry.exact import SECOND_CONTACT, distance_function, sweep_function
 from vgtm_qp.geometry.shapes import Pieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-SECOND_CONTACT = 0.2
-"""Two contacts of a member with one piece are apart by this fraction of its length, at least."""
 
 
 class Motion(NamedTuple):

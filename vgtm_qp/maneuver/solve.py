@@ -15,13 +15,14 @@ from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.manifest import arm_record, make_manifest, mesh_record
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.maneuver.ways_out import ways_out
+from vgtm_qp.maneuver.ways_out import DeadEnd, ways_out
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
 from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.state import State
 from vgtm_qp.step.stops import Stop, StopKind
 
 if TYPE_CHECKING:
@@ -84,7 +85,14 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     try:
         stop = _run(resolver, plan, record, progress)
         if stop is not None and isinstance(resolver, Resolver):
-            way, record, stop = _retry(problem, record, stop, progress)
+            value = plan.path.start + record.rows["progress"][-1] * (plan.path.end - plan.path.start)
+            dead_end = DeadEnd(
+                stop,
+                resolver.state.control_vertices,
+                resolver.arm.truss.height,
+                plan.path.at(value).velocity,
+            )
+            way, record, stop = _retry(problem, record, dead_end, progress)
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
     maneuver = _assemble(problem, resolver, record, stop, setup_time, way)
@@ -96,11 +104,11 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
 
 
 def _retry(
-    problem: Problem, record: _Record, stop: Stop, progress: Progress | None
+    problem: Problem, record: _Record, dead_end: DeadEnd, progress: Progress | None
 ) -> tuple[str, _Record, Stop | None]:
     """Return what comes furthest of the maneuver that stopped and of other ways to do it, by name."""
-    best: tuple[str, _Record, Stop | None] = ("", record, stop)
-    for name, other in ways_out(problem, stop):
+    best: tuple[str, _Record, Stop | None] = ("", record, dead_end.stop)
+    for name, other in ways_out(problem, dead_end):
         # A kernel takes longer to compile than a maneuver to solve without it.
         resolver = Resolver(build_arm(other, compiled=False))
         plan = make_plan(other, *resolver.tip())
@@ -121,20 +129,55 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
     keeps_moving = bool(np.isfinite(resolver.arm.truss.acceleration[resolver.arm.truss.actuators]).any())
     while value < last:
         aim, dt = plan.next_mark(value, keeps_moving=keeps_moving)
-        before, clock = dict(resolver.phases), perf_counter()
+        before, known, clock = resolver.state, dict(resolver.phases), perf_counter()
         step = resolver.follow(plan.path, value, aim, dt=dt)
         seconds = perf_counter() - clock
         if step.status is StepStatus.BLOCKED:
             return _stop(resolver, plan, value, aim, dt, step)
+        stop = _given_up(resolver, plan, value, aim, dt, step, before)
+        if stop is not None and step.left_path:
+            # The arm would brake from here off the path, which is no part of the maneuver.
+            return stop
         value = aim if step.status is StepStatus.REACHED else value + step.progress * (aim - value)
-        phases = {name: total - before[name] for name, total in resolver.phases.items()}
+        phases = {name: total - known[name] for name, total in resolver.phases.items()}
         _add_state(record, resolver, plan, value, seconds, phases)
+        if stop is not None:
+            _come_to_rest(resolver, plan, record, value)
+            return stop
         stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
         if stalled >= _STALLED_STEPS:
             return _stop(resolver, plan, value, aim, dt, step)
         if progress is not None:
             progress((value - start) / (end - start), step)
     return None
+
+
+def _given_up(
+    resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step, before: State
+) -> Stop | None:
+    """Return why the maneuver ends with a step in which the arm braked; None where it goes on afterwards.
+
+    A hard tip that had to brake is no longer on time, and one that had to leave its path is no longer on that.
+    """
+    mode = resolver.arm.tip_mode
+    if not step.braked or not isinstance(resolver, Resolver) or mode == "elastic":
+        return None
+    if mode != "hard" and not step.left_path:
+        return None
+    return resolver.explain(plan.path, value, mark, dt=dt, last=step, state=before)
+
+
+def _come_to_rest(resolver: AnyResolver, plan: Plan, record: _Record, value: float) -> None:
+    """Record the steps in which the arm comes to rest on its path."""
+    end = plan.path.end
+    while isinstance(resolver, Resolver) and value < end:
+        known, clock = dict(resolver.phases), perf_counter()
+        step = resolver.brake(plan.path, value, end)
+        if step is None or step.left_path:
+            return
+        value += step.progress * (end - value)
+        phases = {name: total - known[name] for name, total in resolver.phases.items()}
+        _add_state(record, resolver, plan, value, perf_counter() - clock, phases)
 
 
 def _stop(resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step) -> Stop:

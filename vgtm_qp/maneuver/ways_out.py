@@ -1,44 +1,150 @@
 """Ways out of a dead end: the same maneuver once more from home, its redundancy resolved otherwise.
 
 A path that is blocked for one shape of the arm may be open for another, and the null-space terms decide which shape it
-takes. The ways stand in the order of what they bought over random scenes (``vgtm study robustness``).
+takes. The ways stand in the order of what they bought over random scenes (``vgtm study robustness``; README, section
+Robustness).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.goal import WaypointManeuver
 from vgtm_qp.step.stops import Stop, StopKind
 
+Array = NDArray[np.float64]
+
 _HOPELESS = (StopKind.INTERRUPTED, StopKind.SINGULAR, StopKind.OUT_OF_REACH, StopKind.LOCKED)
 
+_BULGE, _SLIGHT_BULGE = 0.3, 0.1
+"""How far the middle of a bulged curve is drawn sideways, as a part of the arm's height."""
+_FIRM_TRACKING = 1.0
+"""The least weight of tracking with which the arm takes the shape of a bulged curve."""
+_MORE_VERTICES = 3
 
-def ways_out(problem: Problem, stop: Stop) -> Iterator[tuple[str, Problem]]:
-    """Yield name and problem of each way that is worth trying after a `stop`; none where retries are off."""
-    method = problem.method
-    if not method.retries or stop.kind in _HOPELESS:
+_SIDES = {"to its left": 1, "to its right": 3, "away from what blocks it": 0, "towards it": 2}
+"""Quarters of a turn about the arm, as seen along it, from the direction away from what blocks it."""
+
+
+@dataclass(frozen=True, eq=False)
+class DeadEnd:
+    """Where an arm stopped.
+
+    Attributes
+    ----------
+    stop : Stop
+    control_vertices : (V, 3)
+        The curve there, m; V = 0 without one.
+    height : float
+        Of the arm at home, m.
+    heading : (3,)
+        Where the path goes on from there.
+    """
+
+    stop: Stop
+    control_vertices: Array
+    height: float
+    heading: Array
+
+
+Changes = dict[str, Any]
+
+
+def ways_out(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]]:
+    """Yield name and problem of each way that is worth trying; none where retries are off."""
+    if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
-    weights = method.weights
-    ways: dict[str, dict[str, Any]] = {
-        "actuators drawn to their home lengths": {
-            "method.weights.stroke_centring": 10.0 * max(weights.stroke_centring, 0.02)
-        },
-        "shorter steps": {"maneuver.steps": 3 * getattr(problem.maneuver, "steps", 0)},
-        "actuator rates as the metric": {
-            "method.weights.actuator_rate": 50.0 * max(weights.actuator_rate, 0.02)
-        },
-        "no curve": {"method.tracking": "none", "method.hard_tracking": False},
-    }
-    for name, changes in ways.items():
-        if name == "shorter steps" and not isinstance(problem.maneuver, WaypointManeuver):
-            continue
-        if name == "no curve" and method.tracking == "none":
+    for name, change in _WAYS.items():
+        changes = change(problem, dead_end)
+        if not changes:
             continue
         try:
             yield name, problem.replace(changes)
         except ProblemError:
             continue
+
+
+def _drawn_home(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+    return {"method.weights.stroke_centring": 10.0 * max(problem.method.weights.stroke_centring, 0.02)}
+
+
+def _shorter_steps(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+    maneuver = problem.maneuver
+    return {"maneuver.steps": 3 * maneuver.steps} if isinstance(maneuver, WaypointManeuver) else {}
+
+
+def _actuator_rates(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+    return {"method.weights.actuator_rate": 50.0 * max(problem.method.weights.actuator_rate, 0.02)}
+
+
+def _no_curve(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+    if problem.method.tracking == "none":
+        return {}
+    return {"method.tracking": "none", "method.hard_tracking": False}
+
+
+def _more_vertices(problem: Problem, dead_end: DeadEnd) -> Changes:
+    if problem.curve is None or not len(dead_end.control_vertices):
+        return {}
+    return {"curve.control_vertices": problem.curve.control_vertices + _MORE_VERTICES}
+
+
+def _bulged(quarter: int, size: float = _BULGE) -> Callable[[Problem, DeadEnd], Changes]:
+    """Return the way that bulges the curve to one of its four sides."""
+
+    def change(problem: Problem, dead_end: DeadEnd) -> Changes:
+        vertices = len(dead_end.control_vertices)
+        if problem.curve is None or problem.curve.control_vertex_goals or vertices < 4:
+            return {}
+        goals = bulge(dead_end, quarter, size)
+        return {
+            "curve.control_vertex_goals": [
+                {"index": i, "position": goals[i].tolist()} for i in range(2, vertices - 1)
+            ],
+            "method.weights.tracking": max(problem.method.weights.tracking, _FIRM_TRACKING),
+        }
+
+    return change
+
+
+def bulge(dead_end: DeadEnd, quarter: int, size: float = _BULGE) -> Array:
+    """Return (V, 3) the control vertices where the arm stopped, drawn sideways like half a wave, m.
+
+    The middle moves by about `size` times the arm's height. `quarter` counts right angles about the chord from the
+    direction away from what blocks the arm; where no obstacle does, from the one in which its path goes on.
+    """
+    vertices = dead_end.control_vertices
+    chord = vertices[-1] - vertices[0]
+    chord = chord / np.linalg.norm(chord)
+    aside = _across(chord, np.array(dead_end.stop.away), dead_end.heading)
+    sides = (aside, np.cross(chord, aside), -aside, -np.cross(chord, aside))
+    wave = np.sin(np.pi * np.arange(len(vertices)) / (len(vertices) - 1))
+    return np.asarray(vertices + size * dead_end.height * wave[:, None] * sides[quarter])
+
+
+def _across(axis: Array, *wanted: Array) -> Array:
+    """Return (3,) the unit vector across `axis` next to the first direction that is not along it."""
+    for direction in (*wanted, *np.eye(3)):
+        across = direction - axis * (axis @ direction)
+        length = float(np.linalg.norm(across))
+        if length > 1e-6 * max(float(np.linalg.norm(direction)), 1e-6):
+            return np.asarray(across / length)
+    raise AssertionError("no axis is along all of x, y and z")
+
+
+_WAYS: dict[str, Callable[[Problem, DeadEnd], Changes]] = {
+    "actuators drawn to their home lengths": _drawn_home,
+    **{f"curve bulged {side}": _bulged(quarter) for side, quarter in _SIDES.items()},
+    "curve bulged a little away from what blocks it": _bulged(0, _SLIGHT_BULGE),
+    "shorter steps": _shorter_steps,
+    "actuator rates as the metric": _actuator_rates,
+    "no curve": _no_curve,
+    "more control vertices": _more_vertices,
+}

@@ -14,12 +14,12 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import SLACK_CURVATURE, CurveNumbers, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import SLACK_CURVATURE, UNBOUNDED, CurveNumbers, StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 
-UNBOUNDED = 1e30
 FEASIBILITY = 1e-10
+_LARGEST_RESIDUAL = 1e-8
 
 
 class InfeasibleStepError(SolverError):
@@ -294,21 +294,25 @@ def check_answer(
     Raises
     ------
     SolverError
-        A residual is above 1e-8, the dual one relative to the greatest gradient or multiplier.
+        The norm of a residual is above 1e-8, the dual one relative to the norms of gradient and multipliers.
     """
     size = len(x)
     values = np.concatenate((x, constraint @ x))
-    primal = max(float((values - upper).max()), float((lower - values).max()))
+    beyond = values - np.minimum(np.maximum(values, lower), upper)
     stationarity = hessian @ x
     stationarity += gradient
     stationarity += y[:size]
     stationarity += y[size:] @ constraint
-    dual = _largest(stationarity) / (1.0 + _largest(gradient) + _largest(y))
-    if not (primal <= 1e-8 and dual <= 1e-8):
+    refuse_large(_norm(beyond), _norm(stationarity) / (1.0 + _norm(gradient) + _norm(y)), flag)
+
+
+def refuse_large(primal: float, dual: float, flag: int) -> None:
+    """Raise AnswerError where a residual is above 1e-8, or not a number."""
+    if not (primal <= _LARGEST_RESIDUAL and dual <= _LARGEST_RESIDUAL):
         raise AnswerError(
             f"daqp (exit flag {flag}) left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
         )
 
 
-def _largest(vector: Array) -> float:
-    return max(float(vector.max()), -float(vector.min()))
+def _norm(vector: Array) -> float:
+    return float(np.sqrt(vector @ vector))

@@ -7,41 +7,34 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.condensed import FEASIBILITY, UNBOUNDED, InfeasibleStepError, check_answer
-from vgtm_qp.qp.fused_graph import Bound, row_function, settle_function
+from vgtm_qp.qp.condensed import FEASIBILITY, InfeasibleStepError, check_answer, refuse_large
+from vgtm_qp.qp.fused_graph import NEAR, Bound, row_function, settle_function
 from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, StepSolution, progress_scale
-from vgtm_qp.qp.settle import held, settling_gain
+from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepSolution
 from vgtm_qp.qp.shape import CurveRows
 
 Array = NDArray[np.float64]
 
+_AXES = np.arange(3)
 _EQUALITY = 5
 """DAQP's mark for a row that is always active."""
 
 
-@dataclass(frozen=True)
-class TipGoal:
-    """The end effector's rows: which of the six tip rows, combined how, move at which rate towards which error.
+class TipGoal(NamedTuple):
+    """Where the end effector is to be, position (3,), m, and rotation (3, 3), and its rates per unit of progress."""
 
-    Attributes
-    ----------
-    rate, error : (n_e,)
-        m or rad per unit of progress, and goal minus value, m or rad.
-    across : (r, 3) or None
-        Combines the three angular-velocity rows into those that are tracked; None where no orientation is.
-    """
-
-    rate: Array
-    error: Array
-    across: Array | None
+    position: Array
+    rotation: Array
+    velocity: Array
+    spin: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,38 +67,68 @@ def _bound_kernel(bound: Bound) -> Kernel:
     return kernel
 
 
+class Taken(NamedTuple):
+    """Where the answer of a QP leads.
+
+    Attributes
+    ----------
+    solution : StepSolution
+        Whose ``nodes`` are positions, not displacements, m.
+    closed : Closed
+        With the tip at its goal.
+    vertices : (V, 3)
+        The curve, m.
+    progress, moved : float
+        Progress along the path, and the greatest displacement of a coordinate by the answer, m.
+    before, after : float
+        The tip's errors before and after it was settled, m and rad.
+    """
+
+    solution: StepSolution
+    closed: Closed
+    vertices: Array
+    progress: float
+    moved: float
+    before: float
+    after: float
+
+
 class FusedSolver:
     """Linearises, condenses and solves; for arms with `elimination_stages`."""
 
-    def __init__(self, layout: Layout, stages: list[Stage], position_axes: NDArray[np.int64]) -> None:
-        self.layout = layout
+    def __init__(self, layout: Layout, stages: list[Stage]) -> None:
         truss = layout.truss
         self._rows = _bound_kernel(row_function(layout, stages))
-        self._settled = _bound_kernel(settle_function(layout, stages))
-        self._position_axes = position_axes
         nodes, actuators = layout.node_columns, len(truss.actuators)
         self._actuators = actuators
         self._free_curve = layout.free_curve
-        self._size = actuators + self._free_curve + 1
-        self._torsion = self._size - 1 - layout.torsion
-        out = self._rows.outputs
-        self._stack = out[0].reshape(self._size, -1)
-        self._response = self._stack[:, :nodes]
-        self._tip = out[1].reshape(actuators + 1, 6).T
-        self._box = out[2].reshape(3, actuators)
-        self.tip_position, self.tip_rotation = out[3], out[4].reshape(3, 3).T
-        self._curve_gradient, self._offset, self._normal = out[5], out[6].reshape(layout.vertices, 3), out[7]
-        self._gram = np.zeros((self._size, self._size))
-        self._hessian = np.zeros((self._size, self._size))
-        self._gradient = np.zeros(self._size)
-        self._scale = 1.0 / np.sqrt(layout.weights.node_rate)
-        self._spread = np.zeros((0, len(truss.free) + 1, 3))
-        self._place = np.where(truss.base, len(truss.free), layout.node_column // 3)
-        self._constant = np.zeros((self._size - 1, self._size - 1))
+        self._size = size = actuators + self._free_curve + 1
+        self._torsion = size - 1 - layout.torsion
+        self._tip = len(layout.tip_rows)
         self._hard = layout.hard_rows
+        out = self._rows.outputs
+        self._stack = out[0].reshape(size, -1)
+        self._response = self._stack[:, :nodes]
+        self._linear, self._curvature = out[4], out[5]
+        self._offset, self._normal = out[6].reshape(layout.vertices, 3), out[7]
+        self._hessian = np.zeros((size, size))
+        self._gradient = np.zeros(size)
+        self._constant = np.zeros((size, size))
+        self._scale = 1.0 / np.sqrt(layout.weights.node_rate)
+        self._width = nodes + 3
+        self._place = 3 * np.where(truss.base, len(truss.free), layout.node_column // 3)
+        self._settled = settled = _bound_kernel(settle_function(layout, stages))
+        for argument, shared in enumerate((0, 4, 5, 8, 9, 10, 11, 7)):
+            settled.bind_input(argument, self._rows.inputs[shared])
+        for argument, result in ((8, 0), (12, 6), (13, 7)):
+            settled.bind_input(argument, out[result])
+        settled.bind_input(14, self._rows.inputs[3])
+        settled.bind_input(15, self._hessian)
+        settled.bind_input(16, self._gradient)
+        self._answer, self._multipliers = settled.inputs[17], settled.inputs[18]
+        self._gram, self._taken = settled.inputs[19].reshape(actuators, actuators), settled.inputs[20]
+        self._reserve(size + self._tip + self._hard + NEAR)
         self._draw(layout)
-        self._settling = np.zeros((0, actuators)), np.ones(actuators, dtype=bool)
-        self._reserve(self._size + 64)
         if self._hard:
             self._soft = np.ones(self._stack.shape[1])
             self._soft[nodes : nodes + self._hard] = 0.0
@@ -122,34 +145,43 @@ class FusedSolver:
         self._goal_weight = (
             np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
         )
-        self._constant_normal = np.full(3, np.nan)
+        self._constant = np.zeros((self._size, self._size))
+        self._constant_normal = b""
 
     def load(
         self,
         X: Array,
         Y: Array,
-        base: Array,
         vertices: Array,
         lower: Array,
         upper: Array,
+        goal: TipGoal,
+        progress: float,
         *,
         motion: bool,
+        base: Array | None = None,
         curve: CurveRows | None = None,
         goals: Array | None = None,
     ) -> None:
-        """Linearise: residuals at `X` (N, 3), Jacobians at `Y`; see `row_function`. Sets tip_position and tip_rotation.
+        """Linearise: residuals at `X` (N, 3), Jacobians at `Y`; see `row_function`.
 
-        `curve` are the rows of a curve that is more than its tables, `goals` (V, 3) those of the control vertices.
+        `base` (N, 3) are where base nodes go, `curve` the rows of a curve that is more than its tables, `goals` (V, 3)
+        those of the control vertices.
         """
         inputs = self._rows.inputs
         inputs[0][:] = X.reshape(-1)
         inputs[1][:] = Y.reshape(-1)
-        inputs[2][:] = base.reshape(-1)
+        inputs[2][:] = inputs[0] if base is None else base.reshape(-1)
         inputs[3][:] = vertices.reshape(-1)
         inputs[4][:] = lower
         inputs[5][:] = upper
         inputs[6][0] = 1.0 if motion else 0.0
-        for k, table in enumerate(curve or (), start=7):
+        inputs[7][0] = progress
+        inputs[8][:] = goal.position
+        inputs[9][:] = goal.rotation.T.reshape(-1)
+        inputs[10][:] = goal.velocity
+        inputs[11][:] = goal.spin
+        for k, table in enumerate(curve or (), start=12):
             inputs[k][:] = table.reshape(-1)
         self._rows()
         if self.layout.vertex_goals:
@@ -157,7 +189,7 @@ class FusedSolver:
             if motion:
                 self._goal_pull += self.layout.goal_pull(vertices, goals)
 
-    def solve(self, goal: TipGoal, progress: float, clearance: ClearanceRows) -> StepSolution:
+    def solve(self, clearance: ClearanceRows) -> StepSolution:
         """Solve the QP at the configuration loaded last.
 
         Raises
@@ -165,65 +197,26 @@ class FusedSolver:
         InfeasibleStepError, SolverError
             As ``CondensedSolver.solve``.
         """
-        size, count, weights = self._size, self._actuators, self.layout.weights
-        hessian, gradient = self._assemble()
-        rate = goal.rate
-        curvature = weights.progress * progress_scale(rate)
-        hessian[-1, -1] = curvature
-        gradient[-1] = curvature * (progress - 2.0)
-
-        tip, hard, near = len(rate), self._hard, len(clearance)
-        rows = tip + hard + near
-        if size + rows > len(self._lower):
-            self._reserve(2 * (size + rows))
-        constraint = self._constraint[:rows]
-        lower, upper, sense = (
-            self._lower[: size + rows],
-            self._upper[: size + rows],
-            self._sense[: size + rows],
-        )
-        lower[:count], upper[:count] = self._box[0], self._box[1]
-        lower[size - 1], upper[size - 1] = -progress, 1.0 - progress
-        tip_rows = self._tip[self._position_axes]
-        if goal.across is not None:
-            tip_rows = np.concatenate([tip_rows, goal.across @ self._tip[3:]])
-        constraint[:tip, :count] = tip_rows[:, :-1]
-        constraint[:tip, -1] = -rate
-        lower[size : size + tip] = goal.error - tip_rows[:, -1]
-        equal = size + tip + hard
-        if hard:
-            block = self._stack[:, self.layout.node_columns : self.layout.node_columns + hard]
-            constraint[tip : tip + hard, :-1] = block[:-1].T
-            lower[size + tip : equal] = -block[-1]
-        upper[size:equal] = lower[size:equal]
-        sense[size:equal] = _EQUALITY
-        if near:
-            spread = self._spread_rows(clearance)
-            answer = spread @ self._response.T
-            answer *= self._scale
-            constraint[tip + hard :, :count] = answer[:, :count]
-            constraint[tip + hard :, count:] = 0.0
-            np.subtract(clearance.lower, answer[:, -1], out=lower[equal:])
-            upper[equal:] = UNBOUNDED
-            sense[equal:] = 0
-        x, _, flag, info = daqp.solve(
-            hessian, gradient, constraint, upper, lower, sense, primal_tol=FEASIBILITY, eps_prox=0.0
-        )
-        if flag == -1:
-            raise InfeasibleStepError("the hard rows of the step contradict one another")
-        multipliers = info["lam"]
-        check_answer(x, multipliers, flag, hessian, gradient, constraint, lower, upper)
-        self._settling = tip_rows[:, :-1], ~held(x[:count], self._box[0], self._box[1])
-
-        truss = self.layout.truss
-        nodes = np.zeros((truss.node_count, 3))
-        moved = x[:count] @ self._response[:count] + self._response[-1]
+        x, flag, info = self.ask(clearance)
+        multipliers, rows = info["lam"], self._tip + self._hard + len(clearance)
+        bounds = self._lower[: self._size + rows], self._upper[: self._size + rows]
+        check_answer(x, multipliers, flag, self._hessian, self._gradient, self._constraint[:rows], *bounds)
+        count = self._actuators
+        nodes = np.zeros((self.layout.truss.node_count, 3))
+        moved = np.dot(x[:count], self._response[:count])
+        moved += self._response[-1]
         moved *= self._scale
-        nodes[truss.free] = moved.reshape(-1, 3)
-        vertices = np.array(self._offset)
+        nodes[self.layout.truss.free] = moved.reshape(-1, 3)
+        vertices = self._offset.copy()
         if self._free_curve:
             vertices[1] += self._normal * x[count]
             vertices[2:] += x[count + 1 : self._torsion].reshape(-1, 3)
+        return self._solution(x, info, len(clearance), nodes, vertices)
+
+    def _solution(
+        self, x: Array, info: dict[str, Any], near: int, nodes: Array, vertices: Array
+    ) -> StepSolution:
+        multipliers, count = info["lam"], self._actuators
         return StepSolution(
             nodes=nodes,
             actuators=x[:count],
@@ -231,80 +224,142 @@ class FusedSolver:
             progress=float(x[-1]),
             actuator_multipliers=multipliers[:count],
             clearance_multipliers=-multipliers[len(multipliers) - near :],
-            iterations=int(info["iterations"]),
+            iterations=info["iterations"],
             torsion=x[self._torsion : -1],
         )
 
+    def ask(self, clearance: ClearanceRows) -> tuple[Array, int, dict[str, Any]]:
+        """Return DAQP's answer to the QP at the configuration loaded last, not checked yet, exit flag and details.
+
+        Raises
+        ------
+        InfeasibleStepError
+            The hard rows contradict one another.
+        """
+        size, count, hard, near = self._size, self._actuators, self._hard, len(clearance.lower)
+        hessian, gradient = self._assemble()
+        first = self._tip + hard
+        rows = first + near
+        if size + rows > len(self._lower):
+            self._reserve(2 * (size + rows))
+        constraint, lower, upper = self._constraint[:rows], self._lower, self._upper
+        if hard:
+            block = self._stack[:, self.layout.node_columns : self.layout.node_columns + hard]
+            constraint[self._tip : first, :-1] = block[:-1].T
+            upper[size + self._tip : size + first] = lower[size + self._tip : size + first] = -block[-1]
+        if near:
+            answer = np.dot(self._spread_rows(clearance), self._response.T)
+            answer *= self._scale
+            constraint[first:, :count] = answer[:, :count]
+            np.subtract(clearance.lower, answer[:, -1], out=lower[size + first : size + rows])
+        self._used, before = size + rows, self._used
+        if before > size + rows:
+            lower[size + rows : before] = -UNBOUNDED
+        x, _, flag, info = daqp.solve(
+            hessian,
+            gradient,
+            constraint,
+            upper[: size + rows],
+            lower[: size + rows],
+            self._sense[: size + rows],
+            primal_tol=FEASIBILITY,
+            eps_prox=0.0,
+        )
+        if flag == -1:
+            raise InfeasibleStepError("the hard rows of the step contradict one another")
+        self._answer[:] = x
+        return x, flag, info
+
+    def take(self, answer: tuple[Array, int, dict[str, Any]], near: int) -> Taken:
+        """Return where an answer of :meth:`ask` leads that had so many clearance rows, at most ``NEAR``.
+
+        Raises
+        ------
+        AnswerError
+            The answer's residuals are too large.
+        """
+        x, flag, info = answer
+        multipliers, count = info["lam"], len(info["lam"])
+        self._multipliers[:count] = multipliers
+        self._multipliers[count:] = 0.0
+        self._settle(1.0)
+        out = self._settled.outputs
+        error, before, after, progress, moved, primal, dual = out[5].tolist()
+        refuse_large(primal, dual, flag)
+        closed = self._closed(error)
+        vertices = out[4].reshape(-1, 3).copy()
+        solution = self._solution(x, info, near, out[6].reshape(-1, 3).copy(), vertices)
+        return Taken(solution, closed, vertices, progress, moved, before, after)
+
     def settle(
         self, X: Array, lower: Array, upper: Array, position: Array, rotation: Array
-    ) -> tuple[Closed, Array]:
+    ) -> tuple[Closed, float, float]:
         """Return `X` (N, 3) with its lengths closed, actuators in their boxes (n_a,), m, and its tip at a pose.
 
-        Beside it stand the tip's errors before and after settling, (2, n_e).
+        Beside it stand the tip's errors before and after settling, m and rad.
         """
-        kernel, gain = self._settled, self.gain()
-        inputs, out = kernel.inputs, kernel.outputs
+        inputs = self._settled.inputs
         inputs[0][:] = X.reshape(-1)
         inputs[1][:] = lower
         inputs[2][:] = upper
         inputs[3][:] = position
         inputs[4][:] = rotation.T.reshape(-1)
-        if gain is None:
-            inputs[5][:] = 0.0
-        else:
-            inputs[5].reshape(-1, len(self._place), 3)[:] = gain
-        kernel()
-        closed = Closed(
-            out[0].reshape(-1, 3).copy(),
-            out[1].copy(),
-            float(out[2][0]),
-            out[3].copy(),
-            out[4].reshape(3, 3).T.copy(),
-        )
-        return closed, out[5].reshape(2, -1)
+        self._settle(0.0)
+        error, before, after = self._settled.outputs[5].tolist()[:3]
+        return self._closed(error), before, after
 
-    def gain(self) -> Array | None:
-        """Return the node displacements (n_e, N, 3) per unit of tip error that leave actuators at their bounds.
+    def _settle(self, taken: float) -> None:
+        if not self._hard:
+            response = self._response[: self._actuators]
+            np.dot(response, response.T, out=self._gram)
+        self._taken[0] = taken
+        self._settled()
 
-        None where they cannot; see :mod:`vgtm_qp.qp.settle`.
-        """
-        if self._hard:
-            return None
-        weights, truss = self.layout.weights, self.layout.truss
-        response = self._response[: self._actuators].T * self._scale
-        gain = settling_gain(
-            response, *self._settling, weights.node_rate, weights.actuator_rate + weights.stroke_centring
+    def _closed(self, error: float) -> Closed:
+        X, lengths, position, rotation = self._settled.outputs[:4]
+        return Closed(
+            X.reshape(-1, 3).copy(), lengths.copy(), error, position.copy(), rotation.reshape(3, 3).T.copy()
         )
-        if gain is None:
-            return None
-        nodes = np.zeros((gain.shape[1], truss.node_count, 3))
-        nodes[:, truss.free] = (gain.T @ response.T).reshape(gain.shape[1], -1, 3)
-        return nodes
 
     def _reserve(self, rows: int) -> None:
-        """Make room for bounds of all unknowns and `rows` less so many constraints."""
-        self._constraint = np.zeros((rows - self._size, self._size))
+        """Make room for bounds of all unknowns and `rows` less so many constraints; kernels write the first of them."""
+        size, equal = self._size, self._size + self._tip + self._hard
+        self._constraint = np.zeros((rows - size, size))
         self._lower, self._upper = np.full(rows, -UNBOUNDED), np.full(rows, UNBOUNDED)
         self._sense = np.zeros(rows, dtype=np.int32)
+        self._row_start = self._width * np.arange(rows - size)[:, None, None]
+        self._sense[size:equal] = _EQUALITY
+        tip_rows = self._constraint[: self._tip].reshape(-1)
+        bounds = (values[: size + self._tip] for values in (self._lower, self._upper))
+        for result, array in enumerate((tip_rows, *bounds), start=1):
+            array[:] = self._rows.outputs[result]
+            self._rows.bind_output(result, array)
+        checked = equal + NEAR
+        self._used = checked
+        for argument, array in (
+            (9, self._constraint[: checked - size]),
+            (10, self._lower),
+            (11, self._upper),
+        ):
+            self._settled.bind_input(argument, array.reshape(-1)[: self._settled.inputs[argument].size])
 
     def _assemble(self) -> tuple[Array, Array]:
-        """Return Hessian and gradient of the objective but for the progress along the path."""
-        count, size = self._actuators, self._size
-        stack = self._stack
-        np.dot(stack * self._soft if self._hard else stack, stack.T, out=self._gram)
-        if self._free_curve and not np.array_equal(self._normal, self._constant_normal):
-            self._constant = self._constant_hessian()
-            self._constant_normal = self._normal.copy()
-        elif not self._free_curve and not self._constant[0, 0]:
-            self._constant = self._constant_hessian()
-        hessian, gradient = self._hessian, self._gradient
-        np.add(self._gram[:-1, :-1], self._constant, out=hessian[: size - 1, : size - 1])
-        gradient[:-1] = self._gram[-1, :-1]
-        gradient[:count] += self._box[2]
-        gradient[count:-1] += self._curve_gradient
+        """Return Hessian and gradient of the objective."""
+        count, stack = self._actuators, self._stack
+        hessian, gradient, linear = self._hessian, self._gradient, self._linear
+        np.dot(stack * self._soft if self._hard else stack, stack.T, out=hessian)
+        np.add(hessian[-1], linear, out=gradient)
+        gradient[-1] = linear[-1]
         if self.layout.vertex_goals:
             gradient[count] += self._goal_pull[1] @ self._normal
             gradient[count + 1 : self._torsion] += self._goal_pull[2:].reshape(-1)
+        if self._normal.tobytes() != self._constant_normal:
+            self._constant[:-1, :-1] = self._constant_hessian()
+            self._constant_normal = self._normal.tobytes()
+        hessian[-1] = 0.0
+        hessian[:, -1] = 0.0
+        self._constant[-1, -1] = self._curvature[0]
+        hessian += self._constant
         return hessian, gradient
 
     def _constant_hessian(self) -> Array:
@@ -324,12 +379,9 @@ class FusedSolver:
 
     def _spread_rows(self, clearance: ClearanceRows) -> Array:
         """Return the clearance rows (R, 3 (N - N_c)) over the free nodes' displacements."""
-        near = len(clearance)
-        if len(self._spread) < near:
-            self._spread = np.zeros((2 * near, len(self.layout.truss.free) + 1, 3))
-        spread = self._spread[:near]
-        spread[:] = 0.0
-        place, index = self._place[clearance.nodes], np.arange(near)
-        for slot in range(place.shape[1]):
-            spread[index, place[:, slot]] += clearance.coefficients[:, slot]
-        return spread[:, :-1].reshape(near, -1)
+        near, width = len(clearance), self._width
+        flat = self._place[clearance.nodes][:, :, None] + _AXES
+        flat += self._row_start[:near]
+        # Sums what stands at one place: a row may name a node twice.
+        spread = np.bincount(flat.reshape(-1), clearance.coefficients.reshape(-1), near * width)
+        return np.asarray(spread.reshape(near, width)[:, :-3], dtype=float)

@@ -119,6 +119,11 @@ class Layout:
         return 0 if self.general is None else self.general.spacings
 
     @property
+    def least_squares(self) -> int:
+        """Number of the objective's rows over displacements: nodes, gaps and turns of the faces, spacings."""
+        return self.node_columns + (3 + self.turns) * len(self.tracked) + self.spacings
+
+    @property
     def free_curve(self) -> int:
         """Number of coordinates of the curve that its base leaves free: 3 V - 5 + T."""
         return 3 * self.vertices - 5 + self.torsion if self.vertices else 0

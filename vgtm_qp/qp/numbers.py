@@ -182,7 +182,14 @@ class StepSolution:
 SLACK_CURVATURE = 1e-6
 """Curvature of the slacks of an elastic tip, for solvers of strictly convex QPs: their penalty itself is linear."""
 
-_SHORT_WAY = 0.01
+SHORT_WAY = 0.01
+"""A way of the tip, m, below which progress along it counts more, see :func:`progress_scale`."""
+
+CLOSED = 2e-8
+"""A tip error of a state that a motion need not close, m or rad: within what an accepted state may have."""
+
+UNBOUNDED = 1e30
+"""A bound that is none."""
 
 
 def progress_scale(rate: Array) -> float:
@@ -193,4 +200,4 @@ def progress_scale(rate: Array) -> float:
     nothing, and any positive number serves.
     """
     way = float(np.sqrt(rate @ rate))
-    return way * max(way, _SHORT_WAY) if way > 1e-6 else 1.0
+    return way * max(way, SHORT_WAY) if way > 1e-6 else 1.0

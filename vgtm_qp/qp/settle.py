@@ -13,14 +13,14 @@ from scipy.linalg.lapack import dgesv, dposv
 
 Array = NDArray[np.float64]
 
-_WORST_CONDITION = 1e8
-_AT_BOUND = 1e-6
+WORST_CONDITION = 1e8
+AT_BOUND = 1e-6
 """An actuator nearer than this to a bound counts as held there, m."""
 
 
 def held(displacement: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
     """Return which actuators (n_a,) a QP left at a bound; by where they are, since multipliers may vanish there."""
-    return np.asarray((displacement < lower + _AT_BOUND) | (displacement > upper - _AT_BOUND))
+    return np.asarray((displacement < lower + AT_BOUND) | (displacement > upper - AT_BOUND))
 
 
 def settling_gain(
@@ -49,7 +49,7 @@ def settling_gain(
         return None
     normal = rows @ answer
     _, _, shares, failed = dgesv(normal, np.eye(len(tip)))
-    if failed or not np.abs(shares).max() * np.abs(normal).max() < _WORST_CONDITION:
+    if failed or not np.abs(shares).max() * np.abs(normal).max() < WORST_CONDITION:
         return None
     gain = np.zeros((len(free), len(tip)))
     gain[free] = answer @ shares

@@ -223,7 +223,7 @@ def make_engine(
     if solver == DEFAULT_SOLVER and compiled:
         stages = elimination_stages(layout)
         if stages is not None and len(layout.truss.actuators) <= FUSED_ACTUATORS:
-            return FusedEngine(FusedSolver(layout, stages, task.axes), task)
+            return FusedEngine(FusedSolver(layout, stages))
     chosen = make_solver(solver, layout)
     if isinstance(chosen, (StagedSolver, TrackedSolver)) and compiled and ChainEngine.serves(chosen):
         return ChainEngine(chosen, kinematics, task, layout.truss.home_lengths)

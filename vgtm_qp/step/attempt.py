@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +12,20 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.condensed import AnswerError, InfeasibleStepError
 from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.fused_graph import LEFT
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
-from vgtm_qp.step.engine import Accuracy, Engine
+from vgtm_qp.step.engine import Accuracy, Engine, FusedEngine
 from vgtm_qp.step.linearise import Target
+from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.separation import Separation, Shortfall
-from vgtm_qp.step.state import State, frozen
+from vgtm_qp.step.state import State, sealed
 from vgtm_qp.step.task import TipTask
 from vgtm_qp.step.tracking import HardTracking
 
 Array = NDArray[np.float64]
 
 
-_MOTION_MARGIN = 3.0
+_MOTION_MARGIN = 2.0
 """A member may move by so many times what is expected of it before a pair that matters can be missed."""
 
 _DEVIATION = 0.1
@@ -116,15 +118,38 @@ class Outcome:
         duration = self.time - before.time
         return State(
             time=self.time,
-            nodes=frozen(self.closed.X),
-            control_vertices=frozen(self.control_vertices),
-            torsion=frozen(self.torsion),
-            lengths=frozen(self.closed.lengths),
-            length_rates=frozen((self.closed.lengths - before.lengths) / duration),
-            motion=frozen(self.closed.X - before.nodes),
+            nodes=sealed(self.closed.X),
+            control_vertices=sealed(self.control_vertices),
+            torsion=sealed(self.torsion),
+            lengths=sealed(self.closed.lengths),
+            length_rates=sealed((self.closed.lengths - before.lengths) / duration),
+            motion=sealed(self.closed.X - before.nodes),
             duration=duration,
             shortfall=self.shortfall,
         )
+
+
+class _Move(NamedTuple):
+    """Where the answer of one QP leads.
+
+    Attributes
+    ----------
+    solution : StepSolution
+    X, vertices, torsion, progress
+        Node positions (N, 3) and the curve (V, 3), m, and (T,), rad, by the answer, and the progress along the path.
+    furthest : float
+        Greatest displacement of a coordinate, m.
+    closed : Closed or None
+        The configuration with its lengths closed and its tip at its goal; None where only another QP leads there.
+    """
+
+    solution: StepSolution
+    X: Array
+    vertices: Array
+    torsion: Array
+    progress: float
+    furthest: float
+    closed: Closed | None
 
 
 class Attempt:
@@ -174,10 +199,10 @@ class Attempt:
         X, vertices, torsion = state.nodes, state.control_vertices, state.torsion
         guess = share * state.motion
         Y = X + 0.5 * guess
-        whole = share >= 1.0
-        reach = (
-            _MOTION_MARGIN * self._expected(target, guess) if whole else self.separation.distances.influence
-        )
+        goal = target.path.at(target.start + progress * span)
+        reach = separation.distances.influence
+        if share >= 1.0:
+            reach = _MOTION_MARGIN * self._expected(target, goal, guess)
         stations: list[float] = []
         first: StepSolution | None = None
         first_rows: ClearanceRows | None = None
@@ -199,10 +224,11 @@ class Attempt:
             if motion and target.base is not None:
                 rows = rows.after(np.where(self.task.base[:, None], target.base - X, 0.0))
             phases.add("distance")
-            goal = target.path.at(target.start + progress * span)
+            if not motion:
+                goal = target.path.at(target.start + progress * span)
             try:
                 at = (X, Y if motion else X, vertices, target, goal, progress, rows)
-                solution = self._solve(*at, motion=motion, torsion=torsion)
+                move = self._move(*at, motion=motion, torsion=torsion)
             except AnswerError as error:
                 return replace(outcome(str(error), count), solver_failed=True)
             except InfeasibleStepError:
@@ -210,31 +236,17 @@ class Attempt:
             except SolverError as error:
                 return outcome(str(error), count)
             finally:
-                phases.add("qp")
+                phases.add("correction")
             if motion:
-                first, first_rows = solution, rows
-            X = X + solution.nodes
-            if target.base is not None:
-                X = np.where(self.task.base[:, None], target.base, X)
-            vertices, torsion = vertices + solution.vertices, torsion + solution.torsion
-            progress = min(max(progress + solution.progress, 0.0), 1.0)
-            if progress < 1.0:
-                left = (1.0 - progress) * abs(span) * float(np.abs([goal.velocity, goal.spin]).max())
-                if left <= self.tolerances.tip:
-                    # Interior-point solvers stop just short of the end, and so would the arm, for one more step.
-                    progress = 1.0
-            moved = float(np.abs(solution.nodes).max())
-            if not moved < np.inf:
+                first, first_rows = move.solution, rows
+            X, vertices, torsion, progress = move.X, move.vertices, move.torsion, move.progress
+            if not move.furthest < np.inf:
                 return outcome("singular pose", count)
             # A pair that one correction pushes away must still be there in the next, or two of them take turns.
-            reach = max(reach, moved)
-            settled = self.engine.settle(
-                X, target, target.path.at(target.start + progress * span), self._accuracy
-            )
-            phases.add("correction")
-            if settled is None:
+            reach = max(reach, move.furthest)
+            if move.closed is None:
                 continue
-            closed, X = settled, settled.X
+            closed, X = move.closed, move.closed.X
             if self.tracking is not None:
                 gap = self.tracking.error(X, vertices, torsion, target.base_rotation)
                 if not gap <= self.tolerances.tracking:
@@ -253,6 +265,76 @@ class Attempt:
                 return outcome("clearance between the states", count)
         return outcome("no convergence", self.max_qps)
 
+    def _move(
+        self,
+        X: Array,
+        Y: Array,
+        vertices: Array,
+        target: Target,
+        goal: PathPoint,
+        progress: float,
+        rows: ClearanceRows,
+        *,
+        motion: bool,
+        torsion: Array,
+    ) -> _Move:
+        """Return where the answer of a QP leads, settled where that needs no other one."""
+        if isinstance(self.engine, FusedEngine):
+            at = (X, Y, vertices, target, goal, progress, rows)
+            move = self._move_at_once(*at, motion=motion, torsion=torsion)
+            if move is not None:
+                return move
+        span = target.end - target.start
+        try:
+            solution = self._solve(
+                X, Y, vertices, target, goal, progress, rows, motion=motion, torsion=torsion
+            )
+        finally:
+            self.phases.add("qp")
+        X = X + solution.nodes
+        if target.base is not None:
+            X = np.where(self.task.base[:, None], target.base, X)
+        progress = min(max(progress + solution.progress, 0.0), 1.0)
+        if progress < 1.0:
+            left = (1.0 - progress) * abs(span) * float(np.abs([goal.velocity, goal.spin]).max())
+            if left <= LEFT:
+                # Interior-point solvers stop just short of the end, and so would the arm, for one more step.
+                progress = 1.0
+        furthest = float(np.abs(solution.nodes).max())
+        closed = None
+        if furthest < np.inf:
+            then = target.path.at(target.start + progress * span)
+            closed = self.engine.settle(X, target, then, self._accuracy)
+        curve = vertices + solution.vertices, torsion + solution.torsion
+        return _Move(solution, X, *curve, progress, furthest, closed)
+
+    def _move_at_once(self, *at: Any, motion: bool, torsion: Array) -> _Move | None:
+        """Return the same by one call after the QP; None where that does not serve."""
+        assert isinstance(self.engine, FusedEngine)
+        try:
+            take = self.engine.ask(*at, motion=motion, torsion=torsion)
+        except InfeasibleStepError:
+            # Whether that is for the margin alone is found out where it can be left out.
+            return None
+        self.phases.add("qp")
+        if take is None:
+            return None
+        taken, accuracy = take(), self._accuracy
+        closed, solution = taken.closed, taken.solution
+        is_good = (
+            closed.error <= accuracy.member and taken.before <= accuracy.start and taken.after <= accuracy.tip
+        )
+        turned = torsion + solution.torsion if len(torsion) else torsion
+        return _Move(
+            solution,
+            solution.nodes,
+            taken.vertices,
+            turned,
+            taken.progress,
+            taken.moved,
+            closed if is_good else None,
+        )
+
     def _solve(self, *at: Any, motion: bool, torsion: Array) -> StepSolution:
         """Return the engine's answer; where even a zero step is forbidden by the margin, without the margin."""
         rows = at[-1]
@@ -264,10 +346,9 @@ class Attempt:
         np.minimum(rows.lower, 0.0, out=rows.lower)
         return self.engine.solve(*at, motion=motion, torsion=torsion)
 
-    def _expected(self, target: Target, guess: Array) -> float:
+    def _expected(self, target: Target, goal: PathPoint, guess: Array) -> float:
         """Return about how far a node moves in the step, m; anything where the arm was at rest."""
         last = float(np.abs(guess).max())
         if last == 0.0 or target.base is not None:
             return self.separation.distances.influence
-        way = target.path.at(target.end).position - target.path.at(target.start).position
-        return max(last, float(np.abs(way).max()))
+        return max(last, abs(target.end - target.start) * float(np.abs(goal.velocity).max()))

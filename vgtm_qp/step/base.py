@@ -35,6 +35,11 @@ class BaseMotion:
         )
         self._home = truss.home
 
+    @property
+    def end(self) -> float:
+        """Time from which the base rests, s."""
+        return self._path.end
+
     def rotation(self, time: float) -> Array:
         """Return (3, 3) the rotation of the base frame at `time`, s."""
         return self._path.at(time).rotation
@@ -43,3 +48,8 @@ class BaseMotion:
         """Return (N, 3) home positions moved with the base to its pose at `time`, s: rho_c where nodes are given, m."""
         pose = self._path.at(time)
         return np.asarray(self._home @ pose.rotation.T + pose.position)
+
+    def carried(self, points: Array, before: float, after: float) -> Array:
+        """Return where `points` (K, 3), m, are at the time `after`, s, if they move with the base from `before` on."""
+        was, now = self._path.at(before), self._path.at(after)
+        return np.asarray((points - was.position) @ (now.rotation @ was.rotation.T).T + now.position)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.fused import Closed, FusedSolver, TipGoal
-from vgtm_qp.qp.fused_graph import SETTLING_STEPS
+from vgtm_qp.qp.fused import Closed, FusedSolver, Taken, TipGoal
+from vgtm_qp.qp.fused_graph import NEAR, SETTLING_STEPS
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import FaceSolver, LengthSolver
 from vgtm_qp.qp.long.closing import MOST_STEPS
@@ -27,7 +27,6 @@ from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.step.linearise import Linearisation, Target, base_frame
 from vgtm_qp.step.path import PathPoint
-from vgtm_qp.step.task import TipTask, worth_closing
 from vgtm_qp.truss.kinematics import Kinematics
 
 Array = NDArray[np.float64]
@@ -312,13 +311,12 @@ class ElasticEngine(PlainEngine):
 class FusedEngine:
     """One compiled call from positions to QP, for trusses whose bays can be eliminated one after another."""
 
-    def __init__(self, solver: FusedSolver, task: TipTask) -> None:
+    def __init__(self, solver: FusedSolver) -> None:
         self._solver = solver
-        self._task = task
 
     def drawn(self, layout: Layout) -> FusedEngine:
         """Return the engine for a layout that differs in the control vertices with goals alone."""
-        return FusedEngine(self._solver.drawn(layout), self._task)
+        return FusedEngine(self._solver.drawn(layout))
 
     def solve(
         self,
@@ -334,31 +332,69 @@ class FusedEngine:
         torsion: Array | None = None,
     ) -> StepSolution:
         """See :class:`Engine`."""
+        self._load(X, Y, vertices, target, goal, progress, torsion, motion=motion)
+        return self._solver.solve(rows)
+
+    def _load(
+        self,
+        X: Array,
+        Y: Array,
+        vertices: Array,
+        target: Target,
+        goal: PathPoint,
+        progress: float,
+        torsion: Array | None,
+        *,
+        motion: bool,
+    ) -> None:
         solver, shape = self._solver, self._solver.layout.general
-        curve = None
+        curve, span = None, target.end - target.start
         if shape is not None:
             frame = base_frame(solver.layout.truss, target.base_rotation)
             curve = shape.rows(vertices, np.zeros(0) if torsion is None else torsion, frame)
         solver.load(
             X,
             Y,
-            X if target.base is None else target.base,
             vertices,
             target.lower,
             target.upper,
+            TipGoal(goal.position, goal.rotation, goal.velocity * span, goal.spin * span),
+            progress,
             motion=motion,
+            base=target.base,
             curve=curve,
             goals=target.vertex_goals,
         )
-        error, rate, across = self._task.residual(solver.tip_position, solver.tip_rotation, goal)
-        if motion:
-            error = worth_closing(error)
-        return solver.solve(TipGoal(rate * (target.end - target.start), error, across), progress, rows)
+
+    def ask(
+        self,
+        X: Array,
+        Y: Array,
+        vertices: Array,
+        target: Target,
+        goal: PathPoint,
+        progress: float,
+        rows: ClearanceRows,
+        *,
+        motion: bool,
+        torsion: Array | None = None,
+    ) -> Callable[[], Taken] | None:
+        """Solve the QP as :meth:`solve` does; return what checks the answer and settles where it leads.
+
+        None where that is not one call: the path turns within the step, the base moves, or too many rows are near.
+        """
+        near = len(rows)
+        if near > NEAR or target.base is not None or not target.path.is_straight(target.start, target.end):
+            return None
+        self._load(X, Y, vertices, target, goal, progress, torsion, motion=motion)
+        answer = self._solver.ask(rows)
+        return lambda: self._solver.take(answer, near)
 
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
-        closed, errors = self._solver.settle(X, target.lower, target.upper, goal.position, goal.rotation)
-        before, after = np.abs(errors).max(axis=1).tolist()
+        closed, before, after = self._solver.settle(
+            X, target.lower, target.upper, goal.position, goal.rotation
+        )
         if closed.error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip:
             return closed
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -133,6 +133,11 @@ class Path:
         else:
             position = self.positions[k] + along * self._velocity[k]
         return PathPoint(position, rotation, self._velocity[k], self._spin[k])
+
+    def is_straight(self, start: float, end: float) -> bool:
+        """Whether the rates are the same all the way between two values."""
+        low, high = (start, end) if start < end else (end, start)
+        return bisect_right(self._knots, low) >= bisect_left(self._knots, high)
 
     def continued(self, pieces: float) -> Path:
         """Return the path that goes on as it ends, for so many times its last piece, but for less than half a turn."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +19,7 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.step.arm import Arm, build_arm, reshaped
 from vgtm_qp.step.attempt import Attempt, Outcome
-from vgtm_qp.step.braking import Braking, find_braking
+from vgtm_qp.step.braking import Brakes, Braking
 from vgtm_qp.step.checks import excess_of_freedom, unreachable_tip
 from vgtm_qp.step.curve import curve_key, with_curve
 from vgtm_qp.step.limits import length_box
@@ -26,7 +28,7 @@ from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
 from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.step.stops import Limits, Stop, StopKind, explain
+from vgtm_qp.step.stops import BASE_MOVES_ON, CANNOT_BRAKE, Limits, Stop, StopKind, explain
 from vgtm_qp.step.tracking import HardTracking
 from vgtm_qp.step.whole import whole_qp
 
@@ -42,6 +44,11 @@ _SMALLEST_MOVING = 0.25
 
 _BEYOND = 60.0
 """An arm that is at the end of its path may brake beyond it, within so many times its last piece."""
+
+_OFF_PATH = "the arm could brake after it only off its path"
+
+_ANY_RANK = 2
+"""The rank of braking in any way at all."""
 
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
@@ -75,6 +82,7 @@ class Resolver:
             truss.rate[truss.actuators],
             truss.acceleration[truss.actuators],
         )
+        self._starts_at_once = bool(np.isinf(self._limits[2]).all())
         self._vertex_goals = arm.vertex_goals
         self._braking: Braking | None = None
         self._arms: dict[tuple[object, ...], Arm] = {}
@@ -315,31 +323,18 @@ class Resolver:
         can_brake = braking is not None and bool(braking.steps) and whole == 1.0
         if can_brake:
             smallest = max(smallest, _SMALLEST_MOVING)
-        share, lengths = 1.0, state.lengths[self.arm.truss.actuators]
-        outcome, after = self._try(path, start, start + whole * (end - start), box, dt)
-        while not outcome.accepted and share > smallest and self.arm.tip_mode == "scaled":
-            share /= 2
-            reach, near = start + share * whole * (end - start), _within(lengths, share * _TRUST, *box)
-            outcome, after = self._try(path, start, reach, near, dt, share)
-        if not outcome.accepted and self._must_brake:
-            slow = _creeping(lengths, self._limits[2] * dt * dt, *box)
-            if slow is not None:
-                share = 1.0
-                outcome, after = self._try(path, start, start + whole * (end - start), slow, dt)
+        share, outcome, after = self._first_accepted(
+            path,
+            start,
+            start + whole * (end - start),
+            box,
+            dt,
+            smallest,
+            braking.rank if can_brake and braking is not None else _ANY_RANK,
+        )
         told = (tuple(self._row_names), outcome.solution, outcome.rows, outcome.solver_failed)
         if not outcome.accepted and braking is not None and can_brake:
-            self.state, value = braking.steps[0]
-            self._braking = braking.rest
-            progress = (value - start) / (end - start) if path is braking.path else 0.0
-            return Step(
-                StepStatus.SLOWED,
-                progress,
-                self.state,
-                outcome.reason,
-                outcome.iterations,
-                *told,
-                braked=True,
-            )
+            return self._brake(braking, path, start, end, outcome.reason, outcome.iterations, *told)
         if not outcome.accepted:
             return Step(StepStatus.BLOCKED, 0.0, state, outcome.reason, outcome.iterations, *told)
         progress = share * whole * outcome.progress
@@ -348,6 +343,50 @@ class Resolver:
             self._braking = replace(after, origin=self.state)
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return Step(status, progress, self.state, "", outcome.iterations, *told)
+
+    def _first_accepted(
+        self,
+        path: Path,
+        start: float,
+        end: float,
+        box: tuple[Array, Array],
+        dt: float,
+        smallest: float,
+        worst: int,
+    ) -> tuple[float, Outcome, Braking | None]:
+        """Return the first attempt at a piece of path or a part of it that is accepted, or else the last.
+
+        Beside it stand the part that was tried and how the arm brakes after it. An attempt after which the arm brakes
+        in a better way comes before others, and one of a rank beyond the `worst`, as good as the arm could brake now,
+        is none.
+        """
+        best: tuple[float, Outcome, Braking | None] | None = None
+        for share, outcome, after in self._attempts(path, start, end, box, dt, smallest):
+            found = share, outcome, after
+            rank = 0 if after is None else after.rank
+            if outcome.accepted and rank <= worst:
+                best, worst = found, rank - 1
+                if not rank:
+                    break
+        if best is not None:
+            return best
+        share, outcome, _ = found
+        return share, replace(outcome, accepted=False, reason=outcome.reason or _OFF_PATH), None
+
+    def _attempts(
+        self, path: Path, start: float, end: float, box: tuple[Array, Array], dt: float, smallest: float
+    ) -> Iterator[tuple[float, Outcome, Braking | None]]:
+        """Yield the attempts at a piece of path: the whole, halves of it where the tip may be slow, and creeping."""
+        share, lengths = 1.0, self.state.lengths[self.arm.truss.actuators]
+        yield share, *self._try(path, start, end, box, dt)
+        while share > smallest and self.arm.tip_mode == "scaled":
+            share /= 2
+            near = _within(lengths, share * _TRUST, *box)
+            yield share, *self._try(path, start, start + share * (end - start), near, dt, share)
+        if self._must_brake:
+            slow = _creeping(lengths, self._limits[2] * dt * dt, *box)
+            if slow is not None:
+                yield 1.0, *self._try(path, start, end, slow, dt)
 
     def _try(
         self, path: Path, start: float, reach: float, box: tuple[Array, Array], dt: float, share: float = 1.0
@@ -365,33 +404,52 @@ class Resolver:
                 path = path.continued(_BEYOND)
             braking = self._find_braking(outcome.state_after(state), path, start + covered, 2.0 * covered, dt)
             if braking is None:
-                outcome = replace(outcome, accepted=False, reason="the arm could not brake after it")
+                outcome = replace(outcome, accepted=False, reason=CANNOT_BRAKE)
         return outcome, braking
+
+    def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:
+        """Take the next of the steps that bring a moving arm with limited accelerations to rest.
+
+        They were known before the last step was taken, each within the limits and clear. None where the arm may stay
+        as it is; nothing moves then. Progress is counted from `start` to `end` of a `path` that it brakes on.
+        """
+        braking = self._braking
+        if braking is None or braking.origin is not self.state or not braking.steps:
+            return None
+        return self._brake(braking, path, start, end, "", 0, tuple(self._row_names))
+
+    def _brake(
+        self, braking: Braking, path: Path | None, start: float, end: float, reason: str, qps: int, *told: Any
+    ) -> Step:
+        """Take the first step of `braking`; `told` is what the step says besides."""
+        self.state, value = braking.steps[0]
+        self._braking = braking.rest
+        on_path = braking.on_path > 0
+        progress = (value - start) / (end - start) if on_path and path is braking.path else 0.0
+        step = Step(StepStatus.SLOWED, progress, self.state, reason, qps, *told)
+        return replace(step, braked=True, left_path=not on_path)
 
     @property
     def _must_brake(self) -> bool:
-        """Whether a moving arm cannot simply stay where it is: accelerations are limited, and its base rests."""
-        is_free = bool(np.isinf(self._limits[2]).all())
-        return not is_free and self.arm.base_motion is None and self.arm.tip_mode == "scaled"
+        """Whether a moving arm cannot simply stay where it is: accelerations are limited."""
+        return not self._starts_at_once
 
     def _find_braking(
         self, state: State, path: Path, value: float, piece: float, dt: float
     ) -> Braking | None:
         """Return how the arm comes to rest from `state`, at `value` of `path`, in steps of `dt`, s."""
-        return find_braking(
+        brakes = Brakes(
+            self.arm,
             self._attempt,
-            self.arm.truss.actuators,
-            state,
-            path,
-            value,
-            piece,
+            dt,
             lambda now: self._box(dt, now),
             lambda now, *piece_and_box: self._target_from(now, dt, *piece_and_box),
         )
+        return brakes.find(state, path, value, piece)
 
     def _duration(self, dt: float | None) -> float:
         dt = self.arm.dt if dt is None else dt
-        if not (np.isfinite(dt) and dt > 0.0):
+        if not (math.isfinite(dt) and dt > 0.0):
             raise GoalError(
                 f"dt must be a positive number of seconds, not {dt!r}; the state of the arm is unchanged"
             )
@@ -413,22 +471,32 @@ class Resolver:
         return Target(path, start, end, *box, then, *self.arm.base_at(then), self._vertex_goals)
 
     def explain(
-        self, path: Path, start: float, end: float, *, dt: float | None = None, last: Step | None = None
+        self,
+        path: Path,
+        start: float,
+        end: float,
+        *,
+        dt: float | None = None,
+        last: Step | None = None,
+        state: State | None = None,
     ) -> Stop:
-        """Return why the arm does not get on from its present state along `path` from its value `start` to `end`.
+        """Return why the arm does not get on from a state along `path` from its value `start` to `end`.
 
-        Worth asking after a `last` step that was blocked or hardly moved. The state is unchanged.
+        Worth asking after a `last` step that was blocked, hardly moved or braked. The state is the present one by
+        default; nothing moves.
         """
-        dt = self.arm.dt if dt is None else dt
+        dt, state = self.arm.dt if dt is None else dt, state or self.state
         told = ("", {}, False) if last is None else (last.reason, last.multipliers, last.solver_failed)
-        return explain(self.arm, self._separation, self.state, path, start, end, self._limits_now(dt), *told)
+        if last is not None and last.left_path:
+            told = (BASE_MOVES_ON, last.multipliers, False)
+        return explain(self.arm, self._separation, state, path, start, end, self._limits_at(state, dt), *told)
 
-    def _limits_now(self, dt: float) -> Limits:
-        """Return the boxes of a step of `dt`, s, from the present state, and what sets each of their sides."""
-        state, actuators = self.state, self.arm.truss.actuators
+    def _limits_at(self, state: State, dt: float) -> Limits:
+        """Return the boxes of a step of `dt`, s, from `state`, and what sets each of their sides."""
+        actuators = self.arm.truss.actuators
         stroke, rate, _ = self._limits
         length = state.lengths[actuators]
-        lower, upper = self._box(dt)
+        lower, upper = self._box(dt, state)
 
         def kinds(bound: Array, end: Array, fastest: Array) -> list[StopKind]:
             kind = np.where(np.abs(bound - fastest) < 1e-9, StopKind.RATE, StopKind.ACCELERATION)

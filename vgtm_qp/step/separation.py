@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.clearance import BetweenReport, Clearance, NearPairs, Pair
+from vgtm_qp.geometry.pairs import certified
+from vgtm_qp.geometry.watch import Contacts, Watch
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.linearise import clearance_rows
@@ -26,7 +28,7 @@ Index = NDArray[np.int64]
 Shortfall = Mapping[Pair, float]
 """Pairs that are nearer than they may be, with their distances, m."""
 
-_BINDING = 0.01
+_BINDING = 0.002
 """Pairs that are nearer than this to their floor, m, are asked of FCL too."""
 
 _MOST_PIECES = 16
@@ -63,6 +65,7 @@ class Separation:
         self.distances = distances
         self._truss = truss
         self._ends = None if truss.joints is None else EndKinematics(truss)
+        self._watch = Watch(monitor) if Watch.serves(monitor) else None
         self._corners = (
             _corners(truss) if distances.minimum_angle > 0.0 else np.zeros((0, 2, 2), dtype=np.int64)
         )
@@ -108,6 +111,8 @@ class Separation:
         )
         if self._truss.joints is None:
             floors = floor - kept.rounding, max(self_floor - kept.rounding, 0.0)
+            if self._watch is not None and self._watch.follow(start, end, *floors):
+                return certified(min(floors), self.monitor.names)
             return self.monitor.between(start, end, start_time, end_time, *floors)
         # Cut in k pieces the ends leave their chords by a k-th of a k-th.
         deviation = self.deviation(start, end)
@@ -149,13 +154,14 @@ class Separation:
         """
         kept, motion = self.distances, duration > 0.0
         reach += self.monitor.pieces.fastest * duration
+        limits = min(kept.influence, kept.safe + reach), min(kept.influence, kept.self_safe + 2.0 * reach)
+        fcl_reach = kept.safe + _BINDING if motion else 0.0
+        watched = None if self._watch is None or short else self._watch.near(X, *limits, fcl_reach)
+        if watched is not None:
+            rows = self._watched_rows(watched, motion=motion)
+            return rows.joined(self._angle_rows(X, motion=motion)) if len(self._corners) else rows
         pairs = self.monitor.near(
-            X,
-            time,
-            min(kept.influence, kept.safe + reach),
-            use_fcl=motion,
-            fcl_reach=kept.safe + _BINDING,
-            self_reach=min(kept.influence, kept.self_safe + 2.0 * reach),
+            X, time, limits[0], use_fcl=motion, fcl_reach=fcl_reach, self_reach=limits[1]
         )
         rows = self._clearance_rows(X, pairs)
         if motion:
@@ -172,6 +178,18 @@ class Separation:
         if motion and self.monitor.pieces.moving:
             rows.lower += pairs.normal_speed * duration
         return rows.joined(self._angle_rows(X, motion=motion)) if len(self._corners) else rows
+
+    def _watched_rows(self, contacts: Contacts, *, motion: bool) -> ClearanceRows:
+        """Return the rows n . d(witness) >= floor - distance of contacts in a scene at rest."""
+        kept = self.distances
+        if not len(contacts.distance):
+            return ClearanceRows(name=contacts.name)
+        coefficients = contacts.weights[:, :, None] * contacts.normal[:, None, :]
+        lower = kept.safe + kept.margin - contacts.distance
+        lower += (kept.self_safe - kept.safe) * contacts.is_self
+        if motion:
+            np.minimum(lower, 2.0 * kept.margin, out=lower)
+        return ClearanceRows(contacts.nodes, coefficients, lower, contacts.name)
 
     def rows_between(
         self, start: Array, X: Array, start_time: float, time: float, stations: list[float]

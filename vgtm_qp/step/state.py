@@ -20,6 +20,12 @@ def frozen(array: Array) -> Array:
     return copy
 
 
+def sealed(array: Array) -> Array:
+    """Return `array` itself, read-only from now on: for one that nobody else writes to."""
+    array.setflags(write=False)
+    return array
+
+
 @dataclass(frozen=True, eq=False)
 class State:
     """Where the arm is.

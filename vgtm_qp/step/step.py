@@ -42,6 +42,8 @@ class Step:
     braked : bool
         Whether no other step was found than to brake on the path that the arm was on before: limited accelerations
         do not let it leave that at once.
+    left_path : bool
+        Whether the tip left the path in that: it is elastic, or its base moves on whatever happens.
     """
 
     status: StepStatus
@@ -54,6 +56,7 @@ class Step:
     _rows: ClearanceRows | None = None
     solver_failed: bool = False
     braked: bool = False
+    left_path: bool = False
 
     def __str__(self) -> str:
         """Return one line: how it ended, how far and when, and what held the arm back where something did."""

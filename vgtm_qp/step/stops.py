@@ -40,6 +40,11 @@ _SINGULAR = 0.1
 """A share below which the tip moves far less than the actuators do."""
 _PRESSES = 1e-7
 
+CANNOT_BRAKE = "the arm could not brake after it"
+"""The reason of a step that is refused since no way was found to come to rest after it."""
+BASE_MOVES_ON = "its base moves on, and the tip cannot stay on its path with accelerations as limited"
+"""The reason of a step in which the tip leaves its path."""
+
 
 class StopKind(StrEnum):
     """What stops an arm."""
@@ -67,20 +72,24 @@ class Stop:
     kind : StopKind
         ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
         where the tip cannot start in that direction whatever the limits; ``out of reach`` where the arm is stretched
-        towards a goal further away; ``nonlinear`` where no row forbids the step to first order; ``solver`` where
-        none does and the QP solver gave no good answer.
+        towards a goal further away; ``nonlinear`` where no row forbids the step to first order, and ``acceleration``
+        if it is one after which the arm could not brake; ``solver`` where none does and the QP solver gave no good
+        answer.
     multipliers : dict
         Rows of the set, the most decisive first, and the share of the way that each costs per metre (radian).
     obstacles : tuple of str
         Names of the obstacles in the set.
     reason : str
         What the last attempt said.
+    away : tuple of float
+        (3,) where the obstacles in the set push the arm, each as much as it costs; zero without any.
     """
 
     kind: StopKind
     multipliers: Mapping[str, float] = field(default_factory=dict)
     obstacles: tuple[str, ...] = ()
     reason: str = ""
+    away: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -91,7 +100,10 @@ class Stop:
         parts = [
             str(self.kind),
             ", ".join(self.multipliers),
-            self.reason if self.kind in (StopKind.NONLINEAR, StopKind.SOLVER) else "",
+            self.reason
+            if self.kind in (StopKind.NONLINEAR, StopKind.SOLVER)
+            or self.reason in (CANNOT_BRAKE, BASE_MOVES_ON)
+            else "",
         ]
         return ": ".join(part for part in parts if part)
 
@@ -144,7 +156,8 @@ def explain(
         if share <= _SINGULAR:
             return Stop(kind, reason=reason)
         kinds = [_kind(name) for name in pressing]
-        kind = next((kind for kind in StopKind if kind in kinds), StopKind.NONLINEAR)
+        other = StopKind.ACCELERATION if reason in (CANNOT_BRAKE, BASE_MOVES_ON) else StopKind.NONLINEAR
+        kind = next((kind for kind in StopKind if kind in kinds), other)
         return Stop(kind, pressing, _obstacles(arm, pressing), reason)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
         kept[k] = False
@@ -161,10 +174,13 @@ def explain(
     ):
         kind = StopKind.OUT_OF_REACH
     multipliers: dict[str, float] = {}
+    away = np.zeros(3)
     for k in chosen:
         name = program.name(k)
         multipliers[name] = max(multipliers.get(name, 0.0), float(costs[k]))
-    return Stop(kind, multipliers, _obstacles(arm, multipliers), reason)
+        if program.kind(k) is StopKind.OBSTACLE:
+            away += float(costs[k]) * program.normal(k)
+    return Stop(kind, multipliers, _obstacles(arm, multipliers), reason, tuple(away.tolist()))
 
 
 def _obstacles(arm: Arm, names: Iterable[str]) -> tuple[str, ...]:
@@ -259,6 +275,10 @@ class _Program:
         if k < near:
             return self._rows.name(k)
         return f"{self.kind(k)}: {self._limits.names[(k - near) % actuators]}"
+
+    def normal(self, k: int) -> Array:
+        """Return (3,) the direction in which the arm as a whole leaves the obstacle of row `k`."""
+        return np.asarray(self._rows.coefficients[k].sum(axis=0))
 
     def kind(self, k: int) -> StopKind:
         """Return what row `k` is about."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import GoalError, nearest
+from vgtm_qp.qp.numbers import CLOSED
 from vgtm_qp.step.path import PathPoint, turn_between, vector_from_rotation
 from vgtm_qp.truss.kinematics import Kinematics
 
@@ -25,16 +26,13 @@ _ROWS = {
 }
 
 
-_CLOSED = 2e-8
-
-
 def worth_closing(error: Array) -> Array:
     """Return a tip error (n_e,), or zeros where it is within what an accepted state may have, m or rad.
 
     An arm that limits and clearances hold on all sides cannot close even that: its QP would have no solution, where
     staying as it is has one whose multipliers tell what holds it.
     """
-    return error if float(np.abs(error).max(initial=0.0)) > _CLOSED else np.zeros_like(error)
+    return error if float(np.abs(error).max(initial=0.0)) > CLOSED else np.zeros_like(error)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.condensed import FEASIBILITY, UNBOUNDED, InfeasibleStepError
+from vgtm_qp.qp.condensed import FEASIBILITY, InfeasibleStepError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepNumbers, StepSolution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -1,0 +1,149 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_geometry_clearance import brute_force
+
+from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.geometry.pairs import Pair
+from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
+from vgtm_qp.geometry.watch import Watch
+
+MEMBERS = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
+
+FORWARD = np.array([1.0, 0.0, 0.0])
+
+
+def scene(rng, *, round_numbers=False):
+    """Nodes, and a monitor of their members among a box, a ball and a post at rest."""
+
+    def vector(bound):
+        v = rng.uniform(-bound, bound, 3)
+        return np.round(4.0 * v) / 4.0 if round_numbers else v
+
+    def turn():
+        return (
+            np.eye(3) if round_numbers else Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+        )
+
+    obstacles = [
+        box("box", vector(2.0), rng.choice([0.25, 0.5, 0.75], 3), turn()),
+        sphere("ball", vector(2.0), 0.25),
+        cylinder("post", vector(2.0), 0.25, 1.0, turn()),
+    ]
+    nodes = np.array([vector(1.5) for _ in range(6)])
+    return nodes, Clearance(MEMBERS, 0.03, obstacles, safe=0.08, influence=0.5)
+
+
+def walk(X, rng, count, size):
+    """Node positions of a walk, one array for each state."""
+    states = [X]
+    for _ in range(count):
+        drift = rng.normal(size=3) * size
+        states.append(states[-1] + drift + rng.normal(size=X.shape) * 0.3 * size)
+    return states
+
+
+def nearest_by_name(found):
+    """Least distance of each pair, m, by its name."""
+    nearest = {}
+    for k, distance in enumerate(found.distance):
+        nearest[found.name(k)] = min(nearest.get(found.name(k), np.inf), distance)
+    return nearest
+
+
+@pytest.mark.parametrize("round_numbers", [False, True])
+def test_every_pair_nearer_than_the_limits_is_there_in_every_state(round_numbers):
+    compared = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        X, monitor = scene(rng, round_numbers=round_numbers)
+        watch = Watch(monitor)
+        for state in walk(X, rng, 25, 0.06):
+            limits = {False: rng.uniform(0.2, 0.5), True: rng.uniform(0.1, 0.3)}
+            every = brute_force(monitor, state, 0.0).items()
+            wanted = {
+                monitor.names.clearance(Pair(*pair)): distance
+                for pair, distance in every
+                if distance < limits[pair[2]]
+            }
+            found = watch.near(state, limits[False], limits[True], 0.0)
+            if found is None:
+                assert min(wanted.values()) <= 0.0
+                continue
+            assert nearest_by_name(found) == pytest.approx(wanted, abs=1e-9)
+            compared += len(wanted)
+            along = np.einsum("rs,rsc,rc->r", found.weights, state[found.nodes], found.normal)
+            np.testing.assert_allclose(along[found.is_self], found.distance[found.is_self] + 0.06, atol=1e-9)
+    assert compared >= 100
+
+
+def test_what_is_proven_on_the_way_holds_at_every_instant():
+    proven = 0
+    for seed in range(100, 110):
+        rng = np.random.default_rng(seed)
+        X, monitor = scene(rng)
+        watch = Watch(monitor)
+        for start, end in pairwise(walk(X, rng, 12, 0.05)):
+            here = brute_force(monitor, start, 0.0).items()
+            floors = [
+                max(0.0, 0.9 * min(distance for pair, distance in here if pair[2] is is_self))
+                for is_self in (False, True)
+            ]
+            watch.near(start, floors[0] + 0.2, floors[1] + 0.2, 0.0)
+            if not watch.follow(start, end, *floors):
+                continue
+            proven += 1
+            for s in np.linspace(0.0, 1.0, 11):
+                for pair, distance in brute_force(monitor, start + s * (end - start), 0.0).items():
+                    assert distance >= floors[pair[2]] - 1e-12
+    assert proven >= 20
+
+
+def test_a_way_into_an_obstacle_is_not_proven():
+    wall = box("wall", [1.0, 0.0, 0.0], [0.1, 4.0, 4.0])
+    monitor = Clearance([(0, 1)], 0.03, [wall], safe=0.08, influence=0.5, self_collision=False)
+    start = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    watch = Watch(monitor)
+    assert watch.follow(start, start + 0.1 * FORWARD, 0.08, 0.0)
+    assert not watch.follow(start, start + 0.9 * FORWARD, 0.08, 0.0)
+    # Through the wall to where all is clear again: only the way tells.
+    assert not watch.follow(start, start + 2.0 * FORWARD, 0.08, 0.0)
+    assert watch.follow(start, start - 0.5 * FORWARD, 0.08, 0.0)
+    for number in (np.nan, np.inf):
+        with pytest.raises(GeometryError, match="finite"):
+            watch.follow(start, np.full((2, 3), number), 0.08, 0.0)
+    assert watch.follow(start, start + 0.1 * FORWARD, 0.08, 0.0)
+    assert not watch.follow(start, start + 0.9 * FORWARD, 0.08, 0.0)
+
+
+def test_a_way_from_a_state_that_was_left_is_bound_from_there():
+    rng = np.random.default_rng(3)
+    X, monitor = scene(rng)
+    watch, fresh = Watch(monitor), Watch(monitor)
+    states = walk(X, rng, 10, 0.1)
+    for state in states:
+        watch.near(state, 0.4, 0.3, 0.0)
+    for state in states:
+        found, wanted = watch.near(state, 0.4, 0.3, 0.0), fresh.near(state, 0.4, 0.3, 0.0)
+        assert (found is None) == (wanted is None)
+        if found is not None:
+            np.testing.assert_allclose(np.sort(found.distance), np.sort(wanted.distance), atol=1e-12)
+
+
+def test_scenes_that_it_serves():
+    def monitor(*obstacles, members=MEMBERS, **options):
+        return Clearance(members, 0.03, obstacles, safe=0.08, influence=0.5, **options)
+
+    ball = sphere("ball", [5.0, 0.0, 0.0], 0.2)
+    wedge = mesh(
+        "wedge", ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    )
+    assert Watch.serves(monitor(ball))
+    assert Watch.serves(monitor())
+    assert not Watch.serves(monitor(wedge))
+    assert not Watch.serves(monitor(sphere("ball", [5.0, 0.0, 0.0], 0.2, [0.1, 0.0, 0.0])))
+    assert not Watch.serves(monitor(self_collision=False))
+    assert not Watch.serves(monitor(ball, ends=lambda X: X[np.array(MEMBERS)]))
+    assert not Watch.serves(monitor(members=[(k, k + 1) for k in range(200)]))
