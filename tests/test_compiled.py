@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -103,4 +105,16 @@ def test_finishing_leaves_nothing_to_wait_for(tmp_path, monkeypatch):
     finish_compiling()
     assert list(tmp_path.glob("awaited-*.so"))
     monkeypatch.setattr(compiled_module, "_run", None)
+    assert kernel.is_compiled
+
+
+@needs_compiler
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_forked_process_does_not_wait_for_the_compilers_of_its_parent(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    kernel = Kernel(_long("forked", 1.5))
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if kernel.is_compiled else 1)
+    assert os.waitpid(child, 0)[1] == 0
     assert kernel.is_compiled

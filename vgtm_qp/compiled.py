@@ -200,6 +200,7 @@ class _Build:
         key = _hash(source, cc)
         self._cc, self._target = cc, folder / f"{function.name()}-{key}.so"
         self._parts: list[Future[Path | None]] = []
+        self.process = os.getpid()
         self._main = folder / f"{function.name()}-{key}.o"
         if not self._target.exists():
             rest, units = _split(source)
@@ -241,6 +242,9 @@ class _Compiling:
         """Return the compiled function when it is there, or the one it comes from where no compiler works."""
         if self._build is None or self._cc is None:
             return self._function
+        if self._build.process != os.getpid():
+            # The compilers were at work for the process that this one was forked from.
+            self._build = _Build(self._function, self._cc)
         for _ in range(2):
             library = self._build.library()
             if library is None:
