@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+
 import casadi as ca
+import numpy as np
 import pytest
 
-from vgtm_qp.compiled import Kernel, compiler
+from vgtm_qp import compiled as compiled_module
+from vgtm_qp.compiled import Kernel, compiler, finish_compiling
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -40,3 +44,77 @@ def test_where_the_cache_is_no_folder_the_virtual_machine_serves(tmp_path, monke
     kernel = Kernel(_square())
     assert not kernel.is_compiled
     assert _value(kernel) == 9.0
+
+
+def _long(name: str, scale: float) -> ca.Function:
+    """A function of some hundred lines, and one that maps it."""
+    x = ca.SX.sym("x", 40)
+    y = ca.vertcat(*[ca.sqrt(1.0 + x[k] ** 2) * ca.fmax(x[k - 1], 0.1) + ca.sin(x[k]) for k in range(40)])
+    inner = ca.Function(f"inner_{name}", [x], [y])
+    z = ca.MX.sym("z", 40, 3)
+    return ca.Function(name, [z], [scale * inner.map(3)(z)])
+
+
+@needs_compiler
+def test_what_two_kernels_share_is_compiled_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    kernels = [Kernel(_long(name, scale)) for name, scale in (("one", 1.0), ("other", 2.0))]
+    assert all(kernel.is_compiled for kernel in kernels)
+    assert len(list(tmp_path.glob("*.so"))) == 2
+    assert len(list(tmp_path.glob("*.o"))) == 1
+    interpreted = Kernel(_long("one", 1.0), compiled=False)
+    values = np.linspace(-1.0, 2.0, 120)
+    for kernel in (*kernels, interpreted):
+        kernel.inputs[0][:] = values
+        kernel()
+    np.testing.assert_allclose(kernels[0].outputs[0], interpreted.outputs[0], atol=1e-15)
+    np.testing.assert_allclose(kernels[1].outputs[0], 2.0 * interpreted.outputs[0], atol=1e-15)
+
+
+@needs_compiler
+def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    monkeypatch.setattr(compiled_module, "_LONG", 0)
+    a, b = ca.MX.sym("a", 4, 4), ca.MX.sym("b", 4, 4)
+    product = ca.Function("product", [a, b], [a @ b + ca.fmin(a, b)])
+    kernel, rng = Kernel(product), np.random.default_rng(0)
+    assert kernel.is_compiled
+    for array in kernel.inputs:
+        array[:] = rng.normal(size=16)
+    kernel()
+    first, second = (array.reshape(4, 4).T for array in kernel.inputs)
+    wanted = first @ second + np.minimum(first, second)
+    np.testing.assert_allclose(kernel.outputs[0].reshape(4, 4).T, wanted, atol=1e-15)
+
+
+def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    kernel = Kernel(_square())
+    source, result = np.array([4.0]), np.zeros(1)
+    kernel.bind_input(0, source)
+    kernel.bind_output(0, result)
+    kernel()
+    assert result[0] == 16.0
+    assert kernel.outputs[0] is result
+
+
+@needs_compiler
+def test_finishing_leaves_nothing_to_wait_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    kernel = Kernel(_long("awaited", 3.0))
+    finish_compiling()
+    assert list(tmp_path.glob("awaited-*.so"))
+    monkeypatch.setattr(compiled_module, "_run", None)
+    assert kernel.is_compiled
+
+
+@needs_compiler
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_forked_process_does_not_wait_for_the_compilers_of_its_parent(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    kernel = Kernel(_long("forked", 1.5))
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if kernel.is_compiled else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    assert kernel.is_compiled

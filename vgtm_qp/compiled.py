@@ -3,6 +3,10 @@
 ``Function.buffer()`` costs 0.5-4 us a call where ``F(array)`` costs 23 us. A kernel is compiled when a C compiler
 is there and the library is kept by a hash of its source, so the second process pays only for a `dlopen`. Without a
 compiler the CasADi virtual machine evaluates the same graph, 4 to 10 times slower.
+
+The first time, the compiler's time is what an arm waits for. The straight-line functions that a kernel maps or calls
+are compiled by themselves, once for all kernels that use them, by several processes at a time, and a kernel waits for
+its own when it is called first.
 """
 
 from __future__ import annotations
@@ -10,11 +14,15 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import shlex
 import shutil
 import subprocess
 import tempfile
 import threading
+import weakref
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +32,34 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
-_building = threading.Lock()
+_FLAGS = (
+    "-O2",
+    "-march=native",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fPIC",
+    "-fvisibility=hidden",
+    '-DCASADI_SYMBOL_EXPORT=__attribute__((visibility("default")))',
+)
+_QUICK = ("-O1",)
+"""For what calls the straight-line functions, where it is long: half the compiler's time, and little to gain."""
+
+_LONG = 100_000
+"""Source texts of more characters take the compiler seconds."""
+
+_MOST_COMPILERS = 4
+_WORTH_IT = 100
+"""Functions of fewer lines are not compiled by themselves."""
+
+_FUNCTION = re.compile(r"^static int (casadi_f\d+)\(.*?^}\n", re.MULTILINE | re.DOTALL)
+_HELPER = re.compile(
+    r"^(?:static |inline )*casadi_real (casadi_\w+)\([^;{]*\{(?:[^\n]*\}\n|.*?^\}\n)",
+    re.MULTILINE | re.DOTALL,
+)
+_PRELUDE = """#include <math.h>
+#define casadi_real double
+#define casadi_int long long int
+"""
 
 
 def compiler() -> str | None:
@@ -56,47 +90,187 @@ def _machine() -> str:
     return next((line for line in lines if line.startswith(("flags", "Features"))), "")
 
 
-def _library(function: ca.Function, cc: str) -> Path | None:
-    """Return the compiled shared library of `function`, from the cache where it is there."""
-    generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
-    generator.add(function)
-    source = generator.dump()
-    key = hashlib.sha256(
-        "\0".join((source, cc, *_FLAGS, ca.CasadiMeta.version(), _machine())).encode()
+def _hash(*parts: str) -> str:
+    return hashlib.sha256(
+        "\0".join((*parts, *_FLAGS, *_QUICK, ca.CasadiMeta.version(), _machine())).encode()
     ).hexdigest()[:32]
-    target = cache_directory() / f"{function.name()}-{key}.so"
+
+
+def _split(source: str) -> tuple[str, dict[str, str]]:
+    """Return `source` with its long straight-line functions left out but declared, and those by their new names.
+
+    A function that calls no other, and uses nothing but one-line helpers, has a name made of its text: what is mapped
+    over faces, pairs or bays is one function in however many kernels.
+    """
+    helpers = {match.group(1): match.group(0) for match in _HELPER.finditer(source)}
+    units: dict[str, str] = {}
+    renamed: dict[str, str] = {}
+    for match in _FUNCTION.finditer(source):
+        name, text = match.group(1), match.group(0)
+        used = set(re.findall(r"\bcasadi_\w+", text)) - {name, "casadi_real", "casadi_int"}
+        if text.count("\n") < _WORTH_IT or not used <= helpers.keys():
+            continue
+        body = text[text.index("(") :]
+        before = "".join(
+            re.sub(r"^(?:static |inline )*", "static inline ", helpers[helper]) for helper in sorted(used)
+        )
+        unit = f"vgtm_{_hash(before, body)}"
+        units[unit] = f"{_PRELUDE}{before}int {unit}{body}"
+        renamed[name] = unit
+        source = source.replace(text, f"int {unit}{body[: body.index('{')].rstrip()};\n", 1)
+    for name, unit in renamed.items():
+        source = re.sub(rf"^#define {name} .*\n", "", source, flags=re.MULTILINE)
+        source = re.sub(rf"\b{name}\b", unit, source)
+    return source, units
+
+
+def _with_fast_helpers(source: str) -> str:
+    """Return `source` with all before its first function, matrix products among it, compiled as the rest is not."""
+    head = re.search(r"^/\* \w+:\(", source, flags=re.MULTILINE)
+    if head is None:
+        return source
+    before, after = source[: head.start()], source[head.start() :]
+    return (
+        '#include <math.h>\n#pragma GCC push_options\n#pragma GCC optimize ("O2")\n'
+        f"{before}#pragma GCC pop_options\n{after}"
+    )
+
+
+class _Compilers:
+    """Compilers at work for this process."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self._pool: ThreadPoolExecutor | None = None
+        self._units: dict[Path, Future[Path | None]] = {}
+
+    def compile(self, cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Future[Path | None]:
+        """Begin to compile `text` into the object `target`, unless that is done or being done."""
+        with self.lock:
+            if target not in self._units or (self._units[target].done() and not target.exists()):
+                self._pool = self._pool or ThreadPoolExecutor(
+                    max(1, min(_MOST_COMPILERS, os.cpu_count() or 1)), "vgtm-compiler"
+                )
+                self._units[target] = self._pool.submit(_object, cc, text, target, flags)
+            return self._units[target]
+
+
+_compilers = _Compilers()
+_resolving = threading.RLock()
+
+
+def _forget() -> None:
+    """Begin anew in a forked process, which has none of the threads."""
+    global _compilers, _resolving
+    _compilers, _resolving = _Compilers(), threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
+
+
+def _run(command: list[str]) -> None:
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+
+
+def _object(cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Path | None:
+    """Return the object file that `text` was compiled to; None where it cannot be."""
     if target.exists():
         return target
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-            c_file, so_file = Path(scratch) / "kernel.c", Path(scratch) / "kernel.so"
-            c_file.write_text(source)
-            command = [*shlex.split(cc), *_FLAGS, str(c_file), "-o", str(so_file), "-lm"]
-            subprocess.run(command, check=True, capture_output=True, timeout=300)
-            so_file.replace(target)
+            c_file, o_file = Path(scratch) / "kernel.c", Path(scratch) / "kernel.o"
+            c_file.write_text(text)
+            _run([*shlex.split(cc), *_FLAGS, *flags, "-c", str(c_file), "-o", str(o_file)])
+            o_file.replace(target)
     except (OSError, subprocess.SubprocessError):
         return None
     return target
 
 
-def compile_function(function: ca.Function) -> ca.Function:
-    """Return `function` compiled to machine code, or as it is where no compiler works."""
-    cc = compiler()
-    if cc is None:
-        return function
-    with _building:
+class _Build:
+    """A library that is being compiled."""
+
+    def __init__(self, function: ca.Function, cc: str) -> None:
+        generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
+        generator.add(function)
+        source = generator.dump()
+        folder = cache_directory()
+        key = _hash(source, cc)
+        self._cc, self._target = cc, folder / f"{function.name()}-{key}.so"
+        self._parts: list[Future[Path | None]] = []
+        self.process = os.getpid()
+        self._main = folder / f"{function.name()}-{key}.o"
+        if not self._target.exists():
+            rest, units = _split(source)
+            texts = {folder / f"{name}-{_hash(cc)[:8]}.o": text for name, text in units.items()}
+            quick = _QUICK if len(rest) > _LONG else ()
+            texts[self._main] = _with_fast_helpers(rest) if quick else rest
+            # The longest first: nothing waits for it at the end.
+            longest = sorted(texts, key=lambda path: -len(texts[path]))
+            self._parts = [
+                _compilers.compile(cc, texts[path], path, quick if path == self._main else ())
+                for path in longest
+            ]
+
+    def library(self) -> Path | None:
+        """Return the shared library as soon as it is there; None where it cannot be compiled."""
+        if self._target.exists():
+            return self._target
+        objects = [part.result() for part in self._parts]
+        try:
+            with tempfile.TemporaryDirectory(dir=self._target.parent) as scratch:
+                so_file = Path(scratch) / "kernel.so"
+                _run([*shlex.split(self._cc), "-shared", *map(str, objects), "-o", str(so_file), "-lm"])
+                so_file.replace(self._target)
+            self._main.unlink(missing_ok=True)
+        except (OSError, subprocess.SubprocessError):
+            # Another process may have made the library meanwhile, and cleared up.
+            pass
+        return self._target if self._target.exists() else None
+
+
+class _Compiling:
+    """A function on its way to machine code."""
+
+    def __init__(self, function: ca.Function) -> None:
+        self._function, self._cc = function, compiler()
+        self._build = None if self._cc is None else _Build(function, self._cc)
+
+    def result(self) -> ca.Function:
+        """Return the compiled function when it is there, or the one it comes from where no compiler works."""
+        if self._build is None or self._cc is None:
+            return self._function
+        if self._build.process != os.getpid():
+            # The compilers were at work for the process that this one was forked from.
+            self._build = _Build(self._function, self._cc)
         for _ in range(2):
-            library = _library(function, cc)
+            library = self._build.library()
             if library is None:
                 break
             try:
-                return ca.external(function.name(), str(library))
+                return ca.external(self._function.name(), str(library))
             except RuntimeError:
                 # Cut short by a full disk, or from a machine with another C library: compiled once more.
                 with contextlib.suppress(OSError):
                     library.unlink(missing_ok=True)
-    return function
+                self._build = _Build(self._function, self._cc)
+        return self._function
+
+
+def compile_function(function: ca.Function) -> ca.Function:
+    """Return `function` compiled to machine code, or as it is where no compiler works."""
+    return _Compiling(function).result()
+
+
+_waiting: weakref.WeakSet[Kernel] = weakref.WeakSet()
+
+
+def finish_compiling() -> None:
+    """Wait until all kernels of this process are compiled, so that none of them has to be waited for later."""
+    for kernel in list(_waiting):
+        _ = kernel.is_compiled
 
 
 class Kernel:
@@ -110,17 +284,45 @@ class Kernel:
     """
 
     def __init__(self, function: ca.Function, *, compiled: bool = True) -> None:
-        self.function = compile_function(function) if compiled else function
-        self.is_compiled = self.function is not function
-        buffer: Any
-        buffer, self._evaluate = self.function.buffer()
-        self._buffer = buffer
+        self._given = function
+        self._compiling = _Compiling(function) if compiled else None
+        self._found: ca.Function | None = None
+        self._buffer: Any = None
         self.inputs: list[Array] = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
         self.outputs: list[Array] = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
-        for i, array in enumerate(self.inputs):
-            self._buffer.set_arg(i, array.data)
-        for i, array in enumerate(self.outputs):
-            self._buffer.set_res(i, array.data)
+        # Until it is called first, when this is replaced by the evaluation itself.
+        self._evaluate: Callable[[], None] = self._evaluate_first
+        if compiled:
+            _waiting.add(self)
+        else:
+            self._resolve()
+
+    def _resolve(self) -> ca.Function:
+        with _resolving:
+            if self._found is None:
+                self._found = self._given if self._compiling is None else self._compiling.result()
+                self._compiling = None
+                _waiting.discard(self)
+                self._buffer, self._evaluate = self._found.buffer()
+                for i, array in enumerate(self.inputs):
+                    self._buffer.set_arg(i, array.reshape(-1).data)
+                for i, array in enumerate(self.outputs):
+                    self._buffer.set_res(i, array.reshape(-1).data)
+            return self._found
+
+    def _evaluate_first(self) -> None:
+        self._resolve()
+        self._evaluate()
+
+    @property
+    def function(self) -> ca.Function:
+        """The function that is evaluated, compiled where it can be; waits for the compiler."""
+        return self._resolve()
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether it is machine code; waits for the compiler."""
+        return self._resolve() is not self._given
 
     def __call__(self) -> None:
         """Evaluate: read `inputs`, overwrite `outputs`."""
@@ -131,7 +333,8 @@ class Kernel:
         if array.size != self.inputs[index].size or not array.flags.c_contiguous or array.dtype != np.float64:
             raise ValueError(f"argument {index} takes {self.inputs[index].size} contiguous float64 numbers")
         self.inputs[index] = array
-        self._buffer.set_arg(index, array.reshape(-1).data)
+        if self._buffer is not None:
+            self._buffer.set_arg(index, array.reshape(-1).data)
 
     def bind_output(self, index: int, array: Array) -> None:
         """Let result `index` be written to `array` (C-contiguous float64, of its size), which the kernel keeps."""
@@ -142,7 +345,8 @@ class Kernel:
         ):
             raise ValueError(f"result {index} gives {self.outputs[index].size} contiguous float64 numbers")
         self.outputs[index] = array
-        self._buffer.set_res(index, array.reshape(-1).data)
+        if self._buffer is not None:
+            self._buffer.set_res(index, array.reshape(-1).data)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Refuse to pickle: a kernel holds addresses; build it in the worker."""

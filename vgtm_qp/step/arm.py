@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.errors import Mistake, ProblemError, nearest
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
@@ -165,13 +166,15 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
     }
     if truss.joints is not None:
         options["ends"] = partial(member_ends, truss)
+    engine = make_engine(problem.method.solver, layout, kinematics, task, compiled=compiled)
     monitor = Clearance(truss.members, truss.radius, self_collision=clearance.self_collision, **options)
+    finish_compiling()
     return Arm(
         truss=truss,
         kinematics=kinematics,
         layout=layout,
         task=task,
-        engine=make_engine(problem.method.solver, layout, kinematics, task, compiled=compiled),
+        engine=engine,
         monitor=monitor,
         home_lengths=truss.home_lengths,
         control_vertices=curve.vertices,
@@ -198,6 +201,7 @@ def reshaped(arm: Arm, layout: Layout) -> Arm:
         engine = arm.engine.drawn(layout)
     else:
         engine = make_engine(arm.solver, layout, arm.kinematics, arm.task)
+        finish_compiling()
     return replace(arm, layout=layout, engine=engine)
 
 

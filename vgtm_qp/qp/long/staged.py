@@ -6,8 +6,6 @@ are global unknowns beside them; rows with bounds meet in a small dense QP of th
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
@@ -50,6 +48,7 @@ class StagedSolver:
         self._columns = Sweep(elimination.columns(_BLOCK), periods)
         self._forward = Sweep(elimination.forward(), periods)
         self._balance = Sweep(elimination.balance(), periods)
+        self._strokes_sweep = Sweep(elimination.strokes(len(self.layout.tip_rows)), periods)
         self._elimination = elimination
         gains = self._factor.outputs[1]
         for k, array in enumerate((self.data.head, self.data.tail, self.data.table)):
@@ -61,6 +60,8 @@ class StagedSolver:
         self._forward_head, self._forward_gains, self._motions = (
             array.reshape(periods, -1) for array in self._forward.inputs[1:]
         )
+        for k, array in enumerate((self._forward_head, self._forward_gains)):
+            self._strokes_sweep.bind_input(1 + k, array)
         own = chain.nodes.shape[1]
         # Rows of base nodes, which answer to no displacement, go to places behind the last one that is read.
         self._rows = np.zeros(((periods + 1) * _BLOCK * own, 3))
@@ -145,13 +146,6 @@ class StagedSolver:
                 motions - self._outer[:, :-1] @ dtrtrs(self._curve_factor, known_curve, lower=1, trans=1)[0]
             )
         return self._strokes_of(motions)
-
-    @cached_property
-    def _strokes_sweep(self) -> Sweep:
-        sweep = Sweep(self._elimination.strokes(len(self.layout.tip_rows)), self.chain.periods)
-        for k, array in enumerate((self._forward_head, self._forward_gains)):
-            sweep.bind_input(1 + k, array)
-        return sweep
 
     def _strokes_of(self, motions: Array) -> Array:
         """Return (n_a, n_e) the changes of the actuated lengths in free motions (freedom, n_e) of the bays."""
