@@ -29,6 +29,9 @@ Shortfall = Mapping[Pair, float]
 _BINDING = 0.01
 """Pairs that are nearer than this to their floor, m, are asked of FCL too."""
 
+_LEAST_APPROACH = 2e-3
+"""A pair that slows down may come nearer by so much in one step all the same, m."""
+
 _MOST_PIECES = 16
 
 _NEAR_ANGLE = 0.3
@@ -43,7 +46,9 @@ class Distances:
     """What is kept: surface to surface from obstacles and between members, m, and angles between members, rad.
 
     The QP keeps `margin` more, m, for what is not linear in its step; pairs further than `influence`, m, are not
-    in it. A pair that is too near at the start of a step is driven apart by up to `recovery`, m, in one step.
+    in it. A pair that is too near at the start of a step is driven apart by up to `recovery`, m, in one step. A pair
+    may use up the part `approach` of its room in one step: where that is 1, members come at full speed and stop dead,
+    which is a jump in the rates of all actuators.
     """
 
     safe: float
@@ -52,6 +57,7 @@ class Distances:
     margin: float = 2e-4
     minimum_angle: float = 0.0
     recovery: float = 0.01
+    approach: float = 1.0
     rounding: float = 1e-10
 
 
@@ -140,7 +146,7 @@ class Separation:
         duration
             How long the obstacles move on until the end of the step, s; zero at the end. Where it is not, a zero
             step is allowed as far as the obstacles rest, but for the margin that the step before may have used up
-            and for what is to be recovered.
+            and for what is to be recovered; and pairs slow down before they touch.
         reach
             How far a node moves at most, m: a pair further from its floor than that cannot become active. One that
             was missed because a member moved further is found by the check of the new state, and corrected.
@@ -159,6 +165,8 @@ class Separation:
         )
         rows = self._clearance_rows(X, pairs)
         if motion:
+            slowed = np.minimum(kept.approach * rows.lower, -_LEAST_APPROACH)
+            np.maximum(rows.lower, slowed, out=rows.lower)
             np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
         for k in (
             np.flatnonzero(pairs.distance < np.where(pairs.is_self, kept.self_safe, kept.safe))
