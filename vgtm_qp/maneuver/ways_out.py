@@ -76,7 +76,8 @@ def _drawn_home(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
 
 
 def _at_full_speed(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    return {"method.slow_approach": False} if problem.method.slow_approach else {}
+    slows = problem.method.slow_approach and problem.end_effector.mode == "scaled"
+    return {"method.slow_approach": False} if slows else {}
 
 
 def _shorter_steps(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001

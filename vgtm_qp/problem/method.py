@@ -113,7 +113,7 @@ class Method(Table):
     slow_approach: Flag = Field(
         default=True,
         description="whether members slow down before they touch, and actuators before the ends of their strokes, so "
-        "that rates do not jump",
+        "that rates do not jump; with mode scaled",
     )
     step_limit: Length | None = Field(
         default=None,

@@ -80,7 +80,7 @@ class Resolver:
             arm.influence,
             arm.margin,
             arm.minimum_angle,
-            approach=_APPROACH if arm.slow_approach else 1.0,
+            approach=_APPROACH if self._slows_down else 1.0,
         )
         self._separation = Separation(arm.truss, arm.monitor, distances)
         self._attempt = Attempt(arm.engine, arm.task, self._separation, tracking=_hard_tracking(arm))
@@ -103,6 +103,11 @@ class Resolver:
     def phases(self) -> dict[str, float]:
         """Seconds spent so far in each phase."""
         return self._attempt.phases.seconds
+
+    @property
+    def _slows_down(self) -> bool:
+        """Whether pairs and actuators slow down before contacts and strokes: only a tip that may be late lets them."""
+        return self.arm.slow_approach and self.arm.tip_mode == "scaled"
 
     @property
     def locked(self) -> frozenset[str]:
@@ -472,7 +477,7 @@ class Resolver:
 
     def _slowing(self, box: tuple[Array, Array]) -> tuple[Array, Array]:
         """Return the part of the boxes (n_a,) within which actuators slow down before the ends of their strokes, m."""
-        if not self.arm.slow_approach or self._must_brake:
+        if not self._slows_down or self._must_brake:
             return box
         length, stroke = self.state.lengths[self.arm.truss.actuators], self._limits[0]
         down, up = (
