@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from vgtm_qp.curve.redundancy import add_control_vertices, remove_control_vertic
 from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
+from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.step.arm import Arm, build_arm, reshaped
 from vgtm_qp.step.attempt import Attempt, Outcome
 from vgtm_qp.step.braking import Brakes, Braking
@@ -443,6 +445,10 @@ class Resolver:
         step = Step(StepStatus.SLOWED, progress, self.state, reason, qps, *told)
         return replace(step, braked=True, left_path=not on_path)
 
+    @cached_property
+    def _length_solver(self) -> LengthSolver:
+        return LengthSolver(self.arm.layout)
+
     @property
     def _must_brake(self) -> bool:
         """Whether a moving arm cannot simply stay where it is: accelerations are limited."""
@@ -458,6 +464,7 @@ class Resolver:
             dt,
             lambda now: self._box(dt, now),
             lambda now, *piece_and_box: self._target_from(now, dt, *piece_and_box),
+            lambda: self._length_solver,
         )
         return brakes.find(state, path, value, piece)
 
