@@ -241,3 +241,17 @@ def test_contacts_with_two_cubes_do_not_jolt_the_arm_and_what_they_add_is_within
     _, abrupt = changes_of_rates(cubes.replace({"method.slow_approach": False}))
     assert changes.max() <= 0.4 * abrupt.max()
     assert changes.sum() <= 0.9 * abrupt.sum()
+
+
+def test_an_arm_at_rest_need_not_flee_from_an_obstacle_that_only_comes_nearer():
+    crate = box("crate", [1.3, 0.0, 1.5], [0.5, 2.0, 2.0], velocity=[-0.3, 0.0, 0.0])
+    resolver = Resolver(problem(obstacle=[crate]))
+    rows = resolver._separation.rows(resolver.state.nodes, 0.0, 1.0, 2.0, {}, 0.0)
+    near = [k for k in range(len(rows)) if "crate" in rows.name(k)]
+    assert near
+    assert max(rows.lower[k] for k in near) < 0.0
+    resting = Resolver(problem(obstacle=[{**crate, "velocity": [0.0, 0.0, 0.0]}]))
+    still = resting._separation.rows(resting.state.nodes, 0.0, 1.0, 2.0, {}, 0.0)
+    least = max(still.lower[k] for k in range(len(still)) if "crate" in still.name(k))
+    room = resting.arm.monitor.least(resting.state.nodes, 0.0, among="obstacles")[0] - resting.arm.safe
+    assert least == pytest.approx(-0.4 * room, abs=1e-3)

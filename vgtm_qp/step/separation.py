@@ -165,8 +165,6 @@ class Separation:
         )
         rows = self._clearance_rows(X, pairs)
         if motion:
-            slowed = np.minimum(kept.approach * rows.lower, -_LEAST_APPROACH)
-            np.maximum(rows.lower, slowed, out=rows.lower)
             np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
         for k in (
             np.flatnonzero(pairs.distance < np.where(pairs.is_self, kept.self_safe, kept.safe))
@@ -179,6 +177,9 @@ class Separation:
                 rows.lower[k] = min(before + gain, least) - pairs.distance[k]
         if motion and self.monitor.pieces.moving:
             rows.lower += pairs.normal_speed * duration
+        if motion:
+            # Of the room that is left when the obstacles have moved: the arm need not flee from what only comes nearer.
+            np.maximum(rows.lower, np.minimum(kept.approach * rows.lower, -_LEAST_APPROACH), out=rows.lower)
         return rows.joined(self._angle_rows(X, motion=motion)) if len(self._corners) else rows
 
     def rows_between(
