@@ -120,6 +120,37 @@ def test_slow_actuators_slow_a_scaled_tip_down_and_stop_a_hard_one(mode, slower)
         assert all(name.startswith("rate: ") for name in maneuver.blocked_by)
 
 
+POSES = [
+    (["position", "orientation"], {"position": [0.4, 0.1, 2.6], "rotation_vector": [0.1, 0.2, 0.15]}),
+    (["position", "pointing"], {"position": [0.4, 0.1, 2.6], "pointing": [0.3, 0.1, 1.0]}),
+    (["orientation"], {"rotation_vector": [0.1, 0.2, 0.15]}),
+    (["x", "z"], {"position": [0.4, 0.1, 2.6]}),
+]
+
+
+@pytest.mark.parametrize(("track", "goal"), POSES)
+@pytest.mark.parametrize("mode", ["scaled", "hard", "elastic"])
+def test_every_kind_of_pose_is_met_in_every_mode(track, goal, mode):
+    problem = vq.Problem.from_dict(
+        {
+            "truss": {"module": "hexapod", "bays": 3},
+            "curve": {"control_vertices": 4},
+            "end_effector": {"track": track, "mode": mode},
+            "maneuver": {"steps": 12, "waypoint": [{"time": 4.0, **goal}]},
+            "obstacle": [
+                {"name": "mast", "shape": "cylinder", "center": [1.0, 0.0, 1.5], "radius": 0.2, "height": 2.0}
+            ],
+            "method": {"retries": False},
+        }
+    )
+    maneuver = vq.solve(problem)
+    assert maneuver.status == "solved", maneuver.blocked_by
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    errors = (maneuver.certificate.tip_error.value, maneuver.certificate.tip_direction_error.value)
+    assert all(error is None or error < 1e-8 for error in errors)
+    assert len(maneuver.time) == 13 or mode == "scaled"
+
+
 def test_a_path_that_stands_still_is_solved():
     tip = vq.solve(three_bays()).tip_position[0]
     waypoint = [{"time": 1.0, "position": tip.tolist()}]

@@ -197,17 +197,61 @@ def test_offset_joints_pass_cubes_with_clearance_between_their_true_ends():
     assert maneuver.certificate.ok, maneuver.certificate.failures()
 
 
-def test_a_member_that_slides_along_a_cube_does_not_chatter():
-    """Several witness rows on parallel faces: actuator rates change no more than twice as much as in free motion."""
+def changes_of_rates(problem):
+    """Return the maneuver and (T - 2,) by how much all actuators' rates change from each step to the next, m/s."""
+    maneuver = vq.solve(problem)
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    rate = np.diff(maneuver.member_lengths, axis=0) / np.diff(maneuver.time)[:, None]
+    return maneuver, np.abs(np.diff(rate, axis=0)).sum(axis=1)
+
+
+def sliding():
     free = vq.load_problem("five_bay_free").replace(
         {"maneuver.waypoint": [{"time": 10.0, "position": [1.2, 0.4, 3.5]}]}
     )
-    beside_a_face = free.replace({"obstacle": [box("cube", [0.0, 3.05, 2.0], 4.5)]})
-    changes = []
-    for scene in (free, beside_a_face):
-        maneuver = vq.solve(scene)
-        assert maneuver.status == "solved"
-        rate = np.diff(maneuver.member_lengths, axis=0) / np.diff(maneuver.time)[:, None]
-        changes.append(float(np.abs(np.diff(rate, axis=0)).sum()))
-    assert np.count_nonzero(maneuver.clearance < 0.0806) > 30
-    assert changes[1] <= 2.0 * changes[0], changes
+    return free, free.replace({"obstacle": [box("cube", [0.0, 3.05, 2.0], 4.5)]})
+
+
+def test_a_member_that_slides_along_a_cube_does_not_chatter():
+    """Several witness rows on parallel faces: actuator rates change no more than twice as much as in free motion."""
+    free, beside_a_face = (changes_of_rates(scene) for scene in sliding())
+    assert np.count_nonzero(beside_a_face[0].clearance < 0.0806) > 30
+    assert beside_a_face[1].sum() <= 1.5 * free[1].sum()
+    assert beside_a_face[1].max() <= 0.1
+
+
+def test_members_that_touch_at_full_speed_jolt_all_actuators():
+    _, scene = sliding()
+    slow, abrupt = (
+        changes_of_rates(scene.replace({"method.slow_approach": value}))[1] for value in (True, False)
+    )
+    assert slow.max() <= 0.4 * abrupt.max()
+    assert slow.sum() <= 0.9 * abrupt.sum()
+
+
+def test_contacts_with_two_cubes_do_not_jolt_the_arm_and_what_they_add_is_within_free_motion():
+    """Free of the ends of its strokes: those add as much again as the cubes."""
+    cubes = vq.load_problem("five_bay_two_cubes")
+    free = changes_of_rates(cubes.replace({"obstacle": []}))[1].sum()
+    _, changes = changes_of_rates(cubes.replace({"truss.stroke": [0.4, 1.7]}))
+    assert changes.sum() <= 2.0 * free
+    _, changes = changes_of_rates(cubes)
+    assert changes.sum() <= 2.6 * free
+    _, abrupt = changes_of_rates(cubes.replace({"method.slow_approach": False}))
+    assert changes.max() <= 0.4 * abrupt.max()
+    assert changes.sum() <= 0.9 * abrupt.sum()
+
+
+def test_an_arm_at_rest_need_not_flee_from_an_obstacle_that_only_comes_nearer():
+    crate = box("crate", [1.3, 0.0, 1.5], [0.5, 2.0, 2.0], velocity=[-0.3, 0.0, 0.0])
+    resolver = Resolver(problem(obstacle=[crate]))
+    rows = resolver._separation.rows(resolver.state.nodes, 0.0, 1.0, 2.0, {}, 0.0)
+    near = [k for k in range(len(rows)) if "crate" in rows.name(k)]
+    assert near
+    assert max(rows.lower[k] for k in near) < 0.0
+    resting = Resolver(problem(obstacle=[{**crate, "velocity": [0.0, 0.0, 0.0]}]))
+    still = resting._separation.rows(resting.state.nodes, 0.0, 1.0, 2.0, {}, 0.0)
+    least = max(still.lower[k] for k in range(len(still)) if "crate" in still.name(k))
+    room = resting.arm.monitor.least(resting.state.nodes, 0.0, among="obstacles")[0] - resting.arm.safe
+    assert least == pytest.approx(-0.4 * room, abs=1e-3)

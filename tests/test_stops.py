@@ -150,7 +150,7 @@ def test_the_ways_out_are_those_that_a_problem_has():
     patient = problem(**{"method.retries": True})
     names = [name for name, _ in ways_out(patient, dead_end(vertices=4))]
     assert names[0] == "actuators drawn to their home lengths"
-    assert [name.startswith("curve bulged") for name in names] == [False] + 5 * [True] + 4 * [False]
+    assert [name.startswith("curve bulged") for name in names] == [False] + 5 * [True] + 5 * [False]
     assert len(set(names)) == len(names)
     for name, other in ways_out(patient, dead_end(vertices=4)):
         assert other != patient, name
@@ -165,9 +165,7 @@ def test_the_ways_out_are_those_that_a_problem_has():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("seed", "number", "way"), [(0, 9, ""), (1991, 119, "curve bulged"), (1991, 83, "curve bulged")]
-)
+@pytest.mark.parametrize(("seed", "number", "way"), [(0, 9, "actuators drawn"), (0, 57, "curve bulged")])
 def test_a_dead_end_of_one_shape_is_passed_in_another(seed, number, way):
     from vgtm_qp.study.scenes import random_scene
 

@@ -75,6 +75,11 @@ def _drawn_home(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
     return {"method.weights.stroke_centring": 10.0 * max(problem.method.weights.stroke_centring, 0.02)}
 
 
+def _at_full_speed(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+    slows = problem.method.slow_approach and problem.end_effector.mode == "scaled"
+    return {"method.slow_approach": False} if slows else {}
+
+
 def _shorter_steps(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
     maneuver = problem.maneuver
     return {"maneuver.steps": 3 * maneuver.steps} if isinstance(maneuver, WaypointManeuver) else {}
@@ -143,6 +148,7 @@ _WAYS: dict[str, Callable[[Problem, DeadEnd], Changes]] = {
     "actuators drawn to their home lengths": _drawn_home,
     **{f"curve bulged {side}": _bulged(quarter) for side, quarter in _SIDES.items()},
     "curve bulged a little away from what blocks it": _bulged(0, _SLIGHT_BULGE),
+    "no slowing down before contacts": _at_full_speed,
     "shorter steps": _shorter_steps,
     "actuator rates as the metric": _actuator_rates,
     "no curve": _no_curve,

@@ -110,6 +110,11 @@ class Method(Table):
     retries: Flag = Field(
         default=True, description="whether other ways out of a dead end are tried before giving up"
     )
+    slow_approach: Flag = Field(
+        default=True,
+        description="whether members slow down before they touch, and actuators before the ends of their strokes, so "
+        "that rates do not jump; with mode scaled",
+    )
     step_limit: Length | None = Field(
         default=None,
         description="greatest displacement of a node in one step, m; set from the members where absent",

@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import SLACK_CURVATURE, UNBOUNDED, CurveNumbers, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import UNBOUNDED, CurveNumbers, StepNumbers, StepSolution, slack_curvature
 
 Array = NDArray[np.float64]
 
@@ -264,7 +264,7 @@ def _with_slacks(
     wide[:tip, size : size + tip], wide[:tip, size + tip :] = np.eye(tip), -np.eye(tip)
     larger = np.zeros((size + slacks, size + slacks))
     larger[:size, :size] = hessian
-    larger[size:, size:] = SLACK_CURVATURE * np.eye(slacks)
+    larger[size:, size:] = slack_curvature(penalty) * np.eye(slacks)
 
     def with_bounds(bounds: Array, of_slacks: float) -> Array:
         return np.concatenate([bounds[:size], np.full(slacks, of_slacks), bounds[size:]])

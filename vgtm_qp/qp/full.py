@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import SLACK_CURVATURE, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution, slack_curvature
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -151,7 +151,7 @@ class FullBuilder:
                 sparse.diags(np.full(sizes["position"], 0.0 if layout.hard_tracking else weights.tracking)),
                 sparse.diags(0.0 * layout.turn_weights if layout.hard_turns else layout.turn_weights),
                 sparse.diags(np.full(sizes["spacing"], weights.spacing)),
-                sparse.diags(np.full(sizes["slack"], SLACK_CURVATURE)),
+                sparse.diags(np.full(sizes["slack"], slack_curvature(weights.end_effector))),
                 np.ones((1, 1)),
             ],
             format="csc",

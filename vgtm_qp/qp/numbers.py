@@ -179,8 +179,17 @@ class StepSolution:
     tip_slack: float = 0.0
 
 
-SLACK_CURVATURE = 1e-6
-"""Curvature of the slacks of an elastic tip, for solvers of strictly convex QPs: their penalty itself is linear."""
+_SLACK_CURVATURE, _LEAST_PENALTY = 1e-5, 0.1
+
+
+def slack_curvature(penalty: float) -> float:
+    """Return the curvature of the slacks of an elastic tip, for solvers of strictly convex QPs.
+
+    Their penalty itself is linear. The curvature goes with it: a dual method starts at the slack of no constraints,
+    their ratio, whose rounding is what is left of the rows' accuracy.
+    """
+    return _SLACK_CURVATURE * max(penalty, _LEAST_PENALTY)
+
 
 SHORT_WAY = 0.01
 """A way of the tip, m, below which progress along it counts more, see :func:`progress_scale`."""

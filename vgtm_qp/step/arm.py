@@ -79,6 +79,8 @@ class Arm:
         Actuated members that lock later than at the start, and the times, s.
     base_motion : BaseMotion or None
         None where the base rests.
+    slow_approach : bool
+        Whether members slow down before they touch, and actuators before the ends of their strokes.
     measure : Clearance or None
         What the clearance of a state is measured with where the monitor does not see pairs of members.
     """
@@ -103,6 +105,7 @@ class Arm:
     solver: str = DEFAULT_SOLVER
     base_motion: BaseMotion | None = None
     jams: tuple[tuple[str, float], ...] = ()
+    slow_approach: bool = True
     measure: Clearance | None = None
 
     def least_clearance(self, X: Array, time: float, among: str = "all") -> float:
@@ -189,6 +192,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
         minimum_angle=clearance.minimum_angle,
         tip_mode=problem.end_effector.mode,
         base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
+        slow_approach=problem.method.slow_approach,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
         measure=None if clearance.self_collision else Clearance(truss.members, truss.radius, **options),
     )

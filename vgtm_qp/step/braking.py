@@ -83,6 +83,8 @@ class Brakes:
         Least and greatest lengths of the actuators, m, after a step from a state.
     target
         What a step is asked for: from a state along a path, from one of its values to another, within a box.
+    lengths
+        What closes the arm's lengths; it takes its time to be made, and few arms ever need it.
     """
 
     arm: Arm
@@ -90,6 +92,7 @@ class Brakes:
     dt: float
     box: Callable[[State], Box]
     target: Callable[[State, Path, float, float, Box], Target]
+    lengths: Callable[[], LengthSolver]
 
     def find(self, state: State, path: Path, value: float, piece: float) -> Braking | None:
         """Return the steps that bring the arm from `state` to where it may stay, or None where they were not found.
@@ -176,7 +179,7 @@ class Brakes:
         """Brake every actuator by itself, whatever becomes of the tip; none where faces must stay on the curve."""
         if self.arm.layout.hard_tracking:
             return None
-        solver = LengthSolver(self.arm.layout)
+        solver = self.lengths()
         return self._follow(
             state,
             lambda now, limits: self._released(now, limits, solver),

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from vgtm_qp.curve.redundancy import add_control_vertices, remove_control_vertic
 from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
+from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.step.arm import Arm, build_arm, reshaped
 from vgtm_qp.step.attempt import Attempt, Outcome
 from vgtm_qp.step.braking import Brakes, Braking
@@ -38,6 +40,10 @@ Array = NDArray[np.float64]
 
 _TRUST = 0.2
 """An actuator moves by no more than this times the part of the step that is tried, m, where the whole one failed."""
+
+_APPROACH, _STROKE_APPROACH, _LEAST_APPROACH = 0.4, 0.3, 2e-3
+"""Of the room to its least clearance a pair, and to the end of its stroke an actuator, may use this part in one step,
+or so much, m."""
 
 _SMALLEST_MOVING = 0.25
 """The least part of a piece of path that is tried by an arm that can brake instead."""
@@ -71,7 +77,14 @@ class Resolver:
                 raise ProblemError(str(problem.source or problem.name), mistakes)
             for excess in excess_of_freedom(problem, arm):
                 warnings.warn(f"{excess.key} = {excess.value}: {excess.expected}", stacklevel=2)
-        distances = Distances(arm.safe, arm.self_safe, arm.influence, arm.margin, arm.minimum_angle)
+        distances = Distances(
+            arm.safe,
+            arm.self_safe,
+            arm.influence,
+            arm.margin,
+            arm.minimum_angle,
+            approach=_APPROACH if self._slows_down else 1.0,
+        )
         self._separation = Separation(arm.truss, arm.monitor, distances)
         self._attempt = Attempt(arm.engine, arm.task, self._separation, tracking=_hard_tracking(arm))
         self.state = arm.home_state()
@@ -94,6 +107,11 @@ class Resolver:
     def phases(self) -> dict[str, float]:
         """Seconds spent so far in each phase."""
         return self._attempt.phases.seconds
+
+    @property
+    def _slows_down(self) -> bool:
+        """Whether pairs and actuators slow down before contacts and strokes: only a tip that may be late lets them."""
+        return self.arm.slow_approach and self.arm.tip_mode == "scaled"
 
     @property
     def locked(self) -> frozenset[str]:
@@ -318,7 +336,7 @@ class Resolver:
         dt = self._duration(dt)
         whole = self._until_jam(dt)
         dt *= whole
-        state, box = self.state, self._box(dt)
+        state, box = self.state, self._slowing(self._box(dt))
         braking = self._braking if self._braking is not None and self._braking.origin is state else None
         can_brake = braking is not None and bool(braking.steps) and whole == 1.0
         if can_brake:
@@ -429,6 +447,10 @@ class Resolver:
         step = Step(StepStatus.SLOWED, progress, self.state, reason, qps, *told)
         return replace(step, braked=True, left_path=not on_path)
 
+    @cached_property
+    def _length_solver(self) -> LengthSolver:
+        return LengthSolver(self.arm.layout)
+
     @property
     def _must_brake(self) -> bool:
         """Whether a moving arm cannot simply stay where it is: accelerations are limited."""
@@ -444,6 +466,7 @@ class Resolver:
             dt,
             lambda now: self._box(dt, now),
             lambda now, *piece_and_box: self._target_from(now, dt, *piece_and_box),
+            lambda: self._length_solver,
         )
         return brakes.find(state, path, value, piece)
 
@@ -460,6 +483,19 @@ class Resolver:
         state, actuators = state or self.state, self.arm.truss.actuators
         length, rate = state.lengths[actuators], state.length_rates[actuators]
         return length_box(length, rate, *self._limits, dt, state.duration or None)
+
+    def _slowing(self, box: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Return the part of the boxes (n_a,) within which actuators slow down before the ends of their strokes, m."""
+        if not self._slows_down or self._must_brake:
+            return box
+        length, stroke = self.state.lengths[self.arm.truss.actuators], self._limits[0]
+        down, up = (
+            np.maximum(_STROKE_APPROACH * room, np.minimum(room, _LEAST_APPROACH))
+            for room in (np.maximum(length - stroke[:, 0], 0.0), np.maximum(stroke[:, 1] - length, 0.0))
+        )
+        return np.maximum(box[0], np.minimum(length - down, box[1])), np.minimum(
+            box[1], np.maximum(length + up, box[0])
+        )
 
     def _target(self, path: Path, start: float, end: float, dt: float, box: tuple[Array, Array]) -> Target:
         return self._target_from(self.state, dt, path, start, end, box)

@@ -31,6 +31,9 @@ Shortfall = Mapping[Pair, float]
 _BINDING = 0.002
 """Pairs that are nearer than this to their floor, m, are asked of FCL too."""
 
+_LEAST_APPROACH = 2e-3
+"""A pair that slows down may come nearer by so much in one step all the same, m."""
+
 _MOST_PIECES = 16
 
 _NEAR_ANGLE = 0.3
@@ -45,7 +48,9 @@ class Distances:
     """What is kept: surface to surface from obstacles and between members, m, and angles between members, rad.
 
     The QP keeps `margin` more, m, for what is not linear in its step; pairs further than `influence`, m, are not
-    in it. A pair that is too near at the start of a step is driven apart by up to `recovery`, m, in one step.
+    in it. A pair that is too near at the start of a step is driven apart by up to `recovery`, m, in one step. A pair
+    may use up the part `approach` of its room in one step: where that is 1, members come at full speed and stop dead,
+    which is a jump in the rates of all actuators.
     """
 
     safe: float
@@ -54,6 +59,7 @@ class Distances:
     margin: float = 2e-4
     minimum_angle: float = 0.0
     recovery: float = 0.01
+    approach: float = 1.0
     rounding: float = 1e-10
 
 
@@ -145,7 +151,7 @@ class Separation:
         duration
             How long the obstacles move on until the end of the step, s; zero at the end. Where it is not, a zero
             step is allowed as far as the obstacles rest, but for the margin that the step before may have used up
-            and for what is to be recovered.
+            and for what is to be recovered; and pairs slow down before they touch.
         reach
             How far a node moves at most, m: a pair further from its floor than that cannot become active. One that
             was missed because a member moved further is found by the check of the new state, and corrected.
@@ -158,8 +164,7 @@ class Separation:
         fcl_reach = kept.safe + _BINDING if motion else 0.0
         watched = None if self._watch is None or short else self._watch.near(X, *limits, fcl_reach)
         if watched is not None:
-            rows = self._watched_rows(watched, motion=motion)
-            return rows.joined(self._angle_rows(X, motion=motion)) if len(self._corners) else rows
+            return self._with_angles(self._watched_rows(watched, motion=motion), X, motion=motion)
         pairs = self.monitor.near(
             X, time, limits[0], use_fcl=motion, fcl_reach=fcl_reach, self_reach=limits[1]
         )
@@ -177,6 +182,14 @@ class Separation:
                 rows.lower[k] = min(before + gain, least) - pairs.distance[k]
         if motion and self.monitor.pieces.moving:
             rows.lower += pairs.normal_speed * duration
+        return self._with_angles(rows, X, motion=motion)
+
+    def _with_angles(self, rows: ClearanceRows, X: Array, *, motion: bool) -> ClearanceRows:
+        """Return the rows of near pairs, slowing down where they are to move, and those of angles at `X`."""
+        if motion:
+            # Of the room that is left when the obstacles have moved: the arm need not flee from what only comes nearer.
+            slow = np.minimum(self.distances.approach * rows.lower, -_LEAST_APPROACH)
+            np.maximum(rows.lower, slow, out=rows.lower)
         return rows.joined(self._angle_rows(X, motion=motion)) if len(self._corners) else rows
 
     def _watched_rows(self, contacts: Contacts, *, motion: bool) -> ClearanceRows:
