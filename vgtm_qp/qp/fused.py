@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.condensed import FEASIBILITY, InfeasibleStepError, check_answer, refuse_large
-from vgtm_qp.qp.fused_graph import NEAR, Bound, row_function, settle_function
+from vgtm_qp.qp.fused_parts import Bound
+from vgtm_qp.qp.fused_rows import row_function
+from vgtm_qp.qp.fused_settle import NEAR, settle_function
 from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepSolution

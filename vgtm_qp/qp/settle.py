@@ -14,6 +14,13 @@ from scipy.linalg.lapack import dgesv, dposv
 Array = NDArray[np.float64]
 
 WORST_CONDITION = 1e8
+SETTLING_STEPS = 6
+SETTLED = 1e-11
+"""A tip this near to its goal gains nothing by being settled once more, m or rad."""
+
+LEFT = 1e-8
+"""A rest of the tip's way, m or rad, that is none."""
+
 AT_BOUND = 1e-6
 """An actuator nearer than this to a bound counts as held there, m."""
 

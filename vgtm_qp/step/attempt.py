@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.condensed import AnswerError, InfeasibleStepError
 from vgtm_qp.qp.fused import Closed
-from vgtm_qp.qp.fused_graph import LEFT
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.qp.settle import LEFT
 from vgtm_qp.step.engine import Accuracy, Engine, FusedEngine
 from vgtm_qp.step.linearise import Target
 from vgtm_qp.step.path import PathPoint

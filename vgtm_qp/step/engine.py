@@ -16,14 +16,14 @@ from scipy.linalg.lapack import dgesv
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.fused import Closed, FusedSolver, Taken, TipGoal
-from vgtm_qp.qp.fused_graph import NEAR, SETTLING_STEPS
+from vgtm_qp.qp.fused_settle import NEAR
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import FaceSolver, LengthSolver
 from vgtm_qp.qp.long.closing import MOST_STEPS
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
-from vgtm_qp.qp.settle import held, settling_gain
+from vgtm_qp.qp.settle import SETTLING_STEPS, held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.step.linearise import Linearisation, Target, base_frame
 from vgtm_qp.step.path import PathPoint
