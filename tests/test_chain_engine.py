@@ -18,7 +18,7 @@ from vgtm_qp.qp.long.values import PeriodValues
 from vgtm_qp.step import arm as arm_module
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import Accuracy, PlainEngine
-from vgtm_qp.step.linearise import Linearisation
+from vgtm_qp.step.linearise import Linearisation, QPInput
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, StepStatus
 from vgtm_qp.truss import modules
@@ -76,12 +76,10 @@ def test_both_engines_give_one_answer(name, vertices, hard, base):
     for motion, progress in ((True, 0.0), (False, 0.7), (True, 0.0)):
         goal = target.path.at(progress)
         at = Y if motion else X
-        free = plain.solve(X, at, points, target, goal, progress, rows, motion=motion)
-        pressed = rows if hard else pressing(rows, free)
-        answers = [
-            engine.solve(X, at, points, target, goal, progress, pressed, motion=motion)
-            for engine in (chain, plain)
-        ]
+        asked = QPInput(X, at, points, np.zeros(0), target, goal, progress, rows, motion)
+        free = plain.solve(asked)
+        pressed = asked if hard else asked._replace(rows=pressing(rows, free))
+        answers = [engine.solve(pressed) for engine in (chain, plain)]
         assert_same_answer(*answers)
         np.testing.assert_allclose(
             answers[0].clearance_multipliers, answers[1].clearance_multipliers, atol=1e-8
@@ -116,7 +114,9 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
     target = replace(target, path=path)
     ends = []
     for engine in (plain, chain):
-        answer = engine.solve(truss.home, truss.home, points, target, path.at(0.0), 0.0, rows, motion=True)
+        home = truss.home
+        asked = QPInput(home, home, points, np.zeros(0), target, path.at(0.0), 0.0, rows, True)
+        answer = engine.solve(asked)
         goal = path.at(max(answer.progress, 0.0))
         ends.append(engine.settle(truss.home + answer.nodes, target, goal, ACCURACY))
     if ends[0] is None:

@@ -16,7 +16,7 @@ from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.shape import CurveShape, turn_rows
 from vgtm_qp.qp.solvers import make_solver
 from vgtm_qp.step.engine import Accuracy, FusedEngine, PlainEngine
-from vgtm_qp.step.linearise import Linearisation, Target
+from vgtm_qp.step.linearise import Linearisation, QPInput, Target
 from vgtm_qp.step.path import Path, rotation_from_vector
 from vgtm_qp.truss.kinematics import Kinematics
 
@@ -128,12 +128,10 @@ def test_both_engines_give_one_answer(name, joint_offset, base):
     for motion, progress in ((True, 0.0), (False, 0.7)):
         goal = target.path.at(progress)
         at = Y if motion else X
-        free = plain.solve(X, at, vertices, target, goal, progress, rows, motion=motion)
+        asked = QPInput(X, at, vertices, np.zeros(0), target, goal, progress, rows, motion)
+        free = plain.solve(asked)
         pressed = pressing(rows, free)
-        answers = [
-            engine.solve(X, at, vertices, target, goal, progress, pressed, motion=motion)
-            for engine in (fused, plain)
-        ]
+        answers = [engine.solve(asked._replace(rows=pressed)) for engine in (fused, plain)]
         assert_same_answer(*answers)
         np.testing.assert_allclose(
             answers[0].clearance_multipliers, answers[1].clearance_multipliers, atol=1e-8
@@ -172,12 +170,10 @@ def test_both_engines_give_one_answer_on_every_curve(name, shape, family):
     target = replace(target, base_rotation=turn, vertex_goals=goals)
     full = PlainEngine(plain._linearisation, make_solver("piqp", layout))
     for motion, progress in ((True, 0.0), (False, 0.7)):
-        arguments = (X, Y if motion else X, vertices, target, target.path.at(progress), progress)
-        options = {"motion": motion, "torsion": torsion}
-        pressed = pressing(rows, plain.solve(*arguments, rows, **options))
-        found, wanted, other = (
-            engine.solve(*arguments, pressed, **options) for engine in (fused, plain, full)
-        )
+        goal = target.path.at(progress)
+        asked = QPInput(X, Y if motion else X, vertices, torsion, target, goal, progress, rows, motion)
+        pressed = asked._replace(rows=pressing(rows, plain.solve(asked)))
+        found, wanted, other = (engine.solve(pressed) for engine in (fused, plain, full))
         assert_same_answer(found, wanted)
         np.testing.assert_allclose(found.torsion, wanted.torsion, atol=1e-10)
         assert_same_answer(other, wanted, 3e-6)
@@ -192,8 +188,9 @@ def test_both_engines_keep_the_whole_pose_of_faces_on_the_curve(name):
     target = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0)
     torsion = np.array([0.05, -0.02])
     for motion in (True, False):
-        arguments = (X, Y if motion else X, vertices, target, target.path.at(0.0), 0.0, rows)
-        answers = [engine.solve(*arguments, motion=motion, torsion=torsion) for engine in (fused, plain)]
+        at, goal = Y if motion else X, target.path.at(0.0)
+        asked = QPInput(X, at, vertices, torsion, target, goal, 0.0, rows, motion)
+        answers = [engine.solve(asked) for engine in (fused, plain)]
         assert_same_answer(*answers, 1e-9)
     truss = layout.truss
     moved = X + answers[0].nodes

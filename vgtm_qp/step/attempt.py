@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.qp.settle import LEFT
 from vgtm_qp.step.engine import Accuracy, Engine, FusedEngine
-from vgtm_qp.step.linearise import Target
+from vgtm_qp.step.linearise import QPInput, Target
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.state import State, sealed
@@ -25,7 +25,7 @@ from vgtm_qp.step.tracking import HardTracking
 Array = NDArray[np.float64]
 
 
-_MOTION_MARGIN = 2.0
+_MOTION_MARGIN = 2.5
 """A member may move by so many times what is expected of it before a pair that matters can be missed."""
 
 _DEVIATION = 0.1
@@ -228,8 +228,8 @@ class Attempt:
             if not motion:
                 goal = target.path.at(target.start + progress * span)
             try:
-                at = (X, Y if motion else X, vertices, target, goal, progress, rows)
-                move = self._move(*at, motion=motion, torsion=torsion)
+                at = Y if motion else X
+                move = self._move(QPInput(X, at, vertices, torsion, target, goal, progress, rows, motion))
             except AnswerError as error:
                 return replace(outcome(str(error), count), solver_failed=True)
             except InfeasibleStepError:
@@ -266,36 +266,21 @@ class Attempt:
                 return outcome("clearance between the states", count)
         return outcome("no convergence", self.max_qps)
 
-    def _move(
-        self,
-        X: Array,
-        Y: Array,
-        vertices: Array,
-        target: Target,
-        goal: PathPoint,
-        progress: float,
-        rows: ClearanceRows,
-        *,
-        motion: bool,
-        torsion: Array,
-    ) -> _Move:
+    def _move(self, asked: QPInput) -> _Move:
         """Return where the answer of a QP leads, settled where that needs no other one."""
         if isinstance(self.engine, FusedEngine):
-            at = (X, Y, vertices, target, goal, progress, rows)
-            move = self._move_at_once(*at, motion=motion, torsion=torsion)
+            move = self._move_at_once(self.engine, asked)
             if move is not None:
                 return move
-        span = target.end - target.start
         try:
-            solution = self._solve(
-                X, Y, vertices, target, goal, progress, rows, motion=motion, torsion=torsion
-            )
+            solution = self._solve(asked)
         finally:
             self.phases.add("qp")
-        X = X + solution.nodes
+        target, goal, span = asked.target, asked.goal, asked.target.end - asked.target.start
+        X = asked.X + solution.nodes
         if target.base is not None:
             X = np.where(self.task.base[:, None], target.base, X)
-        progress = min(max(progress + solution.progress, 0.0), 1.0)
+        progress = min(max(asked.progress + solution.progress, 0.0), 1.0)
         if progress < 1.0:
             left = (1.0 - progress) * abs(span) * float(np.abs([goal.velocity, goal.spin]).max())
             if left <= LEFT:
@@ -306,14 +291,13 @@ class Attempt:
         if furthest < np.inf:
             then = target.path.at(target.start + progress * span)
             closed = self.engine.settle(X, target, then, self._accuracy)
-        curve = vertices + solution.vertices, torsion + solution.torsion
+        curve = asked.vertices + solution.vertices, asked.torsion + solution.torsion
         return _Move(solution, X, *curve, progress, furthest, closed)
 
-    def _move_at_once(self, *at: Any, motion: bool, torsion: Array) -> _Move | None:
+    def _move_at_once(self, engine: FusedEngine, asked: QPInput) -> _Move | None:
         """Return the same by one call after the QP; None where that does not serve."""
-        assert isinstance(self.engine, FusedEngine)
         try:
-            take = self.engine.ask(*at, motion=motion, torsion=torsion)
+            take = engine.ask(asked)
         except InfeasibleStepError:
             # Whether that is for the margin alone is found out where it can be left out.
             return None
@@ -321,31 +305,28 @@ class Attempt:
         if take is None:
             return None
         taken, accuracy = take(), self._accuracy
-        closed, solution = taken.closed, taken.solution
-        is_good = (
-            closed.error <= accuracy.member and taken.before <= accuracy.start and taken.after <= accuracy.tip
-        )
+        closed: Closed | None = taken.closed
+        if not (
+            taken.closed.error <= accuracy.member
+            and taken.before <= accuracy.start
+            and taken.after <= accuracy.tip
+        ):
+            closed = None
+        solution, torsion = taken.solution, asked.torsion
         turned = torsion + solution.torsion if len(torsion) else torsion
-        return _Move(
-            solution,
-            solution.nodes,
-            taken.vertices,
-            turned,
-            taken.progress,
-            taken.moved,
-            closed if is_good else None,
-        )
+        curve = taken.vertices, turned
+        return _Move(solution, solution.nodes, *curve, taken.progress, taken.moved, closed)
 
-    def _solve(self, *at: Any, motion: bool, torsion: Array) -> StepSolution:
+    def _solve(self, asked: QPInput) -> StepSolution:
         """Return the engine's answer; where even a zero step is forbidden by the margin, without the margin."""
-        rows = at[-1]
+        rows = asked.rows
         try:
-            return self.engine.solve(*at, motion=motion, torsion=torsion)
+            return self.engine.solve(asked)
         except InfeasibleStepError:
-            if not motion or not len(rows) or rows.lower.max() <= 0.0:
+            if not asked.motion or not len(rows) or rows.lower.max() <= 0.0:
                 raise
         np.minimum(rows.lower, 0.0, out=rows.lower)
-        return self.engine.solve(*at, motion=motion, torsion=torsion)
+        return self.engine.solve(asked)
 
     def _expected(self, target: Target, goal: PathPoint, guess: Array) -> float:
         """Return about how far a node moves in the step, m; anything where the arm was at rest."""

@@ -20,10 +20,10 @@ from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.long.values import PeriodValues
 from vgtm_qp.qp.long.working_set import RowNumbers
-from vgtm_qp.qp.numbers import ClearanceRows, StepSolution, progress_scale
+from vgtm_qp.qp.numbers import StepSolution, progress_scale
 from vgtm_qp.qp.settle import held
 from vgtm_qp.step.engine import Accuracy, LengthCloser, enough_length, enough_tip_error, within
-from vgtm_qp.step.linearise import Target
+from vgtm_qp.step.linearise import QPInput, Target
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.task import TipTask, worth_closing
 from vgtm_qp.truss.kinematics import Kinematics, frame_constants, frame_function
@@ -93,21 +93,10 @@ class ChainEngine:
             not layout.vertices or bool(truss.base[truss.faces[0]].all())
         )
 
-    def solve(
-        self,
-        X: Array,
-        Y: Array,
-        vertices: Array,
-        target: Target,
-        goal: PathPoint,
-        progress: float,
-        rows: ClearanceRows,
-        *,
-        motion: bool,
-        torsion: Array | None = None,  # noqa: ARG002
-    ) -> StepSolution:
+    def solve(self, asked: QPInput) -> StepSolution:
         """See ``engine.Engine``."""
         layout, truss, weights = self._layout, self._layout.truss, self._layout.weights
+        X, Y, vertices, _, target, goal, progress, rows, motion = asked
         moved = None if target.base is None else np.where(truss.base[:, None], target.base - X, 0.0)
         if layout.vertices:
             base = X if moved is None else X + moved

@@ -22,10 +22,10 @@ from vgtm_qp.qp.lengths import FaceSolver, LengthSolver
 from vgtm_qp.qp.long.closing import MOST_STEPS
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 from vgtm_qp.qp.settle import SETTLING_STEPS, held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
-from vgtm_qp.step.linearise import Linearisation, Target, base_frame
+from vgtm_qp.step.linearise import Linearisation, QPInput, Target, base_frame
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.truss.kinematics import Kinematics
 
@@ -52,20 +52,8 @@ class Accuracy:
 class Engine(Protocol):
     """Solves the QP of a step and closes the lengths."""
 
-    def solve(
-        self,
-        X: Array,
-        Y: Array,
-        vertices: Array,
-        target: Target,
-        goal: PathPoint,
-        progress: float,
-        rows: ClearanceRows,
-        *,
-        motion: bool,
-        torsion: Array | None = None,
-    ) -> StepSolution:
-        """Return the QP's answer at `X` (N, 3) with Jacobians at `Y`; raise ``SolverError`` instead of a wrong one."""
+    def solve(self, asked: QPInput) -> StepSolution:
+        """Return the QP's answer; raise ``SolverError`` instead of a wrong one."""
         ...
 
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
@@ -211,30 +199,24 @@ class PlainEngine:
         self._vertices: Array = np.zeros((0, 3))
         self._strokes: Array = np.zeros(0)
 
-    def solve(
-        self,
-        X: Array,
-        Y: Array,
-        vertices: Array,
-        target: Target,
-        goal: PathPoint,  # noqa: ARG002
-        progress: float,
-        rows: ClearanceRows,
-        *,
-        motion: bool,
-        torsion: Array | None = None,
-    ) -> StepSolution:
+    def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
-        at = None if Y is X else Y
         numbers = self._linearisation.numbers(
-            X, vertices, target, progress, rows, motion=motion, at=at, torsion=torsion
+            asked.X,
+            asked.vertices,
+            asked.target,
+            asked.progress,
+            asked.rows,
+            motion=asked.motion,
+            at=None if asked.Y is asked.X else asked.Y,
+            torsion=asked.torsion,
         )
         solution = self._solver.solve(numbers)
         lengths = self._linearisation.kinematics.lengths[self._linearisation.layout.truss.actuators]
         self._strokes = lengths + solution.actuators
         # The kinematics overwrites its gradients at the next configuration.
         self._last = replace(numbers, gradient=numbers.gradient.copy()), solution
-        self._vertices = vertices + solution.vertices
+        self._vertices = asked.vertices + solution.vertices
         return solution
 
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
@@ -318,76 +300,42 @@ class FusedEngine:
         """Return the engine for a layout that differs in the control vertices with goals alone."""
         return FusedEngine(self._solver.drawn(layout))
 
-    def solve(
-        self,
-        X: Array,
-        Y: Array,
-        vertices: Array,
-        target: Target,
-        goal: PathPoint,
-        progress: float,
-        rows: ClearanceRows,
-        *,
-        motion: bool,
-        torsion: Array | None = None,
-    ) -> StepSolution:
+    def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
-        self._load(X, Y, vertices, target, goal, progress, torsion, motion=motion)
-        return self._solver.solve(rows)
+        self._load(asked)
+        return self._solver.solve(asked.rows)
 
-    def _load(
-        self,
-        X: Array,
-        Y: Array,
-        vertices: Array,
-        target: Target,
-        goal: PathPoint,
-        progress: float,
-        torsion: Array | None,
-        *,
-        motion: bool,
-    ) -> None:
+    def _load(self, asked: QPInput) -> None:
         solver, shape = self._solver, self._solver.layout.general
-        curve, span = None, target.end - target.start
+        target, goal, curve = asked.target, asked.goal, None
+        span = target.end - target.start
         if shape is not None:
             frame = base_frame(solver.layout.truss, target.base_rotation)
-            curve = shape.rows(vertices, np.zeros(0) if torsion is None else torsion, frame)
+            curve = shape.rows(asked.vertices, asked.torsion, frame)
         solver.load(
-            X,
-            Y,
-            vertices,
+            asked.X,
+            asked.Y,
+            asked.vertices,
             target.lower,
             target.upper,
             TipGoal(goal.position, goal.rotation, goal.velocity * span, goal.spin * span),
-            progress,
-            motion=motion,
+            asked.progress,
+            motion=asked.motion,
             base=target.base,
             curve=curve,
             goals=target.vertex_goals,
         )
 
-    def ask(
-        self,
-        X: Array,
-        Y: Array,
-        vertices: Array,
-        target: Target,
-        goal: PathPoint,
-        progress: float,
-        rows: ClearanceRows,
-        *,
-        motion: bool,
-        torsion: Array | None = None,
-    ) -> Callable[[], Taken] | None:
+    def ask(self, asked: QPInput) -> Callable[[], Taken] | None:
         """Solve the QP as :meth:`solve` does; return what checks the answer and settles where it leads.
 
         None where that is not one call: the path turns within the step, the base moves, or too many rows are near.
         """
-        near = len(rows)
+        near, target = len(asked.rows), asked.target
         if near > NEAR or target.base is not None or not target.path.is_straight(target.start, target.end):
             return None
-        self._load(X, Y, vertices, target, goal, progress, torsion, motion=motion)
-        answer = self._solver.ask(rows)
+        self._load(asked)
+        answer = self._solver.ask(asked.rows)
         return lambda: self._solver.take(answer, near)
 
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:

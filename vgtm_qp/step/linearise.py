@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from vgtm_qp.geometry.clearance import Clearance, NearPairs
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers, progress_scale
 from vgtm_qp.qp.shape import turn_rows
-from vgtm_qp.step.path import Path
+from vgtm_qp.step.path import Path, PathPoint
 from vgtm_qp.step.task import TipTask, worth_closing
 from vgtm_qp.truss.kinematics import Kinematics
 from vgtm_qp.truss.truss import Truss
@@ -49,6 +50,38 @@ class Target:
     base: Array | None = None
     base_rotation: Array | None = None
     vertex_goals: Array | None = None
+
+
+class QPInput(NamedTuple):
+    """What the QP of a step is linearised at and asked for.
+
+    Attributes
+    ----------
+    X : (N, 3)
+        Node positions where residuals are taken, m.
+    Y : (N, 3)
+        Those where Jacobians are; `X` itself for a correction.
+    vertices, torsion : (V, 3), (T,)
+        The curve, m and rad.
+    target : Target
+    goal : PathPoint
+        The tip's, at `progress`.
+    progress : float
+        How much of the target's piece of path lies behind the tip, 0 to 1.
+    rows : ClearanceRows
+    motion : bool
+        Whether it moves the arm; a correction returns to the constraints on the shortest way.
+    """
+
+    X: Array
+    Y: Array
+    vertices: Array
+    torsion: Array
+    target: Target
+    goal: PathPoint
+    progress: float
+    rows: ClearanceRows
+    motion: bool
 
 
 class Linearisation:
