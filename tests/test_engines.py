@@ -181,6 +181,40 @@ def test_both_engines_give_one_answer_on_every_curve(name, shape, family):
         assert np.any(wanted.torsion) == bool(layout.torsion)
 
 
+@pytest.mark.parametrize("name", ["octahedral", "longeron"])
+def test_both_engines_hold_faces_on_the_curve_where_these_determine_the_nodes(name):
+    truss = TRUSSES[name]()
+    kinematics = Kinematics(truss)
+    layout, task = make_layout(truss, kinematics, ("position",), vertices=5)
+    layout = replace(layout, hard_tracking=True)
+    plain = PlainEngine(
+        Linearisation(layout, kinematics, task, truss.home_lengths), make_solver("daqp", layout)
+    )
+    fused = FusedEngine(FusedSolver(layout, elimination_stages(layout)))
+    X = truss.home
+    kinematics.evaluate(X)
+    lengths, here = kinematics.lengths[truss.actuators].copy(), kinematics.tip_position(X)
+    rotation = np.stack([kinematics.tip_rotation] * 2)
+    path = Path(np.array([0.0, 1.0]), here + np.outer([0.0, 1.0], [0.02, 0.01, -0.015]), rotation)
+    target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
+    centres = kinematics.face_centres(X)[[0, *layout.tracked]]
+    vertices = np.linspace(0, 1, layout.vertices)[:, None] * (centres[-1] - centres[0]) + centres[0]
+    asked = QPInput(X, X, vertices, np.zeros(0), target, path.at(0.0), 0.0, ClearanceRows(), True)
+    closed = []
+    for engine in (fused, plain):
+        answer = engine.solve(asked)
+        goal = path.at(answer.progress)
+        closed.append(engine.settle(X + answer.nodes, target, goal, Accuracy(1e-10, 1e-8, 1e-2)))
+        kinematics.evaluate(closed[-1].X)
+        gap = kinematics.face_centres(closed[-1].X)[layout.tracked]
+        gap -= layout.curve_weights @ (vertices + answer.vertices)
+        assert np.abs(gap).max() < 1e-12
+        assert np.abs(answer.nodes).max() > 0.01
+    np.testing.assert_allclose(closed[0].X, closed[1].X, atol=1e-10)
+    take = fused.ask(asked)
+    np.testing.assert_allclose(take().closed.X, closed[0].X, atol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["hexapod", "tetrahedral-123", "tetrahedral-23"])
 def test_both_engines_keep_the_whole_pose_of_faces_on_the_curve(name):
     layout, kinematics, plain, fused = engines(name, vertices=6, track=("z",), shape="torsion", hard=True)

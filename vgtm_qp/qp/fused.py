@@ -75,7 +75,7 @@ class Taken(NamedTuple):
     Attributes
     ----------
     solution : StepSolution
-        Whose ``nodes`` are positions, not displacements, m.
+        Whose ``nodes`` and ``vertices`` are positions, not displacements, m.
     closed : Closed
         With the tip at its goal.
     vertices : (V, 3)
@@ -294,11 +294,12 @@ class FusedSolver:
         return Taken(solution, closed, vertices, progress, moved, before, after)
 
     def settle(
-        self, X: Array, lower: Array, upper: Array, position: Array, rotation: Array
+        self, X: Array, vertices: Array, lower: Array, upper: Array, position: Array, rotation: Array
     ) -> tuple[Closed, float, float]:
         """Return `X` (N, 3) with its lengths closed, actuators in their boxes (n_a,), m, and its tip at a pose.
 
-        Beside it stand the tip's errors before and after settling, m and rad.
+        `vertices` (V, 3), m, are the curve that faces are held on with hard tracking. Beside the configuration stand
+        the tip's errors before and after settling, m and rad.
         """
         inputs = self._settled.inputs
         inputs[0][:] = X.reshape(-1)
@@ -306,6 +307,7 @@ class FusedSolver:
         inputs[2][:] = upper
         inputs[3][:] = position
         inputs[4][:] = rotation.T.reshape(-1)
+        inputs[14][:] = vertices.reshape(-1)
         self._settle(0.0)
         error, before, after = self._settled.outputs[5].tolist()[:3]
         return self._closed(error), before, after

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from vgtm_qp.qp.fused_parts import TINY, Bound, Symbols, tip_error, tip_frames
-from vgtm_qp.qp.graph import Stage, TrussGraph
+from vgtm_qp.qp.graph import Stage, TrussGraph, stage_faces
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.settle import AT_BOUND, LEFT, SETTLED, SETTLING_STEPS, WORST_CONDITION
 
 NEAR = 24
 """Clearance rows of a QP whose answer is checked by the compiled function; those of more are checked without it."""
+
+_HELD_STEPS = 4
 
 
 def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
@@ -21,7 +24,8 @@ def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
     progress; progress so far; results 0 to 3, 6 and 7 of `row_function`, with the tip rows and bounds followed by those
     of hard tracking and of ``NEAR`` clearances; p (3, V); Hessian and gradient; the QP's answer and multipliers;
     (n_a, n_a) Gram matrix of the weighted node displacements in R; and 1 where the answer is to be taken, 0 where X is
-    what is to be settled at the goal given.
+    what is to be settled at the goal given. With hard tracking the faces are held on the curve instead, where they and
+    the fixed members determine the nodes: the tip then is where the curve ends.
 
     Results: X, whose fixed members have their home lengths and whose actuators are in their boxes; lengths there; tip
     position; tip rotation; p; and (7) error of the lengths and of the tip before the gain of :mod:`vgtm_qp.qp.settle`
@@ -30,6 +34,8 @@ def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
     """
     symbols, truss = Symbols(layout), layout.truss
     graph = TrussGraph(layout, stages, symbols.constants)
+    is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
+    faces = stage_faces(layout, stages) if is_plain else None
     frames = tip_frames(layout, symbols.constants) if layout.has_tip_frame else None
     goal, turned = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
     velocity, spin, progress = ca.MX.sym("velocity", 3), ca.MX.sym("spin", 3), ca.MX.sym("progress")
@@ -67,6 +73,17 @@ def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
         lengths, gradients = graph.lengths(X)
         return graph.newton(X, aims(lengths), lengths, gradients)
 
+    def on_curve(X: ca.MX, faces: NDArray[np.int64]) -> ca.MX:
+        points = vertices_after @ symbols.constants.add("curve_weights", layout.curve_weights)
+        for _ in range(_HELD_STEPS):
+            lengths, gradients = graph.lengths(X)
+            centres = (
+                X[:, truss.faces[face].tolist()] @ ca.DM(truss.face_weights[face]) for face in layout.tracked
+            )
+            gaps = points - ca.horzcat(*centres)
+            X = graph.newton_on_faces(X, symbols.home_lengths, lengths, gradients, gaps, faces)
+        return X
+
     def tip(X: ca.MX) -> tuple[ca.MX, ca.MX]:
         position = X[:, truss.tip.tolist()] @ ca.DM(truss.tip_weights)
         return position, ca.MX.eye(3) if frames is None else frames.at(X)[0]
@@ -80,8 +97,16 @@ def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
     gone = taken * (reached - progress)
     goal_position, goal_rotation = goal + gone * velocity, _turned(gone * spin) @ turned
 
+    if layout.vertices:
+        free_curve = answer[count : size - 1 - layout.torsion]
+        change = ca.horzcat(
+            ca.MX.zeros(3), free_curve[0] * normal, ca.reshape(free_curve[1:], 3, layout.vertices - 2)
+        )
+        vertices_after = vertices + taken * (offset + change)
+    else:
+        vertices_after = vertices
     start = symbols.X + spread(moved)
-    X = closed(closed(start))
+    X = closed(closed(start)) if faces is None else on_curve(start, faces)
     first = error = tip_error(layout.tip_rows, *tip(X), goal_position, goal_rotation)
     if not layout.hard_rows:
         free = ca.logic_and(chosen > low[:count] + AT_BOUND, chosen < high[:count] - AT_BOUND)
@@ -107,14 +132,6 @@ def settle_function(layout: Layout, stages: list[Stage]) -> Bound:
     position, rotation = tip(X)
     lengths, _ = graph.lengths(X)
 
-    if layout.vertices:
-        free_curve = answer[count : size - 1 - layout.torsion]
-        change = ca.horzcat(
-            ca.MX.zeros(3), free_curve[0] * normal, ca.reshape(free_curve[1:], 3, layout.vertices - 2)
-        )
-        vertices_after = vertices + taken * (offset + change)
-    else:
-        vertices_after = vertices
     values = ca.vertcat(answer, constraint.T @ answer)
     beyond = ca.fmax(ca.fmax(values - high, low - values), 0.0)
     stationarity = hessian @ answer + gradient + multipliers[:size] + constraint @ multipliers[size:]

@@ -154,19 +154,52 @@ class TrussGraph:
 
     def newton(self, X: ca.MX, wanted: ca.MX, lengths: ca.MX, gradients: ca.MX) -> ca.MX:
         """Return positions (3, N) after one Newton step of the free nodes to `wanted` lengths (M, 1)."""
-        truss = self.layout.truss
         error = wanted - lengths
-        place: dict[int, ca.MX] = {}
-        for k, stage in enumerate(self.stages):
+        blocks = [self.blocks(k, gradients) for k in range(len(self.stages))]
+        return X + self._substituted(blocks, [error[stage.members.tolist()] for stage in self.stages])
+
+    def newton_on_faces(
+        self, X: ca.MX, wanted: ca.MX, lengths: ca.MX, gradients: ca.MX, gaps: ca.MX, faces: Index
+    ) -> ca.MX:
+        """Return positions after a Newton step to `wanted` lengths of fixed members and faces moved by `gaps` (3, K).
+
+        `faces` (stages,) are those of :func:`stage_faces`; actuated members take the lengths that follow.
+        """
+        truss, error = self.layout.truss, wanted - lengths
+        tracked = self.layout.tracked.tolist()
+        blocks, rhs = [], []
+        for k, (stage, face) in enumerate(zip(self.stages, faces.tolist(), strict=True)):
+            fixed = np.flatnonzero(~truss.actuated[stage.members]).tolist()
             D, L = self.blocks(k, gradients)
-            rhs = error[stage.members.tolist()]
+            weight = dict(zip(truss.faces[face].tolist(), truss.face_weights[face], strict=True))
+            centre = ca.sparsify(ca.DM(np.kron([weight[int(n)] for n in stage.nodes], np.eye(3))))
+            blocks.append((ca.vertcat(D[fixed, :], centre), ca.vertcat(L[fixed, :], ca.MX(3, L.size2()))))
+            rhs.append(ca.vertcat(error[stage.members[fixed].tolist()], gaps[:, tracked.index(face)]))
+        return X + self._substituted(blocks, rhs)
+
+    def _substituted(self, blocks: list[tuple[ca.MX, ca.MX]], rhs: list[ca.MX]) -> ca.MX:
+        """Return displacements (3, N) of all nodes: each stage's blocks D and L place its nodes after earlier ones."""
+        place: dict[int, ca.MX] = {}
+        for stage, (D, L), right in zip(self.stages, blocks, rhs, strict=True):
             if len(stage.earlier):
-                rhs = rhs - L @ ca.vertcat(*(place[int(node)] for node in stage.earlier))
-            step = self._solver(D.sparsity(), 1)(D, rhs)
+                right = right - L @ ca.vertcat(*(place[int(node)] for node in stage.earlier))
+            step = self._solver(D.sparsity(), 1)(D, right)
             for j, node in enumerate(stage.nodes):
                 place[int(node)] = step[3 * j : 3 * j + 3]
         zero = ca.DM.zeros(3)
-        return X + ca.horzcat(*(place.get(node, zero) for node in range(truss.node_count)))
+        return ca.horzcat(*(place.get(node, zero) for node in range(self.layout.truss.node_count)))
+
+
+def stage_faces(layout: Layout, stages: list[Stage]) -> Index | None:
+    """Return the tracked face of each stage where its place determines the stage's nodes with the fixed members.
+
+    None where that is not so: a face's three coordinates must stand for three actuated members.
+    """
+    truss = layout.truss
+    nodes_of = {frozenset(truss.faces[face].tolist()): int(face) for face in layout.tracked}
+    faces = [nodes_of.get(frozenset(stage.nodes.tolist()), -1) for stage in stages]
+    three = all(int(truss.actuated[stage.members].sum()) == 3 for stage in stages)
+    return np.array(faces) if three and min(faces) >= 0 and len(faces) == len(layout.tracked) else None
 
 
 class Constants:

@@ -17,11 +17,11 @@ from scipy.linalg.lapack import dgesv
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.fused import Closed, FusedSolver, Taken, TipGoal
 from vgtm_qp.qp.fused_settle import NEAR
+from vgtm_qp.qp.graph import elimination_stages, stage_faces
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import FaceSolver, LengthSolver
 from vgtm_qp.qp.long.closing import MOST_STEPS
 from vgtm_qp.qp.long.staged import StagedSolver
-from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 from vgtm_qp.qp.settle import SETTLING_STEPS, held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
@@ -194,7 +194,7 @@ class PlainEngine:
         self._solver = solver
         arm = linearisation.layout, linearisation.kinematics, linearisation.home_lengths
         self._lengths = LengthCloser(*arm)
-        self._faces = CurveCloser(*arm) if isinstance(solver, TrackedSolver) else None
+        self._faces = CurveCloser(*arm) if _holds_faces(linearisation.layout) else None
         self._last: tuple[StepNumbers, StepSolution] | None = None
         self._vertices: Array = np.zeros((0, 3))
         self._strokes: Array = np.zeros(0)
@@ -277,6 +277,13 @@ class PlainEngine:
         return None if gain is None else every @ gain
 
 
+def _holds_faces(layout: Layout) -> bool:
+    """Whether faces that are held on the curve determine the nodes with the fixed members."""
+    is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
+    stages = elimination_stages(layout) if is_plain else None
+    return stages is not None and stage_faces(layout, stages) is not None
+
+
 class ElasticEngine(PlainEngine):
     """A tip that may leave its path at an exact penalty: there it is where the QP puts it."""
 
@@ -295,6 +302,7 @@ class FusedEngine:
 
     def __init__(self, solver: FusedSolver) -> None:
         self._solver = solver
+        self._vertices = np.zeros((solver.layout.vertices, 3))
 
     def drawn(self, layout: Layout) -> FusedEngine:
         """Return the engine for a layout that differs in the control vertices with goals alone."""
@@ -303,7 +311,9 @@ class FusedEngine:
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
         self._load(asked)
-        return self._solver.solve(asked.rows)
+        solution = self._solver.solve(asked.rows)
+        self._vertices = asked.vertices + solution.vertices
+        return solution
 
     def _load(self, asked: QPInput) -> None:
         solver, shape = self._solver, self._solver.layout.general
@@ -341,7 +351,7 @@ class FusedEngine:
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
         closed, before, after = self._solver.settle(
-            X, target.lower, target.upper, goal.position, goal.rotation
+            X, self._vertices, target.lower, target.upper, goal.position, goal.rotation
         )
         if closed.error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip:
             return closed
