@@ -180,7 +180,7 @@ def _localised(basis: Array) -> Array:
 
 def _name_motion(truss: Truss, motion: Array) -> str:
     size = np.linalg.norm(motion, axis=1)
-    order = [int(i) for i in np.argsort(-size, kind="stable") if size[i] > 1e-6 * size.max()]
+    order = [int(i) for i in _from_largest(size) if size[i] > 1e-6 * size.max()]
     names = [f"node {truss.node_names[truss.free[i]]} along {_direction(motion[i])}" for i in order[:_NAMED]]
     return _listed(names, len(order), "nodes")
 
@@ -191,10 +191,15 @@ def _direction(vector: Array) -> str:
 
 
 def _name_members(truss: Truss, stress: Array) -> str:
-    order = [int(k) for k in np.argsort(-np.abs(stress), kind="stable") if abs(stress[k]) > 1e-6]
+    order = [int(k) for k in _from_largest(np.abs(stress)) if abs(stress[k]) > 1e-6]
     return _listed([truss.member_names[k] for k in order[:_NAMED]], len(order), "members")
 
 
 def _listed(names: list[str], count: int, what: str) -> str:
     more = f" and {count - len(names)} more {what}" if count > len(names) else ""
     return ", ".join(names) + more
+
+
+def _from_largest(size: Array) -> NDArray[np.int64]:
+    """Return the indices of `size` (K,) from the largest on; what differs by rounding alone stays in order."""
+    return np.argsort(-np.round(size / max(float(size.max(initial=0.0)), 1e-300), 9), kind="stable")
