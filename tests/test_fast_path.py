@@ -1,0 +1,43 @@
+"""The compiled step with its watch on near pairs, beside the plain one with neither: one step, to 1e-10."""
+
+import numpy as np
+import pytest
+
+import vgtm_qp as vq
+from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.engine import FusedEngine, PlainEngine
+
+SCENES = [
+    ("five_bay_two_cubes", {}),
+    ("five_bay_two_cubes", {"method.hard_tracking": True}),
+    ("five_bay_two_cubes", {"method.slow_approach": False}),
+    ("five_bay_two_cubes_pointing", {}),
+    ("tetrahedral_truss_circle", {}),
+]
+
+
+@pytest.mark.parametrize(("name", "changes"), SCENES)
+def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, changes):
+    problem = vq.load_problem(name).replace(changes)
+    fast, plain = vq.Resolver(problem), vq.Resolver(build_arm(problem, compiled=False))
+    assert isinstance(fast.arm.engine, FusedEngine)
+    assert isinstance(plain.arm.engine, PlainEngine)
+    watched = fast._separation._watch is not None
+    assert watched == (fast.arm.monitor.self_collision or bool(problem.obstacle))
+    plain._separation._watch = None
+    plan = make_plan(problem, *fast.tip())
+    value, compared, furthest = plan.path.start, 0, 0.0
+    for mark in plan.marks.tolist():
+        plain.state = fast.state
+        steps = [one.follow(plan.path, value, mark, dt=mark - value) for one in (fast, plain)]
+        if vq.StepStatus.BLOCKED in {step.status for step in steps}:
+            break
+        assert steps[0].qps == pytest.approx(steps[1].qps, abs=1)
+        if steps[0].qps == steps[1].qps:
+            compared += 1
+            apart = np.abs(steps[0].state.nodes - steps[1].state.nodes).max()
+            furthest = max(furthest, float(apart))
+        value += steps[0].progress * (mark - value)
+    assert compared >= 20
+    assert furthest < 1e-10
