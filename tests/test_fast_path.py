@@ -13,7 +13,9 @@ SCENES = [
     ("five_bay_two_cubes", {"method.hard_tracking": True}),
     ("five_bay_two_cubes", {"method.slow_approach": False}),
     ("five_bay_two_cubes_pointing", {}),
-    ("tetrahedral_truss_circle", {}),
+    ("hexapod_past_a_cube", {}),
+    ("longeron_past_a_cube", {}),
+    ("tetrahedral_past_a_cube", {}),
 ]
 
 
