@@ -295,3 +295,24 @@ def test_a_small_rest_of_a_piece_is_covered_with_the_next_one_but_for_the_last(v
 @pytest.mark.parametrize(("value", "aim"), [(0.0, 1.0), (0.5, 1.5), (0.96, 2.0), (3.4, 4.0)])
 def test_an_arm_that_keeps_moving_aims_a_whole_piece_ahead(value, aim):
     assert plan().next_mark(value, keeps_moving=True) == (aim, 1.0)
+
+
+def test_a_curve_that_changes_while_the_arm_moves_leaves_it_able_to_brake():
+    resolver = vq.Resolver(problem(0.1))
+    tip, _ = resolver.tip()
+    for _ in range(8):
+        resolver.step(position=[0.6, 0.0, 2.0], dt=0.2)
+    assert resolver._braking.steps
+    resolver.set_control_vertices(7)
+    assert {len(state.control_vertices) for state, _ in resolver._braking.steps} == {7}
+    step = resolver.step(position=tip, dt=0.2)
+    assert step.status is vq.StepStatus.SLOWED
+    assert step.braked
+
+
+def test_a_step_too_short_to_rest_in_says_so():
+    resolver = vq.Resolver(problem(0.1))
+    resolver.step(position=[0.6, 0.0, 2.0], dt=0.2)
+    step = resolver.step(position=[0.6, 0.0, 2.0], dt=0.002)
+    if step.status is vq.StepStatus.BLOCKED:
+        assert "less than the last step took" in step.reason

@@ -14,7 +14,6 @@ SCENES = [
     ("five_bay_two_cubes", {"method.slow_approach": False}),
     ("five_bay_two_cubes_pointing", {}),
     ("hexapod_past_a_cube", {}),
-    ("longeron_past_a_cube", {}),
     ("tetrahedral_past_a_cube", {}),
 ]
 

@@ -716,3 +716,32 @@ def test_an_unknown_solver_and_a_serial_arm_are_refused_with_their_place(crate_p
     with pytest.raises(ProblemError, match=r"truss\.module"):
         Resolver(arm_problem(truss={"module": "plate", "rows": 4, "columns": 3, "bays": None}))
     assert issubclass(ProblemError, VgtmError)
+
+
+@pytest.mark.parametrize("dt", ["soon", np.nan, np.inf, 0.0, -1.0, 1e300, 1e-300])
+def test_a_duration_that_is_none_is_refused(dt):
+    resolver = Resolver(arm_problem(bays=2))
+    before = resolver.state
+    with pytest.raises(vq.GoalError, match="dt must be a positive number of seconds"):
+        resolver.step(position=[0.0, 0.0, 1.5], dt=dt)
+    assert resolver.state is before
+
+
+def test_a_state_of_another_curve_is_refused():
+    resolver = Resolver(arm_problem(bays=3))
+    before = resolver.state
+    resolver.set_control_vertices(len(before.control_vertices) + 2)
+    with pytest.raises(vq.GoalError, match="control vertices; the arm has"):
+        resolver.state = before
+
+
+def test_goals_of_control_vertices_that_come_and_go_in_clutter_leave_one_set_of_bounds():
+    """What grows with the rows of one curve's QP must grow for the other that shares its compiled functions."""
+    problem = vq.load_problem("five_bay_two_cubes")
+    resolver = Resolver(problem)
+    tip, _ = resolver.tip()
+    for k in range(24):
+        resolver.set_control_vertex_goal(4, [0.1, 0.0, 3.0] if k % 6 < 3 else None)
+        resolver._attempt.engine._solver._reserve(80 + 7 * k)
+        step = resolver.step(position=tip + (k + 1) * np.array([0.032, 0.0, -0.0156]), dt=0.2)
+        assert step.status is vq.StepStatus.REACHED, (k, step)

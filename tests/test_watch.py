@@ -147,3 +147,39 @@ def test_scenes_that_it_serves():
     assert not Watch.serves(monitor(self_collision=False))
     assert not Watch.serves(monitor(ball, ends=lambda X: X[np.array(MEMBERS)]))
     assert not Watch.serves(monitor(members=[(k, k + 1) for k in range(200)]))
+
+
+def test_a_pair_whose_centres_coincide_at_first_is_watched_like_every_other():
+    """A bound that multiplies the distance of the centres by an infinite reach is no number there."""
+    ball = sphere("ball", [0.0, 0.0, 0.5], 0.05)
+    members = [(0, 1), (2, 3)]
+    monitor = Clearance(members, 0.03, [ball], safe=0.08, influence=0.5)
+    X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [-0.5, 0.0, 0.5], [0.5, 0.0, 0.5]])
+    watch = Watch(monitor)
+    assert watch.near(X, 0.3, 0.3, 0.0) is None
+    clear = X + np.array([[0.0, 0.5, 0.0]] * 2 + [[0.0, -0.5, 0.0]] * 2)
+    watch.near(clear, 0.6, 1.2, 0.0)
+    found = watch.near(clear, 0.6, 1.2, 0.0)
+    assert sorted(found.is_self.tolist()) == [False, False, True]
+    assert not watch.follow(clear, X, 0.08, 0.02)
+    assert len(monitor.every_pair(X).groups[0]) == 2
+
+
+def test_members_that_all_meet_at_one_node_have_nothing_to_watch():
+    monitor = Clearance([(0, 3), (1, 3), (2, 3)], 0.03, [], safe=0.08, influence=0.5)
+    X = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    watch = Watch(monitor)
+    assert not len(watch.near(X, 0.5, 0.5, 0.0).distance)
+    assert watch.follow(X, X + 0.1 * FORWARD, 0.08, 0.02)
+    with pytest.raises(GeometryError):
+        watch.follow(X, np.full(X.shape, np.nan), 0.08, 0.02)
+
+
+@pytest.mark.parametrize("floor", [-0.05, -0.001, 0.0])
+def test_floors_below_zero_are_those_of_surfaces_that_overlap_already(floor):
+    wall = box("wall", [1.0, 0.0, 0.0], [0.1, 4.0, 4.0])
+    monitor = Clearance([(0, 1), (1, 2)], 0.03, [wall], safe=0.08, influence=0.5, self_collision=False)
+    X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]) + 0.93 * FORWARD
+    watch = Watch(monitor)
+    assert not watch.follow(X, X + 0.2 * FORWARD, floor, floor)
+    assert watch.follow(X - 0.2 * FORWARD, X - 0.1 * FORWARD, floor, floor)

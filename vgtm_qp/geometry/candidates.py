@@ -86,6 +86,8 @@ def _near_pieces(
     counts = np.fromiter((len(f) for f in found), dtype=np.int64, count=len(found))
     piece = np.repeat(np.arange(len(found)), counts)
     member = np.fromiter((m for f in found for m in f), dtype=np.int64, count=int(counts.sum()))
+    if np.isinf(horizon):
+        return member, piece
     way = middle[member] - centers[piece]
     apart = np.sqrt(np.einsum("kc,kc->k", way, way))
     span = np.abs(np.einsum("kc,kc->k", way, half[member]))
@@ -100,11 +102,13 @@ def _near_members(middle: Array, half: Array, members: Members, horizon: float) 
     longest = float(np.max(np.linalg.norm(half, axis=1) + radius))
     pairs = cKDTree(middle).query_pairs(2.0 * longest + horizon, output_type="ndarray").astype(np.int64)
     first, second = pairs[:, 0], pairs[:, 1]
-    way = middle[first] - middle[second]
-    apart = np.sqrt(np.einsum("kc,kc->k", way, way))
-    span = np.abs(np.einsum("kc,kc->k", way, half[first])) + np.abs(np.einsum("kc,kc->k", way, half[second]))
-    near = apart * (apart - radius[first] - radius[second] - horizon) <= span
-    first, second = first[near], second[near]
+    if not np.isinf(horizon):
+        way = middle[first] - middle[second]
+        apart = np.sqrt(np.einsum("kc,kc->k", way, way))
+        span = np.abs(np.einsum("kc,kc->k", way, half[first]))
+        span += np.abs(np.einsum("kc,kc->k", way, half[second]))
+        near = apart * (apart - radius[first] - radius[second] - horizon) <= span
+        first, second = first[near], second[near]
     a, b, c, d = nodes[first, 0], nodes[first, 1], nodes[second, 0], nodes[second, 1]
     strangers = (a != c) & (a != d) & (b != c) & (b != d)
     return first[strangers], second[strangers]

@@ -102,6 +102,8 @@ class FclQueries:
         ax, ay, az, bx, by, bz = ends
         x, y, z = bx - ax, by - ay, bz - az
         length = sqrt(x * x + y * y + z * z)
+        if not length > 0.0:
+            return None
         self._capsule.lz = length
         self._member.setQuatRotation(_quaternion(x, y, z, length))
         self._member.setTranslation(np.array((0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz))))

@@ -100,7 +100,9 @@ class _Pairs:
             Bounds of the distances, m; those of the pairs that are evaluated are written anew.
         """
         # Where none is near yet, those that are due next are looked at in one go.
-        self.near = near = (lower < (limit if self.is_close else _NEXT * limit)).nonzero()[0]
+        reach = limit if self.is_close else max(limit, _NEXT * limit)
+        # A negated comparison also catches what is not a number.
+        self.near = near = (~(lower >= reach)).nonzero()[0]
         size, lowest = len(near), lower.take(near)
         arguments = (
             places.take(self.nodes.take(near, axis=0), axis=0).reshape(size, 24),
@@ -146,7 +148,7 @@ class Watch:
         members, pieces = len(monitor.members), monitor.pieces
         simple = not pieces.moving and monitor.ends_at_nodes and "triangle" not in pieces.shape
         count = members * len(pieces) + (members * (members - 1) // 2 if monitor.self_collision else 0)
-        return simple and 0 < count <= _MOST_PAIRS
+        return simple and members > 1 and 0 < count <= _MOST_PAIRS
 
     def near(self, X: Array, limit: float, self_limit: float, fcl_reach: float) -> Contacts | None:
         """Return all contacts nearer than `limit`, or `self_limit` between members, m; None where surfaces overlap.
@@ -221,7 +223,8 @@ class Watch:
         self._parts = [slice(a, b) for a, b in pairwise(ends.tolist())]
         self._bounds = kernel = Kernel(_bound_function(monitor.members, self._pairs, len(X)), compiled=False)
         kernel.inputs[1][:] = X.reshape(-1)
-        kernel.inputs[2][:] = np.concatenate([group.distance for group in groups])
+        for group, part in zip(groups, self._parts, strict=True):
+            kernel.inputs[2][part] = group.distance
         self._at, self._places = X, np.zeros((len(X), 6))
         return kernel
 
@@ -281,8 +284,9 @@ def _bound_function(members: Index, every: list[_Pairs], nodes: int) -> ca.Funct
         nearer.append(
             _norms(middle[:, a] - middle[:, b]) + turned[a] + turned[b] if pairs.is_self else furthest[a]
         )
-    after = lower - ca.vertcat(*nearer)
-    parts = ca.vertsplit(after, [0, *np.cumsum([len(pairs.group) for pairs in every]).tolist()])
+    after = lower - ca.vertcat(*nearer) if every else lower
+    ends = np.cumsum([0, *(len(pairs.group) for pairs in every)]).tolist()
+    parts = ca.vertsplit(after, ends) if every else []
     # A least of numbers leaves out what is none; the sum does not.
     least = ca.vertcat(*map(ca.mmin, parts), ca.sumsqr(moved))
     return ca.Function("bounds", [X, before, lower], [after, least])

@@ -95,6 +95,17 @@ class Taken(NamedTuple):
     after: float
 
 
+class _Room:
+    """Rows and bounds of the QP, which the compiled functions write to and read; shared by solvers that share those."""
+
+    constraint: Array
+    lower: Array
+    upper: Array
+    sense: NDArray[np.int32]
+    row_start: NDArray[np.int64]
+    used: int
+
+
 class FusedSolver:
     """Linearises, condenses and solves; for arms with `elimination_stages`."""
 
@@ -129,6 +140,7 @@ class FusedSolver:
         settled.bind_input(16, self._gradient)
         self._answer, self._multipliers = settled.inputs[17], settled.inputs[18]
         self._gram, self._taken = settled.inputs[19].reshape(actuators, actuators), settled.inputs[20]
+        self._room = _Room()
         self._reserve(size + self._tip + self._hard + NEAR)
         self._draw(layout)
         if self._hard:
@@ -201,8 +213,10 @@ class FusedSolver:
         """
         x, flag, info = self.ask(clearance)
         multipliers, rows = info["lam"], self._tip + self._hard + len(clearance)
-        bounds = self._lower[: self._size + rows], self._upper[: self._size + rows]
-        check_answer(x, multipliers, flag, self._hessian, self._gradient, self._constraint[:rows], *bounds)
+        bounds = self._room.lower[: self._size + rows], self._room.upper[: self._size + rows]
+        check_answer(
+            x, multipliers, flag, self._hessian, self._gradient, self._room.constraint[:rows], *bounds
+        )
         count = self._actuators
         nodes = np.zeros((self.layout.truss.node_count, 3))
         moved = np.dot(x[:count], self._response[:count])
@@ -242,9 +256,9 @@ class FusedSolver:
         hessian, gradient = self._assemble()
         first = self._tip + hard
         rows = first + near
-        if size + rows > len(self._lower):
+        if size + rows > len(self._room.lower):
             self._reserve(2 * (size + rows))
-        constraint, lower, upper = self._constraint[:rows], self._lower, self._upper
+        constraint, lower, upper = self._room.constraint[:rows], self._room.lower, self._room.upper
         if hard:
             block = self._stack[:, self.layout.node_columns : self.layout.node_columns + hard]
             constraint[self._tip : first, :-1] = block[:-1].T
@@ -254,7 +268,7 @@ class FusedSolver:
             answer *= self._scale
             constraint[first:, :count] = answer[:, :count]
             np.subtract(clearance.lower, answer[:, -1], out=lower[size + first : size + rows])
-        self._used, before = size + rows, self._used
+        self._room.used, before = size + rows, self._room.used
         if before > size + rows:
             lower[size + rows : before] = -UNBOUNDED
         x, _, flag, info = daqp.solve(
@@ -263,7 +277,7 @@ class FusedSolver:
             constraint,
             upper[: size + rows],
             lower[: size + rows],
-            self._sense[: size + rows],
+            self._room.sense[: size + rows],
             primal_tol=FEASIBILITY,
             eps_prox=0.0,
         )
@@ -328,22 +342,22 @@ class FusedSolver:
     def _reserve(self, rows: int) -> None:
         """Make room for bounds of all unknowns and `rows` less so many constraints; kernels write the first of them."""
         size, equal = self._size, self._size + self._tip + self._hard
-        self._constraint = np.zeros((rows - size, size))
-        self._lower, self._upper = np.full(rows, -UNBOUNDED), np.full(rows, UNBOUNDED)
-        self._sense = np.zeros(rows, dtype=np.int32)
-        self._row_start = self._width * np.arange(rows - size)[:, None, None]
-        self._sense[size:equal] = _EQUALITY
-        tip_rows = self._constraint[: self._tip].reshape(-1)
-        bounds = (values[: size + self._tip] for values in (self._lower, self._upper))
+        self._room.constraint = np.zeros((rows - size, size))
+        self._room.lower, self._room.upper = np.full(rows, -UNBOUNDED), np.full(rows, UNBOUNDED)
+        self._room.sense = np.zeros(rows, dtype=np.int32)
+        self._room.row_start = self._width * np.arange(rows - size)[:, None, None]
+        self._room.sense[size:equal] = _EQUALITY
+        tip_rows = self._room.constraint[: self._tip].reshape(-1)
+        bounds = (values[: size + self._tip] for values in (self._room.lower, self._room.upper))
         for result, array in enumerate((tip_rows, *bounds), start=1):
             array[:] = self._rows.outputs[result]
             self._rows.bind_output(result, array)
         checked = equal + NEAR
-        self._used = checked
+        self._room.used = checked
         for argument, array in (
-            (9, self._constraint[: checked - size]),
-            (10, self._lower),
-            (11, self._upper),
+            (9, self._room.constraint[: checked - size]),
+            (10, self._room.lower),
+            (11, self._room.upper),
         ):
             self._settled.bind_input(argument, array.reshape(-1)[: self._settled.inputs[argument].size])
 
@@ -385,7 +399,7 @@ class FusedSolver:
         """Return the clearance rows (R, 3 (N - N_c)) over the free nodes' displacements."""
         near, width = len(clearance), self._width
         flat = self._place[clearance.nodes][:, :, None] + _AXES
-        flat += self._row_start[:near]
+        flat += self._room.row_start[:near]
         # Sums what stands at one place: a row may name a node twice.
         spread = np.bincount(flat.reshape(-1), clearance.coefficients.reshape(-1), near * width)
         return np.asarray(spread.reshape(near, width)[:, :-3], dtype=float)

@@ -114,8 +114,12 @@ class Brakes:
             ride = self._let_go(last)
             if ride is not None:
                 return Braking(state, path, [*along, *((now, value) for now in ride)], len(along), 1)
-        ride = self._let_go(state)
-        return None if ride is None else Braking(state, path, [(now, value) for now in ride], 0, 2)
+        return self.letting_go(state, path, value)
+
+    def letting_go(self, state: State, path: Path, value: float) -> Braking | None:
+        """Return the steps in which every actuator brakes by itself, or None where they were not found."""
+        found = self._let_go(state)
+        return None if found is None else Braking(state, path, [(now, value) for now in found], 0, 2)
 
     def _until_the_base_rests(self) -> float:
         """Return the time from which the base rests, s."""

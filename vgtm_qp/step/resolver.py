@@ -20,7 +20,7 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.step.arm import Arm, build_arm, reshaped
-from vgtm_qp.step.attempt import Attempt, Outcome
+from vgtm_qp.step.attempt import Attempt, Outcome, Tolerances
 from vgtm_qp.step.braking import Brakes, Braking
 from vgtm_qp.step.checks import excess_of_freedom, unreachable_tip
 from vgtm_qp.step.curve import curve_key, with_curve
@@ -59,6 +59,11 @@ _ANY_RANK = 2
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 
+_ROUNDING = float(np.finfo(float).eps)
+
+_SHORTEST, _LONGEST = 1e-8, 1e8
+"""Durations of a step, s: shorter ones are lost in the rounding of the time and of the rates."""
+
 
 class Resolver:
     """Moves one arm step by step. Not to be shared by threads: use one per thread.
@@ -86,16 +91,24 @@ class Resolver:
             approach=_APPROACH if self._slows_down else 1.0,
         )
         self._separation = Separation(arm.truss, arm.monitor, distances)
-        self._attempt = Attempt(arm.engine, arm.task, self._separation, tracking=_hard_tracking(arm))
-        self.state = arm.home_state()
         truss = arm.truss
+        self._starts_at_once = bool(np.isinf(truss.acceleration[truss.actuators]).all())
+        # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
+        member = 1e-10 if self._starts_at_once else max(1e-12, 32.0 * _ROUNDING * truss.height)
+        self._attempt = Attempt(
+            arm.engine,
+            arm.task,
+            self._separation,
+            tracking=_hard_tracking(arm),
+            tolerances=Tolerances(member=member),
+        )
+        self._state = arm.home_state()
         self._actuator_names = tuple(truss.member_names[k] for k in truss.actuators)
         self._limits = (
             truss.stroke[truss.actuators],
             truss.rate[truss.actuators],
             truss.acceleration[truss.actuators],
         )
-        self._starts_at_once = bool(np.isinf(self._limits[2]).all())
         self._vertex_goals = arm.vertex_goals
         self._braking: Braking | None = None
         self._arms: dict[tuple[object, ...], Arm] = {}
@@ -112,6 +125,21 @@ class Resolver:
     def _slows_down(self) -> bool:
         """Whether pairs and actuators slow down before contacts and strokes: only a tip that may be late lets them."""
         return self.arm.slow_approach and self.arm.tip_mode == "scaled"
+
+    @property
+    def state(self) -> State:
+        """Where the arm is; may be set to another state of this arm."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        vertices = self.arm.layout.vertices
+        if len(state.control_vertices) != vertices or len(state.nodes) != self.arm.truss.node_count:
+            raise GoalError(
+                f"this state has {len(state.nodes)} nodes and {len(state.control_vertices)} control vertices; the arm "
+                f"has {self.arm.truss.node_count} and its curve {vertices}"
+            )
+        self._state = state
 
     @property
     def locked(self) -> frozenset[str]:
@@ -138,7 +166,11 @@ class Resolver:
         self._limits[0][k] = self.state.lengths[self.arm.truss.actuators[k]]
         self._row_names[k] = f"locked: {name}"
         self._locked.add(name)
-        self._braking = None
+        before, self._braking = self._braking, None
+        if before is not None and before.origin is self.state and before.steps:
+            # What jams stops at once, as it will; the others brake, each by itself.
+            brakes = self._brakes(before.steps[0][0].duration)
+            self._braking = brakes.letting_go(self.state, before.path, before.steps[0][1])
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
@@ -203,9 +235,22 @@ class Resolver:
         more = count - len(state.control_vertices)
         change = add_control_vertices(curve, more) if more >= 0 else remove_control_vertices(curve, -more)
         if more:
+            braking = self._braking
             self._reshape(change.curve.family, ())
             self.state = replace(state, control_vertices=frozen(change.curve.control_vertices))
+            if braking is not None and braking.origin is state:
+                steps = [
+                    (self._with_vertices(then, shape.family, more), value) for then, value in braking.steps
+                ]
+                self._braking = replace(braking, origin=self.state, steps=steps)
         return change.change
+
+    def _with_vertices(self, state: State, family: CurveFamily, more: int) -> State:
+        """Return a state whose curve of a `family` has so many control vertices more, or fewer."""
+        frame = base_frame(self.arm.truss, self.arm.base_at(state.time)[1])
+        curve = Curve(family, state.control_vertices, state.torsion, frame)
+        change = add_control_vertices(curve, more) if more >= 0 else remove_control_vertices(curve, -more)
+        return replace(state, control_vertices=frozen(change.curve.control_vertices))
 
     def _reshape(self, family: CurveFamily | None, vertex_goals: tuple[int, ...]) -> None:
         """Go on with another curve; what was built for one is kept for the next time."""
@@ -422,7 +467,10 @@ class Resolver:
                 path = path.continued(_BEYOND)
             braking = self._find_braking(outcome.state_after(state), path, start + covered, 2.0 * covered, dt)
             if braking is None:
-                outcome = replace(outcome, accepted=False, reason=CANNOT_BRAKE)
+                # A step may be too short to rest in what the longer one before it allowed.
+                shorter = dt < (1.0 - 1e-9) * state.duration
+                why = f"{CANNOT_BRAKE} in {dt:g} s, less than the last step took" if shorter else CANNOT_BRAKE
+                outcome = replace(outcome, accepted=False, reason=why)
         return outcome, braking
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:
@@ -460,7 +508,10 @@ class Resolver:
         self, state: State, path: Path, value: float, piece: float, dt: float
     ) -> Braking | None:
         """Return how the arm comes to rest from `state`, at `value` of `path`, in steps of `dt`, s."""
-        brakes = Brakes(
+        return self._brakes(dt).find(state, path, value, piece)
+
+    def _brakes(self, dt: float) -> Brakes:
+        return Brakes(
             self.arm,
             self._attempt,
             dt,
@@ -468,15 +519,19 @@ class Resolver:
             lambda now, *piece_and_box: self._target_from(now, dt, *piece_and_box),
             lambda: self._length_solver,
         )
-        return brakes.find(state, path, value, piece)
 
     def _duration(self, dt: float | None) -> float:
         dt = self.arm.dt if dt is None else dt
-        if not (math.isfinite(dt) and dt > 0.0):
+        try:
+            duration = float(dt)
+        except (TypeError, ValueError):
+            duration = math.nan
+        if not _SHORTEST <= duration <= _LONGEST:
             raise GoalError(
-                f"dt must be a positive number of seconds, not {dt!r}; the state of the arm is unchanged"
+                f"dt must be a positive number of seconds, from {_SHORTEST:g} to {_LONGEST:g}, not {dt!r}; the state "
+                "of the arm is unchanged"
             )
-        return dt
+        return duration
 
     def _box(self, dt: float, state: State | None = None) -> tuple[Array, Array]:
         """Return the least and greatest lengths of the actuators, m, after a step of `dt`, s."""

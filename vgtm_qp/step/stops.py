@@ -102,7 +102,7 @@ class Stop:
             ", ".join(self.multipliers),
             self.reason
             if self.kind in (StopKind.NONLINEAR, StopKind.SOLVER)
-            or self.reason in (CANNOT_BRAKE, BASE_MOVES_ON)
+            or self.reason.startswith((CANNOT_BRAKE, BASE_MOVES_ON))
             else "",
         ]
         return ": ".join(part for part in parts if part)
@@ -156,7 +156,9 @@ def explain(
         if share <= _SINGULAR:
             return Stop(kind, reason=reason)
         kinds = [_kind(name) for name in pressing]
-        other = StopKind.ACCELERATION if reason in (CANNOT_BRAKE, BASE_MOVES_ON) else StopKind.NONLINEAR
+        other = (
+            StopKind.ACCELERATION if reason.startswith((CANNOT_BRAKE, BASE_MOVES_ON)) else StopKind.NONLINEAR
+        )
         kind = next((kind for kind in StopKind if kind in kinds), other)
         return Stop(kind, pressing, _obstacles(arm, pressing), reason)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
