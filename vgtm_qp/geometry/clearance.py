@@ -26,6 +26,7 @@ _FIRST = 16
 
 
 _FEW_PAIRS = 20_000
+_MOST_WATCHED = 8000
 
 
 class Clearance:
@@ -83,7 +84,8 @@ class Clearance:
         points = self.members if ends is None else np.arange(2 * len(self.members)).reshape(-1, 2)
         self._members = Members(points, self.radius, self.members)
         self._kernels = Kernels()
-        self._kernels.prepare({*self.pieces.shape.tolist()} | ({"segment"} if self_collision else set()))
+        shapes = {*self.pieces.shape.tolist()} | ({"segment"} if self_collision else set())
+        self._kernels.prepare(sorted(shapes), rests=self.rests)
         self._candidates: Candidates | None = None
         self._solids = {
             k: Solid(o.pieces[:, :9].reshape(-1, 3, 3), o.velocity)
@@ -136,6 +138,14 @@ class Clearance:
                 parts.append(self._distinct(part) if group.shape == "triangle" else part)
         candidates.tire(X, time)
         return self._with_enclosed(join(parts, self.names), X, time)
+
+    @property
+    def rests(self) -> bool:
+        """Whether nothing moves but the arm, members end at their nodes, there are no meshes and not too many pairs."""
+        members, pieces = len(self.members), self.pieces
+        simple = not pieces.moving and self.ends_at_nodes and "triangle" not in pieces.shape
+        count = members * len(pieces) + (members * (members - 1) // 2 if self.self_collision else 0)
+        return simple and 0 < count <= _MOST_WATCHED
 
     @property
     def ends_at_nodes(self) -> bool:

@@ -10,11 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.exact import SECOND_CONTACT, distance_function, sweep_function
+from vgtm_qp.geometry.exact import SECOND_CONTACT, distance_function, follow_function, sweep_function
 from vgtm_qp.geometry.shapes import Pieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+FOLLOWED = (1, 128)
+"""Numbers of pairs that a watch evaluates at once."""
+
+_FEW, _MANY, _MANY_SWEPT = (1,), (1, 64, 1024), (1, 64)
 
 
 class Way(NamedTuple):
@@ -85,13 +90,26 @@ class Kernels:
     def __init__(self) -> None:
         self._distance: dict[str, Batch] = {}
         self._sweep: dict[str, Batch] = {}
+        self._follow: dict[str, Batch] = {}
 
-    def prepare(self, shapes: Iterable[str]) -> None:
-        """Compile the kernels of `shapes` for few and for many pairs."""
+    def prepare(self, shapes: Iterable[str], *, rests: bool) -> None:
+        """Begin to compile what steps need: for a scene that is watched, and else for few and for many pairs."""
+        shapes = tuple(shapes)
         for shape in shapes:
-            for count in (1, 64):
+            for count in FOLLOWED if rests else ():
+                self.follow(shape).prepare(count)
+            for count in _FEW if rests else _MANY:
                 self.distance(shape).prepare(count)
-                self.sweep(shape).prepare(count)
+        for shape in shapes:
+            for count in _FEW if rests else _MANY_SWEPT:
+                # A watch does without as a rule; what it does not prove is asked of these.
+                self.sweep(shape).prepare(count, for_later=rests)
+
+    def follow(self, shape: str) -> Batch:
+        """Return the batch of ``follow_function(shape)``."""
+        if shape not in self._follow:
+            self._follow[shape] = Batch(follow_function(shape))
+        return self._follow[shape]
 
     def distance(self, shape: str) -> Batch:
         """Return the batch of ``distance_function(shape)``."""
@@ -155,6 +173,11 @@ class Group:
         order = order[: np.searchsorted(distance[order], horizon)]
         self._set(self.member[order], self.other[order])
         self.distance = distance[order]
+
+    @property
+    def follow(self) -> Batch:
+        """The batch of ``follow_function`` for this shape."""
+        return self._kernels.follow(self.shape)
 
     def select(self, kept: NDArray[np.bool_]) -> None:
         """Drop the pairs that are not `kept`, (C,)."""
