@@ -244,3 +244,15 @@ def test_batches_of_any_size_equal_single_rows(count):
     assert rows.shape == (count, sum(SIZES))
     for k in {0, count // 2, count - 1}:
         np.testing.assert_array_equal(rows[k], BATCH["segment"](ends[k : k + 1], others[k : k + 1])[0])
+
+
+def test_a_batch_that_is_often_large_changes_over_with_the_same_digits():
+    batch = Batch(distance_function("segment"))
+    batch.prepare(1)
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(130, 6)), rng.normal(size=(130, 6))
+    expected = batch(*rows)
+    assert set(batch._kernels) == {16}
+    for _ in range(70):
+        np.testing.assert_array_equal(batch(*rows), expected)
+    assert set(batch._kernels) == {16, 128}

@@ -148,11 +148,19 @@ class _Compilers:
         """Begin to compile `text` into the object `target`, unless that is done or being done."""
         with self.lock:
             if target not in self._units or (self._units[target].done() and not target.exists()):
-                self._pool = self._pool or ThreadPoolExecutor(
-                    max(1, min(_MOST_COMPILERS, os.cpu_count() or 1)), "vgtm-compiler"
-                )
-                self._units[target] = self._pool.submit(_object, cc, text, target, flags)
+                self._units[target] = self._workers().submit(_object, cc, text, target, flags)
             return self._units[target]
+
+    def link(self, compiling: Compiling) -> None:
+        """Have a library made as soon as its parts are there."""
+        with self.lock:
+            self._workers().submit(compiling.make)
+
+    def _workers(self) -> ThreadPoolExecutor:
+        if self._pool is None:
+            most = max(1, min(_MOST_COMPILERS, os.cpu_count() or 1))
+            self._pool = ThreadPoolExecutor(most, "vgtm-compiler")
+        return self._pool
 
 
 _compilers = _Compilers()
@@ -214,6 +222,11 @@ class _Build:
                 for path in longest
             ]
 
+    @property
+    def is_made(self) -> bool:
+        """Whether the shared library is there."""
+        return self._target.exists()
+
     def library(self) -> Path | None:
         """Return the shared library as soon as it is there; None where it cannot be compiled."""
         if self._target.exists():
@@ -231,15 +244,33 @@ class _Build:
         return self._target if self._target.exists() else None
 
 
-class _Compiling:
-    """A function on its way to machine code."""
+class Compiling:
+    """A function on its way to machine code; several kernels may wait for the same."""
 
     def __init__(self, function: ca.Function) -> None:
         self._function, self._cc = function, compiler()
         self._build = None if self._cc is None else _Build(function, self._cc)
+        self._done: ca.Function | None = None
 
     def result(self) -> ca.Function:
         """Return the compiled function when it is there, or the one it comes from where no compiler works."""
+        if self._done is None:
+            self._done = self._wait()
+            self._build = None
+        return self._done
+
+    @property
+    def is_made(self) -> bool:
+        """Whether nothing has to be waited for."""
+        return self._build is None or self._build.is_made
+
+    def make(self) -> None:
+        """Wait until the library is there, if it can be; any thread may."""
+        build = self._build
+        if build is not None and build.process == os.getpid():
+            build.library()
+
+    def _wait(self) -> ca.Function:
         if self._build is None or self._cc is None:
             return self._function
         if self._build.process != os.getpid():
@@ -261,15 +292,28 @@ class _Compiling:
 
 def compile_function(function: ca.Function) -> ca.Function:
     """Return `function` compiled to machine code, or as it is where no compiler works."""
-    return _Compiling(function).result()
+    return Compiling(function).result()
 
 
 _waiting: weakref.WeakSet[Kernel] = weakref.WeakSet()
 
 
 def finish_compiling() -> None:
-    """Wait until all kernels of this process are compiled, so that none of them has to be waited for later."""
-    for kernel in list(_waiting):
+    """Wait until all kernels of this process are compiled, so that none of them has to be waited for later.
+
+    Those that were begun for later go on being compiled.
+    """
+    kernels = list(_waiting)
+    unmade = {
+        kernel.compiling
+        for kernel in kernels
+        if kernel.compiling is not None and not kernel.compiling.is_made
+    }
+    if unmade:
+        # Each is linked as soon as its parts are there, while others are still being compiled.
+        with ThreadPoolExecutor(len(unmade), "vgtm-linker") as pool:
+            list(pool.map(Compiling.make, unmade))
+    for kernel in kernels:
         _ = kernel.is_compiled
 
 
@@ -283,19 +327,28 @@ class Kernel:
         inputs in place, call the kernel, read the outputs. One kernel must not be called by two threads at once.
     """
 
-    def __init__(self, function: ca.Function, *, compiled: bool = True) -> None:
+    def __init__(
+        self, function: ca.Function, *, compiled: bool | Compiling = True, for_later: bool = False
+    ) -> None:
         self._given = function
-        self._compiling = _Compiling(function) if compiled else None
+        self._compiling: Compiling | None
+        if isinstance(compiled, Compiling):
+            self._compiling = compiled
+        else:
+            self._compiling = Compiling(function) if compiled else None
         self._found: ca.Function | None = None
         self._buffer: Any = None
         self.inputs: list[Array] = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
         self.outputs: list[Array] = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
         # Until it is called first, when this is replaced by the evaluation itself.
         self._evaluate: Callable[[], None] = self._evaluate_first
-        if compiled:
-            _waiting.add(self)
-        else:
+        if not compiled:
             self._resolve()
+        elif not for_later:
+            _waiting.add(self)
+        elif self._compiling is not None and not self._compiling.is_made:
+            # Its parts stand before it in the queue, so that they never wait for it.
+            _compilers.link(self._compiling)
 
     def _resolve(self) -> ca.Function:
         with _resolving:
@@ -313,6 +366,11 @@ class Kernel:
     def _evaluate_first(self) -> None:
         self._resolve()
         self._evaluate()
+
+    @property
+    def compiling(self) -> Compiling | None:
+        """What it waits for when it is called first; None once it was."""
+        return self._compiling
 
     @property
     def function(self) -> ca.Function:

@@ -2,54 +2,82 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.compiled import Kernel, compile_function
+from vgtm_qp.compiled import Compiling, Kernel
 
 Array = NDArray[np.float64]
 
 _CAPACITIES = (16, 128, 1024)
 
+_BEGIN = 8
+_SWITCH = 64
+"""A capacity that was not prepared is compiled from the 8th call that asks for it on, and used from the 64th on.
+
+Until then smaller ones serve, with the same digits: a list that is made once is not worth a compiler, and no step waits
+for one.
+"""
+
 
 class Batch:
     """A CasADi function of column vectors, evaluated on rows; its outputs stand side by side in one array.
 
-    Capacities are compiled when first needed. Not for two threads at once.
+    Not for two threads at once.
     """
 
     def __init__(self, function: ca.Function) -> None:
         self._function = function
         self._kernels: dict[int, tuple[Kernel, list[Array], Array]] = {}
+        self._begun: dict[int, Kernel] = {}
+        self._asked: dict[int, int] = {}
 
-    def prepare(self, count: int) -> None:
-        """Compile what `count` rows need, so that no step has to wait for it."""
-        self._kernel(_capacity(count))
+    def prepare(self, count: int, *, for_later: bool = False) -> None:
+        """Begin to compile what `count` rows need, so that no step has to wait for it.
 
-    def _kernel(self, capacity: int) -> tuple[Kernel, list[Array], Array]:
+        What is `for_later` is not waited for by :func:`vgtm_qp.compiled.finish_compiling`.
+        """
+        self._use(_capacity(count, _CAPACITIES), for_later=for_later)
+
+    def _use(self, capacity: int, *, for_later: bool = True) -> None:
         if capacity not in self._kernels:
-            kernel = Kernel(_mapped(self._function, capacity), compiled=False)
+            kernel = self._begun.pop(capacity, None)
+            kernel = kernel or _kernel(self._function, capacity, for_later=for_later)
             inputs = [x.reshape(capacity, -1) for x in kernel.inputs]
             self._kernels[capacity] = kernel, inputs, kernel.outputs[0].reshape(capacity, -1)
-        return self._kernels[capacity]
+
+    def _ask(self, capacity: int) -> None:
+        """Note that a capacity that is not there would be of use."""
+        asked = self._asked[capacity] = self._asked.get(capacity, 0) + 1
+        if capacity == _CAPACITIES[0] or asked >= _SWITCH:
+            self._use(capacity)
+        elif asked == _BEGIN:
+            self._begun[capacity] = _kernel(self._function, capacity, for_later=True)
+        if not self._kernels:
+            self._use(_CAPACITIES[0])
 
     def __call__(self, *rows: Array) -> Array:
         """Evaluate on `rows`, one (K, width) array per argument, and return a new (K, outputs) array."""
         count = len(rows[0])
-        capacity = _capacity(count)
+        capacity = _capacity(count, _CAPACITIES)
+        if capacity not in self._kernels:
+            self._ask(capacity)
+            capacity = _capacity(count, self._kernels)
         if count <= capacity:
             return self._part(capacity, rows, 0, count)
         parts = []
         start = 0
         while start < count:
-            capacity = _capacity(count - start)
+            capacity = _capacity(count - start, self._kernels)
             parts.append(self._part(capacity, rows, start, min(start + capacity, count)))
             start += capacity
         return np.concatenate(parts)
 
     def _part(self, capacity: int, rows: tuple[Array, ...], start: int, stop: int) -> Array:
-        kernel, inputs, output = self._kernel(capacity)
+        kernel, inputs, output = self._kernels[capacity]
         size = stop - start
         for target, source in zip(inputs, rows, strict=True):
             target[:size] = source[start:stop]
@@ -57,20 +85,22 @@ class Batch:
         return output[:size].copy()
 
 
-_functions: dict[tuple[str, int], ca.Function] = {}
+_functions: dict[tuple[str, int], tuple[ca.Function, Compiling]] = {}
 
 
-def _mapped(function: ca.Function, capacity: int) -> ca.Function:
-    """Return `function` with its outputs in one column, mapped and compiled; once for all batches of a process."""
+def _kernel(function: ca.Function, capacity: int, *, for_later: bool) -> Kernel:
+    """Return `function` with its outputs in one column, mapped; compiled once for all batches of a process."""
     key = (function.name(), capacity)
     if key not in _functions:
         arguments = function.sx_in()
         packed = ca.Function(function.name(), arguments, [ca.cse(ca.vertcat(*function.call(arguments)))])
-        _functions[key] = compile_function(packed.map(f"{key[0]}_{capacity}", "serial", capacity, [], []))
-    return _functions[key]
+        mapped = packed.map(f"{key[0]}_{capacity}", "serial", capacity, [], [])
+        _functions[key] = mapped, Compiling(mapped)
+    mapped, compiling = _functions[key]
+    return Kernel(mapped, compiled=compiling, for_later=for_later)
 
 
-def _capacity(count: int) -> int:
+def _capacity(count: int, capacities: Iterable[int]) -> int:
     """Return the largest capacity of which no more than half would be padding, else the smallest."""
-    fitting = [c for c in _CAPACITIES if c <= 2 * count]
-    return fitting[-1] if fitting else _CAPACITIES[0]
+    fitting = [c for c in capacities if c <= 2 * count]
+    return max(fitting) if fitting else min(capacities)

@@ -26,6 +26,7 @@ _FIRST = 16
 
 
 _FEW_PAIRS = 20_000
+_MOST_WATCHED = 8000
 
 
 class Clearance:
@@ -83,9 +84,9 @@ class Clearance:
         points = self.members if ends is None else np.arange(2 * len(self.members)).reshape(-1, 2)
         self._members = Members(points, self.radius, self.members)
         self._kernels = Kernels()
-        self._kernels.prepare({*self.pieces.shape.tolist()} | ({"segment"} if self_collision else set()))
+        shapes = {*self.pieces.shape.tolist()} | ({"segment"} if self_collision else set())
+        self._kernels.prepare(sorted(shapes), rests=self.rests)
         self._candidates: Candidates | None = None
-        self._wasted = 0
         self._solids = {
             k: Solid(o.pieces[:, :9].reshape(-1, 3, 3), o.velocity)
             for k, o in enumerate(self.obstacles)
@@ -125,19 +126,26 @@ class Clearance:
         X = self._points(X)
         candidates, motion = self._covering(X, time, reach, self_reach)
         parts = []
-        wasted = 0
         for group in candidates.groups:
             limit = self_reach if group.is_self else reach
             rows = np.flatnonzero(group.lower(motion, limit)[0] < limit)
             if len(rows):
                 contacts = self._contacts(group, X, time, rows, min(limit, fcl_reach))
                 first = np.flatnonzero(contacts.distance < limit)
-                wasted += len(rows) - len(first)
+                candidates.waste(group, len(rows) - len(first))
                 second = first[contacts.two()[first] & (contacts.distance_second[first] < limit)]
                 part = self._pairs(group, rows, contacts, first, second)
                 parts.append(self._distinct(part) if group.shape == "triangle" else part)
-        self._tire(candidates, X, time, wasted)
+        candidates.tire(X, time)
         return self._with_enclosed(join(parts, self.names), X, time)
+
+    @property
+    def rests(self) -> bool:
+        """Whether nothing moves but the arm, members end at their nodes, there are no meshes and not too many pairs."""
+        members, pieces = len(self.members), self.pieces
+        simple = not pieces.moving and self.ends_at_nodes and "triangle" not in pieces.shape
+        count = members * len(pieces) + (members * (members - 1) // 2 if self.self_collision else 0)
+        return simple and members > 1 and 0 < count <= _MOST_WATCHED
 
     @property
     def ends_at_nodes(self) -> bool:
@@ -153,13 +161,6 @@ class Clearance:
     def _points(self, X: Array) -> Array:
         """Return the points that members end at, from node positions (N, 3)."""
         return X if self._ends is None else self._ends(X).reshape(-1, 3)
-
-    def _tire(self, candidates: Candidates, X: Array, time: float, wasted: int) -> None:
-        """Renew the reference once the pairs evaluated for nothing have cost as much as that does."""
-        self._wasted += wasted
-        if self._wasted > sum(map(len, candidates.groups)):
-            candidates.refresh(X, time)
-            self._wasted = 0
 
     def _contacts(self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float) -> Contacts:
         segments, others = group.segments(X, rows), group.others(X, time, rows)
@@ -218,13 +219,12 @@ class Clearance:
             k = int(np.argmin(enclosed.distance))
             best, pair = float(enclosed.distance[k]), enclosed.pair(k)
         reach = self_reach = 0.0
-        wasted = 0
         while True:
             candidates, motion = self._covering(X, time, reach, self_reach)
             for group in candidates.groups:
                 if group.is_self in wanted:
                     distance, row, count = _least_of(group, motion, X, time, best)
-                    wasted += count
+                    candidates.waste(group, count)
                     if row >= 0:
                         best = distance
                         pair = Pair(int(group.member[row]), int(group.other[row]), group.is_self)
@@ -233,7 +233,7 @@ class Clearance:
             search = False in wanted and len(self.pieces) > 0 and far < min(best, extent)
             search_self = True in wanted and far_self < min(best, extent)
             if not (search or search_self):
-                self._tire(candidates, X, time, wasted)
+                candidates.tire(X, time)
                 return best, pair
             reach = 2.0 * max(far, self.influence) if search else reach
             self_reach = 2.0 * max(far_self, self.self_influence) if search_self else self_reach
@@ -386,6 +386,7 @@ class Clearance:
         With an `end` they hold on the whole straight way there, and the motion is the greatest on it.
         """
         candidates = self._candidates
+        far = far_self = np.nan
         if candidates is not None:
             motion = candidates.motion(X, time, end, end_time)
             far, far_self = candidates.beyond(motion)
@@ -394,23 +395,28 @@ class Clearance:
         # What is not a number fails the comparisons above and comes here.
         if not (np.isfinite(X).all() and (end is None or np.isfinite(end).all())):
             raise GeometryError("node positions must be finite numbers")
-        travel = 0.0 if end is None else float(self._members.moved(end, X).max(initial=0.0))
+        travel = 0.0 if end is None else float(np.sqrt(((end - X) ** 2).sum(axis=1).max(initial=0.0)))
         drift = 0.0 if end_time is None else self.pieces.fastest * abs(end_time - time)
         horizon = max(reach, self.influence) + self.influence + travel + drift
-        self_horizon = max(self_reach, self.self_influence) + self.self_influence + 2.0 * travel
+        self_horizon = max(self_reach, self.self_influence) + self.influence + 2.0 * travel
         if len(self.members) * (len(self.members) + len(self.pieces)) <= _FEW_PAIRS:
             # A list of all pairs never needs another broad phase, which would cost more than its tail does.
             horizon = self_horizon = 2.0 * self._extent(X, time) + horizon + self_horizon
-        self._candidates = candidates = Candidates(
-            self._members,
-            self.pieces,
-            self._kernels,
-            X,
-            time,
-            horizon,
-            self_horizon if self.self_collision else None,
-        )
-        self._wasted = 0
+        if candidates is None:
+            self._candidates = candidates = Candidates(
+                self._members,
+                self.pieces,
+                self._kernels,
+                X,
+                time,
+                horizon,
+                self_horizon if self.self_collision else None,
+            )
+        else:
+            if not far >= reach:
+                candidates.renew_pieces(X, time, horizon)
+            if not far_self >= self_reach:
+                candidates.follow_members(X, time, self_reach, travel, self_horizon)
         return candidates, candidates.motion(X, time, end, end_time)
 
 

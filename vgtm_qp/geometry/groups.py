@@ -10,18 +10,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.exact import SECOND_CONTACT, distance_function, sweep_function
+from vgtm_qp.geometry.exact import SECOND_CONTACT, distance_function, follow_function, sweep_function
 from vgtm_qp.geometry.shapes import Pieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+FOLLOWED = (1, 128)
+"""Numbers of pairs that a watch evaluates at once."""
+
+_FEW, _MANY, _MANY_SWEPT = (1,), (1, 64, 1024), (1, 64)
+
+
+class Way(NamedTuple):
+    """Where the points that members end at are, or a straight way of theirs, and how far from a reference.
+
+    Attributes
+    ----------
+    states : tuple of (N, 3)
+        Positions, or those at both ends of the way, m.
+    reference : (N, 3)
+        m.
+    moved : (N,)
+        How far each point is from where it was, at most, m; for members and pieces.
+    greatest : float
+        By how much the distance of a pair has changed since the reference at most, m.
+    """
+
+    states: tuple[Array, ...]
+    reference: Array
+    moved: Array
+    greatest: float
+
 
 class Motion(NamedTuple):
-    """How far each member (M,) is from where it was, at most, the greatest of that, and the time since."""
+    """Ways from where members were compared with pieces, and with each other in stiff or soft parts; seconds since."""
 
-    members: Array
-    greatest: float
+    to_pieces: Way
+    stiff: Way
+    soft: Way
     elapsed: float
 
 
@@ -35,12 +62,6 @@ class Members:
     nodes: Index
     radius: Array
     joined: Index
-
-    def moved(self, X: Array, reference: Array) -> Array:
-        """Return how far any point of each member is from where it was, at most, (M,)."""
-        shift = X - reference
-        moved = np.sqrt(np.einsum("ic,ic->i", shift, shift))
-        return np.asarray(np.maximum(moved[self.nodes[:, 0]], moved[self.nodes[:, 1]]))
 
 
 class Contacts:
@@ -69,13 +90,26 @@ class Kernels:
     def __init__(self) -> None:
         self._distance: dict[str, Batch] = {}
         self._sweep: dict[str, Batch] = {}
+        self._follow: dict[str, Batch] = {}
 
-    def prepare(self, shapes: Iterable[str]) -> None:
-        """Compile the kernels of `shapes` for few and for many pairs."""
+    def prepare(self, shapes: Iterable[str], *, rests: bool) -> None:
+        """Begin to compile what steps need: for a scene that is watched, and else for few and for many pairs."""
+        shapes = tuple(shapes)
         for shape in shapes:
-            for count in (1, 64):
+            for count in FOLLOWED if rests else ():
+                self.follow(shape).prepare(count)
+            for count in _FEW if rests else _MANY:
                 self.distance(shape).prepare(count)
-                self.sweep(shape).prepare(count)
+        for shape in shapes:
+            for count in _FEW if rests else _MANY_SWEPT:
+                # A watch does without as a rule; what it does not prove is asked of these.
+                self.sweep(shape).prepare(count, for_later=rests)
+
+    def follow(self, shape: str) -> Batch:
+        """Return the batch of ``follow_function(shape)``."""
+        if shape not in self._follow:
+            self._follow[shape] = Batch(follow_function(shape))
+        return self._follow[shape]
 
     def distance(self, shape: str) -> Batch:
         """Return the batch of ``distance_function(shape)``."""
@@ -99,14 +133,22 @@ class Group:
         `other` is a piece or, for ``"segment"``, a member.
     distance : (C,)
         Surface distance at the reference configuration, m, ascending once :meth:`keep_near` was called.
-    is_self, moving : bool
-        Whether these are pairs of members; whether some obstacle moves.
+    is_self, is_soft, moving : bool
+        Whether these are pairs of members; of parts of the arm that bend; whether some obstacle moves.
     """
 
     def __init__(
-        self, shape: str, member: Index, other: Index, members: Members, pieces: Pieces, kernels: Kernels
+        self,
+        shape: str,
+        member: Index,
+        other: Index,
+        members: Members,
+        pieces: Pieces,
+        kernels: Kernels,
+        *,
+        is_soft: bool = False,
     ) -> None:
-        self.shape, self.is_self = shape, shape == "segment"
+        self.shape, self.is_self, self.is_soft = shape, shape == "segment", is_soft
         self.moving = pieces.moving and not self.is_self
         self._members, self._pieces, self._kernels = members, pieces, kernels
         self._set(member, other)
@@ -132,22 +174,57 @@ class Group:
         self._set(self.member[order], self.other[order])
         self.distance = distance[order]
 
+    @property
+    def follow(self) -> Batch:
+        """The batch of ``follow_function`` for this shape."""
+        return self._kernels.follow(self.shape)
+
+    def select(self, kept: NDArray[np.bool_]) -> None:
+        """Drop the pairs that are not `kept`, (C,)."""
+        distance = self.distance[kept]
+        self._set(self.member[kept], self.other[kept])
+        self.distance = distance
+
     def lower(self, motion: Motion, limit: float) -> tuple[Array, float]:
         """Return lower bounds of the surface distances of the first pairs, and one of all the others.
 
         Those others cannot have come nearer than `limit`.
         """
-        shrink = (2.0 if self.is_self else 1.0) * motion.greatest
+        way = motion.to_pieces if not self.is_self else motion.soft if self.is_soft else motion.stiff
+        shrink = way.greatest
         if self.moving:
             shrink += self._pieces.fastest * motion.elapsed
         # Only near the head of the sorted list can the motion have mattered.
-        count = len(self) if len(self) <= 64 else int(np.searchsorted(self.distance, limit + shrink))
-        bound = self.distance[:count] - motion.members[self.member[:count]]
+        few = len(self) <= 64 and not self.is_self
+        count = len(self) if few else int(np.searchsorted(self.distance, limit + shrink))
         if self.is_self:
-            bound -= motion.members[self.other[:count]]
-        elif self.moving:
-            bound -= self.speed[:count] * motion.elapsed
+            bound = self.distance[:count] - self._nearer(way, count)
+        else:
+            bound = self.distance[:count] - way.moved.take(self.nodes[:count]).max(axis=1)
+            if self.moving:
+                bound -= self.speed[:count] * motion.elapsed
         return bound, float(self.distance[count] - shrink) if count < len(self) else np.inf
+
+    def _nearer(self, way: Way, count: int) -> Array:
+        """Return by how much the first pairs of members have come nearer at most, (count,), m.
+
+        That is no more than a point of one has moved relative to a point of the other: than their middles have, and
+        both have turned about those. On a straight way it is greatest at an end.
+        """
+        nearer = np.zeros(count)
+        if count:
+            nodes = np.concatenate([self.nodes[:count], self.other_nodes[:count]], axis=1)
+            reference = way.reference.take(nodes, axis=0)
+            for state in way.states:
+                shift = state.take(nodes, axis=0) - reference
+                between = 0.5 * (shift[:, 0] + shift[:, 1] - shift[:, 2] - shift[:, 3])
+                vectors = np.stack(
+                    [between, 0.5 * (shift[:, 1] - shift[:, 0]), 0.5 * (shift[:, 3] - shift[:, 2])], axis=1
+                )
+                np.maximum(
+                    nearer, np.sqrt(np.einsum("ksc,ksc->ks", vectors, vectors)).sum(axis=1), out=nearer
+                )
+        return nearer
 
     def segments(self, X: Array, rows: Index) -> Array:
         """Return the members' ends (k, 6)."""

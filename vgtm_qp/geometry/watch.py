@@ -18,20 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.geometry.batch import Batch
 from vgtm_qp.geometry.clearance import Clearance
-from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
+from vgtm_qp.geometry.exact import CONTACT, WIDTH
 from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.formulas import FAR
-from vgtm_qp.geometry.groups import Group
+from vgtm_qp.geometry.groups import FOLLOWED, Group
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.shapes import GeometryError
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_MOST_PAIRS = 8000
-_AT_ONCE = 128
+_AT_ONCE = FOLLOWED[-1]
 _AHEAD = 1.2
 """Pairs are evaluated from so many times the distance on that mattered last: it may be larger in the next state."""
 
@@ -77,9 +75,7 @@ class _Pairs:
         piece = np.zeros((len(group), WIDTH)) if group.is_self else parameters[group.other]
         normal = np.tile([0.0, 0.0, 1.0], (len(group), 1))
         self.known = np.concatenate([piece, group.radius[:, None], normal], axis=1)
-        self._contacts = Batch(follow_function(group.shape))
-        for count in (1, _AT_ONCE):
-            self._contacts.prepare(count)
+        self._contacts = group.follow
         self.near = np.zeros(0, dtype=np.int64)
         """Pairs that were evaluated in the present state,"""
         self.contacts = np.zeros((0, CONTACT))
@@ -144,11 +140,8 @@ class Watch:
 
     @staticmethod
     def serves(monitor: Clearance) -> bool:
-        """Whether nothing moves but the arm, members end at their nodes, there are no meshes and not too many pairs."""
-        members, pieces = len(monitor.members), monitor.pieces
-        simple = not pieces.moving and monitor.ends_at_nodes and "triangle" not in pieces.shape
-        count = members * len(pieces) + (members * (members - 1) // 2 if monitor.self_collision else 0)
-        return simple and members > 1 and 0 < count <= _MOST_PAIRS
+        """Whether nothing moves but the arm and there are not too many pairs."""
+        return monitor.rests
 
     def near(self, X: Array, limit: float, self_limit: float, fcl_reach: float) -> Contacts | None:
         """Return all contacts nearer than `limit`, or `self_limit` between members, m; None where surfaces overlap.

@@ -1,0 +1,180 @@
+from collections import Counter
+
+import numpy as np
+import pytest
+from geometry_reference import octahedral_arm
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.geometry.shapes import box, sphere
+
+BAYS = 40
+
+
+def long_arm(bays=BAYS):
+    """Nodes, and a monitor of an arm with two obstacles, whose lists are not of all pairs."""
+    X, members = octahedral_arm(bays)
+    height = float(X[:, 2].max())
+    obstacles = [box("cube", (1.2, 0.0, 0.7 * height), 0.5), sphere("ball", (-1.5, 0.3, 0.4 * height), 0.4)]
+    return X, Clearance(members, 0.03, obstacles, safe=0.08, influence=0.5)
+
+
+def turned(X, first, rotation):
+    """The arm with all faces from `first` on turned about that one, m."""
+    bent = X.copy()
+    center = X[3 * first : 3 * first + 3].mean(axis=0)
+    bent[3 * first :] = center + (X[3 * first :] - center) @ rotation.as_matrix().T
+    return bent
+
+
+def every_distance(monitor, X, time=0.0):
+    """Distance of each pair (member, other, is_self), evaluated one by one."""
+    distances = {}
+    for group in monitor.every_pair(X).groups:
+        for m, k, distance in zip(group.member, group.other, group.distance, strict=True):
+            distances[
+                (int(min(m, k)), int(max(m, k)), True) if group.is_self else (int(m), int(k), False)
+            ] = float(distance)
+    return distances
+
+
+def key(member, other, is_self):
+    pair = (min(member, other), max(member, other)) if is_self else (member, other)
+    return int(pair[0]), int(pair[1]), bool(is_self)
+
+
+def bends(rng, X, count):
+    """States of an arm that goes as a whole, bends at a few joints, and now and then folds or jumps home."""
+    home, hinges = X, rng.integers(1, BAYS, 2)
+    for _ in range(count):
+        kind = rng.choice(["goes", "bends", "bends", "wobbles", "folds", "home"])
+        if kind == "goes":
+            X = X + rng.normal(size=3) * 0.3
+        elif kind == "bends":
+            X = turned(X, rng.choice(hinges), Rotation.from_rotvec(rng.normal(size=3) * 0.1))
+        elif kind == "wobbles":
+            X = X + rng.normal(size=X.shape) * 0.02
+        elif kind == "folds":
+            X = turned(X, rng.integers(1, BAYS), Rotation.from_rotvec([0.0, rng.choice([1.5, 2.9]), 0.0]))
+        else:
+            X = home
+        yield X
+
+
+def loose_rods(rng):
+    """Nodes, and a monitor of short rods that fill a long box: pairs are at all distances."""
+    middle = rng.uniform(0.0, 1.0, size=(160, 3)) * (1.5, 1.5, 12.0)
+    X = np.stack([middle, middle + 0.1 * rng.normal(size=(160, 3))], axis=1).reshape(-1, 3)
+    members = np.arange(320).reshape(-1, 2)
+    return X, Clearance(members, 0.001, [sphere("ball", (3.0, 0.0, 5.0), 0.5)], safe=0.08, influence=0.5)
+
+
+def squeezes(rng, X, count):
+    """States of rods that are carried far, are drawn together at a place, and go back now and then."""
+    home, places = X, rng.uniform(0.0, 12.0, size=2)
+    for _ in range(count):
+        if rng.random() < 0.1:
+            X = home
+        way = X - (X.mean(axis=0) * (1, 1, 0) + (0, 0, rng.choice(places)))
+        pull = rng.choice([0.02, 0.2]) * np.exp(-((way / 2.0) ** 2).sum(axis=1, keepdims=True))
+        X = X - pull * way + np.array([0.2, 0.2, 0.0])
+        yield X
+
+
+def scene_and_states(seed, rods, count):
+    rng = np.random.default_rng(seed)
+    X, monitor = loose_rods(rng) if rods else long_arm()
+    return rng, monitor, X, (squeezes if rods else bends)(rng, X, count)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.booleans())
+def test_no_near_pair_of_what_bends_is_missed(seed, rods):
+    rng, monitor, _, states = scene_and_states(seed, rods, 8)
+    for state in states:
+        exact = every_distance(monitor, state)
+        reach, self_reach = rng.choice([0.2, 0.5]), rng.choice([0.1, 0.22, 0.5])
+        near = monitor.near(state, 0.0, reach, use_fcl=False, self_reach=self_reach)
+        found = [key(*row) for row in zip(near.member, near.other, near.is_self, strict=True)]
+        expected = {pair for pair, distance in exact.items() if distance < (self_reach if pair[2] else reach)}
+        assert set(found) == expected
+        # A pair has two rows at most, however many lists there are.
+        assert max(Counter(found).values(), default=0) <= 2
+        for pair, distance in zip(found, near.distance, strict=True):
+            assert distance >= exact[pair] - 1e-9
+        floors = {False: rng.choice([0.0, 0.08]), True: rng.choice([0.0, 0.03])}
+        keeps = all(distance >= floors[pair[2]] for pair, distance in exact.items())
+        assert monitor.keeps(state, 0.0, floors[False], floors[True]) == keeps
+
+
+def check_bounds(candidates, motion, exact):
+    """Assert that no bound exceeds the distance it bounds."""
+    listed = set()
+    for group in candidates.groups:
+        pairs = [key(*pair, group.is_self) for pair in zip(group.member, group.other, strict=True)]
+        assert listed.isdisjoint(pairs)
+        listed.update(pairs)
+        distances = np.array([exact[pair] for pair in pairs])
+        for limit in (0.1, np.inf):
+            lower, others = group.lower(motion, limit)
+            assert (lower <= distances[: len(lower)] + 1e-9).all()
+            assert (others <= distances[len(lower) :] + 1e-9).all()
+    far, far_self = candidates.beyond(motion)
+    for pair, distance in exact.items():
+        assert pair in listed or distance >= (far_self if pair[2] else far) - 1e-9
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.booleans(), st.booleans())
+def test_bounds_of_what_bends_never_exceed_the_distances(seed, rods, refreshed):
+    rng, monitor, X, states = scene_and_states(seed, rods, 10)
+    monitor.near(X)
+    candidates = monitor._candidates
+    before = X
+    for state in states:
+        # Lists are brought up to a state, and hold for the way to another one.
+        monitor.keeps(before, 0.0, 0.0, rng.choice([0.0, 0.2]))
+        check_bounds(candidates, candidates.motion(before, 0.0), every_distance(monitor, before))
+        check_bounds(candidates, candidates.motion(before, 0.0, state, 0.0), every_distance(monitor, state))
+        if refreshed:
+            candidates.refresh(state, 0.0)
+            check_bounds(candidates, candidates.motion(state, 0.0), every_distance(monitor, state))
+        before = state
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.02, 0.4))
+def test_what_is_proven_of_an_arm_that_bends_holds_on_the_way(seed, size):
+    rng = np.random.default_rng(seed)
+    X, monitor = long_arm()
+    start = X
+    for _ in range(4):
+        end = turned(start, rng.integers(1, BAYS), Rotation.from_rotvec(rng.normal(size=3) * size))
+        report = monitor.between(start, end, 0.0, 0.0, 0.02, 0.01)
+        for s in np.linspace(0.0, 1.0, 6) if report.certified else ():
+            exact = every_distance(monitor, start + s * (end - start))
+            assert all(d >= (0.01 if pair[2] else 0.02) - 1e-9 for pair, d in exact.items())
+        start = end
+
+
+@pytest.mark.parametrize("hinge", [None, BAYS - 3])
+def test_an_arm_that_is_carried_or_bends_in_one_place_is_compared_once(monkeypatch, hinge):
+    X, monitor = long_arm()
+    monitor.near(X)
+    renewed = []
+    monkeypatch.setattr(monitor._candidates, "renew_members", lambda *arguments: renewed.append(arguments))
+    nearer = 0
+    for k in range(1, 40):
+        state = X + np.array([0.3 * k, 0.1 * k, 0.0])
+        if hinge is not None:
+            state = turned(state, hinge, Rotation.from_rotvec((0.0, 0.06 * k, 0.0)))
+        near = monitor.near(state, use_fcl=False)
+        found = {key(*row) for row in zip(near.member, near.other, near.is_self, strict=True)}
+        exact = every_distance(monitor, state)
+        assert found == {pair for pair, d in exact.items() if d < (0.22 if pair[2] else 0.5)}
+        assert sum(map(len, monitor._candidates.groups)) < 5000
+        nearer += int(near.is_self.sum())
+    assert not renewed
+    assert (nearer > 0) == (hinge is not None)
