@@ -18,8 +18,8 @@ _BEGIN = 8
 _SWITCH = 64
 """A capacity that was not prepared is compiled from the 8th call that asks for it on, and used from the 64th on.
 
-Until then smaller ones serve, with the same digits: a list that is made once is not worth a compiler, and no step waits
-for one.
+Until then smaller ones serve, with the same answers but for rounding: a list that is made once is not worth a compiler,
+and no step waits for one.
 """
 
 
