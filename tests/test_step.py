@@ -745,3 +745,14 @@ def test_goals_of_control_vertices_that_come_and_go_in_clutter_leave_one_set_of_
         resolver._attempt.engine._solver._reserve(80 + 7 * k)
         step = resolver.step(position=tip + (k + 1) * np.array([0.032, 0.0, -0.0156]), dt=0.2)
         assert step.status is vq.StepStatus.REACHED, (k, step)
+
+
+def test_what_holds_an_actuator_is_named_by_the_limit_that_does():
+    free = vq.load_problem("five_bay_free")
+    slow = vq.Resolver(free.replace({"truss.rate": 0.02, "method.slow_approach": False}))
+    step = slow.step(position=[0.2, 0.0, 3.9], dt=0.2)
+    assert any(name.startswith("rate: B") for name in step.active), step.active
+    gentle = vq.Resolver(free.replace({"truss.acceleration": 0.1, "end_effector.mode": "hard"}))
+    step = gentle.step(position=[0.06, 0.0, 4.0], dt=0.2)
+    assert step.status is vq.StepStatus.BLOCKED
+    assert all(not name.startswith("stroke: ") for name in step.active), step.active

@@ -117,6 +117,10 @@ def _report(summary: dict[str, Any]) -> str:
     lines = [f"{summary['name']}: {summary['status']}, {verified}"]
     if summary["blocked_by"]:
         lines += [f"  stopped by {name}" for name in summary["blocked_by"][:4]]
+    if summary["way_out"]:
+        lines.append(
+            f"  a dead end as asked; by a way out: {summary['way_out']} (method.retries = false for none)"
+        )
     lines += [f"  not within tolerance: {line}" for line in summary["failures"]]
     step = summary["step_time"]
     rows = [

@@ -51,6 +51,8 @@ def study(
     titles = {name: Study.named(name).title for name in wanted}
     if workers < 1:
         raise GoalError(f"--workers must be 1 or more, not {workers}")
+    if scenes is not None and scenes < 1:
+        raise GoalError(f"--scenes must be 1 or more, not {scenes}")
     given = {"scenes": scenes, "seed": seed, "ipopt": ipopt or None}
     options = {key: value for key, value in given.items() if value is not None}
     for name in titles:

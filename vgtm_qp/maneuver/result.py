@@ -138,6 +138,8 @@ class Maneuver:
     def __str__(self) -> str:
         """Return one paragraph: name, status, steps, what stopped it, what verification found."""
         text = f"{self._name}: {self.status}, {100.0 * self.reached:.4g} % of the path in {self.steps} steps."
+        if way := self.manifest.get("way_out"):
+            text += f" Not as asked at first, which was a dead end, but by a way out: {way}."
         if self.blocked_by:
             text += f" Stopped by {', '.join(self.blocked_by[:4])}."
         certificate = self.certificate
@@ -225,6 +227,7 @@ class Maneuver:
             "step_time": self._step_time(),
             "setup_time": manifest.get("setup_time"),
             "blocked_by": list(self.blocked_by),
+            "way_out": str(self.manifest.get("way_out", "")),
             "verified": None if certificate is None else certificate.ok,
             "failures": [] if certificate is None else list(certificate.failures()),
             "result": None if result is None else str(result),

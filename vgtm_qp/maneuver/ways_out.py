@@ -90,9 +90,10 @@ def _actuator_rates(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: AR
 
 
 def _no_curve(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    if problem.method.tracking == "none":
+    # Who wants the faces on the curve exactly does not want to be without one.
+    if problem.method.tracking == "none" or problem.method.hard_tracking:
         return {}
-    return {"method.tracking": "none", "method.hard_tracking": False}
+    return {"method.tracking": "none"}
 
 
 def _more_vertices(problem: Problem, dead_end: DeadEnd) -> Changes:

@@ -101,4 +101,4 @@ def pose_displacement(start: PathPoint, end: PathPoint) -> tuple[Array, Array]:
 
 
 def _step(status: StepStatus, progress: float, state: State, reason: str) -> Step:
-    return Step(status, progress, state, reason, 0, ())
+    return Step(status, progress, state, reason, 0, lambda k, upper: "")  # noqa: ARG005

@@ -233,7 +233,7 @@ class Attempt:
             except AnswerError as error:
                 return replace(outcome(str(error), count), solver_failed=True)
             except InfeasibleStepError:
-                return outcome("infeasible", count)
+                return outcome("no displacement keeps all limits and clearances", count)
             except SolverError as error:
                 return outcome(str(error), count)
             finally:

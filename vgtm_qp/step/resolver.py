@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -395,7 +395,7 @@ class Resolver:
             smallest,
             braking.rank if can_brake and braking is not None else _ANY_RANK,
         )
-        told = (tuple(self._row_names), outcome.solution, outcome.rows, outcome.solver_failed)
+        told = (self._limit_names(state, dt, box), outcome.solution, outcome.rows, outcome.solver_failed)
         if not outcome.accepted and braking is not None and can_brake:
             return self._brake(braking, path, start, end, outcome.reason, outcome.iterations, *told)
         if not outcome.accepted:
@@ -482,7 +482,7 @@ class Resolver:
         braking = self._braking
         if braking is None or braking.origin is not self.state or not braking.steps:
             return None
-        return self._brake(braking, path, start, end, "", 0, tuple(self._row_names))
+        return self._brake(braking, path, start, end, "", 0, str)
 
     def _brake(
         self, braking: Braking, path: Path | None, start: float, end: float, reason: str, qps: int, *told: Any
@@ -560,6 +560,22 @@ class Resolver:
     ) -> Target:
         then = state.time + dt
         return Target(path, start, end, *box, then, *self.arm.base_at(then), self._vertex_goals)
+
+    def _limit_names(self, state: State, dt: float, box: tuple[Array, Array]) -> Callable[[int, bool], str]:
+        """Return what names the limit at the lower (False) or upper side of an actuator's box, by its number."""
+        (stroke, rate, acceleration), rows = self._limits, tuple(self._row_names)
+        ends, names, actuators = stroke.copy(), self._actuator_names, self.arm.truss.actuators
+
+        def name(k: int, upper: bool) -> str:
+            bound, way = float(box[upper][k]), rate[k] * dt
+            if rows[k].startswith("locked") or abs(bound - ends[k, int(upper)]) < _INSTANT:
+                return rows[k]
+            length = float(state.lengths[actuators[k]])
+            if abs(bound - (length + way if upper else length - way)) < _INSTANT:
+                return f"rate: {names[k]}"
+            return rows[k] if math.isinf(acceleration[k]) else f"acceleration: {names[k]}"
+
+        return name
 
     def explain(
         self,

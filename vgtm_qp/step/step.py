@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -51,7 +52,7 @@ class Step:
     state: State
     reason: str
     qps: int
-    _actuators: tuple[str, ...]
+    _limit_name: Callable[[int, bool], str]
     _solution: StepSolution | None = None
     _rows: ClearanceRows | None = None
     solver_failed: bool = False
@@ -77,9 +78,10 @@ class Step:
         for k in np.flatnonzero(pressing > 1e-9):
             name = self._rows.name(int(k))
             found[name] = max(found.get(name, 0.0), float(pressing[k]))
-        strokes = np.abs(self._solution.actuator_multipliers)
+        pull = self._solution.actuator_multipliers
+        strokes = np.abs(pull)
         for k in np.flatnonzero(strokes > 1e-9):
-            found[self._actuators[k]] = float(strokes[k])
+            found[self._limit_name(int(k), bool(pull[k] > 0.0))] = float(strokes[k])
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     @property
