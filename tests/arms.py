@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss import modules
+from vgtm_qp.arm.truss.graph import graph_truss
+from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.curve.families import bezier
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.task import TipTask
-from vgtm_qp.truss import modules
-from vgtm_qp.truss.graph import graph_truss
-from vgtm_qp.truss.kinematics import Kinematics
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

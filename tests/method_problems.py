@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from vgtm_qp.arm.truss.build import build_truss
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import AnyResolver
 from vgtm_qp.problem import Problem
-from vgtm_qp.truss.build import build_truss
 
 MODULES: dict[str, dict[str, Any]] = {
     "octahedral": {"module": "octahedral", "bays": 5},

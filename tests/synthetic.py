@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.joints import Joints
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.maneuver.manifest import arm_record, make_manifest
 from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.truss.joints import Joints
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ from arms import arm_problem, central_differences
 from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss import modules
 from vgtm_qp.errors import GoalError, ProblemError
 from vgtm_qp.problem.truss import BasePose
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.resolver import Resolver, StepStatus
-from vgtm_qp.truss import modules
 
 POSES = (
     {"time": 2.0, "position": [0.2, 0.0, 0.1], "rotation_vector": [0.0, 0.2, 0.3]},

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.bench import contestants, measure, report, scenes
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
@@ -27,7 +28,6 @@ from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
 from vgtm_qp.step.path import Path as TipPath
 from vgtm_qp.step.state import State
-from vgtm_qp.truss.joints import member_ends
 
 SPENT = {"type": "number", "minimum": 0}
 TIMING = {

@@ -9,6 +9,9 @@ import pytest
 from arms import make_layout
 from test_engines import assert_same_answer, make_step, pressing
 
+from vgtm_qp.arm.truss import modules
+from vgtm_qp.arm.truss.build import lock_members
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.bench.scenes import make_scenes
 from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.chain_data import ChainData
@@ -21,9 +24,6 @@ from vgtm_qp.step.engine import Accuracy, PlainEngine
 from vgtm_qp.step.linearise import Linearisation, QPInput
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, StepStatus
-from vgtm_qp.truss import modules
-from vgtm_qp.truss.build import lock_members
-from vgtm_qp.truss.kinematics import Kinematics
 
 MODULES = {
     "octahedral": lambda: modules.octahedral(5),

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
+from vgtm_qp.arm.truss.graph import graph_truss
+from vgtm_qp.arm.truss.mobility import describe
+from vgtm_qp.arm.truss.modules import double_octahedral, hexapod, longeron, octahedral
+from vgtm_qp.arm.truss.stages import placement_stages
 from vgtm_qp.errors import ProblemError, TrussError
-from vgtm_qp.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.truss.graph import graph_truss
-from vgtm_qp.truss.mobility import describe
-from vgtm_qp.truss.modules import double_octahedral, hexapod, longeron, octahedral
-from vgtm_qp.truss.stages import placement_stages
 
 CMU = json.loads((Path(__file__).parent / "data" / "cmu_truss.json").read_text())
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from arms import TRUSSES, make_layout, random_pose
 
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.fused import FusedSolver
@@ -18,7 +19,6 @@ from vgtm_qp.qp.solvers import make_solver
 from vgtm_qp.step.engine import Accuracy, FusedEngine, PlainEngine
 from vgtm_qp.step.linearise import Linearisation, QPInput, Target
 from vgtm_qp.step.path import Path, rotation_from_vector
-from vgtm_qp.truss.kinematics import Kinematics
 
 ELIMINABLE = [name for name in TRUSSES if name != "graph"]
 TRACKS = {"hexapod": ("position", "orientation"), "longeron": ("x", "pointing")}

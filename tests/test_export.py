@@ -168,7 +168,7 @@ def test_masses_add_up_to_those_of_the_members(maneuver: vq.Maneuver):
 
 
 def test_offset_joints_have_no_mujoco_model():
-    from vgtm_qp.truss.joints import Joints
+    from vgtm_qp.arm.truss.joints import Joints
 
     joints = Joints(triangle=np.tile([0, 1, 2], (5, 1)), offset=np.zeros((6, 2, 3)))
     nodes = place(np.array([1.4, 1.4, 1.4, 1.5, 1.5, 0.9]))[None]

@@ -7,8 +7,8 @@ import pytest
 from arms import TRUSSES, central_differences, make_layout, random_pose
 from scipy.spatial.transform import Rotation
 
-from vgtm_qp.truss.joints import member_ends
-from vgtm_qp.truss.kinematics import Kinematics
+from vgtm_qp.arm.truss.joints import member_ends
+from vgtm_qp.arm.truss.kinematics import Kinematics
 
 OFFSETS = (0.0, 0.12)
 

@@ -11,10 +11,10 @@ from arms import arm_problem
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from vgtm_qp.arm.truss import modules
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem, load_problem
-from vgtm_qp.truss import modules
 from vgtm_qp.verify import verify
 
 PROBLEMS = Path(__file__).parents[1] / "problems"

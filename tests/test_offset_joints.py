@@ -7,13 +7,13 @@ import pytest
 from arms import TRUSSES, arm_problem, central_differences, random_pose
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.joints import member_ends
+from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.errors import TrussError
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.study.scenes import random_scene
-from vgtm_qp.truss.joints import member_ends
-from vgtm_qp.truss.kinematics import EndKinematics
 
 
 @pytest.mark.parametrize("name", TRUSSES)

@@ -9,12 +9,12 @@ import pytest
 from arms import TRUSSES, make_layout, random_pose
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.errors import SolverError, VgtmError
 from vgtm_qp.qp.condensed import InfeasibleStepError
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
 from vgtm_qp.qp.solvers import _TIGHT, FullSolver, available_solvers, make_solver
-from vgtm_qp.truss.kinematics import Kinematics
 
 FULL_SOLVERS = ["osqp", "piqp", "clarabel"]
 SOLVERS = ["daqp", *FULL_SOLVERS]

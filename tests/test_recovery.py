@@ -10,11 +10,11 @@ import pytest
 from arms import mast
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss import modules
+from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.cli import main
 from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.resolver import Resolver
-from vgtm_qp.truss import modules
-from vgtm_qp.truss.joints import member_ends
 
 BASE = {
     "name": "three bays",

@@ -11,6 +11,9 @@ from arms import make_layout, mast, random_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vgtm_qp.arm.truss import modules
+from vgtm_qp.arm.truss.build import lock_members
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.errors import SolverError
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp import lengths as lengths_module
@@ -28,9 +31,6 @@ from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import make_solver
 from vgtm_qp.step.linearise import Linearisation, Target
 from vgtm_qp.step.path import Path, rotation_from_vector
-from vgtm_qp.truss import modules
-from vgtm_qp.truss.build import lock_members
-from vgtm_qp.truss.kinematics import Kinematics
 
 MODULES = {
     "octahedral": lambda **kw: modules.octahedral(4, **kw),

@@ -10,6 +10,8 @@ from arms import TRUSSES, arm_problem, central_differences, make_layout, random_
 from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.joints import member_ends
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.errors import GoalError, ProblemError, VgtmError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
@@ -19,8 +21,6 @@ from vgtm_qp.step.linearise import Linearisation, Target, clearance_rows
 from vgtm_qp.step.path import Path, turn_between, vector_from_rotation
 from vgtm_qp.step.resolver import Resolver, StepStatus
 from vgtm_qp.step.task import TipTask
-from vgtm_qp.truss.joints import member_ends
-from vgtm_qp.truss.kinematics import Kinematics
 
 FRAMED = [name for name in TRUSSES if name != "graph"]
 

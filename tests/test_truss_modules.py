@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
+from vgtm_qp.arm.truss.build import build_truss, lock_members
+from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
+from vgtm_qp.arm.truss.joints import member_ends
+from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.truss.mobility import describe, tip_response, trackable_coordinates
+from vgtm_qp.arm.truss.modules import double_octahedral, hexapod, longeron, octahedral, tetrahedral
+from vgtm_qp.arm.truss.plate import plate
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
-from vgtm_qp.truss.build import build_truss, lock_members
-from vgtm_qp.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.truss.joints import member_ends
-from vgtm_qp.truss.kinematics import Kinematics
-from vgtm_qp.truss.mobility import describe, tip_response, trackable_coordinates
-from vgtm_qp.truss.modules import double_octahedral, hexapod, longeron, octahedral, tetrahedral
-from vgtm_qp.truss.plate import plate
 
 MODULES = {
     "octahedral": octahedral,

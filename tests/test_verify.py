@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from synthetic import LENGTHS, RADIUS, found_clearances, good_maneuver, maneuver_of, place, swing, tripod
 
+from vgtm_qp.arm.truss.joints import Joints
+from vgtm_qp.arm.truss.modules import octahedral
 from vgtm_qp.errors import ResultError
 from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.truss.joints import Joints
-from vgtm_qp.truss.modules import octahedral
 from vgtm_qp.verify import check, verify, verify_file
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Least, Motion
@@ -291,7 +291,7 @@ def offset_joints() -> Joints:
 
 
 def test_offset_joints_place_ends_and_bound_their_paths() -> None:
-    from vgtm_qp.truss.joints import member_ends
+    from vgtm_qp.arm.truss.joints import member_ends
 
     truss = tripod(offset_joints())
     rng = np.random.default_rng(2)
@@ -428,7 +428,7 @@ def test_shares_no_code_with_the_solver() -> None:
                 assert str(node.module).startswith(allowed), f"{file.name}: {node.module}"
     code = """
         import sys, vgtm_qp.verify
-        shared = ("casadi", "fcl", "vgtm_qp.geometry", "vgtm_qp.qp", "vgtm_qp.step", "vgtm_qp.truss")
+        shared = ("casadi", "fcl", "vgtm_qp.geometry", "vgtm_qp.qp", "vgtm_qp.step", "vgtm_qp.arm.truss")
         print([name for name in sys.modules if name.startswith(shared)])
     """
     lines = "\n".join(line.strip() for line in code.strip().splitlines())

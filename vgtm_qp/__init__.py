@@ -8,6 +8,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vgtm_qp.arm.truss.build import build_truss
+    from vgtm_qp.arm.truss.mobility import describe
+    from vgtm_qp.arm.truss.truss import Truss
     from vgtm_qp.errors import (
         CurveError,
         ExportError,
@@ -28,9 +31,6 @@ if TYPE_CHECKING:
     from vgtm_qp.methods.compare import Report, compare
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
     from vgtm_qp.step.resolver import Resolver, Step, StepStatus
-    from vgtm_qp.truss.build import build_truss
-    from vgtm_qp.truss.mobility import describe
-    from vgtm_qp.truss.truss import Truss
     from vgtm_qp.verify import verify, verify_file
 
 _HOMES = {
@@ -54,9 +54,9 @@ _HOMES = {
     "vgtm_qp.methods.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
     "vgtm_qp.step.resolver": ("Resolver", "Step", "StepStatus"),
-    "vgtm_qp.truss.build": ("build_truss",),
-    "vgtm_qp.truss.mobility": ("describe",),
-    "vgtm_qp.truss.truss": ("Truss",),
+    "vgtm_qp.arm.truss.build": ("build_truss",),
+    "vgtm_qp.arm.truss.mobility": ("describe",),
+    "vgtm_qp.arm.truss.truss": ("Truss",),
     "vgtm_qp.verify": ("verify", "verify_file"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

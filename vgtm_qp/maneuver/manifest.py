@@ -18,7 +18,7 @@ from vgtm_qp.errors import ResultError
 from vgtm_qp.maneuver.certificate import Certificate
 
 if TYPE_CHECKING:
-    from vgtm_qp.truss.truss import Truss
+    from vgtm_qp.arm.truss.truss import Truss
 
 SCHEMA_VERSION = 1
 """Version of the result file that this package writes and reads."""

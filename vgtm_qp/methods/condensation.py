@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.segment_system import Entries
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.truss.kinematics import Kinematics
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -6,11 +6,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import frame_constants, frame_function, member_function
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.path import turn_between, vector_from_rotation
-from vgtm_qp.truss.kinematics import frame_constants, frame_function, member_function
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.condensation import Condensation, CurveNodes, least_norm
@@ -14,7 +15,6 @@ from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
 from vgtm_qp.methods.segment_system import SegmentSystem
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.truss.kinematics import Kinematics
 
 Array = NDArray[np.float64]
 

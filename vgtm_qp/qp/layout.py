@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import member_nodes
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
-from vgtm_qp.truss.kinematics import member_nodes
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

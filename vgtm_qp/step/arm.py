@@ -10,6 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.build import LockError, build_truss
+from vgtm_qp.arm.truss.joints import member_ends
+from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.errors import Mistake, ProblemError, nearest
 from vgtm_qp.geometry import shapes
@@ -33,10 +37,6 @@ from vgtm_qp.step.linearise import Linearisation
 from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
-from vgtm_qp.truss.build import LockError, build_truss
-from vgtm_qp.truss.joints import member_ends
-from vgtm_qp.truss.kinematics import Kinematics
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.problem.truss import BasePose
 from vgtm_qp.step.path import Path, rotation_from_vector
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import Kinematics, frame_constants, frame_function
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.long.closing import MOST_STEPS, TOO_FAR
@@ -26,7 +27,6 @@ from vgtm_qp.step.engine import Accuracy, LengthCloser, enough_length, enough_ti
 from vgtm_qp.step.linearise import QPInput, Target
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.task import TipTask, worth_closing
-from vgtm_qp.truss.kinematics import Kinematics, frame_constants, frame_function
 
 Array = NDArray[np.float64]
 

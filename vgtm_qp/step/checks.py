@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from vgtm_qp.arm.truss.mobility import RANK_TOLERANCE, actuator_response, describe
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
 from vgtm_qp.errors import Mistake
 from vgtm_qp.geometry.clearance import Clearance
@@ -18,8 +20,6 @@ from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.problem.table import Place, shown
 from vgtm_qp.step.arm import Arm
 from vgtm_qp.step.path import PathPoint
-from vgtm_qp.truss.mobility import RANK_TOLERANCE, actuator_response, describe
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

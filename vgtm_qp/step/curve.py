@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
 from vgtm_qp.errors import Mistake, ProblemError
@@ -14,7 +15,6 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.step.task import TipTask
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.fused import Closed, FusedSolver, Taken, TipGoal
 from vgtm_qp.qp.fused_settle import NEAR
@@ -27,7 +28,6 @@ from vgtm_qp.qp.settle import SETTLING_STEPS, held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.step.linearise import Linearisation, QPInput, Target, base_frame
 from vgtm_qp.step.path import PathPoint
-from vgtm_qp.truss.kinematics import Kinematics
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.truss.truss import Truss
+from vgtm_qp.arm.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

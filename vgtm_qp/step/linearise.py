@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.geometry.clearance import Clearance, NearPairs
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers, progress_scale
 from vgtm_qp.qp.shape import turn_rows
 from vgtm_qp.step.path import Path, PathPoint
 from vgtm_qp.step.task import TipTask, worth_closing
-from vgtm_qp.truss.kinematics import Kinematics
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 

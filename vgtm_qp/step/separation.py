@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.joints import member_ends
+from vgtm_qp.arm.truss.kinematics import EndKinematics
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.geometry.clearance import BetweenReport, Clearance, NearPairs, Pair
 from vgtm_qp.geometry.pairs import certified
 from vgtm_qp.geometry.watch import Contacts, Watch
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.linearise import clearance_rows
-from vgtm_qp.truss.joints import member_ends
-from vgtm_qp.truss.kinematics import EndKinematics
-from vgtm_qp.truss.truss import Truss
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

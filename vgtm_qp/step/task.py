@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.qp.numbers import CLOSED
 from vgtm_qp.step.path import PathPoint, turn_between, vector_from_rotation
-from vgtm_qp.truss.kinematics import Kinematics
 
 Array = NDArray[np.float64]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.shape import turn_rows
 from vgtm_qp.step.linearise import base_frame
-from vgtm_qp.truss.kinematics import Kinematics
 
 Array = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from vgtm_qp.arm.truss.build import build_truss
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.problem import Problem
-from vgtm_qp.truss.build import build_truss
-from vgtm_qp.truss.truss import Truss
 
 DURATION = 10.0
 

@@ -14,12 +14,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import joint_frame
 from vgtm_qp.geometry.clearance import NearPairs
 from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.arm import Arm
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.state import State, frozen
-from vgtm_qp.truss.kinematics import joint_frame
 
 Array = NDArray[np.float64]
 

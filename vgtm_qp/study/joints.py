@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.problem import load_problem
@@ -15,7 +16,6 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.arm import build_arm
 from vgtm_qp.study.drawing import MARKS, label, panels
 from vgtm_qp.study.workers import Row, Task
-from vgtm_qp.truss.kinematics import Kinematics
 
 Array = NDArray[np.float64]
 

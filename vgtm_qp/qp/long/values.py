@@ -6,11 +6,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.kinematics import face_frame, frame_constants
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
 from vgtm_qp.qp.long.elimination import member_lengths
-from vgtm_qp.truss.kinematics import face_frame, frame_constants
 
 Array = NDArray[np.float64]
 

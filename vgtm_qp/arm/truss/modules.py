@@ -12,9 +12,9 @@ from typing import Unpack
 
 import numpy as np
 
+from vgtm_qp.arm.truss.assembly import Limits, MemberRow, assemble
+from vgtm_qp.arm.truss.truss import Array, Index, Truss
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.assembly import Limits, MemberRow, assemble
-from vgtm_qp.truss.truss import Array, Index, Truss
 
 
 def octahedral(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:

@@ -6,9 +6,9 @@ from typing import Unpack
 
 import numpy as np
 
+from vgtm_qp.arm.truss.assembly import Limits, MemberRow, assemble
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.assembly import Limits, MemberRow, assemble
-from vgtm_qp.truss.truss import Truss
 
 
 def plate(
@@ -28,7 +28,7 @@ def plate(
     spacing, depth : float
         Distance of neighbouring surface nodes, and of the apexes from the surface, m.
     **limits
-        See :class:`vgtm_qp.truss.assembly.Limits`; the stroke is 0.7 to 1.4 times the home length by default.
+        See :class:`vgtm_qp.arm.truss.assembly.Limits`; the stroke is 0.7 to 1.4 times the home length by default.
 
     Raises
     ------

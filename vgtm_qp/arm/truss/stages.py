@@ -8,8 +8,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 
+from vgtm_qp.arm.truss.truss import Index, Mask
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.truss import Index, Mask
 
 
 def placement_stages(base: Mask, members: Index) -> Index:

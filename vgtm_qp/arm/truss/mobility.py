@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from vgtm_qp.truss.determinacy import DeterminacyReport, check_determinacy, length_jacobian
-from vgtm_qp.truss.kinematics import Kinematics
-from vgtm_qp.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, length_jacobian
+from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.truss.truss import Array, Index, Truss
 
 RANK_TOLERANCE = 1e-8
 """Singular values of a tip or face Jacobian below this fraction of the greatest one count as zero."""
@@ -33,7 +33,7 @@ class TrussDescription:
     free_motions : int
         Unknown coordinates less fixed members: what the actuators and nothing else decide.
     trackable, face_stride
-        As in :class:`vgtm_qp.truss.truss.Truss`.
+        As in :class:`vgtm_qp.arm.truss.truss.Truss`.
     determinacy : DeterminacyReport
         Rank and smallest singular value of the square length Jacobian.
     tip_rank, tip_coordinates : int

@@ -8,9 +8,9 @@ from typing import NamedTuple, TypedDict
 
 import numpy as np
 
+from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
+from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.joints import axial_joints, joint_triangles
-from vgtm_qp.truss.truss import Array, Index, Mask, Truss
 
 
 class Limits(TypedDict, total=False):
@@ -64,7 +64,7 @@ def assemble(
     weights
         Of the three nodes of every face.
 
-    Other parameters are as in :class:`vgtm_qp.truss.truss.Truss`.
+    Other parameters are as in :class:`vgtm_qp.arm.truss.truss.Truss`.
 
     Raises
     ------

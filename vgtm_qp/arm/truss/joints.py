@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import TrussError
 
 if TYPE_CHECKING:
-    from vgtm_qp.truss.truss import Truss
+    from vgtm_qp.arm.truss.truss import Truss
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -85,7 +85,7 @@ def joint_triangles(
     Parameters
     ----------
     node_names, home, members, stage
-        As in :class:`vgtm_qp.truss.truss.Truss`.
+        As in :class:`vgtm_qp.arm.truss.truss.Truss`.
     chosen : mapping, optional
         The two other nodes of some nodes' triangles, counter-clockwise about z.
 

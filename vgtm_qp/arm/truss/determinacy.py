@@ -14,8 +14,8 @@ from scipy import sparse
 from scipy.linalg import qr
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
+from vgtm_qp.arm.truss.truss import Array, Truss
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.truss import Array, Truss
 
 RANK_TOLERANCE = 1e-10
 """Singular values below this fraction of the greatest one count as zero."""
@@ -66,7 +66,7 @@ def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
         direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         gradient = np.stack([direction, -direction], axis=1)
     else:
-        from vgtm_qp.truss.kinematics import Kinematics
+        from vgtm_qp.arm.truss.kinematics import Kinematics
 
         kinematics = Kinematics(truss, compiled=False)
         kinematics.evaluate(X)

@@ -10,10 +10,10 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from vgtm_qp.arm.truss.joints import Array, Index
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import TrussError
-from vgtm_qp.truss.joints import Array, Index
-from vgtm_qp.truss.truss import Truss
 
 
 def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.joints import Joints, member_ends
 from vgtm_qp.errors import TrussError, nearest
-from vgtm_qp.truss.joints import Joints, member_ends
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

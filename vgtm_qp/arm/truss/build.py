@@ -7,14 +7,14 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from vgtm_qp.arm.truss import modules
+from vgtm_qp.arm.truss.assembly import Limits
+from vgtm_qp.arm.truss.graph import truss_from_graph
+from vgtm_qp.arm.truss.joints import member_ends
+from vgtm_qp.arm.truss.plate import plate
+from vgtm_qp.arm.truss.truss import Array, Truss
 from vgtm_qp.errors import TrussError, nearest
 from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, PlateTruss, TetrahedralTruss
-from vgtm_qp.truss import modules
-from vgtm_qp.truss.assembly import Limits
-from vgtm_qp.truss.graph import truss_from_graph
-from vgtm_qp.truss.joints import member_ends
-from vgtm_qp.truss.plate import plate
-from vgtm_qp.truss.truss import Array, Truss
 
 _MODULES = {
     "octahedral": modules.octahedral,

@@ -11,13 +11,13 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
+from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
+from vgtm_qp.arm.truss.joints import Joints, axial_joints, joint_triangles
+from vgtm_qp.arm.truss.mobility import trackable_coordinates
+from vgtm_qp.arm.truss.stages import placement_stages
+from vgtm_qp.arm.truss.truss import Array, Index, Truss
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import GraphTruss, Member
-from vgtm_qp.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.truss.joints import Joints, axial_joints, joint_triangles
-from vgtm_qp.truss.mobility import trackable_coordinates
-from vgtm_qp.truss.stages import placement_stages
-from vgtm_qp.truss.truss import Array, Index, Truss
 
 _LENGTH_SLACK = 1e-3
 """Positions this near, as a fraction, to the given lengths are corrected to them: rounded, not mistaken."""
@@ -65,7 +65,7 @@ def truss_from_graph(spec: GraphTruss) -> Truss:
     """Build the truss of a ``[truss]`` table with ``module = "graph"``; `locked` is left to the caller.
 
     Home positions are corrected to the lengths that are given. The joint frame at a node without ``joint``
-    is that of :func:`vgtm_qp.truss.joints.joint_triangles`.
+    is that of :func:`vgtm_qp.arm.truss.joints.joint_triangles`.
 
     Raises
     ------
