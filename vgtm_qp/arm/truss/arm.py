@@ -1,0 +1,170 @@
+"""The first arm behind the door: a truss, whose configuration is the positions of its nodes, eqs. (7)-(10)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from vgtm_qp.arm.arm import Label, MotionPattern, Pose, Stations, Tip
+from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arm.truss.kinematics import TrussKinematics
+from vgtm_qp.arm.truss.lengths import LengthRows
+from vgtm_qp.arm.truss.symbols import TrussSymbols
+from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
+
+
+class TrussArm:
+    """See ``arm.Arm``."""
+
+    def __init__(self, truss: Truss) -> None:
+        self.truss = truss
+        self.kind = truss.module
+
+    @property
+    def node_names(self) -> tuple[str, ...]:
+        """Length N."""
+        return self.truss.node_names
+
+    @property
+    def home(self) -> Array:
+        """(N, 3) nodes at home, m."""
+        return self.truss.home
+
+    @property
+    def home_configuration(self) -> Array:
+        """(N, 3) nodes at home, m."""
+        return self.truss.home
+
+    @property
+    def base(self) -> Mask:
+        """(N,) nodes that only the base moves."""
+        return self.truss.base
+
+    @property
+    def free(self) -> Index:
+        """(N - N_c,) the others in stage order."""
+        return self.truss.free
+
+    @property
+    def quantity_names(self) -> tuple[str, ...]:
+        """Names of the members."""
+        return self.truss.member_names
+
+    @property
+    def actuated(self) -> Mask:
+        """(M,) members that change their length."""
+        return self.truss.actuated
+
+    @property
+    def actuators(self) -> Index:
+        """(n_a,) their indices."""
+        return self.truss.actuators
+
+    @property
+    def actuator_units(self) -> tuple[str, ...]:
+        """Metres."""
+        return ("m",) * len(self.truss.actuators)
+
+    @property
+    def stroke(self) -> Array:
+        """(M, 2) least and greatest lengths, m."""
+        return self.truss.stroke
+
+    @property
+    def rate(self) -> Array:
+        """(M,) m/s."""
+        return self.truss.rate
+
+    @property
+    def acceleration(self) -> Array:
+        """(M,) m/s^2."""
+        return self.truss.acceleration
+
+    @property
+    def home_quantities(self) -> Array:
+        """(M,) lengths at home, m."""
+        return self.truss.home_lengths
+
+    @property
+    def height(self) -> float:
+        """Length of the axis at home, m."""
+        return self.truss.height
+
+    @cached_property
+    def stations(self) -> Stations:
+        """The faces."""
+        truss = self.truss
+        return Stations(
+            truss.faces, truss.face_weights, truss.face_frames, truss.trackable, truss.face_stride
+        )
+
+    @cached_property
+    def end_effector(self) -> Tip:
+        """The tip's nodes."""
+        return Tip(self.truss.tip, self.truss.tip_weights, self.truss.tip_frame)
+
+    @cached_property
+    def motion_pattern(self) -> MotionPattern:
+        """The length Jacobian, and -1 in the rows of actuated members."""
+        truss, scatter = self.truss, self.truss.scatter
+        labels = tuple(
+            Label(
+                f"{'actuator' if on else 'member'}: {name}", "actuated member" if on else "fixed member", "m"
+            )
+            for name, on in zip(truss.member_names, truss.actuated, strict=True)
+        )
+        own = 3 * len(truss.free) + np.arange(len(truss.actuators))
+        return MotionPattern(
+            np.concatenate([scatter.member, truss.actuators]), np.concatenate([scatter.column, own]), labels
+        )
+
+    @property
+    def bays(self) -> Truss:
+        """The truss itself."""
+        return self.truss
+
+    def nodes(self, q: Array) -> Array:
+        """Return the configuration itself."""
+        return q
+
+    def based(self, q: Array, pose: Pose) -> Array:
+        """See ``arm.Arm``."""
+        return np.where(self.truss.base[:, None], self.truss.home @ pose.rotation.T + pose.position, q)
+
+    def carried(self, q: Array, before: Pose, after: Pose) -> Array:
+        """See ``arm.Arm``."""
+        return before.carry(q, after)
+
+    def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:  # noqa: ARG002
+        """See ``arm.Arm``."""
+        return q + nodes
+
+    def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
+        """See ``arm.Arm``."""
+        q = q.copy()
+        q[self.truss.free] += solve()
+        return q
+
+    def points(self, q: Array) -> Array:
+        """Return the nodes; in offset joints the ends of all members, two of each."""
+        return q if self.truss.joints is None else self.truss.member_ends(q).reshape(-1, 3)
+
+    def travel(self, motion: Array) -> float:
+        """See ``arm.Arm``."""
+        return float(np.abs(motion).max())
+
+    def kinematics(self, *, compiled: bool = True) -> TrussKinematics:
+        """See ``arm.Arm``."""
+        return TrussKinematics(self.truss, compiled=compiled)
+
+    def symbols(self, constants: Constants) -> TrussSymbols:
+        """See ``arm.Arm``."""
+        return TrussSymbols(self.truss, constants)
+
+    def motion_rows(self, *values: Array) -> LengthRows:
+        """See ``arm.Arm``: gradients (3 Q M,) and right-hand sides (M,)."""
+        gradient, rhs = values
+        return LengthRows(self.truss, gradient.reshape(len(rhs), -1, 3), rhs)
