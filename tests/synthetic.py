@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.truss import Truss
-from vgtm_qp.maneuver.manifest import arm_record, make_manifest
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.maneuver.arm_record import arm_record
+from vgtm_qp.maneuver.maneuver import Maneuver
+from vgtm_qp.result.manifest import make_manifest
 
 Array = NDArray[np.float64]
 

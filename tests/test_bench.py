@@ -340,7 +340,7 @@ def test_start_is_measured_with_more_to_do_for_more() -> None:
 
 def test_threads_are_held_before_numpy_is_loaded() -> None:
     script = (
-        "import sys; from vgtm_qp.bench.machine import pin_threads; "
+        "import sys; from vgtm_qp.machine import pin_threads; "
         "assert 'numpy' not in sys.modules; assert pin_threads(); "
         "import numpy, os; assert os.environ['OPENBLAS_NUM_THREADS'] == '1'; assert pin_threads(); "
         "del os.environ['OPENBLAS_NUM_THREADS']; assert not pin_threads()"

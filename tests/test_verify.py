@@ -16,7 +16,7 @@ from synthetic import LENGTHS, RADIUS, found_clearances, good_maneuver, maneuver
 from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.modules import octahedral
 from vgtm_qp.errors import ResultError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.verify import check, verify, verify_file
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Least, Motion
@@ -222,7 +222,7 @@ def test_pointing_is_held() -> None:
 def test_mesh_is_tied_to_its_file(tmp_path: Path) -> None:
     import trimesh
 
-    from vgtm_qp.maneuver.manifest import mesh_record
+    from vgtm_qp.result.manifest import mesh_record
 
     file = tmp_path / "part.stl"
     trimesh.creation.box((0.4, 0.4, 0.4)).export(file)
@@ -246,7 +246,7 @@ def test_mesh_is_tied_to_its_file(tmp_path: Path) -> None:
 def test_arm_inside_a_closed_mesh_touches_it(tmp_path: Path) -> None:
     import trimesh
 
-    from vgtm_qp.maneuver.manifest import mesh_record
+    from vgtm_qp.result.manifest import mesh_record
 
     file = tmp_path / "room.stl"
     trimesh.creation.box((20.0, 20.0, 20.0)).export(file)
@@ -424,7 +424,7 @@ def test_shares_no_code_with_the_solver() -> None:
     for file in Path(check.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("vgtm_qp"):
-                allowed = ("vgtm_qp.verify", "vgtm_qp.maneuver", "vgtm_qp.errors", "vgtm_qp.problem")
+                allowed = ("vgtm_qp.verify", "vgtm_qp.result", "vgtm_qp.errors", "vgtm_qp.problem")
                 assert str(node.module).startswith(allowed), f"{file.name}: {node.module}"
     code = """
         import sys, vgtm_qp.verify

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.clearance import AgainstBody, Motion
 from vgtm_qp.verify.obstacles import read_obstacles
@@ -122,7 +122,7 @@ class Replay:
         }
 
 
-def replay(maneuver: Maneuver) -> Replay:
+def replay(maneuver: Result) -> Replay:
     """Replay a maneuver in MuJoCo, as it was solved and under gravity.
 
     The physics replay drives the length of every member through equality constraints, in straight lines
@@ -145,7 +145,7 @@ def replay(maneuver: Maneuver) -> Replay:
 class _Simulation:
     """The MuJoCo model of one maneuver, its data, and where the maneuver's parts are in them."""
 
-    def __init__(self, maneuver: Maneuver) -> None:
+    def __init__(self, maneuver: Result) -> None:
         try:
             import mujoco
         except ImportError:

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from vgtm_qp.bench.contestants import BASELINES, Name, make_baseline
 from vgtm_qp.bench.fresh import Fresh, measure_fresh, measure_start
-from vgtm_qp.bench.machine import commit, describe_machine, versions
 from vgtm_qp.bench.measure import Breakdown, Timing, run_alone, run_in_turn
 from vgtm_qp.bench.scenes import Scene
 from vgtm_qp.errors import ResultError, VgtmError
+from vgtm_qp.machine import commit, machine_record, versions
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.step.resolver import Resolver
+
+_PACKAGES = ("vgtm-qp", "numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl")
 
 SCHEMA_VERSION = 1
 LEAST_BAYS = 50
@@ -156,7 +158,7 @@ def measure(
     seconds, steps, cold
         See :func:`measure_scene`.
     pinned
-        Whether BLAS was held to one thread; see :func:`vgtm_qp.bench.machine.pin_threads`.
+        Whether BLAS was held to one thread; see :func:`vgtm_qp.machine.pin_threads`.
     progress
         Called before each scene.
     """
@@ -164,8 +166,8 @@ def measure(
         "schema_version": SCHEMA_VERSION,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),
-        "machine": describe_machine(),
-        "versions": versions(),
+        "machine": machine_record(),
+        "versions": versions(_PACKAGES),
         "settings": {"seconds": seconds, "steps": steps, "cold": cold, "one_blas_thread": pinned},
         "baselines": {name: BASELINES[name].title for name in names},
         "start": measure_start(),

@@ -57,7 +57,7 @@ def bench(
     turn with each baseline, step by step from the same states, for the ratios. Set-up and memory are those of
     a fresh process.
     """
-    from vgtm_qp.bench.machine import pin_threads
+    from vgtm_qp.machine import pin_threads
 
     pinned = pin_threads()
     from vgtm_qp.bench.contestants import NAMES

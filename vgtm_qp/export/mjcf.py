@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ExportError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.view.drawing import FIXED_COLOUR, OBSTACLE_COLOUR, obstacle_meshes, stroke_colours
 
@@ -27,7 +27,7 @@ ACTUATOR_GROUP = 1
 _STIFFNESS = 2.0e5
 
 
-def write_mjcf(maneuver: Maneuver, path: str | Path) -> Path:
+def write_mjcf(maneuver: Result, path: str | Path) -> Path:
     """Write the MuJoCo model of a maneuver and return its path; opens in MuJoCo's own viewer.
 
     Raises
@@ -40,7 +40,7 @@ def write_mjcf(maneuver: Maneuver, path: str | Path) -> Path:
     return path
 
 
-def mjcf(maneuver: Maneuver) -> str:
+def mjcf(maneuver: Result) -> str:
     """Return the MuJoCo model of a maneuver as XML.
 
     Free nodes are bodies with three slide joints, so ``qpos`` is their displacement from the home pose; base
@@ -115,7 +115,7 @@ def _add_nodes(world: Element, arm: Arm, names: list[str]) -> None:
         _add(body, "site", name=name, size=0.5 * radius)
 
 
-def _add_obstacles(asset: Element, world: Element, maneuver: Maneuver) -> None:
+def _add_obstacles(asset: Element, world: Element, maneuver: Result) -> None:
     directory = Path(maneuver.manifest.get("directory") or ".")
     entries = {str(entry["name"]): entry for entry in maneuver.manifest["problem"].get("obstacle") or ()}
     for mesh in obstacle_meshes(list(entries.values()), directory):
@@ -167,7 +167,7 @@ def _add_members(root: Element, arm: Arm, names: list[str]) -> None:
             )
 
 
-def _add_keyframes(root: Element, maneuver: Maneuver, arm: Arm) -> None:
+def _add_keyframes(root: Element, maneuver: Result, arm: Arm) -> None:
     keyframes = _add(root, "keyframe")
     moving = [
         mesh

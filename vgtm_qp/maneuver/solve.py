@@ -6,27 +6,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
-from vgtm_qp.maneuver.manifest import arm_record, make_manifest, mesh_record
+from vgtm_qp.maneuver.arm_record import arm_record
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import Plan, make_plan
-from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.maneuver.ways_out import DeadEnd, ways_out
+from vgtm_qp.methods import AnyResolver, make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
+from vgtm_qp.result.manifest import make_manifest, mesh_record
 from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
 from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.state import State
 from vgtm_qp.step.stops import Stop, StopKind
-
-if TYPE_CHECKING:
-    from vgtm_qp.methods import AnyResolver
+from vgtm_qp.verify import verify as check
 
 Array = NDArray[np.float64]
 
@@ -68,8 +68,6 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     ProblemError, TrussError, SolverError
         The problem cannot be set up, or is none; no step was taken.
     """
-    from vgtm_qp.methods import make_resolver
-
     check_is_problem(problem)
     started = perf_counter()
     resolver = make_resolver(problem)
@@ -96,11 +94,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
     maneuver = _assemble(problem, resolver, record, stop, setup_time, way)
-    if not verify:
-        return maneuver
-    from vgtm_qp.verify import verify as check
-
-    return maneuver.with_certificate(check(maneuver))
+    return maneuver.with_certificate(check(maneuver)) if verify else maneuver
 
 
 def _retry(

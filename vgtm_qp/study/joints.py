@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.solve import solve
-from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.problem import load_problem
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.arm import build_arm

@@ -9,9 +9,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
-from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.ipopt import IpoptStepper

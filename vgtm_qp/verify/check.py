@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.maneuver.certificate import Certificate, Measure
-from vgtm_qp.maneuver.result import Maneuver, load_result
+from vgtm_qp.result.certificate import Certificate, Measure
+from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Encounters, Least, Motion
 from vgtm_qp.verify.obstacles import read_obstacles, rotation_matrix
@@ -53,10 +53,10 @@ def verify_file(path: str | Path) -> Certificate:
     ResultError
         The file is cut, altered, of another version, or its arm record is malformed.
     """
-    return verify(load_result(path))
+    return verify(Result.load(path))
 
 
-def verify(maneuver: Maneuver) -> Certificate:
+def verify(maneuver: Result) -> Certificate:
     """Return the certificate of `maneuver`, recomputed from its nodes and the problem in its manifest.
 
     Raises
@@ -194,7 +194,7 @@ def _held(arm: Arm, problem: Mapping[str, Any], time: Array, lengths: Array) -> 
     return errors
 
 
-def _jams_between_rows(maneuver: Maneuver, problem: Mapping[str, Any]) -> list[str]:
+def _jams_between_rows(maneuver: Result, problem: Mapping[str, Any]) -> list[str]:
     """Return the members that lock at a time which no row has: nothing says what length they stuck at."""
     found = []
     for entry in (problem.get("truss") or {}).get("locked") or ():
@@ -214,7 +214,7 @@ def _locking_rows(arm: Arm, problem: Mapping[str, Any], time: Array) -> Array:
     return middle
 
 
-def _base_error(arm: Arm, maneuver: Maneuver, problem: Mapping[str, Any]) -> Array:
+def _base_error(arm: Arm, maneuver: Result, problem: Mapping[str, Any]) -> Array:
     """Return (T, N_c) how far base nodes are from where the problem holds them, m.
 
     A base that moves, eqs. (7)-(8), goes from pose to pose on straight lines and single-axis rotations, from its home
@@ -334,7 +334,7 @@ def _least_of(values: Array, unit: str) -> Measure:
     return Measure(float(values.min()) if len(values) else None, unit, None, "least")
 
 
-def _record_contradictions(maneuver: Maneuver, arm: Arm) -> list[str]:
+def _record_contradictions(maneuver: Result, arm: Arm) -> list[str]:
     """Return where the arm record disagrees with the arrays, with itself or with the problem."""
     found = []
     if tuple(maneuver.member_names.tolist()) != arm.member_names:
@@ -369,7 +369,7 @@ def _record_contradictions(maneuver: Maneuver, arm: Arm) -> list[str]:
     return found
 
 
-def _outcome_contradictions(maneuver: Maneuver) -> list[str]:
+def _outcome_contradictions(maneuver: Result) -> list[str]:
     """Return where status, reached and progress disagree."""
     found = []
     if abs(maneuver.progress[-1] - maneuver.reached) > 1e-9:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 from vgtm_qp.verify.obstacles import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ class PathCheck:
 
     Attributes
     ----------
-    maneuver : Maneuver
+    maneuver : Result
         Holds the targets.
     axes : tuple of int
         The tracked coordinates of the position.
@@ -40,7 +40,7 @@ class PathCheck:
         As in the certificate.
     """
 
-    maneuver: Maneuver
+    maneuver: Result
     axes: tuple[int, ...]
     tracks_pointing: bool
     tracks_orientation: bool
@@ -66,7 +66,7 @@ class PathCheck:
         return np.max(errors, axis=0) if errors else None
 
 
-def check_path(maneuver: Maneuver, tip: Array) -> PathCheck:
+def check_path(maneuver: Result, tip: Array) -> PathCheck:
     """Return what the problem of `maneuver` asks of the tip, whose positions (T, 3), m, are `tip`."""
     manifest = maneuver.manifest
     problem = manifest["problem"]
@@ -139,7 +139,7 @@ def _to_polyline(points: Array, corners: Array) -> Array:
     return best
 
 
-def _last_direction(maneuver: Maneuver, wanted: Mapping[str, Any], track: tuple[str, ...]) -> list[str]:
+def _last_direction(maneuver: Result, wanted: Mapping[str, Any], track: tuple[str, ...]) -> list[str]:
     """Return whether a solved maneuver ends in another direction than the last waypoint that names one."""
     if maneuver.status != "solved":
         return []

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.curve.families import make_family
-from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.problem import Problem
+from vgtm_qp.result.result import Result
 from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.verify.arm import Arm
 
@@ -106,7 +106,7 @@ def stroke_colours(share: Array) -> Array:
     return np.stack([np.interp(share, knots, channel) for channel in _STROKE_COLOURS.T], axis=-1)
 
 
-def drawing_of_maneuver(maneuver: Maneuver) -> Drawing:
+def drawing_of_maneuver(maneuver: Result) -> Drawing:
     """Return the drawing of a result, from its manifest.
 
     Raises

@@ -20,7 +20,7 @@ from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError, VgtmError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 from vgtm_qp.view.drawing import (
     CURVE_COLOUR,
     FIXED_COLOUR,
@@ -57,7 +57,7 @@ _GOAL: dict[str, Any] = {"marker": "x", "markersize": 4.5, "markeredgewidth": 1.
 
 
 def plot_frames(
-    maneuver: Maneuver,
+    maneuver: Result,
     *,
     frames: int | Sequence[int] = 6,
     azimuth: float | None = None,
@@ -103,7 +103,7 @@ def plot_frames(
 
 
 def each_frame(
-    maneuver: Maneuver, rows: Sequence[int], *, azimuth: float | None = None, elevation: float = 0.21
+    maneuver: Result, rows: Sequence[int], *, azimuth: float | None = None, elevation: float = 0.21
 ) -> Iterator[Figure]:
     """Yield one figure for each of the states `rows`, all in the view that holds the whole maneuver.
 
@@ -176,7 +176,7 @@ class _View:
     step: float
 
 
-def _rows(maneuver: Maneuver, frames: int | Sequence[int]) -> list[int]:
+def _rows(maneuver: Result, frames: int | Sequence[int]) -> list[int]:
     count = len(maneuver.time)
     if isinstance(frames, int):
         if frames < 1:
@@ -188,7 +188,7 @@ def _rows(maneuver: Maneuver, frames: int | Sequence[int]) -> list[int]:
     return [int(row) for row in frames]
 
 
-def _across(maneuver: Maneuver) -> float:
+def _across(maneuver: Result) -> float:
     """Return the azimuth, rad, from which the tip goes to the right and a little towards the viewer."""
     way = maneuver.tip_position - maneuver.tip_position[0]
     farthest = way[int(np.argmax(np.linalg.norm(way[:, :2], axis=1)))]
@@ -197,7 +197,7 @@ def _across(maneuver: Maneuver) -> float:
 
 
 def _view(
-    maneuver: Maneuver, drawing: Drawing, rows: list[int], projection: Projection, surfaces: list[Surface]
+    maneuver: Result, drawing: Drawing, rows: list[int], projection: Projection, surfaces: list[Surface]
 ) -> _View:
     """Return what holds the arm in all frames and, of the obstacles, what is near it."""
     arm = maneuver.nodes[rows].reshape(-1, 3)
@@ -305,7 +305,7 @@ def _label(axes: Axes, name: str, values: Array, places: Array, scale: float) ->
 
 def _draw_state(
     axes: Axes,
-    maneuver: Maneuver,
+    maneuver: Result,
     drawing: Drawing,
     row: int,
     projection: Projection,
@@ -379,7 +379,7 @@ def _draw_surface(axes: Axes, surface: Surface, time: float, zorder: float) -> N
         axes.add_collection(outline)
 
 
-def _draw_tip(axes: Axes, maneuver: Maneuver, row: int, projection: Projection) -> None:
+def _draw_tip(axes: Axes, maneuver: Result, row: int, projection: Projection) -> None:
     ahead = projection.flat(maneuver.tip_target_position[row:])
     behind = projection.flat(maneuver.tip_position[: row + 1])
     axes.plot(*ahead.T, color=PATH_COLOUR, linewidth=0.9, linestyle=(0, (1, 1.6)), zorder=_ABOVE + 2)

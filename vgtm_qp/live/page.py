@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import VgtmError
+from vgtm_qp.live.read_out import read_out
+from vgtm_qp.live.session import METHODS, Session
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled
-from vgtm_qp.view.read_out import read_out
 from vgtm_qp.view.scene import ArmScene, viser_server
-from vgtm_qp.view.session import METHODS, Session
 
 Array = NDArray[np.float64]
 

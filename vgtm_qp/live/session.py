@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.maneuver.manifest import arm_record
+from vgtm_qp.maneuver.arm_record import arm_record
+from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
@@ -199,6 +200,4 @@ class Session:
 def _make_resolver(problem: Problem) -> Any:
     if problem.method.name == "qp":
         return Resolver(problem)
-    from vgtm_qp.methods import make_resolver
-
     return make_resolver(problem)
