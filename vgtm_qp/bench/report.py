@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vgtm_qp.bench.contestants import BASELINES, Name, make_baseline
 from vgtm_qp.bench.fresh import Fresh, measure_fresh, measure_start
 from vgtm_qp.bench.measure import Breakdown, Timing, run_alone, run_in_turn
-from vgtm_qp.bench.scenes import Scene
+from vgtm_qp.bench.scenes import BenchScene
 from vgtm_qp.errors import ResultError, VgtmError
 from vgtm_qp.machine import commit, machine_record, versions
 from vgtm_qp.maneuver.plan import Plan, make_plan
@@ -87,7 +87,7 @@ class SceneReport:
 
 
 def measure_scene(
-    scene: Scene, names: Sequence[Name], *, seconds: float, steps: int, cold: bool = False
+    scene: BenchScene, names: Sequence[Name], *, seconds: float, steps: int, cold: bool = False
 ) -> SceneReport:
     """Measure one scene: alone, in turn with each of the baselines, and in fresh processes.
 
@@ -127,7 +127,7 @@ def measure_scene(
 
 
 def _against(
-    scene: Scene, name: Name, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
+    scene: BenchScene, name: Name, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
 ) -> Against:
     try:
         baseline = make_baseline(name, scene.problem, scene.bays)
@@ -140,14 +140,14 @@ def _against(
 
 
 def measure(
-    scenes: Iterable[Scene],
+    scenes: Iterable[BenchScene],
     names: Sequence[Name],
     *,
     seconds: float,
     steps: int,
     cold: bool = False,
     pinned: bool = True,
-    progress: Callable[[Scene], None] | None = None,
+    progress: Callable[[BenchScene], None] | None = None,
 ) -> dict[str, Any]:
     """Measure scenes and return the document, plain data for JSON.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import ExportError
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.view.drawing import FIXED_COLOUR, OBSTACLE_COLOUR, obstacle_meshes, stroke_colours
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def mjcf(maneuver: Result) -> str:
         The truss has offset joints, whose attitude point masses cannot have.
     """
     record = maneuver.manifest["arm"]
-    arm = Arm(record, maneuver.members)
+    arm = RecordedArm(record, maneuver.members)
     if not arm.has_pin_joints:
         raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
     name = str(maneuver.manifest["problem"].get("name", "truss"))
@@ -77,13 +77,13 @@ def mjcf(maneuver: Result) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def node_masses(arm: Arm) -> Array:
+def node_masses(arm: RecordedArm) -> Array:
     """Return (N,) the mass at each node, kg: half of every member that ends there."""
     half = 0.5 * MASS_PER_LENGTH * arm.length
     return np.bincount(arm.members.reshape(-1), np.repeat(half, 2), minlength=len(arm.home)).astype(float)
 
 
-def _add_nodes(world: Element, arm: Arm, names: list[str]) -> None:
+def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
     masses, radius = node_masses(arm), float(np.median(arm.radius))
     base = set(arm.base.tolist())
     for k, name in enumerate(names):
@@ -144,7 +144,7 @@ def _add_obstacles(asset: Element, world: Element, maneuver: Result) -> None:
         geom.set("size", _text(size))
 
 
-def _add_members(root: Element, arm: Arm, names: list[str]) -> None:
+def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
     tendons, equalities, actuators = (_add(root, kind) for kind in ("tendon", "equality", "actuator"))
     for k, member in enumerate(arm.member_names):
         colour = stroke_colours(np.array(0.5)) if arm.actuated[k] else np.array(FIXED_COLOUR)
@@ -167,7 +167,7 @@ def _add_members(root: Element, arm: Arm, names: list[str]) -> None:
             )
 
 
-def _add_keyframes(root: Element, maneuver: Result, arm: Arm) -> None:
+def _add_keyframes(root: Element, maneuver: Result, arm: RecordedArm) -> None:
     keyframes = _add(root, "keyframe")
     moving = [
         mesh

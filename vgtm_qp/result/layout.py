@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import ResultError
 
 
-class Layout(NamedTuple):
+class ArrayLayout(NamedTuple):
     """What an array of the result file must be: axes by name or size, kinds of number, finiteness."""
 
     axes: tuple[str | int, ...]
@@ -21,24 +21,24 @@ class Layout(NamedTuple):
 
 
 LAYOUTS = {
-    "time": Layout(("T",)),
-    "nodes": Layout(("T", "N", 3)),
-    "members": Layout(("M", 2), "iu"),
-    "member_names": Layout(("M",), "U"),
-    "member_actuated": Layout(("M",), "b"),
-    "member_lengths": Layout(("T", "M")),
-    "control_vertices": Layout(("T", "V", 3)),
-    "tip_position": Layout(("T", 3)),
-    "tip_rotation": Layout(("T", 3, 3)),
-    "tip_target_position": Layout(("T", 3)),
-    "clearance": Layout(("T",), finite=False),
-    "self_clearance": Layout(("T",), finite=False),
-    "progress": Layout(("T",)),
-    "step_time": Layout(("T",)),
-    "phase_names": Layout(("P",), "U"),
-    "phase_time": Layout(("T", "P")),
-    "tip_target_rotation": Layout(("T", 3, 3), required=False),
-    "tip_target_pointing": Layout(("T", 3), required=False),
+    "time": ArrayLayout(("T",)),
+    "nodes": ArrayLayout(("T", "N", 3)),
+    "members": ArrayLayout(("M", 2), "iu"),
+    "member_names": ArrayLayout(("M",), "U"),
+    "member_actuated": ArrayLayout(("M",), "b"),
+    "member_lengths": ArrayLayout(("T", "M")),
+    "control_vertices": ArrayLayout(("T", "V", 3)),
+    "tip_position": ArrayLayout(("T", 3)),
+    "tip_rotation": ArrayLayout(("T", 3, 3)),
+    "tip_target_position": ArrayLayout(("T", 3)),
+    "clearance": ArrayLayout(("T",), finite=False),
+    "self_clearance": ArrayLayout(("T",), finite=False),
+    "progress": ArrayLayout(("T",)),
+    "step_time": ArrayLayout(("T",)),
+    "phase_names": ArrayLayout(("P",), "U"),
+    "phase_time": ArrayLayout(("T", "P")),
+    "tip_target_rotation": ArrayLayout(("T", 3, 3), required=False),
+    "tip_target_pointing": ArrayLayout(("T", 3), required=False),
 }
 
 

@@ -24,7 +24,7 @@ _LEAST_SINGULAR_VALUE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RandomScene:
     """A random problem.
 
     Attributes
@@ -45,7 +45,7 @@ class Scene:
     shape: Array | None
 
 
-def random_scene(seed: int, number: int, *, steps: int = 30) -> Scene:
+def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
     """Return scene `number` of a `seed`: always the same, whichever scenes were made before it."""
     random = np.random.default_rng([seed, number])
     truss = _truss(random)
@@ -80,7 +80,7 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> Scene:
         if directed:
             waypoint["pointing"] = (kinematics.tip_rotation[:, 2] + 0.5 * random.normal(size=3)).tolist()
     problem["obstacle"] = _cubes(arm, random, shape if reachable else None, int(random.integers(1, 9)))
-    return Scene(number, reachable, Problem.from_dict(problem), shape if reachable else None)
+    return RandomScene(number, reachable, Problem.from_dict(problem), shape if reachable else None)
 
 
 def _truss(random: np.random.Generator) -> dict[str, Any]:

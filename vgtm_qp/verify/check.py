@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import Arm
-from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Encounters, Least, Motion
+from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Encounters, Least, MemberMotion
 from vgtm_qp.verify.obstacles import read_obstacles, rotation_matrix
 from vgtm_qp.verify.path import check_path
 from vgtm_qp.verify.recovery import excuse_recovering
@@ -66,12 +66,12 @@ def verify(maneuver: Result) -> Certificate:
     """
     manifest = maneuver.manifest
     problem = manifest["problem"]
-    arm = Arm(manifest["arm"], maneuver.members)
+    arm = RecordedArm(manifest["arm"], maneuver.members)
     if maneuver.nodes.shape[1] != len(arm.home):
         raise ResultError(
             f"array nodes holds {maneuver.nodes.shape[1]} nodes; manifest.arm describes {len(arm.home)}"
         )
-    motion = Motion(arm, maneuver.time, maneuver.nodes)
+    motion = MemberMotion(arm, maneuver.time, maneuver.nodes)
     lengths = np.linalg.norm(motion.ends[:, :, 1] - motion.ends[:, :, 0], axis=2)
     names = arm.member_names
 
@@ -152,7 +152,7 @@ def verify(maneuver: Result) -> Certificate:
     )
 
 
-def _clearances(motion: Motion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
+def _clearances(motion: MemberMotion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
     """Return the least clearance at states, a bound of it between them, and the least at each state (T,)."""
     count = len(motion.time)
     each = [
@@ -170,7 +170,7 @@ def _clearances(motion: Motion, encounters: Sequence[Encounters]) -> tuple[Least
     return at, between, np.array([least.value for least in each])
 
 
-def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
+def _clearance_difference(stored: Array, found: Array, arm: RecordedArm) -> Array:
     """Return (T,) how far clearances differ; how deep a member is inside an obstacle is not compared."""
     floor = -float(arm.radius.min(initial=np.inf))
     with np.errstate(invalid="ignore"):
@@ -178,7 +178,7 @@ def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
     return np.asarray(np.where(stored == found, 0.0, difference))
 
 
-def _held(arm: Arm, problem: Mapping[str, Any], time: Array, lengths: Array) -> Array:
+def _held(arm: RecordedArm, problem: Mapping[str, Any], time: Array, lengths: Array) -> Array:
     """Return (T, M) how far fixed members are from their lengths, and locked ones from where they stuck."""
     errors = np.where(arm.actuated, 0.0, np.abs(lengths - arm.length))
     for entry in (problem.get("truss") or {}).get("locked") or ():
@@ -204,7 +204,7 @@ def _jams_between_rows(maneuver: Result, problem: Mapping[str, Any]) -> list[str
     return found
 
 
-def _locking_rows(arm: Arm, problem: Mapping[str, Any], time: Array) -> Array:
+def _locking_rows(arm: RecordedArm, problem: Mapping[str, Any], time: Array) -> Array:
     """Return (T - 2, M) whether an acceleration is that of a member which stops because it locks."""
     middle = np.zeros((max(len(time) - 2, 0), len(arm.member_names)), dtype=bool)
     for entry in (problem.get("truss") or {}).get("locked") or ():
@@ -214,7 +214,7 @@ def _locking_rows(arm: Arm, problem: Mapping[str, Any], time: Array) -> Array:
     return middle
 
 
-def _base_error(arm: Arm, maneuver: Result, problem: Mapping[str, Any]) -> Array:
+def _base_error(arm: RecordedArm, maneuver: Result, problem: Mapping[str, Any]) -> Array:
     """Return (T, N_c) how far base nodes are from where the problem holds them, m.
 
     A base that moves, eqs. (7)-(8), goes from pose to pose on straight lines and single-axis rotations, from its home
@@ -250,7 +250,7 @@ def _rotation_vector(rotation: Array) -> Array:
     return np.asarray(twist * (0.5 if sine < 1e-9 else float(np.arctan2(sine, cosine)) / (2.0 * sine)))
 
 
-def _member_angle(motion: Motion) -> Least:
+def _member_angle(motion: MemberMotion) -> Least:
     """Return the least angle at any state between two members that share a node, rad."""
     members = motion.arm.members
     node = members.reshape(-1)
@@ -271,19 +271,19 @@ def _member_angle(motion: Motion) -> Least:
     return least
 
 
-def _beyond_stroke(arm: Arm, lengths: Array) -> Array:
+def _beyond_stroke(arm: RecordedArm, lengths: Array) -> Array:
     """Return (T, M) how far actuated members are outside their strokes, m."""
     outside = np.maximum(arm.stroke[:, 0] - lengths, lengths - arm.stroke[:, 1])
     return np.asarray(np.where(arm.actuated, np.maximum(outside, 0.0), 0.0))
 
 
-def _beyond_rate(arm: Arm, time: Array, lengths: Array) -> Array:
+def _beyond_rate(arm: RecordedArm, time: Array, lengths: Array) -> Array:
     """Return (T - 1, M) how far mean rates over the steps pass their limits, m/s."""
     rates = np.diff(lengths, axis=0) / np.diff(time)[:, None]
     return np.asarray(np.where(arm.actuated, np.maximum(np.abs(rates) - arm.rate, 0.0), 0.0))
 
 
-def _beyond_acceleration(arm: Arm, time: Array, lengths: Array) -> Array:
+def _beyond_acceleration(arm: RecordedArm, time: Array, lengths: Array) -> Array:
     """Return (T - 2, M) how far accelerations pass their limits, m/s^2.
 
     An acceleration is the change of the mean rate from step to step over the time between their middles.
@@ -294,7 +294,7 @@ def _beyond_acceleration(arm: Arm, time: Array, lengths: Array) -> Array:
     return np.asarray(np.where(arm.actuated, np.maximum(np.abs(changes) - arm.acceleration, 0.0), 0.0))
 
 
-def _singular_values(arm: Arm, nodes: Array) -> Array:
+def _singular_values(arm: RecordedArm, nodes: Array) -> Array:
     """Return (S, 3) least of the length Jacobian, least and greatest of the tip's, at S states."""
     states = np.arange(len(nodes))
     if 3 * len(arm.free) > _MANY_UNKNOWNS:
@@ -334,7 +334,7 @@ def _least_of(values: Array, unit: str) -> Measure:
     return Measure(float(values.min()) if len(values) else None, unit, None, "least")
 
 
-def _record_contradictions(maneuver: Result, arm: Arm) -> list[str]:
+def _record_contradictions(maneuver: Result, arm: RecordedArm) -> list[str]:
     """Return where the arm record disagrees with the arrays, with itself or with the problem."""
     found = []
     if tuple(maneuver.member_names.tolist()) != arm.member_names:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.distance import Separation, segment_segment
 from vgtm_qp.verify.obstacles import Body
 
@@ -29,12 +29,12 @@ _CHUNK = 200_000
 
 
 @dataclass(frozen=True)
-class Motion:
+class MemberMotion:
     """The moving arm.
 
     Attributes
     ----------
-    arm : Arm
+    arm : RecordedArm
         Its members.
     time, nodes : (T,), (T, N, 3)
         The states, s and m.
@@ -42,7 +42,7 @@ class Motion:
         Member ends at the states, m.
     """
 
-    arm: Arm
+    arm: RecordedArm
     time: Array
     nodes: Array
     ends: Array = field(init=False)
@@ -126,7 +126,7 @@ class Least:
 class Encounters(ABC):
     """All pairs of one member and one other thing that must keep apart."""
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: MemberMotion) -> None:
         self.motion = motion
         self.held_from: dict[tuple[int, int], int] = {}
         """States from which pairs count; all others do from the first on."""
@@ -258,7 +258,7 @@ class Encounters(ABC):
 class AgainstBody(Encounters):
     """Members against the convex pieces of one obstacle, seen from its moving centre."""
 
-    def __init__(self, motion: Motion, body: Body) -> None:
+    def __init__(self, motion: MemberMotion, body: Body) -> None:
         super().__init__(motion)
         self.body = body
         corners = body.corners

@@ -14,7 +14,7 @@ from vgtm_qp.curve.families import make_family
 from vgtm_qp.problem import Problem
 from vgtm_qp.result.result import Result
 from vgtm_qp.step.path import rotation_from_vector
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import RecordedArm
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -64,7 +64,7 @@ class Drawing:
     Attributes
     ----------
     name : str
-    arm : Arm
+    arm : RecordedArm
         Member ends, radii and strokes.
     curve_weights : (K, V)
         Weights of points along the curve; V = 0 where there is no curve.
@@ -72,7 +72,7 @@ class Drawing:
     """
 
     name: str
-    arm: Arm
+    arm: RecordedArm
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
 
@@ -117,7 +117,7 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
     manifest = maneuver.manifest
     return _drawing(
         manifest["problem"],
-        Arm(manifest["arm"], maneuver.members),
+        RecordedArm(manifest["arm"], maneuver.members),
         maneuver.control_vertices.shape[1],
         Path(manifest.get("directory") or "."),
     )
@@ -126,10 +126,10 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
 def drawing_of_problem(problem: Problem, record: Mapping[str, Any], members: Index, vertices: int) -> Drawing:
     """Return the drawing of a problem from the `arm_record` of its arm and number of control vertices."""
     directory = problem.source.parent if problem.source else Path.cwd()
-    return _drawing(problem.to_dict(), Arm(record, members), vertices, directory)
+    return _drawing(problem.to_dict(), RecordedArm(record, members), vertices, directory)
 
 
-def _drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory: Path) -> Drawing:
+def _drawing(problem: Mapping[str, Any], arm: RecordedArm, vertices: int, directory: Path) -> Drawing:
     weights = np.zeros((0, vertices))
     spec = problem.get("curve")
     if vertices and spec:

@@ -31,7 +31,7 @@ from vgtm_qp.view.drawing import (
     drawing_of_maneuver,
     stroke_colours,
 )
-from vgtm_qp.view.projection import Projection, Surface, layers, pieces
+from vgtm_qp.view.projection import ProjectedMesh, Projection, layers, pieces
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ def plot_frames(
     drawing = drawing_of_maneuver(maneuver)
     rows = _rows(maneuver, frames)
     projection = Projection.looking(_across(maneuver) if azimuth is None else azimuth, elevation)
-    surfaces = [Surface(mesh, projection) for mesh in drawing.obstacles]
+    surfaces = [ProjectedMesh(mesh, projection) for mesh in drawing.obstacles]
     view = _view(maneuver, drawing, rows, projection, surfaces)
     columns = min(3, len(rows)) if len(rows) != 4 else 4
     with mpl.rc_context(_STYLE):
@@ -114,7 +114,7 @@ def each_frame(
     """
     drawing = drawing_of_maneuver(maneuver)
     projection = Projection.looking(_across(maneuver) if azimuth is None else azimuth, elevation)
-    surfaces = [Surface(mesh, projection) for mesh in drawing.obstacles]
+    surfaces = [ProjectedMesh(mesh, projection) for mesh in drawing.obstacles]
     view = _view(maneuver, drawing, list(range(len(maneuver.time))), projection, surfaces)
     for row in _rows(maneuver, rows):
         with mpl.rc_context(_STYLE):
@@ -197,7 +197,7 @@ def _across(maneuver: Result) -> float:
 
 
 def _view(
-    maneuver: Result, drawing: Drawing, rows: list[int], projection: Projection, surfaces: list[Surface]
+    maneuver: Result, drawing: Drawing, rows: list[int], projection: Projection, surfaces: list[ProjectedMesh]
 ) -> _View:
     """Return what holds the arm in all frames and, of the obstacles, what is near it."""
     arm = maneuver.nodes[rows].reshape(-1, 3)
@@ -309,7 +309,7 @@ def _draw_state(
     drawing: Drawing,
     row: int,
     projection: Projection,
-    surfaces: list[Surface],
+    surfaces: list[ProjectedMesh],
     scale: float,
 ) -> None:
     """Draw arm and obstacles, farthest first."""
@@ -361,7 +361,7 @@ def _draw_state(
         axes.plot(*curve.T, color=CURVE_COLOUR, linewidth=1.4, zorder=_ABOVE + 1, path_effects=effects)
 
 
-def _draw_surface(axes: Axes, surface: Surface, time: float, zorder: float) -> None:
+def _draw_surface(axes: Axes, surface: ProjectedMesh, time: float, zorder: float) -> None:
     polygons = surface.polygons(time)
     axes.add_collection(
         PolyCollection(polygons, facecolors=[OBSTACLE_COLOUR], alpha=0.30, linewidths=0.0, zorder=zorder)

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.check import TIP_TOLERANCE
 from vgtm_qp.verify.path import check_path
 
@@ -70,7 +70,7 @@ def plot_strokes(maneuver: Result, *, axes: Axes | None = None) -> Figure:
     In m where all have the same stroke, as parts of it, %, where not. The members that come nearest to a limit
     are named; the others are grey.
     """
-    arm = Arm(maneuver.manifest["arm"], maneuver.members)
+    arm = RecordedArm(maneuver.manifest["arm"], maneuver.members)
     actuators = np.flatnonzero(arm.actuated)
     low, high = arm.stroke[actuators].T
     lengths = maneuver.member_lengths[:, actuators]
