@@ -9,8 +9,8 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.bench.nonlinear import NonlinearStep
 from vgtm_qp.errors import SolverError
+from vgtm_qp.ipopt.linearised import NonlinearStep
 from vgtm_qp.methods import AnyResolver, make_resolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.problem import Problem

@@ -10,11 +10,11 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.ipopt.separating import IpoptStepper
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.study.drawing import label, panels
-from vgtm_qp.study.ipopt import IpoptStepper
 from vgtm_qp.study.scenes import RandomScene, random_scene
 from vgtm_qp.study.statistics import wilson_interval
 from vgtm_qp.study.workers import Row, Task
