@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
+from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.limits import length_box
 from vgtm_qp.step.linearise import clearance_rows
 from vgtm_qp.step.path import Path
@@ -38,9 +38,7 @@ class NonlinearStep:
     """Steps of a truss whose base is at rest: exact lengths and tip, the QP's truss terms."""
 
     def __init__(self, problem: Problem) -> None:
-        # Any solver serves that makes no kernels, for none is asked.
-        changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
-        self._arm = arm = build_arm(problem.replace(changes))
+        self._arm = arm = arm_without_curve(problem)
         truss, weights = arm.truss, problem.method.weights
         free = 3 * len(truss.free)
         symbols = truss_symbols(truss)

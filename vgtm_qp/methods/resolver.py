@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import CurveError, SolverError
-from vgtm_qp.step.arm import Arm
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.path import Path, PathPoint, vector_from_rotation
 from vgtm_qp.step.resolver import Step, StepStatus
 from vgtm_qp.step.state import State, frozen
@@ -93,6 +94,19 @@ class MethodResolver(ABC):
         ratio = np.linalg.norm(nodes[truss.members[:, 0]] - nodes[truss.members[:, 1]], axis=1) / lengths
         if float(ratio.min()) < _COLLAPSED:
             raise SolverError(f"member {truss.member_names[int(np.argmin(ratio))]} collapsed to a point")
+
+
+def arm_without_curve(problem: Problem) -> Arm:
+    """Return the arm of a problem without its curve, for methods that solve no QP of this package.
+
+    Raises
+    ------
+    ProblemError, TrussError
+        The arm cannot be built.
+    """
+    # The solver is never called; this one compiles no kernels.
+    changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
+    return build_arm(problem.replace(changes))
 
 
 def pose_displacement(start: PathPoint, end: PathPoint) -> tuple[Array, Array]:
