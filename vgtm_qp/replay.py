@@ -50,7 +50,7 @@ class ReplayRun:
     contacts: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the worst values as strict JSON data, m; no clearance is None."""
+        """Return the worst values as strict JSON data, m; None if there are no obstacles."""
         clearance = float(self.clearance.min())
         return {
             "max_length_error": float(self.length_error.max()),
@@ -247,7 +247,7 @@ class _Simulation:
             self._data.mocap_pos[count + k] = mesh.position(time)
 
     def _command(self, state: int, share: float) -> None:
-        """Ask for the lengths a `share` of the way from `state` to the next."""
+        """Ask for the lengths at a `share` of the motion from `state` to the next."""
         maneuver = self._maneuver
         after = min(state + 1, len(maneuver.time) - 1)
 

@@ -60,7 +60,7 @@ class SceneReport:
     Attributes
     ----------
     covered : float
-        The part of the maneuver that the measured steps came through, 0 to 1.
+        Share of the maneuver that the measured steps covered, 0 to 1.
     stopped_by : str
         What blocked the arm, empty where nothing did.
     qps : float

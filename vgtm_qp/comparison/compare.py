@@ -33,14 +33,14 @@ def compare(
     methods
         Names of ``vgtm_qp.methods.presets.PRESETS``, at least one.
     progress
-        Called after each step with the method's name, its part of the path, 0 to 1, and the step.
+        Called after each step with the method's name, its share of the path, 0 to 1, and the step.
 
     Raises
     ------
     GoalError
-        `methods` is empty, is not a list, or has a name that is no method's.
+        `methods` is empty, is not a list, or has a name that no method has.
     ProblemError
-        `problem` is none.
+        `problem` is not a Problem.
     """
     check_is_problem(problem)
     check_methods(methods)

@@ -1,4 +1,4 @@
-"""One figure for a comparison: where every method ends, and what it keeps on the way."""
+"""One figure for a comparison: the end state of every method, and its clearance and drift along the path."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class Report:
     ----------
     rows : tuple of Row
     maneuvers : dict
-        The maneuvers by (problem, method); none where the method was refused.
+        The maneuvers by (problem, method); a method that was refused is missing.
     machine : dict
         What the times belong to.
     """

@@ -14,19 +14,19 @@ TIP_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one problem. Lengths in m, times in s; None where there was nothing to measure.
+    """One method on one problem. Lengths in m, times in s; None if there was nothing to measure.
 
     Attributes
     ----------
     solved : bool
-        The maneuver came through and its verification passed.
+        The maneuver reached the end of its path and passed verification.
     kept : bool
-        It came through and kept every limit and clearance of the verification, with members and tip allowed to be
-        off by 1 mm: what a method without drift correction is held against.
+        It reached the end and kept every limit and clearance, with a tolerance of 1 mm for members and tip: the
+        standard for methods without drift correction.
     status : str
         ``solved``, ``blocked`` or ``refused`` (the method cannot be set up for this arm).
     reached : float
-        How far along the path, 0 to 1.
+        Share of the path covered, 0 to 1.
     reason : str
         Step and reason of a breakdown, or the first tolerance that verification found broken.
     actuator_travel : float

@@ -77,7 +77,7 @@ def view(
 
 
 class _Page:
-    """Widgets and loop. Callbacks only leave notes in the inbox; the loop alone touches the session."""
+    """Widgets and loop. Callbacks only put actions into the inbox; the loop alone touches the session."""
 
     def __init__(self, server: Any, session: Session, maneuver: Maneuver | None) -> None:
         self._server, self._session, self._maneuver = server, session, maneuver
@@ -289,7 +289,7 @@ class _Page:
         self._put(self._moment)
 
     def _put(self, moment: float) -> None:
-        """Show the arm at `moment` on its straight way between two states, and leave it to the hand there."""
+        """Show the arm at `moment` on the straight line between two states, from where it can be dragged."""
         maneuver = self._maneuver
         assert maneuver is not None
         at = np.array([moment])

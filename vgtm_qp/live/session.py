@@ -29,7 +29,7 @@ _RETRY_AFTER = 10
 
 @dataclass(frozen=True)
 class Reading:
-    """What the instruments show.
+    """Outcome, active constraints, clearances and step time, as the page shows them.
 
     Attributes
     ----------
@@ -178,7 +178,7 @@ class Session:
         return moved > 1e-9
 
     def reading(self) -> Reading:
-        """Return what the instruments show now."""
+        """Return the readings of the present state."""
         monitor, state = self._resolver.arm.monitor, self.state
         clearance, pair = monitor.least(state.nodes, state.time, among="obstacles")
         last = self._last

@@ -12,7 +12,7 @@ from vgtm_qp.arm.truss.truss import Truss
 
 
 def arm_record(truss: Truss) -> dict[str, Any]:
-    """Return what verification needs to know of `truss`, as JSON data; no limit is None.
+    """Return what verification needs to know of `truss`, as JSON data; None means no limit.
 
     Keys: ``module``, ``bays``, ``node_names``, ``home`` (N, 3), ``base`` (indices of given nodes),
     ``member_names``, ``actuated``, ``length`` (M, at home), ``stroke`` (M, 2), ``rate``, ``acceleration``,

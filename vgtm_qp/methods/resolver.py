@@ -1,4 +1,4 @@
-"""What the resolvers of all other methods share: a state, a clock, and an end with a reason."""
+"""Base class of the resolvers of all other methods: state, phases of time, and the reason of a failure."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class MethodResolver(ABC):
         return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
-        """Move along `path` from its value `start` to `end` in one step, or say why that is the end."""
+        """Move along `path` from its value `start` to `end` in one step; a blocked step has its reason."""
         dt = self.arm.dt if dt is None else dt
         self._steps += 1
         self._mark = perf_counter()
@@ -73,7 +73,7 @@ class MethodResolver(ABC):
         return _step(status, progress, self.state, "")
 
     def spend(self, phase: str) -> None:
-        """Give the time since the last call to `phase`."""
+        """Add the time since the last call to `phase`."""
         now = perf_counter()
         self.phases[phase] += now - self._mark
         self._mark = now

@@ -119,9 +119,9 @@ def _read_array(path: Path, file: Any, name: str) -> NDArray[Any]:
 
 
 def _remove_stale_scratch(path: Path) -> None:
-    """Remove what a save of `path` left behind that was killed; a young one may be that of a save under way."""
+    """Remove scratch files that killed saves of `path` left behind; a young one may belong to a save under way."""
     scratch = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{16}}\.tmp")
-    # The result is saved by now, so what cannot be removed, or another save removes first, is no failure.
+    # The result is saved already: a scratch file that cannot be removed, or that another save removes, is no failure.
     with suppress(OSError):
         for entry in path.parent.iterdir():
             if scratch.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > _STALE_SECONDS:

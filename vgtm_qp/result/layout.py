@@ -12,7 +12,7 @@ from vgtm_qp.errors import ResultError
 
 
 class ArrayLayout(NamedTuple):
-    """What an array of the result file must be: axes by name or size, kinds of number, finiteness."""
+    """Axes by name or size, kinds of number and finiteness of an array of the result file."""
 
     axes: tuple[str | int, ...]
     kinds: str = "f"
@@ -43,7 +43,7 @@ LAYOUTS = {
 
 
 def plain(array: Any) -> NDArray[Any]:
-    """Return an array in the one byte order and width that the file holds."""
+    """Return an array in the byte order and width of the file."""
     array = np.asarray(array)
     wide = {"f": np.float64, "i": np.int64, "u": np.int64}.get(array.dtype.kind)
     return np.asarray(array, dtype=wide, order="C")

@@ -62,15 +62,15 @@ def make_manifest(
     status : str
         One of `STATUSES`.
     reached : float
-        How far along the path, 0 to 1.
+        Share of the path covered, 0 to 1.
     blocked_by : iterable of str
         Names of what stopped it.
     stop : mapping, optional
         What ``Stop.to_dict`` returns.
     way_out : str
-        How the redundancy was resolved where the problem's own way came to a dead end earlier.
+        The change of the problem with which a retry came further, empty if there was none.
     recovered : mapping, optional
-        Pairs that were nearer at home than they may be, ``member / obstacle`` or ``member / member``, and their
+        Pairs below their clearance in the home pose, ``member / obstacle`` or ``member / member``, and their
         distances there, m.
     method : str
         As in the problem's ``[method]``.
@@ -152,7 +152,7 @@ def check_manifest(manifest: Any) -> dict[str, Any]:
 
 
 def dump_manifest(manifest: Mapping[str, Any]) -> str:
-    """Return the one text of `manifest`; ResultError where strict JSON cannot hold it."""
+    """Return the canonical text of `manifest`; ResultError if strict JSON cannot hold it."""
     try:
         return json.dumps(
             manifest, allow_nan=False, sort_keys=True, separators=(",", ":"), ensure_ascii=False
@@ -162,7 +162,7 @@ def dump_manifest(manifest: Mapping[str, Any]) -> str:
 
 
 def parse_manifest(array: NDArray[Any]) -> Any:
-    """Return the JSON data in the ``manifest`` array of a result file; ResultError where it is none."""
+    """Return the JSON data in the ``manifest`` array of a result file; ResultError if it is not JSON."""
     if array.dtype.kind != "U" or array.ndim != 0:
         raise ResultError("the manifest is not one string")
 

@@ -36,9 +36,9 @@ class Result:
     tip_position, tip_rotation, tip_target_position : (T, 3), (T, 3, 3), (T, 3)
         Pose of the end effector and the target that each state was accepted for, m.
     clearance, self_clearance : (T,)
-        Least distance to obstacles, and between members that share no node, m; inf where there are none.
+        Least distance to obstacles, and between members that share no node, m; infinite if nothing is near.
     progress : (T,)
-        How far along the path, 0 to 1.
+        Share of the path covered, 0 to 1.
     step_time, phase_names, phase_time : (T,), (P,), (T, P)
         Computing time of each step and of its phases, s; 0 in row 0.
     manifest : dict
@@ -84,7 +84,7 @@ class Result:
         """Return one paragraph: name, status, steps, what stopped it, what verification found."""
         text = f"{self._name}: {self.status}, {100.0 * self.reached:.4g} % of the path in {self.steps} steps."
         if way := self.manifest.get("way_out"):
-            text += f" Not as asked at first, which was a dead end, but by a way out: {way}."
+            text += f" The problem as given was a dead end; this is the retry with {way}."
         if self.blocked_by:
             text += f" Stopped by {', '.join(self.blocked_by[:4])}."
         certificate = self.certificate
@@ -114,7 +114,7 @@ class Result:
 
     @property
     def reached(self) -> float:
-        """How far along the path the arm came, 0 to 1."""
+        """Share of the path that the arm covered, 0 to 1."""
         return float(self.manifest["reached"])
 
     @property
@@ -140,8 +140,8 @@ class Result:
     def summary(self, result: str | Path | None = None) -> dict[str, Any]:
         """Return what ``vgtm solve --json`` prints, as strict JSON data; `result` is the path of the file.
 
-        What only a certificate knows is None before there is one. A certificate measures no deeper than the members'
-        radius into an obstacle; there the clearance between states is that at the states, which is never greater.
+        Entries that come from the certificate are None before verification. A certificate measures penetration
+        no deeper than a member's radius; beyond that the clearance at the states replaces the one between them.
         """
         certificate = self.certificate
         manifest = self.manifest

@@ -1,4 +1,4 @@
-"""What it costs to ignore the offset of the joints: the tip error of an arm that is taken for one with pin joints."""
+"""What it costs to ignore the offset of the joints: the tip error of an arm that is modelled with pin joints."""
 
 from __future__ import annotations
 

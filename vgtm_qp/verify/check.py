@@ -36,9 +36,9 @@ ARRAY_TOLERANCE = 1e-9
 """Stored arrays against the same recomputed, m."""
 
 _SAFE = 0.05
-"""What a problem that does not say keeps from its obstacles, m."""
+"""Default of ``clearance.safe``, m."""
 _SELF_SHARE = 0.25
-"""What it keeps between members, as a share of that."""
+"""Default of ``clearance.self_safe``, as a share of ``safe``."""
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 _MANY_UNKNOWNS = 2000
@@ -89,8 +89,8 @@ def verify(maneuver: Result) -> Certificate:
     recovered = manifest.get("recovered") or []
     if recovered:
         kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
-        nearer, told = excuse_recovering(recovered, kept, CLEARANCE_TOLERANCE, BETWEEN_TOLERANCE)
-        wrong, notes = [*wrong, *nearer], [*notes, *told]
+        nearer, remarks = excuse_recovering(recovered, kept, CLEARANCE_TOLERANCE, BETWEEN_TOLERANCE)
+        wrong, notes = [*wrong, *nearer], [*notes, *remarks]
         at, between, _ = _clearances(motion, against)
         self_at, self_between, _ = _clearances(motion, members)
 

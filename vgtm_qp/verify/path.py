@@ -33,7 +33,7 @@ class PathCheck:
     tracks_pointing, tracks_orientation : bool
         Whether a direction or the whole attitude was tracked.
     is_elastic : bool
-        Whether the tip may leave its targets, at a price.
+        Whether the tip may leave its targets at a cost.
     target_error : (T,) or None
         Distance of each position target from the path, m.
     contradictions, notes : tuple of str
@@ -113,7 +113,7 @@ def check_path(maneuver: Result, tip: Array) -> PathCheck:
 
 
 def _corners(manifest: Mapping[str, Any], home: Array) -> Array | None:
-    """Return (C, 3) the corners of the path, from the home tip on; None where no position is asked for."""
+    """Return (C, 3) the corners of the path, from the home tip on; None if no position is asked for."""
     wanted = manifest["problem"].get("maneuver") or {}
     points: Any
     if manifest.get("path"):

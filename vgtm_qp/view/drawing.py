@@ -25,7 +25,7 @@ CURVE_COLOUR = (0.0, 0.45, 0.34)
 POLYGON_COLOUR = (0.35, 0.62, 0.53)
 PATH_COLOUR = (0.10, 0.10, 0.12)
 _STROKE_COLOURS = np.array([(0.05, 0.30, 0.80), (0.66, 0.48, 0.72), (0.84, 0.10, 0.12)])
-"""Shortest, middle and longest; told apart by the colour-blind, and from the fixed grey."""
+"""Shortest, middle and longest; distinct for the colour-blind, and from the grey of fixed members."""
 
 _CURVE_POINTS = 49
 _SURROUNDINGS = 0.25
@@ -190,7 +190,7 @@ class Camera:
 
 
 def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
-    """Return a camera on the arm in all states (T, N, 3) and what is near it, across the way of the tip (T, 3).
+    """Return a camera on the arm in all states (T, N, 3) and what is near it, across the path of the tip (T, 3).
 
     Of four sides it is the one from which obstacles hide least of the arm.
     """
@@ -218,12 +218,12 @@ def _direction(azimuth: float, elevation: float) -> Array:
 
 def _hidden(obstacles: Sequence[ObstacleMesh], eye: Array, points: Array) -> int:
     """Return how many of points (K, 3) are behind the box round an obstacle, seen from `eye` (3,)."""
-    ways = points - eye
-    ways = np.where(np.abs(ways) < 1e-12, 1e-12, ways)
+    rays = points - eye
+    rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     behind = np.zeros(len(points), dtype=bool)
     for mesh in obstacles:
         walls = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) + mesh.center - eye
-        crossings = np.sort(walls[:, None] / ways, axis=0)
+        crossings = np.sort(walls[:, None] / rays, axis=0)
         enters, leaves = crossings[0].max(axis=1), crossings[1].min(axis=1)
         behind |= (enters < leaves) & (enters < 1.0) & (leaves > 0.0)
     return int(behind.sum())

@@ -66,7 +66,7 @@ def plot_frames(
     """Return a figure of states of a maneuver side by side, all in the same view and scale.
 
     Members are drawn as thick as they are, grey where fixed and coloured by length where actuated; with them
-    the reference curve, its control polygon, the obstacles, the tip's way so far and the rest of its path.
+    the reference curve, its control polygon, the obstacles, the tip's path so far and the rest of it.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def plot_frames(
     frames
         How many states, evenly spread, or which ones.
     azimuth, elevation
-        Where the view is taken from, rad; by default across the way of the tip.
+        Where the view is taken from, rad; by default across the path of the tip.
 
     Raises
     ------

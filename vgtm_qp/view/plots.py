@@ -23,7 +23,7 @@ from vgtm_qp.verify.path import check_path
 Array = NDArray[np.float64]
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Told apart in every common form of colour blindness (Okabe and Ito, 2008)."""
+"""Distinct in every common form of colour blindness (Okabe and Ito, 2008)."""
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)))
 _FORBIDDEN: Any = {
     "facecolor": "#f3d7d2",
