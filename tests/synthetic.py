@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.truss import Truss
-from vgtm_qp.maneuver.manifest import arm_record, make_manifest
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.maneuver.arm_record import arm_record
+from vgtm_qp.maneuver.maneuver import Maneuver
+from vgtm_qp.result.manifest import make_manifest
 
 Array = NDArray[np.float64]
 
@@ -159,12 +160,12 @@ def found_clearances(maneuver: Maneuver) -> Maneuver:
     from dataclasses import replace
     from pathlib import Path
 
-    from vgtm_qp.verify.arm import Arm
-    from vgtm_qp.verify.clearance import AgainstBody, AgainstMembers, Motion
+    from vgtm_qp.verify.arm import RecordedArm
+    from vgtm_qp.verify.clearance import AgainstBody, AgainstMembers, MemberMotion
     from vgtm_qp.verify.obstacles import read_obstacles
 
     manifest = maneuver.manifest
-    motion = Motion(Arm(manifest["arm"], maneuver.members), maneuver.time, maneuver.nodes)
+    motion = MemberMotion(RecordedArm(manifest["arm"], maneuver.members), maneuver.time, maneuver.nodes)
     bodies, _, _ = read_obstacles(manifest["problem"], manifest["meshes"], Path(manifest["directory"]))
     states = range(len(maneuver.time))
     bodily = [AgainstBody(motion, body) for body in bodies]

@@ -19,10 +19,10 @@ from vgtm_qp.bench import contestants, measure, report, scenes
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.measure import Breakdown, Pairs, Spent, Timing, run_alone, run_in_turn
-from vgtm_qp.bench.nonlinear import NonlinearStep
 from vgtm_qp.bench.tables import render
 from vgtm_qp.cli import bench as command
 from vgtm_qp.cli import main
+from vgtm_qp.ipopt.linearised import NonlinearStep
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
@@ -340,7 +340,7 @@ def test_start_is_measured_with_more_to_do_for_more() -> None:
 
 def test_threads_are_held_before_numpy_is_loaded() -> None:
     script = (
-        "import sys; from vgtm_qp.bench.machine import pin_threads; "
+        "import sys; from vgtm_qp.machine import pin_threads; "
         "assert 'numpy' not in sys.modules; assert pin_threads(); "
         "import numpy, os; assert os.environ['OPENBLAS_NUM_THREADS'] == '1'; assert pin_threads(); "
         "del os.environ['OPENBLAS_NUM_THREADS']; assert not pin_threads()"

@@ -20,7 +20,7 @@ from vgtm_qp.cli.export import FormatName
 from vgtm_qp.export import FORMATS, export_maneuver
 from vgtm_qp.export.mjcf import mjcf, node_masses
 from vgtm_qp.export.trajectory import actuator_names, step_rates, through_rates
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import RecordedArm
 
 MOVING = {
     "name": "drone",
@@ -162,7 +162,7 @@ def test_mujoco_holds_the_truss_up_by_its_actuators(maneuver: vq.Maneuver):
 
 
 def test_masses_add_up_to_those_of_the_members(maneuver: vq.Maneuver):
-    arm = Arm(maneuver.manifest["arm"], maneuver.members)
+    arm = RecordedArm(maneuver.manifest["arm"], maneuver.members)
     assert node_masses(arm).sum() == pytest.approx(arm.length.sum())
     assert node_masses(arm)[4] == pytest.approx(0.5 * arm.length[3:].sum())
 

@@ -14,7 +14,7 @@ import vgtm_qp as vq
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.view.drawing import ObstacleMesh, drawing_of_maneuver
 from vgtm_qp.view.figure import plot_frames, save_figure
-from vgtm_qp.view.projection import Projection, Surface, layers, pieces
+from vgtm_qp.view.projection import ProjectedMesh, Projection, layers, pieces
 
 angles = st.floats(-3.0, 3.0)
 
@@ -25,9 +25,11 @@ def maneuver() -> vq.Maneuver:
     return vq.solve(problem.replace({"maneuver.steps": 12}), verify=False)
 
 
-def surface(mesh: trimesh.Trimesh, projection: Projection, center: tuple[float, float, float]) -> Surface:
+def surface(
+    mesh: trimesh.Trimesh, projection: Projection, center: tuple[float, float, float]
+) -> ProjectedMesh:
     zero = np.zeros(3)
-    return Surface(
+    return ProjectedMesh(
         ObstacleMesh("body", np.asarray(mesh.vertices), np.asarray(mesh.faces), np.array(center), zero),
         projection,
     )
@@ -71,7 +73,7 @@ def test_layers_count_the_surfaces_behind_a_point():
 def test_a_moving_obstacle_is_where_it_is_at_the_time():
     projection = Projection.looking(0.0, 0.0)
     box = trimesh.creation.box(extents=(1, 1, 1))
-    body = Surface(
+    body = ProjectedMesh(
         ObstacleMesh(
             "body", np.asarray(box.vertices), np.asarray(box.faces), np.zeros(3), np.array([1.0, 2.0, 0.0])
         ),

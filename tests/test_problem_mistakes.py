@@ -475,7 +475,7 @@ def test_a_problem_is_not_changed_in_place(tmp_path: Path) -> None:
     problem = load_problem(tmp_path / "p.toml")
     with pytest.raises(ProblemError, match=r'Problem: name: found "other"; expected .*problem\.replace'):
         problem.name = "other"
-    with pytest.raises(ProblemError, match=r"Clearance: safe: found 0\.1; expected no change"):
+    with pytest.raises(ProblemError, match=r"ClearanceTable: safe: found 0\.1; expected no change"):
         problem.clearance.safe = 0.1
     with pytest.raises(ProblemError, match="clearance: found nothing; expected no change"):
         del problem.clearance

@@ -35,7 +35,7 @@ TABLES = {
     "[maneuver]": ("WaypointManeuver", "PathManeuver"),
     "[[maneuver.waypoint]]": ("Waypoint",),
     "[[obstacle]]": ("Box", "Sphere", "Cylinder", "Mesh"),
-    "[clearance]": ("Clearance",),
+    "[clearance]": ("ClearanceTable",),
     "[method]": ("Method",),
     "[method.weights]": ("Weights",),
     "[method.gains]": ("Gains",),

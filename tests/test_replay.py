@@ -11,7 +11,7 @@ from synthetic import maneuver_of, place, tripod
 
 import vgtm_qp as vq
 from vgtm_qp.cli import main
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.replay import Replay, replay
 
 

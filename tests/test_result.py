@@ -20,9 +20,10 @@ from hypothesis import strategies as st
 from synthetic import good_maneuver, maneuver_of, swing, tripod
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.maneuver.certificate import Certificate, Measure
-from vgtm_qp.maneuver.manifest import SCHEMA_VERSION
-from vgtm_qp.maneuver.result import Maneuver, content_digest, load_result
+from vgtm_qp.maneuver.maneuver import Maneuver, load_result
+from vgtm_qp.result.certificate import Certificate, Measure
+from vgtm_qp.result.file import content_digest
+from vgtm_qp.result.manifest import SCHEMA_VERSION
 from vgtm_qp.verify import verify
 
 FIXED = good_maneuver()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
-from vgtm_qp.maneuver.ways_out import DeadEnd, bulge, ways_out
+from vgtm_qp.maneuver.retries import DeadEnd, bulge, retries
 from vgtm_qp.step.stops import Stop, StopKind
 
 BASE = {
@@ -148,20 +148,20 @@ def test_an_arm_that_no_obstacle_pushes_aside_is_bulged_the_way_its_path_goes_on
 
 def test_the_ways_out_are_those_that_a_problem_has():
     patient = problem(**{"method.retries": True})
-    names = [name for name, _ in ways_out(patient, dead_end(vertices=4))]
+    names = [name for name, _ in retries(patient, dead_end(vertices=4))]
     assert names[0] == "actuators drawn to their home lengths"
     assert [name.startswith("curve bulged") for name in names] == [False] + 5 * [True] + 5 * [False]
     assert len(set(names)) == len(names)
-    for name, other in ways_out(patient, dead_end(vertices=4)):
+    for name, other in retries(patient, dead_end(vertices=4)):
         assert other != patient, name
-    assert not list(ways_out(problem(), dead_end()))
+    assert not list(retries(problem(), dead_end()))
     for kind in (StopKind.SINGULAR, StopKind.OUT_OF_REACH, StopKind.LOCKED, StopKind.INTERRUPTED):
-        assert not list(ways_out(patient, dead_end(kind)))
+        assert not list(retries(patient, dead_end(kind)))
     bare = patient.replace({"method.tracking": "none"})
-    found = [name for name, _ in ways_out(bare, dead_end(vertices=0))]
+    found = [name for name, _ in retries(bare, dead_end(vertices=0))]
     assert not any("curve" in name or "vertices" in name for name in found)
     drawn = patient.replace({"curve.control_vertex_goals": [{"index": 2, "position": [0.1, 0.0, 1.5]}]})
-    assert not any("bulged" in name for name, _ in ways_out(drawn, dead_end(vertices=4)))
+    assert not any("bulged" in name for name, _ in retries(drawn, dead_end(vertices=4)))
 
 
 @pytest.mark.slow

@@ -16,10 +16,10 @@ from synthetic import LENGTHS, RADIUS, found_clearances, good_maneuver, maneuver
 from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.modules import octahedral
 from vgtm_qp.errors import ResultError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.verify import check, verify, verify_file
-from vgtm_qp.verify.arm import Arm
-from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Least, Motion
+from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Least, MemberMotion
 from vgtm_qp.verify.obstacles import read_obstacles
 
 
@@ -222,7 +222,7 @@ def test_pointing_is_held() -> None:
 def test_mesh_is_tied_to_its_file(tmp_path: Path) -> None:
     import trimesh
 
-    from vgtm_qp.maneuver.manifest import mesh_record
+    from vgtm_qp.result.manifest import mesh_record
 
     file = tmp_path / "part.stl"
     trimesh.creation.box((0.4, 0.4, 0.4)).export(file)
@@ -246,7 +246,7 @@ def test_mesh_is_tied_to_its_file(tmp_path: Path) -> None:
 def test_arm_inside_a_closed_mesh_touches_it(tmp_path: Path) -> None:
     import trimesh
 
-    from vgtm_qp.maneuver.manifest import mesh_record
+    from vgtm_qp.result.manifest import mesh_record
 
     file = tmp_path / "room.stl"
     trimesh.creation.box((20.0, 20.0, 20.0)).export(file)
@@ -260,7 +260,7 @@ def test_arm_inside_a_closed_mesh_touches_it(tmp_path: Path) -> None:
 def test_singular_values_against_finite_differences() -> None:
     truss = tripod()
     maneuver = good_maneuver()
-    arm = Arm(maneuver.manifest["arm"], truss.members)
+    arm = RecordedArm(maneuver.manifest["arm"], truss.members)
     values = arm.singular_values(place(LENGTHS))
     assert values is not None
     step = 1e-6
@@ -278,7 +278,7 @@ def test_sparse_and_dense_singular_values_agree(monkeypatch: pytest.MonkeyPatch)
     rng = np.random.default_rng(3)
     nodes = truss.home + 0.02 * rng.normal(size=truss.home.shape)
     maneuver = maneuver_of(nodes[None], np.zeros(1), truss, status="blocked", reached=0.0)
-    arm = Arm(maneuver.manifest["arm"], truss.members)
+    arm = RecordedArm(maneuver.manifest["arm"], truss.members)
     dense = arm.singular_values(nodes)
     monkeypatch.setattr(module, "_DENSE_UNKNOWNS", 0)
     assert arm.singular_values(nodes) == pytest.approx(dense, rel=1e-5)
@@ -296,14 +296,14 @@ def test_offset_joints_place_ends_and_bound_their_paths() -> None:
     truss = tripod(offset_joints())
     rng = np.random.default_rng(2)
     maneuver = maneuver_of(truss.home[None], np.zeros(1), truss, status="blocked", reached=0.0)
-    arm = Arm(maneuver.manifest["arm"], truss.members)
+    arm = RecordedArm(maneuver.manifest["arm"], truss.members)
     np.testing.assert_allclose(arm.length, truss.home_lengths, atol=1e-14)
     member = np.arange(6)
     for _ in range(10):
         before = truss.home + 0.05 * rng.normal(size=(5, 3))
         after = before + 0.1 * rng.normal(size=(5, 3))
         np.testing.assert_allclose(arm.ends(before), member_ends(truss, before), atol=1e-14)
-        motion = Motion(arm, np.array([0.0, 1.0]), np.stack([before, after]))
+        motion = MemberMotion(arm, np.array([0.0, 1.0]), np.stack([before, after]))
         bend = motion.bend(0, member)
         h = 1e-3
         for share in np.linspace(h, 1.0 - h, 40):
@@ -314,10 +314,10 @@ def test_offset_joints_place_ends_and_bound_their_paths() -> None:
             assert (second <= bend * (1 + 1e-6) + 1e-6).all()
 
 
-def encounters(truss: Any, nodes: Any, obstacles: list[dict[str, Any]]) -> tuple[Motion, list[Any]]:
+def encounters(truss: Any, nodes: Any, obstacles: list[dict[str, Any]]) -> tuple[MemberMotion, list[Any]]:
     maneuver = maneuver_of(nodes, np.arange(float(len(nodes))), truss, problem={"obstacle": obstacles})
-    arm = Arm(maneuver.manifest["arm"], truss.members)
-    motion = Motion(arm, maneuver.time, maneuver.nodes)
+    arm = RecordedArm(maneuver.manifest["arm"], truss.members)
+    motion = MemberMotion(arm, maneuver.time, maneuver.nodes)
     bodies, _, _ = read_obstacles(maneuver.manifest["problem"], {}, Path())
     return motion, [*(AgainstBody(motion, body) for body in bodies), AgainstMembers(motion)]
 
@@ -424,7 +424,7 @@ def test_shares_no_code_with_the_solver() -> None:
     for file in Path(check.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("vgtm_qp"):
-                allowed = ("vgtm_qp.verify", "vgtm_qp.maneuver", "vgtm_qp.errors", "vgtm_qp.problem")
+                allowed = ("vgtm_qp.verify", "vgtm_qp.result", "vgtm_qp.errors", "vgtm_qp.problem")
                 assert str(node.module).startswith(allowed), f"{file.name}: {node.module}"
     code = """
         import sys, vgtm_qp.verify

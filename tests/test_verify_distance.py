@@ -17,7 +17,7 @@ from vgtm_qp.verify.distance import (
     segment_segment,
     segment_triangle,
 )
-from vgtm_qp.verify.obstacles import Ball, Box, Cylinder, Mesh, rotation_matrix
+from vgtm_qp.verify.obstacles import BallBody, BoxBody, CylinderBody, MeshBody, rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -122,16 +122,16 @@ def test_segment_triangle(a: Array, b: Array, u: Array, v: Array, w: Array) -> N
 bodies = st.sampled_from(["box", "ball", "cylinder", "mesh"])
 
 
-def make(kind: str, turn: Array) -> Box | Ball | Cylinder | Mesh:
+def make(kind: str, turn: Array) -> BoxBody | BallBody | CylinderBody | MeshBody:
     placed = (kind, np.zeros(3), np.zeros(3), rotation_matrix(turn))
     if kind == "box":
-        return Box(*placed, half=np.array([0.3, 0.5, 0.2]))
+        return BoxBody(*placed, half=np.array([0.3, 0.5, 0.2]))
     if kind == "ball":
-        return Ball(*placed, radius=0.4)
+        return BallBody(*placed, radius=0.4)
     if kind == "cylinder":
-        return Cylinder(*placed, radius=0.3, half_height=0.5)
+        return CylinderBody(*placed, radius=0.3, half_height=0.5)
     triangle = np.array([[[0.5, 0.0, 0.0], [-0.2, 0.4, 0.1], [0.0, -0.3, 0.2]]])
-    return Mesh(*placed, triangles=triangle @ placed[3].T, closed=False)
+    return MeshBody(*placed, triangles=triangle @ placed[3].T, closed=False)
 
 
 @many
@@ -163,7 +163,7 @@ def test_winding_number_tells_inside_from_outside() -> None:
     import trimesh
 
     surface = trimesh.creation.torus(1.0, 0.3, major_sections=24, minor_sections=12)
-    mesh = Mesh("ring", np.zeros(3), np.zeros(3), np.eye(3), np.asarray(surface.triangles), closed=True)
+    mesh = MeshBody("ring", np.zeros(3), np.zeros(3), np.eye(3), np.asarray(surface.triangles), closed=True)
     points = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -1.1, 0.05], [1.0, 0.0, 0.29 + 0.05]])
     assert mesh.encloses(points).tolist() == [True, False, True, False]
 

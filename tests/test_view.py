@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import vgtm_qp as vq
-from vgtm_qp.view.page import view
-from vgtm_qp.view.read_out import read_out
-from vgtm_qp.view.session import Session
+from vgtm_qp.live.page import view
+from vgtm_qp.live.read_out import read_out
+from vgtm_qp.live.session import Session
 
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = [

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from vgtm_qp.arm.truss.build import build_truss
     from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.arm.truss.truss import Truss
+    from vgtm_qp.comparison.compare import compare
+    from vgtm_qp.comparison.report import Report
     from vgtm_qp.errors import (
         CurveError,
         ExportError,
@@ -24,12 +26,11 @@ if TYPE_CHECKING:
         VgtmError,
     )
     from vgtm_qp.export import export_maneuver
-    from vgtm_qp.maneuver.certificate import Certificate, Measure
+    from vgtm_qp.maneuver.maneuver import Maneuver, load_result
     from vgtm_qp.maneuver.many import solve_many
-    from vgtm_qp.maneuver.result import Maneuver, load_result
     from vgtm_qp.maneuver.solve import solve
-    from vgtm_qp.methods.compare import Report, compare
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
+    from vgtm_qp.result.certificate import Certificate, Measure
     from vgtm_qp.step.resolver import Resolver, Step, StepStatus
     from vgtm_qp.verify import verify, verify_file
 
@@ -47,11 +48,12 @@ _HOMES = {
         "VgtmError",
     ),
     "vgtm_qp.export": ("export_maneuver",),
-    "vgtm_qp.maneuver.certificate": ("Certificate", "Measure"),
-    "vgtm_qp.maneuver.result": ("Maneuver", "load_result"),
+    "vgtm_qp.result.certificate": ("Certificate", "Measure"),
+    "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),
     "vgtm_qp.maneuver.many": ("solve_many",),
     "vgtm_qp.maneuver.solve": ("solve",),
-    "vgtm_qp.methods.compare": ("Report", "compare"),
+    "vgtm_qp.comparison.compare": ("compare",),
+    "vgtm_qp.comparison.report": ("Report",),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
     "vgtm_qp.step.resolver": ("Resolver", "Step", "StepStatus"),
     "vgtm_qp.arm.truss.build": ("build_truss",),

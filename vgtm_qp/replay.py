@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf
-from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.verify.arm import Arm
-from vgtm_qp.verify.clearance import AgainstBody, Motion
+from vgtm_qp.result.result import Result
+from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.verify.clearance import AgainstBody, MemberMotion
 from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.view.drawing import obstacle_meshes
 
@@ -25,7 +25,7 @@ _PROBED_STATES = 51
 
 
 @dataclass(frozen=True, eq=False)
-class Following:
+class ReplayRun:
     """How a replay followed a maneuver, over its states.
 
     Attributes
@@ -50,7 +50,7 @@ class Following:
     contacts: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the worst values as strict JSON data, m; no clearance is None."""
+        """Return the worst values as strict JSON data, m; None if there are no obstacles."""
         clearance = float(self.clearance.min())
         return {
             "max_length_error": float(self.length_error.max()),
@@ -68,7 +68,7 @@ class Replay:
 
     Attributes
     ----------
-    kinematic, physics : Following
+    kinematic, physics : ReplayRun
     tip_error_per_millimetre : float
         mm at the tip for actuator errors whose squares sum to 1 mm^2, found by pushing each actuator.
     probed_state : int
@@ -77,8 +77,8 @@ class Replay:
         The same from the Jacobian, as the certificate has it.
     """
 
-    kinematic: Following
-    physics: Following
+    kinematic: ReplayRun
+    physics: ReplayRun
     tip_error_per_millimetre: float
     probed_state: int
     certified_tip_error_per_millimetre: float
@@ -122,7 +122,7 @@ class Replay:
         }
 
 
-def replay(maneuver: Maneuver) -> Replay:
+def replay(maneuver: Result) -> Replay:
     """Replay a maneuver in MuJoCo, as it was solved and under gravity.
 
     The physics replay drives the length of every member through equality constraints, in straight lines
@@ -145,13 +145,13 @@ def replay(maneuver: Maneuver) -> Replay:
 class _Simulation:
     """The MuJoCo model of one maneuver, its data, and where the maneuver's parts are in them."""
 
-    def __init__(self, maneuver: Maneuver) -> None:
+    def __init__(self, maneuver: Result) -> None:
         try:
             import mujoco
         except ImportError:
             raise MissingExtraError("mujoco", "mujoco") from None
         self._mujoco, self._maneuver = mujoco, maneuver
-        self._arm = arm = Arm(maneuver.manifest["arm"], maneuver.members)
+        self._arm = arm = RecordedArm(maneuver.manifest["arm"], maneuver.members)
         self._model: Any = mujoco.MjModel.from_xml_string(mjcf(maneuver))
         self._data: Any = mujoco.MjData(self._model)
         self._free = np.setdiff1d(np.arange(len(arm.home)), arm.base)
@@ -164,7 +164,7 @@ class _Simulation:
         self._home_lengths = np.array(self._model.tendon_length0)
         self._tip = maneuver.tip_position
 
-    def kinematic(self) -> Following:
+    def kinematic(self) -> ReplayRun:
         """Put the nodes where they should be and read the lengths that MuJoCo finds."""
         count = len(self._maneuver.time)
         nodes, lengths = np.empty_like(self._maneuver.nodes), np.empty_like(self._maneuver.member_lengths)
@@ -174,9 +174,9 @@ class _Simulation:
             self._mujoco.mj_forward(self._model, self._data)
             nodes[k], lengths[k] = self._data.site_xpos, self._data.ten_length
             contacts += bool(self._data.ncon)
-        return self._following(nodes, lengths, contacts)
+        return self._run_of(nodes, lengths, contacts)
 
-    def physics(self) -> Following:
+    def physics(self) -> ReplayRun:
         """Let the lengths be constraints that move from state to state, and gravity pull."""
         maneuver, model, data = self._maneuver, self._model, self._data
         nodes, lengths = np.empty_like(maneuver.nodes), np.empty_like(maneuver.member_lengths)
@@ -193,7 +193,7 @@ class _Simulation:
                 contacts += bool(data.ncon)
             self._mujoco.mj_fwdPosition(model, data)
             nodes[k], lengths[k] = data.site_xpos, data.ten_length
-        return self._following(nodes, lengths, contacts)
+        return self._run_of(nodes, lengths, contacts)
 
     def most_sensitive_state(self) -> tuple[int, float]:
         """Return the state where actuator errors move the tip most, and how far by the Jacobian, mm/mm."""
@@ -247,7 +247,7 @@ class _Simulation:
             self._data.mocap_pos[count + k] = mesh.position(time)
 
     def _command(self, state: int, share: float) -> None:
-        """Ask for the lengths a `share` of the way from `state` to the next."""
+        """Ask for the lengths at a `share` of the motion from `state` to the next."""
         maneuver = self._maneuver
         after = min(state + 1, len(maneuver.time) - 1)
 
@@ -265,12 +265,12 @@ class _Simulation:
     def _tip_now(self) -> Array:
         return self._arm.tip_position(np.asarray(self._data.site_xpos))
 
-    def _following(self, nodes: Array, lengths: Array, contacts: int) -> Following:
+    def _run_of(self, nodes: Array, lengths: Array, contacts: int) -> ReplayRun:
         errors = lengths - self._maneuver.member_lengths
-        motion = Motion(self._arm, self._maneuver.time, nodes)
+        motion = MemberMotion(self._arm, self._maneuver.time, nodes)
         pairs = [AgainstBody(motion, body) for body in self._bodies]
         least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(nodes))]
-        return Following(
+        return ReplayRun(
             nodes=nodes,
             length_error=np.abs(errors).max(axis=1),
             tip_error=np.linalg.norm(self._arm.tip_position(nodes) - self._tip, axis=1),

@@ -9,12 +9,12 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.bench.nonlinear import NonlinearStep
 from vgtm_qp.errors import SolverError
+from vgtm_qp.ipopt.linearised import NonlinearStep
 from vgtm_qp.methods import AnyResolver, make_resolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
+from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import StepStatus
 from vgtm_qp.step.state import State
@@ -48,9 +48,7 @@ class BarePseudoinverse:
     """Eq. (28) alone: one dense J^+ by singular values; no null-space vector, limit, clearance or check."""
 
     def __init__(self, problem: Problem) -> None:
-        # Any solver serves that makes no kernels, for none is asked.
-        changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
-        self._arm = arm = build_arm(problem.replace(changes))
+        self._arm = arm = arm_without_curve(problem)
         layout, task = arm.layout, arm.task
         first = layout.node_column[arm.truss.tip]
         self._tip = (first[:, None] + np.arange(3)).reshape(-1)

@@ -93,9 +93,9 @@ class Steps:
     qps : list of int
         QPs solved in each step.
     covered : float
-        The greatest part of the maneuver that a pass over it came through, 0 to 1.
+        The greatest share of the maneuver that one pass covered, 0 to 1.
     stopped_by : str
-        What blocked the arm on the way, empty where nothing did.
+        What blocked the arm, empty if nothing did.
     """
 
     spent: list[Spent] = field(default_factory=list)
@@ -130,7 +130,7 @@ class _Place:
 
 
 class _Walk:
-    """A resolver that goes along a plan again and again."""
+    """A resolver that repeats a plan from home."""
 
     def __init__(self, resolver: Resolver, plan: Plan) -> None:
         self._resolver, self._plan = resolver, plan
@@ -138,7 +138,7 @@ class _Walk:
         self.restart()
 
     def restart(self) -> bool:
-        """Go home; False where the arm was stuck there, so that it is of no use to try again."""
+        """Go home; False if the arm was stuck at home, so that another attempt is useless."""
         hopeless = bool(self.stuck) and self.covered == 0.0
         self._resolver.state = self._resolver.arm.home_state()
         self._value, self._index, self._stalled, self.stuck = self._plan.path.start, 0, 0, ""
@@ -181,13 +181,13 @@ class _Walk:
 
 
 class _Clock:
-    """Says how long a run goes on: as told, but for a few steps at least where they are not too slow."""
+    """Limits a run to its seconds and steps, with a few steps at least unless they are too slow."""
 
     def __init__(self, seconds: float, steps: int) -> None:
         self._seconds, self._steps, self._started = seconds, steps, perf_counter()
 
     def goes_on(self, count: int) -> bool:
-        """Whether there is to be a step after `count` of them; always a first one."""
+        """Whether to make another step after `count` steps; the first is always made."""
         if count == 0 or count >= self._steps:
             return count == 0
         limit = self._seconds * (_OVERRUN if count < _LEAST_STEPS else 1.0)
@@ -222,7 +222,7 @@ def run_alone(resolver: Resolver, plan: Plan, *, seconds: float, steps: int) -> 
 
 
 def run_in_turn(resolver: Resolver, baseline: Contestant, plan: Plan, *, seconds: float, steps: int) -> Pairs:
-    """Return the times of a baseline and of the resolver over the same steps, taken in turn."""
+    """Return the times of a baseline and of the resolver over the same steps, in alternation."""
     walk, found = _Walk(resolver, plan), Pairs()
     _take(baseline, walk.place, plan)
     clock, count = _Clock(seconds, steps), 0

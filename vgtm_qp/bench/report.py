@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from vgtm_qp.bench.contestants import BASELINES, Name, make_baseline
 from vgtm_qp.bench.fresh import Fresh, measure_fresh, measure_start
-from vgtm_qp.bench.machine import commit, describe_machine, versions
 from vgtm_qp.bench.measure import Breakdown, Timing, run_alone, run_in_turn
-from vgtm_qp.bench.scenes import Scene
+from vgtm_qp.bench.scenes import BenchScene
 from vgtm_qp.errors import ResultError, VgtmError
+from vgtm_qp.machine import commit, machine_record, versions
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.step.resolver import Resolver
+
+_PACKAGES = ("vgtm-qp", "numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl")
 
 SCHEMA_VERSION = 1
 LEAST_BAYS = 50
@@ -58,7 +60,7 @@ class SceneReport:
     Attributes
     ----------
     covered : float
-        The part of the maneuver that the measured steps came through, 0 to 1.
+        Share of the maneuver that the measured steps covered, 0 to 1.
     stopped_by : str
         What blocked the arm, empty where nothing did.
     qps : float
@@ -85,7 +87,7 @@ class SceneReport:
 
 
 def measure_scene(
-    scene: Scene, names: Sequence[Name], *, seconds: float, steps: int, cold: bool = False
+    scene: BenchScene, names: Sequence[Name], *, seconds: float, steps: int, cold: bool = False
 ) -> SceneReport:
     """Measure one scene: alone, in turn with each of the baselines, and in fresh processes.
 
@@ -125,7 +127,7 @@ def measure_scene(
 
 
 def _against(
-    scene: Scene, name: Name, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
+    scene: BenchScene, name: Name, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
 ) -> Against:
     try:
         baseline = make_baseline(name, scene.problem, scene.bays)
@@ -138,14 +140,14 @@ def _against(
 
 
 def measure(
-    scenes: Iterable[Scene],
+    scenes: Iterable[BenchScene],
     names: Sequence[Name],
     *,
     seconds: float,
     steps: int,
     cold: bool = False,
     pinned: bool = True,
-    progress: Callable[[Scene], None] | None = None,
+    progress: Callable[[BenchScene], None] | None = None,
 ) -> dict[str, Any]:
     """Measure scenes and return the document, plain data for JSON.
 
@@ -156,7 +158,7 @@ def measure(
     seconds, steps, cold
         See :func:`measure_scene`.
     pinned
-        Whether BLAS was held to one thread; see :func:`vgtm_qp.bench.machine.pin_threads`.
+        Whether BLAS was held to one thread; see :func:`vgtm_qp.machine.pin_threads`.
     progress
         Called before each scene.
     """
@@ -164,8 +166,8 @@ def measure(
         "schema_version": SCHEMA_VERSION,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),
-        "machine": describe_machine(),
-        "versions": versions(),
+        "machine": machine_record(),
+        "versions": versions(_PACKAGES),
         "settings": {"seconds": seconds, "steps": steps, "cold": cold, "one_blas_thread": pinned},
         "baselines": {name: BASELINES[name].title for name in names},
         "start": measure_start(),

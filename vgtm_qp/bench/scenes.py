@@ -28,7 +28,7 @@ _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True)
-class Scene:
+class BenchScene:
     """A problem to be measured.
 
     Attributes
@@ -51,7 +51,7 @@ class Scene:
 
 def make_scenes(
     kinds: Iterable[Kind] = KINDS, bays: Sequence[int] = BAYS, trackings: Sequence[Tracking] = TRACKINGS
-) -> list[Scene]:
+) -> list[BenchScene]:
     """Return the scenes of these kinds; `bays` are those of the arms between two cubes.
 
     A direction of the tip cannot be held with hard tracking, so that ``pointing`` is elastic alone.
@@ -60,7 +60,7 @@ def make_scenes(
     for kind in dict.fromkeys(kinds):
         if kind == "tetrahedral":
             problem = load_problem("tetrahedral_truss_circle")
-            scenes.append(Scene("tetrahedral", kind, 14, "none", problem))
+            scenes.append(BenchScene("tetrahedral", kind, 14, "none", problem))
             continue
         for count in _bays_of(kind, bays):
             problem = _problem(kind, count)
@@ -68,7 +68,7 @@ def make_scenes(
                 hard = tracking == "hard"
                 name = f"{kind}-{count}" + ("-hard" if hard else "")
                 scenes.append(
-                    Scene(name, kind, count, tracking, problem.replace({"method.hard_tracking": hard}))
+                    BenchScene(name, kind, count, tracking, problem.replace({"method.hard_tracking": hard}))
                 )
     return scenes
 

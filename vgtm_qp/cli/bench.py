@@ -57,13 +57,13 @@ def bench(
     turn with each baseline, step by step from the same states, for the ratios. Set-up and memory are those of
     a fresh process.
     """
-    from vgtm_qp.bench.machine import pin_threads
+    from vgtm_qp.machine import pin_threads
 
     pinned = pin_threads()
     from vgtm_qp.bench.contestants import NAMES
     from vgtm_qp.bench.report import compare as compared
     from vgtm_qp.bench.report import load_document, measure
-    from vgtm_qp.bench.scenes import BAYS, KINDS, TRACKINGS, Scene, make_scenes
+    from vgtm_qp.bench.scenes import BAYS, KINDS, TRACKINGS, BenchScene, make_scenes
     from vgtm_qp.bench.tables import render
 
     older = None if compare is None else load_document(compare)
@@ -72,7 +72,7 @@ def bench(
     if not pinned:
         note("vgtm bench: BLAS was loaded before its threads could be held to one")
 
-    def follow(under_way: Scene) -> None:
+    def follow(under_way: BenchScene) -> None:
         note(f"{scenes.index(under_way) + 1}/{len(scenes)} {under_way.name}")
 
     found = measure(

@@ -33,8 +33,8 @@ def compare(
     Exit code 0 says that the comparison was made, whatever the methods did.
     """
     from vgtm_qp.cli.progress import following
+    from vgtm_qp.comparison.compare import compare as run
     from vgtm_qp.methods import DEFAULT_METHODS, PRESETS
-    from vgtm_qp.methods.compare import compare as run
     from vgtm_qp.methods.presets import check_methods
     from vgtm_qp.problem import load_problem
     from vgtm_qp.view.figure import save_figure

@@ -16,7 +16,17 @@ _EXTRAS = {
     "export": ("viser", "mcap", "mcap-ros2-support", "imageio-ffmpeg", "pillow", "pyyaml"),
     "mujoco": ("mujoco",),
     "cluster": ("dask", "distributed"),
-    "test": ("hypothesis", "jsonschema", "mypy", "playwright", "pytest", "pytest-xdist", "rosbags", "ruff"),
+    "test": (
+        "hypothesis",
+        "import-linter",
+        "jsonschema",
+        "mypy",
+        "playwright",
+        "pytest",
+        "pytest-xdist",
+        "rosbags",
+        "ruff",
+    ),
 }
 
 
@@ -28,17 +38,21 @@ def doctor(*, json: Json = False) -> int:
     import platform
 
     from vgtm_qp.compiled import cache_directory, compiler
+    from vgtm_qp.machine import versions
 
     cache = cache_directory()
     found: dict[str, Any] = {
         "versions": {"python": platform.python_version(), "system": platform.platform()}
-        | {name: _version(name) for name in ("vgtm-qp", *_CORE)},
+        | versions(("vgtm-qp", *_CORE)),
         "solvers": _tried(_solvers),
         "compiler": compiler(),
         "cache": {"folder": str(cache), "kernels": _kernels_in(cache), "hindrance": _hindrance(cache)},
         "kernels": _tried(_kernels),
         "fcl": _tried(_fcl),
-        "extras": {extra: [name for name in names if not _version(name)] for extra, names in _EXTRAS.items()},
+        "extras": {
+            extra: [name for name, found in versions(names).items() if not found]
+            for extra, names in _EXTRAS.items()
+        },
     }
     needed = ("solvers", "kernels", "fcl")
     broken = [name for name in needed if not found[name]["ok"]]
@@ -69,15 +83,6 @@ def _report(found: dict[str, Any]) -> str:
         state = f"missing {', '.join(missing)}: pip install 'vgtm-qp[{extra}]'" if missing else "installed"
         rows.append((f"extra [{extra}]", state))
     return table(rows, indent="")
-
-
-def _version(package: str) -> str | None:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _tried(trial: Callable[[], str]) -> dict[str, Any]:

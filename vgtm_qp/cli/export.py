@@ -25,7 +25,7 @@ def export(
     """Write a result as an offline page, animation, figure, table, ROS 2 bag or message, or MuJoCo model."""
     from vgtm_qp.cli.files import check_writable
     from vgtm_qp.export import FORMATS, export_maneuver
-    from vgtm_qp.maneuver.result import load_result
+    from vgtm_qp.maneuver.maneuver import load_result
 
     suffix = FORMATS[to].suffix
     path = result.with_suffix(suffix) if output is None else output

@@ -119,7 +119,8 @@ def _report(summary: dict[str, Any]) -> str:
         lines += [f"  stopped by {name}" for name in summary["blocked_by"][:4]]
     if summary["way_out"]:
         lines.append(
-            f"  a dead end as asked; by a way out: {summary['way_out']} (method.retries = false for none)"
+            f"  the problem as given was a dead end; retried with {summary['way_out']} "
+            "(method.retries = false switches this off)"
         )
     lines += [f"  not within tolerance: {line}" for line in summary["failures"]]
     step = summary["step_time"]

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from vgtm_qp.cli.output import ExitCode, Json, document, note, say
 
 if TYPE_CHECKING:
-    from vgtm_qp.maneuver.result import Maneuver
+    from vgtm_qp.maneuver.maneuver import Maneuver
 
 # With several results the first of these that any of them earned is the exit code.
 _WORST_FIRST = (ExitCode.USAGE, ExitCode.UNVERIFIED, ExitCode.BLOCKED, ExitCode.SOLVED)
@@ -29,7 +29,7 @@ def verify(
     fails the verification (4); a maneuver that is right as far as it goes, but was blocked, gives 3.
     """
     from vgtm_qp.errors import ResultError
-    from vgtm_qp.maneuver.result import load_result
+    from vgtm_qp.maneuver.maneuver import load_result
     from vgtm_qp.verify import verify as certify
 
     codes, entries = [], []

@@ -24,9 +24,9 @@ def view(
 
     The page is served to this machine alone, until the command is interrupted.
     """
-    from vgtm_qp.maneuver.result import load_result
+    from vgtm_qp.live.page import view as serve
+    from vgtm_qp.maneuver.maneuver import load_result
     from vgtm_qp.problem import load_problem
-    from vgtm_qp.view.page import view as serve
     from vgtm_qp.view.scene import import_viser
 
     import_viser()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from vgtm_qp.errors import ExportError, nearest
 
 if TYPE_CHECKING:
-    from vgtm_qp.maneuver.result import Maneuver
+    from vgtm_qp.result.result import Result
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Format:
     function: str
 
     @property
-    def write(self) -> Callable[[Maneuver, str | Path], Path]:
+    def write(self) -> Callable[[Result, str | Path], Path]:
         """The function that writes it."""
-        write: Callable[[Maneuver, str | Path], Path] = getattr(import_module(self.module), self.function)
+        write: Callable[[Result, str | Path], Path] = getattr(import_module(self.module), self.function)
         return write
 
 
@@ -54,7 +54,7 @@ FORMATS = {
 """Every format by the name that ``vgtm export --to`` takes."""
 
 
-def export_maneuver(maneuver: Maneuver, path: str | Path, *, to: str | None = None) -> Path:
+def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None) -> Path:
     """Write a maneuver in another form and return the path of the file.
 
     Parameters

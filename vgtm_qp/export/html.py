@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 from vgtm_qp.view.drawing import camera_for, drawing_of_maneuver, resampled
 from vgtm_qp.view.scene import ArmScene, viser_server
 
 _LONGEST = 20.0
 
 
-def write_html(maneuver: Maneuver, path: str | Path, *, frames: int = 200) -> Path:
+def write_html(maneuver: Result, path: str | Path, *, frames: int = 200) -> Path:
     """Write the maneuver as one file that needs neither a network nor a server, and return its path.
 
     Parameters
@@ -60,7 +60,7 @@ def write_html(maneuver: Maneuver, path: str | Path, *, frames: int = 200) -> Pa
     return path
 
 
-def _read_out(maneuver: Maneuver, time: float, clearance: float) -> str:
+def _read_out(maneuver: Result, time: float, clearance: float) -> str:
     text = f"{time:.1f} s"
     if np.isfinite(maneuver.clearance).any():
         text += f"   clearance {1000.0 * clearance:.0f} mm"

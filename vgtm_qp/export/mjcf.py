@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ExportError
-from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.result.result import Result
+from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.view.drawing import FIXED_COLOUR, OBSTACLE_COLOUR, obstacle_meshes, stroke_colours
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ ACTUATOR_GROUP = 1
 _STIFFNESS = 2.0e5
 
 
-def write_mjcf(maneuver: Maneuver, path: str | Path) -> Path:
+def write_mjcf(maneuver: Result, path: str | Path) -> Path:
     """Write the MuJoCo model of a maneuver and return its path; opens in MuJoCo's own viewer.
 
     Raises
@@ -40,7 +40,7 @@ def write_mjcf(maneuver: Maneuver, path: str | Path) -> Path:
     return path
 
 
-def mjcf(maneuver: Maneuver) -> str:
+def mjcf(maneuver: Result) -> str:
     """Return the MuJoCo model of a maneuver as XML.
 
     Free nodes are bodies with three slide joints, so ``qpos`` is their displacement from the home pose; base
@@ -55,7 +55,7 @@ def mjcf(maneuver: Maneuver) -> str:
         The truss has offset joints, whose attitude point masses cannot have.
     """
     record = maneuver.manifest["arm"]
-    arm = Arm(record, maneuver.members)
+    arm = RecordedArm(record, maneuver.members)
     if not arm.has_pin_joints:
         raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
     name = str(maneuver.manifest["problem"].get("name", "truss"))
@@ -77,13 +77,13 @@ def mjcf(maneuver: Maneuver) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def node_masses(arm: Arm) -> Array:
+def node_masses(arm: RecordedArm) -> Array:
     """Return (N,) the mass at each node, kg: half of every member that ends there."""
     half = 0.5 * MASS_PER_LENGTH * arm.length
     return np.bincount(arm.members.reshape(-1), np.repeat(half, 2), minlength=len(arm.home)).astype(float)
 
 
-def _add_nodes(world: Element, arm: Arm, names: list[str]) -> None:
+def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
     masses, radius = node_masses(arm), float(np.median(arm.radius))
     base = set(arm.base.tolist())
     for k, name in enumerate(names):
@@ -115,7 +115,7 @@ def _add_nodes(world: Element, arm: Arm, names: list[str]) -> None:
         _add(body, "site", name=name, size=0.5 * radius)
 
 
-def _add_obstacles(asset: Element, world: Element, maneuver: Maneuver) -> None:
+def _add_obstacles(asset: Element, world: Element, maneuver: Result) -> None:
     directory = Path(maneuver.manifest.get("directory") or ".")
     entries = {str(entry["name"]): entry for entry in maneuver.manifest["problem"].get("obstacle") or ()}
     for mesh in obstacle_meshes(list(entries.values()), directory):
@@ -144,7 +144,7 @@ def _add_obstacles(asset: Element, world: Element, maneuver: Maneuver) -> None:
         geom.set("size", _text(size))
 
 
-def _add_members(root: Element, arm: Arm, names: list[str]) -> None:
+def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
     tendons, equalities, actuators = (_add(root, kind) for kind in ("tendon", "equality", "actuator"))
     for k, member in enumerate(arm.member_names):
         colour = stroke_colours(np.array(0.5)) if arm.actuated[k] else np.array(FIXED_COLOUR)
@@ -167,7 +167,7 @@ def _add_members(root: Element, arm: Arm, names: list[str]) -> None:
             )
 
 
-def _add_keyframes(root: Element, maneuver: Maneuver, arm: Arm) -> None:
+def _add_keyframes(root: Element, maneuver: Result, arm: RecordedArm) -> None:
     keyframes = _add(root, "keyframe")
     moving = [
         mesh

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ExportError, MissingExtraError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 
 _MOST_FRAMES = 120
 _DOTS_PER_INCH = 100
@@ -17,14 +17,14 @@ _LONGEST = 12.0
 _NEARLY_WHITE = 248
 
 
-def write_figure(maneuver: Maneuver, path: str | Path) -> Path:
+def write_figure(maneuver: Result, path: str | Path) -> Path:
     """Write frames of the maneuver side by side, as .pdf or .png."""
     from vgtm_qp.view.figure import plot_frames, save_figure
 
     return save_figure(plot_frames(maneuver), path)
 
 
-def write_animation(maneuver: Maneuver, path: str | Path) -> Path:
+def write_animation(maneuver: Result, path: str | Path) -> Path:
     """Write the maneuver as .gif or .mp4, in its own time, or in 12 s where it is longer.
 
     Raises
@@ -46,7 +46,7 @@ def write_animation(maneuver: Maneuver, path: str | Path) -> Path:
     return path
 
 
-def _pictures(maneuver: Maneuver) -> list[NDArray[np.uint8]]:
+def _pictures(maneuver: Result) -> list[NDArray[np.uint8]]:
     """Return (H, W, 3) pictures, H and W even as video wants them."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

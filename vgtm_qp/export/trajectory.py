@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import MissingExtraError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 
 Array = NDArray[np.float64]
 
@@ -47,17 +47,17 @@ uint32 nanosec"""
 )
 
 
-def actuator_names(maneuver: Maneuver) -> list[str]:
+def actuator_names(maneuver: Result) -> list[str]:
     """Return the names of the actuated members, the joints of every trajectory here."""
     return [str(name) for name in maneuver.member_names[maneuver.member_actuated]]
 
 
-def actuator_lengths(maneuver: Maneuver) -> Array:
+def actuator_lengths(maneuver: Result) -> Array:
     """Return (T, n_a) lengths of the actuated members, m."""
     return maneuver.member_lengths[:, maneuver.member_actuated]
 
 
-def step_rates(maneuver: Maneuver) -> Array:
+def step_rates(maneuver: Result) -> Array:
     """Return (T, n_a) mean rates over the step that led to each state, m/s, as the rate limit has them."""
     lengths = actuator_lengths(maneuver)
     rates = np.zeros_like(lengths)
@@ -65,7 +65,7 @@ def step_rates(maneuver: Maneuver) -> Array:
     return rates
 
 
-def through_rates(maneuver: Maneuver) -> Array:
+def through_rates(maneuver: Result) -> Array:
     """Return (T, n_a) rates with which a controller passes the states, m/s: central, and rest at both ends.
 
     A central rate lies between the mean rates of its two steps, so it keeps the limits that they keep.
@@ -76,7 +76,7 @@ def through_rates(maneuver: Maneuver) -> Array:
     return rates
 
 
-def write_csv(maneuver: Maneuver, path: str | Path) -> Path:
+def write_csv(maneuver: Result, path: str | Path) -> Path:
     """Write one row a state: time, length of each actuator, rate of each over the step before; m and s."""
     names = actuator_names(maneuver)
     path = Path(path)
@@ -90,7 +90,7 @@ def write_csv(maneuver: Maneuver, path: str | Path) -> Path:
     return path
 
 
-def joint_trajectory(maneuver: Maneuver) -> dict[str, Any]:
+def joint_trajectory(maneuver: Result) -> dict[str, Any]:
     """Return the fields of a ``trajectory_msgs/msg/JointTrajectory``; its positions are lengths, m."""
     start = float(maneuver.time[0])
     points = [
@@ -112,7 +112,7 @@ def joint_trajectory(maneuver: Maneuver) -> dict[str, Any]:
     }
 
 
-def write_ros(maneuver: Maneuver, path: str | Path) -> Path:
+def write_ros(maneuver: Result, path: str | Path) -> Path:
     """Write a JointTrajectory as YAML, in the form that ``ros2 topic pub`` takes.
 
     Raises
@@ -130,7 +130,7 @@ def write_ros(maneuver: Maneuver, path: str | Path) -> Path:
     return path
 
 
-def write_mcap(maneuver: Maneuver, path: str | Path) -> Path:
+def write_mcap(maneuver: Result, path: str | Path) -> Path:
     """Write a ROS 2 bag: one JointState a state, and the whole JointTrajectory at its start.
 
     Raises

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
 

@@ -15,7 +15,7 @@ from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
 Array = NDArray[np.float64]
 
 _SMALL_REST = 0.05
-"""A part of the piece between two marks that is not worth a step of its own."""
+"""Share of an interval between marks below which no step of its own is made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,8 @@ class Plan:
     def next_mark(self, value: float, *, keeps_moving: bool = False) -> tuple[float, float]:
         """Return where the step from `value` of the path aims, and how long it takes, s.
 
-        It aims at the next mark or, a small rest of a piece before that, at the one after it: marks are but a wish of
-        timing. An arm that `keeps_moving`, since its accelerations are limited, aims a whole piece ahead of itself.
+        It aims at the next mark, or at the one after if the next is very near: marks are preferred times, not
+        constraints. An arm with limited accelerations (`keeps_moving`) aims a whole interval ahead.
         """
         marks = self.marks
         k = int(np.searchsorted(marks, value, side="right"))

@@ -6,27 +6,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
-from vgtm_qp.maneuver.manifest import arm_record, make_manifest, mesh_record
+from vgtm_qp.maneuver.arm_record import arm_record
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import Plan, make_plan
-from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.maneuver.ways_out import DeadEnd, ways_out
+from vgtm_qp.maneuver.retries import DeadEnd, retries
+from vgtm_qp.methods import AnyResolver, make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
+from vgtm_qp.result.manifest import make_manifest, mesh_record
 from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
 from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.step.state import State
 from vgtm_qp.step.stops import Stop, StopKind
-
-if TYPE_CHECKING:
-    from vgtm_qp.methods import AnyResolver
+from vgtm_qp.verify import verify as check
 
 Array = NDArray[np.float64]
 
@@ -58,18 +58,16 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     problem
         What `load_problem` returns.
     progress
-        Called after each step with the part of the path that was covered, 0 to 1, and the step. An interrupt while
-        it runs, or in the loop, ends the maneuver there with what was solved.
+        Called after each step with the share of the path covered, 0 to 1, and the step. An interrupt ends the
+        maneuver with the steps made so far.
     verify
         Check the result again from its nodes alone.
 
     Raises
     ------
     ProblemError, TrussError, SolverError
-        The problem cannot be set up, or is none; no step was taken.
+        The problem cannot be set up, or is not a Problem; no step was made.
     """
-    from vgtm_qp.methods import make_resolver
-
     check_is_problem(problem)
     started = perf_counter()
     resolver = make_resolver(problem)
@@ -96,19 +94,15 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
     maneuver = _assemble(problem, resolver, record, stop, setup_time, way)
-    if not verify:
-        return maneuver
-    from vgtm_qp.verify import verify as check
-
-    return maneuver.with_certificate(check(maneuver))
+    return maneuver.with_certificate(check(maneuver)) if verify else maneuver
 
 
 def _retry(
     problem: Problem, record: _Record, dead_end: DeadEnd, progress: Progress | None
 ) -> tuple[str, _Record, Stop | None]:
-    """Return what comes furthest of the maneuver that stopped and of other ways to do it, by name."""
+    """Return name, record and stop of the attempt that comes furthest; the name is empty for the first attempt."""
     best: tuple[str, _Record, Stop | None] = ("", record, dead_end.stop)
-    for name, other in ways_out(problem, dead_end):
+    for name, other in retries(problem, dead_end):
         # A kernel takes longer to compile than a maneuver to solve without it.
         resolver = Resolver(build_arm(other, compiled=False))
         plan = make_plan(other, *resolver.tip())
@@ -123,7 +117,7 @@ def _retry(
 
 
 def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress | None) -> Stop | None:
-    """Step along the plan; return why the arm stopped for good, or None where it came through."""
+    """Step along the plan; return why the arm stopped for good, or None if it reached the end."""
     value, start, end = plan.path.start, plan.path.start, plan.path.end
     stalled, last = 0, float(plan.marks[-1])
     keeps_moving = bool(np.isfinite(resolver.arm.truss.acceleration[resolver.arm.truss.actuators]).any())
@@ -136,7 +130,7 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
             return _stop(resolver, plan, value, aim, dt, step)
         stop = _given_up(resolver, plan, value, aim, dt, step, before)
         if stop is not None and step.left_path:
-            # The arm would brake from here off the path, which is no part of the maneuver.
+            # From here on the arm would brake off the path; those states do not belong to the maneuver.
             return stop
         value = aim if step.status is StepStatus.REACHED else value + step.progress * (aim - value)
         phases = {name: total - known[name] for name, total in resolver.phases.items()}
@@ -155,9 +149,9 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
 def _given_up(
     resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step, before: State
 ) -> Stop | None:
-    """Return why the maneuver ends with a step in which the arm braked; None where it goes on afterwards.
+    """Return why the maneuver ends with a step in which the arm braked; None if it goes on afterwards.
 
-    A hard tip that had to brake is no longer on time, and one that had to leave its path is no longer on that.
+    A hard tip may not be late, so braking ends it; any tip but an elastic one ends when it leaves the path.
     """
     mode = resolver.arm.tip_mode
     if not step.braked or not isinstance(resolver, Resolver) or mode == "elastic":
@@ -269,7 +263,7 @@ def _assemble(
 
 
 def _too_near(arm: Arm, X: Array) -> dict[str, float]:
-    """Return the pairs that are nearer than they may be at home, at `X` (N, 3), and their distances, m."""
+    """Return the pairs below their clearance in the home pose `X` (N, 3), and their distances, m."""
     kept = Separation(arm.truss, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence))
     found: dict[str, float] = {}
     for pair, distance in kept.shortfall(X, 0.0).items():

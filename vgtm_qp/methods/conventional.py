@@ -21,12 +21,12 @@ from vgtm_qp.methods.resolver import (
     MAX_CORRECTIONS,
     TIP_TOLERANCE,
     MethodResolver,
+    arm_without_curve,
     pose_displacement,
 )
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Method
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.path import Path
 
 Array = NDArray[np.float64]
@@ -170,8 +170,7 @@ class ConventionalResolver(MethodResolver):
 
     def __init__(self, problem: Problem) -> None:
         method = problem.method
-        changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
-        super().__init__(build_arm(problem.replace(changes)), method.step_limit)
+        super().__init__(arm_without_curve(problem), method.step_limit)
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         self._objective = TrussObjective(names, method.weights, self.arm)
         layout = self.arm.layout

@@ -8,7 +8,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.curve import Curve, degree_of_redundancy, make_family
+from vgtm_qp.curve import Curve, degree_of_redundancy
 from vgtm_qp.curve.redundancy import BASE_ROWS
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.condensation import CurveNodes
@@ -49,8 +49,8 @@ class CurveMotion:
         method, spec, truss = problem.method, problem.curve, arm.truss
         if spec is None or not len(truss.faces):
             raise CurveError("this method needs a reference curve and a truss with faces")
-        options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
-        family = make_family(spec.family, spec.control_vertices, **options)
+        family = arm.layout.family
+        assert family is not None, "an arm with faces and a curve is laid out with its family"
         self._arm, self._task = arm, arm.task
         spare = degree_of_redundancy(spec.control_vertices, len(arm.task.row_names), spec.torsion_vertices)
         if spare < 0:

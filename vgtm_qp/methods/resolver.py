@@ -1,4 +1,4 @@
-"""What the resolvers of all other methods share: a state, a clock, and an end with a reason."""
+"""Base class of the resolvers of all other methods: state, phases of time, and the reason of a failure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import CurveError, SolverError
-from vgtm_qp.step.arm import Arm
+from vgtm_qp.problem import Problem
+from vgtm_qp.step.arm import Arm, build_arm
 from vgtm_qp.step.path import Path, PathPoint, vector_from_rotation
 from vgtm_qp.step.resolver import Step, StepStatus
 from vgtm_qp.step.state import State, frozen
@@ -44,7 +45,7 @@ class MethodResolver(ABC):
         return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
-        """Move along `path` from its value `start` to `end` in one step, or say why that is the end."""
+        """Move along `path` from its value `start` to `end` in one step; a blocked step has its reason."""
         dt = self.arm.dt if dt is None else dt
         self._steps += 1
         self._mark = perf_counter()
@@ -72,7 +73,7 @@ class MethodResolver(ABC):
         return _step(status, progress, self.state, "")
 
     def spend(self, phase: str) -> None:
-        """Give the time since the last call to `phase`."""
+        """Add the time since the last call to `phase`."""
         now = perf_counter()
         self.phases[phase] += now - self._mark
         self._mark = now
@@ -93,6 +94,19 @@ class MethodResolver(ABC):
         ratio = np.linalg.norm(nodes[truss.members[:, 0]] - nodes[truss.members[:, 1]], axis=1) / lengths
         if float(ratio.min()) < _COLLAPSED:
             raise SolverError(f"member {truss.member_names[int(np.argmin(ratio))]} collapsed to a point")
+
+
+def arm_without_curve(problem: Problem) -> Arm:
+    """Return the arm of a problem without its curve, for methods that solve no QP of this package.
+
+    Raises
+    ------
+    ProblemError, TrussError
+        The arm cannot be built.
+    """
+    # The solver is never called; this one compiles no kernels.
+    changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
+    return build_arm(problem.replace(changes))
 
 
 def pose_displacement(start: PathPoint, end: PathPoint) -> tuple[Array, Array]:

@@ -91,7 +91,7 @@ class Tracker:
         """Return node positions (N, 3), m, that meet eq. (39) and all fixed lengths, by Newton's method from `X`.
 
         A step of a segment with spare motions is A^+ (residual + A t) - t, with t what it has travelled from `X`:
-        its fixed point is the least displacement, whatever way led there.
+        its fixed point is the least displacement, whatever the iterates were.
 
         Raises
         ------

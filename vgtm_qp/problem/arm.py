@@ -43,7 +43,7 @@ class Joint(Table):
             yield ("home",), f"a value within the limits, {self.limits[0]:g} to {self.limits[1]:g}"
 
 
-class Arm(Table):
+class ArmTable(Table):
     """A serial arm."""
 
     called: ClassVar[str] = "an arm"

@@ -76,7 +76,7 @@ Obstacle = Annotated[
 ]
 
 
-class Clearance(Table):
+class ClearanceTable(Table):
     """Distances, from surface to surface, that are kept at states and between them."""
 
     called: ClassVar[str] = "[clearance]"

@@ -9,11 +9,11 @@ from typing import Annotated, Any, ClassVar, Self
 from pydantic import Field, PrivateAttr, WithJsonSchema, model_validator
 
 from vgtm_qp.errors import Mistake, ProblemError
-from vgtm_qp.problem.arm import Arm
+from vgtm_qp.problem.arm import ArmTable
 from vgtm_qp.problem.fields import Name, expect
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
-from vgtm_qp.problem.obstacle import Clearance, Obstacle
+from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
 from vgtm_qp.problem.shape import Curve, Surface
 from vgtm_qp.problem.table import Place, Table, key_path, shown, value_at
 from vgtm_qp.problem.truss import PlateTruss, Truss, unique
@@ -42,7 +42,7 @@ class Problem(Table):
     ] = Field(default=SCHEMA_VERSION, description="version of the form of this file")
     name: Name = Field(default="unnamed", description="title in tables and figures")
     truss: Truss | None = Field(default=None, description="the arm: a truss")
-    arm: Arm | None = Field(default=None, description="a serial arm, in the place of a truss")
+    arm: ArmTable | None = Field(default=None, description="a serial arm, in the place of a truss")
     curve: Curve | None = Field(
         default=None, description="the reference curve; a Bezier of 6 vertices where absent"
     )
@@ -54,7 +54,9 @@ class Problem(Table):
     )
     maneuver: Maneuver = Field(description="where the end effector goes")
     obstacle: tuple[Obstacle, ...] = Field(default=(), description="what the arm keeps away from")
-    clearance: Clearance = Field(default_factory=lambda: Clearance(), description="how far it keeps away")
+    clearance: ClearanceTable = Field(
+        default_factory=lambda: ClearanceTable(), description="how far it keeps away"
+    )
     method: Method = Field(default_factory=lambda: Method(), description="how each step is solved")
 
     _source: Path | None = PrivateAttr(None)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from vgtm_qp.comparison.compare import run_method
+from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
-from vgtm_qp.methods.compare import markdown_table, run_method
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.arms import bending_problem, built_truss
 from vgtm_qp.study.drawing import MARKS, label, panels

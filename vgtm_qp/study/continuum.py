@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.study.arms import bending_problem

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from vgtm_qp.methods.compare import markdown_table, run_method
+from vgtm_qp.comparison.compare import run_method
+from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.problem import load_problem
 from vgtm_qp.study.drawing import draw_truss, label, panels
 from vgtm_qp.study.workers import Row, Task

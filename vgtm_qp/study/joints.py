@@ -1,4 +1,4 @@
-"""What it costs to ignore the offset of the joints: the tip error of an arm that is taken for one with pin joints."""
+"""What it costs to ignore the offset of the joints: the tip error of an arm that is modelled with pin joints."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.solve import solve
-from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.problem import load_problem
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.arm import build_arm

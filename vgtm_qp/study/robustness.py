@@ -9,13 +9,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.ipopt.separating import IpoptStepper
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
-from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.study.drawing import label, panels
-from vgtm_qp.study.ipopt import IpoptStepper
-from vgtm_qp.study.scenes import Scene, random_scene
+from vgtm_qp.study.scenes import RandomScene, random_scene
 from vgtm_qp.study.statistics import wilson_interval
 from vgtm_qp.study.workers import Row, Task
 
@@ -53,7 +53,7 @@ def run(seed: int, number: int, steps: int, solver: str) -> Row:
     return _describe(scene) | found | {"seconds": process_time() - started}
 
 
-def _here(scene: Scene) -> Row:
+def _here(scene: RandomScene) -> Row:
     maneuver = solve(scene.problem)
     manifest = maneuver.manifest
     stop = manifest["stop"]
@@ -68,14 +68,14 @@ def _here(scene: Scene) -> Row:
     }
 
 
-def _by_ipopt(scene: Scene) -> Row:
+def _by_ipopt(scene: RandomScene) -> Row:
     resolver = Resolver(scene.problem)
     plan = make_plan(scene.problem, *resolver.tip())
     _, values = IpoptStepper(resolver.arm).run(plan)
     return {"reached": (values[-1] - plan.path.start) / (plan.path.end - plan.path.start)}
 
 
-def _describe(scene: Scene) -> dict[str, Any]:
+def _describe(scene: RandomScene) -> dict[str, Any]:
     truss = scene.problem.to_dict()["truss"]
     return {
         "module": truss["module"],

@@ -8,9 +8,9 @@ from time import thread_time
 import numpy as np
 from matplotlib.figure import Figure
 
+from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import make_resolver, with_method
-from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.study.arms import bending_problem
 from vgtm_qp.study.drawing import MARKS, label, mark_bays, panels
 from vgtm_qp.study.statistics import exponent

@@ -24,7 +24,7 @@ _LEAST_SINGULAR_VALUE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RandomScene:
     """A random problem.
 
     Attributes
@@ -45,7 +45,7 @@ class Scene:
     shape: Array | None
 
 
-def random_scene(seed: int, number: int, *, steps: int = 30) -> Scene:
+def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
     """Return scene `number` of a `seed`: always the same, whichever scenes were made before it."""
     random = np.random.default_rng([seed, number])
     truss = _truss(random)
@@ -80,7 +80,7 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> Scene:
         if directed:
             waypoint["pointing"] = (kinematics.tip_rotation[:, 2] + 0.5 * random.normal(size=3)).tolist()
     problem["obstacle"] = _cubes(arm, random, shape if reachable else None, int(random.integers(1, 9)))
-    return Scene(number, reachable, Problem.from_dict(problem), shape if reachable else None)
+    return RandomScene(number, reachable, Problem.from_dict(problem), shape if reachable else None)
 
 
 def _truss(random: np.random.Generator) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def random_shape(arm: Arm, random: np.random.Generator) -> Array:
     """Return node positions (N, 3) of a bent shape within the strokes whose members keep their clearance, m.
 
     Actuator lengths vary smoothly along and around the arm; they are approached from home by Newton's method, and
-    the furthest shape is taken that is neither near a singular pose nor in its own way.
+    the result is the furthest shape that is neither nearly singular nor in self-collision.
     """
     truss, kinematics = arm.truss, arm.kinematics
     actuators = truss.actuators
@@ -181,8 +181,8 @@ def _cubes(arm: Arm, random: np.random.Generator, shape: Array | None, count: in
     truss = arm.truss
     states = [truss.home] if shape is None else [truss.home, shape]
     tips = np.stack([state[truss.tip] for state in states])
-    way = np.linspace(0.0, 1.0, 21)[:, None, None]
-    passage = (tips[0] + way * (tips[-1] - tips[0])).reshape(-1, 3)
+    share = np.linspace(0.0, 1.0, 21)[:, None, None]
+    passage = (tips[0] + share * (tips[-1] - tips[0])).reshape(-1, 3)
     cubes: list[dict[str, Any]] = []
     for _ in range(60):
         if len(cubes) == count:

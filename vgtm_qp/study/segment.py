@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.methods.compare import markdown_table
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.study.arms import bending_problem

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vgtm_qp.errors import GoalError, nearest
-from vgtm_qp.methods.machine import describe_machine, machine
+from vgtm_qp.machine import machine, sentence
 from vgtm_qp.study.workers import Row, Task, run_dask, run_here, run_processes
 
 if TYPE_CHECKING:
@@ -157,9 +157,9 @@ def run_study(
     failed = [row for row in rows if "failed" in row]
     lines = [f"## {study.title}", "", study.text(rows).strip(), ""]
     lines += [f"Not counted: a run that failed, {row['failed']}" for row in failed]
-    told = (f" --{key}" if value is True else f" --{key} {value}" for key, value in (options or {}).items())
-    again = f"vgtm study {name}{' --short' if short else ''}{''.join(told)}"
-    lines += [f"Measured on: {describe_machine(found)}. Made again by `{again}`.", ""]
+    given = (f" --{key}" if value is True else f" --{key} {value}" for key, value in (options or {}).items())
+    again = f"vgtm study {name}{' --short' if short else ''}{''.join(given)}"
+    lines += [f"Measured on: {sentence(found)}. Made again by `{again}`.", ""]
     (place / f"{name}.md").write_text("\n".join(lines))
     return place
 

@@ -17,7 +17,7 @@ _DENSE_UNKNOWNS = 300
 """Above this many free coordinates singular values come from a sparse factorisation."""
 
 
-class Arm:
+class RecordedArm:
     """A truss as the manifest records it (``arm_record``).
 
     Attributes

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.maneuver.certificate import Certificate, Measure
-from vgtm_qp.maneuver.result import Maneuver, load_result
-from vgtm_qp.verify.arm import Arm
-from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Encounters, Least, Motion
+from vgtm_qp.result.certificate import Certificate, Measure
+from vgtm_qp.result.result import Result
+from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Encounters, Least, MemberMotion
 from vgtm_qp.verify.obstacles import read_obstacles, rotation_matrix
 from vgtm_qp.verify.path import check_path
 from vgtm_qp.verify.recovery import excuse_recovering
@@ -36,9 +36,9 @@ ARRAY_TOLERANCE = 1e-9
 """Stored arrays against the same recomputed, m."""
 
 _SAFE = 0.05
-"""What a problem that does not say keeps from its obstacles, m."""
+"""Default of ``clearance.safe``, m."""
 _SELF_SHARE = 0.25
-"""What it keeps between members, as a share of that."""
+"""Default of ``clearance.self_safe``, as a share of ``safe``."""
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 _MANY_UNKNOWNS = 2000
@@ -53,10 +53,10 @@ def verify_file(path: str | Path) -> Certificate:
     ResultError
         The file is cut, altered, of another version, or its arm record is malformed.
     """
-    return verify(load_result(path))
+    return verify(Result.load(path))
 
 
-def verify(maneuver: Maneuver) -> Certificate:
+def verify(maneuver: Result) -> Certificate:
     """Return the certificate of `maneuver`, recomputed from its nodes and the problem in its manifest.
 
     Raises
@@ -66,12 +66,12 @@ def verify(maneuver: Maneuver) -> Certificate:
     """
     manifest = maneuver.manifest
     problem = manifest["problem"]
-    arm = Arm(manifest["arm"], maneuver.members)
+    arm = RecordedArm(manifest["arm"], maneuver.members)
     if maneuver.nodes.shape[1] != len(arm.home):
         raise ResultError(
             f"array nodes holds {maneuver.nodes.shape[1]} nodes; manifest.arm describes {len(arm.home)}"
         )
-    motion = Motion(arm, maneuver.time, maneuver.nodes)
+    motion = MemberMotion(arm, maneuver.time, maneuver.nodes)
     lengths = np.linalg.norm(motion.ends[:, :, 1] - motion.ends[:, :, 0], axis=2)
     names = arm.member_names
 
@@ -89,8 +89,8 @@ def verify(maneuver: Maneuver) -> Certificate:
     recovered = manifest.get("recovered") or []
     if recovered:
         kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
-        nearer, told = excuse_recovering(recovered, kept, CLEARANCE_TOLERANCE, BETWEEN_TOLERANCE)
-        wrong, notes = [*wrong, *nearer], [*notes, *told]
+        nearer, remarks = excuse_recovering(recovered, kept, CLEARANCE_TOLERANCE, BETWEEN_TOLERANCE)
+        wrong, notes = [*wrong, *nearer], [*notes, *remarks]
         at, between, _ = _clearances(motion, against)
         self_at, self_between, _ = _clearances(motion, members)
 
@@ -152,7 +152,7 @@ def verify(maneuver: Maneuver) -> Certificate:
     )
 
 
-def _clearances(motion: Motion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
+def _clearances(motion: MemberMotion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
     """Return the least clearance at states, a bound of it between them, and the least at each state (T,)."""
     count = len(motion.time)
     each = [
@@ -170,7 +170,7 @@ def _clearances(motion: Motion, encounters: Sequence[Encounters]) -> tuple[Least
     return at, between, np.array([least.value for least in each])
 
 
-def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
+def _clearance_difference(stored: Array, found: Array, arm: RecordedArm) -> Array:
     """Return (T,) how far clearances differ; how deep a member is inside an obstacle is not compared."""
     floor = -float(arm.radius.min(initial=np.inf))
     with np.errstate(invalid="ignore"):
@@ -178,7 +178,7 @@ def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
     return np.asarray(np.where(stored == found, 0.0, difference))
 
 
-def _held(arm: Arm, problem: Mapping[str, Any], time: Array, lengths: Array) -> Array:
+def _held(arm: RecordedArm, problem: Mapping[str, Any], time: Array, lengths: Array) -> Array:
     """Return (T, M) how far fixed members are from their lengths, and locked ones from where they stuck."""
     errors = np.where(arm.actuated, 0.0, np.abs(lengths - arm.length))
     for entry in (problem.get("truss") or {}).get("locked") or ():
@@ -194,7 +194,7 @@ def _held(arm: Arm, problem: Mapping[str, Any], time: Array, lengths: Array) -> 
     return errors
 
 
-def _jams_between_rows(maneuver: Maneuver, problem: Mapping[str, Any]) -> list[str]:
+def _jams_between_rows(maneuver: Result, problem: Mapping[str, Any]) -> list[str]:
     """Return the members that lock at a time which no row has: nothing says what length they stuck at."""
     found = []
     for entry in (problem.get("truss") or {}).get("locked") or ():
@@ -204,7 +204,7 @@ def _jams_between_rows(maneuver: Maneuver, problem: Mapping[str, Any]) -> list[s
     return found
 
 
-def _locking_rows(arm: Arm, problem: Mapping[str, Any], time: Array) -> Array:
+def _locking_rows(arm: RecordedArm, problem: Mapping[str, Any], time: Array) -> Array:
     """Return (T - 2, M) whether an acceleration is that of a member which stops because it locks."""
     middle = np.zeros((max(len(time) - 2, 0), len(arm.member_names)), dtype=bool)
     for entry in (problem.get("truss") or {}).get("locked") or ():
@@ -214,7 +214,7 @@ def _locking_rows(arm: Arm, problem: Mapping[str, Any], time: Array) -> Array:
     return middle
 
 
-def _base_error(arm: Arm, maneuver: Maneuver, problem: Mapping[str, Any]) -> Array:
+def _base_error(arm: RecordedArm, maneuver: Result, problem: Mapping[str, Any]) -> Array:
     """Return (T, N_c) how far base nodes are from where the problem holds them, m.
 
     A base that moves, eqs. (7)-(8), goes from pose to pose on straight lines and single-axis rotations, from its home
@@ -250,7 +250,7 @@ def _rotation_vector(rotation: Array) -> Array:
     return np.asarray(twist * (0.5 if sine < 1e-9 else float(np.arctan2(sine, cosine)) / (2.0 * sine)))
 
 
-def _member_angle(motion: Motion) -> Least:
+def _member_angle(motion: MemberMotion) -> Least:
     """Return the least angle at any state between two members that share a node, rad."""
     members = motion.arm.members
     node = members.reshape(-1)
@@ -271,19 +271,19 @@ def _member_angle(motion: Motion) -> Least:
     return least
 
 
-def _beyond_stroke(arm: Arm, lengths: Array) -> Array:
+def _beyond_stroke(arm: RecordedArm, lengths: Array) -> Array:
     """Return (T, M) how far actuated members are outside their strokes, m."""
     outside = np.maximum(arm.stroke[:, 0] - lengths, lengths - arm.stroke[:, 1])
     return np.asarray(np.where(arm.actuated, np.maximum(outside, 0.0), 0.0))
 
 
-def _beyond_rate(arm: Arm, time: Array, lengths: Array) -> Array:
+def _beyond_rate(arm: RecordedArm, time: Array, lengths: Array) -> Array:
     """Return (T - 1, M) how far mean rates over the steps pass their limits, m/s."""
     rates = np.diff(lengths, axis=0) / np.diff(time)[:, None]
     return np.asarray(np.where(arm.actuated, np.maximum(np.abs(rates) - arm.rate, 0.0), 0.0))
 
 
-def _beyond_acceleration(arm: Arm, time: Array, lengths: Array) -> Array:
+def _beyond_acceleration(arm: RecordedArm, time: Array, lengths: Array) -> Array:
     """Return (T - 2, M) how far accelerations pass their limits, m/s^2.
 
     An acceleration is the change of the mean rate from step to step over the time between their middles.
@@ -294,7 +294,7 @@ def _beyond_acceleration(arm: Arm, time: Array, lengths: Array) -> Array:
     return np.asarray(np.where(arm.actuated, np.maximum(np.abs(changes) - arm.acceleration, 0.0), 0.0))
 
 
-def _singular_values(arm: Arm, nodes: Array) -> Array:
+def _singular_values(arm: RecordedArm, nodes: Array) -> Array:
     """Return (S, 3) least of the length Jacobian, least and greatest of the tip's, at S states."""
     states = np.arange(len(nodes))
     if 3 * len(arm.free) > _MANY_UNKNOWNS:
@@ -334,7 +334,7 @@ def _least_of(values: Array, unit: str) -> Measure:
     return Measure(float(values.min()) if len(values) else None, unit, None, "least")
 
 
-def _record_contradictions(maneuver: Maneuver, arm: Arm) -> list[str]:
+def _record_contradictions(maneuver: Result, arm: RecordedArm) -> list[str]:
     """Return where the arm record disagrees with the arrays, with itself or with the problem."""
     found = []
     if tuple(maneuver.member_names.tolist()) != arm.member_names:
@@ -369,7 +369,7 @@ def _record_contradictions(maneuver: Maneuver, arm: Arm) -> list[str]:
     return found
 
 
-def _outcome_contradictions(maneuver: Maneuver) -> list[str]:
+def _outcome_contradictions(maneuver: Result) -> list[str]:
     """Return where status, reached and progress disagree."""
     found = []
     if abs(maneuver.progress[-1] - maneuver.reached) > 1e-9:

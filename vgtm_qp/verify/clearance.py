@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.distance import Separation, segment_segment
 from vgtm_qp.verify.obstacles import Body
 
@@ -29,12 +29,12 @@ _CHUNK = 200_000
 
 
 @dataclass(frozen=True)
-class Motion:
+class MemberMotion:
     """The moving arm.
 
     Attributes
     ----------
-    arm : Arm
+    arm : RecordedArm
         Its members.
     time, nodes : (T,), (T, N, 3)
         The states, s and m.
@@ -42,7 +42,7 @@ class Motion:
         Member ends at the states, m.
     """
 
-    arm: Arm
+    arm: RecordedArm
     time: Array
     nodes: Array
     ends: Array = field(init=False)
@@ -52,13 +52,13 @@ class Motion:
         object.__setattr__(self, "ends", np.stack([self.arm.ends(state) for state in self.nodes]))
 
     def ends_between(self, step: int, member: Index, share: Array) -> Array:
-        """Return (P, 2, 3) the ends, m, of members (P,) at shares (P,) of the way from state `step` on."""
+        """Return (P, 2, 3) the ends, m, of members (P,) at shares (P,) of the motion from state `step` to the next."""
         corner = self.arm.corners(member)
         before, after = self.nodes[step][corner], self.nodes[step + 1][corner]
         return self.arm.ends_at(before + share[:, None, None, None] * (after - before), member)
 
     def bend(self, step: int, member: Index) -> Array:
-        """Return (P,) an upper bound, m, of |d2 r / d share2| of members' ends on the way from state `step`.
+        """Return (P,) an upper bound, m, of |d2 r / d share2| of members' ends in the motion from state `step`.
 
         Zero for pin joints. The joint frame's axes are unit vectors of polynomials w of the share, and
         |(w/|w|)''| <= |w''|/|w| + 3 (|w'|/|w|)^2, with |w| bounded below from its ends; inf where that fails.
@@ -126,17 +126,17 @@ class Least:
 class Encounters(ABC):
     """All pairs of one member and one other thing that must keep apart."""
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: MemberMotion) -> None:
         self.motion = motion
         self.held_from: dict[tuple[int, int], int] = {}
-        """States from which pairs count; all others do from the first on."""
+        """First state at which each pair counts; pairs that are missing count from the first state on."""
 
     @abstractmethod
     def pairs_named(self, name: str) -> list[tuple[int, int]]:
-        """Return the pairs of that name, none where there is no such pair."""
+        """Return the pairs of that name, an empty list if there are none."""
 
     def _held(self, pairs: tuple[Index, Index], state: int) -> tuple[Index, Index]:
-        """Return those of the pairs (P,), (P,) that count at a state and on the way from it."""
+        """Return those of the pairs (P,), (P,) that count at a state and in the motion from it."""
         if not self.held_from:
             return pairs
         each = zip(pairs[0].tolist(), pairs[1].tolist(), strict=True)
@@ -204,7 +204,7 @@ class Encounters(ABC):
         return np.inf
 
     def between(self, step: int, limit: Least, bound: Least) -> tuple[Least, Least]:
-        """Return `limit` and `bound` brought down by what happens on the way from state `step` to the next.
+        """Return `limit` and `bound` lowered by the motion from state `step` to the next.
 
         `limit` is the least clearance at any instant looked at; `bound` is proven to be below every clearance
         on the steps seen so far, and comes within `RESOLUTION` of `limit`.
@@ -218,7 +218,7 @@ class Encounters(ABC):
         return limit, bound
 
     def divide(self, step: int, pair: tuple[Index, Index], limit: Least, bound: Least) -> tuple[Least, Least]:
-        """Return `limit` and `bound` brought down by pairs (P,), (P,) on the way from state `step` to the next."""
+        """Return `limit` and `bound` lowered by pairs (P,), (P,) in the motion from state `step` to the next."""
         count = len(pair[0])
         start, width = np.zeros(count), 1.0
         bend = self.bend(step, pair)
@@ -258,7 +258,7 @@ class Encounters(ABC):
 class AgainstBody(Encounters):
     """Members against the convex pieces of one obstacle, seen from its moving centre."""
 
-    def __init__(self, motion: Motion, body: Body) -> None:
+    def __init__(self, motion: MemberMotion, body: Body) -> None:
         super().__init__(motion)
         self.body = body
         corners = body.corners

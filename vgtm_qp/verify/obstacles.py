@@ -71,7 +71,7 @@ def _box_corners(half: Array, rotation: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Box(Body):
+class BoxBody(Body):
     """A solid box of half edges `half` (3,), m."""
 
     half: Array
@@ -92,7 +92,7 @@ class Box(Body):
 
 
 @dataclass(frozen=True)
-class Ball(Body):
+class BallBody(Body):
     """A solid sphere of radius `radius`, m."""
 
     radius: float
@@ -112,7 +112,7 @@ class Ball(Body):
 
 
 @dataclass(frozen=True)
-class Cylinder(Body):
+class CylinderBody(Body):
     """A solid cylinder round its own z axis, of radius `radius` and height 2 `half_height`, m."""
 
     radius: float
@@ -137,7 +137,7 @@ class Cylinder(Body):
 
 
 @dataclass(frozen=True)
-class Mesh(Body):
+class MeshBody(Body):
     """A surface of `triangles` (F, 3, 3), m, already turned to its attitude; solid where `closed`."""
 
     triangles: Array
@@ -200,11 +200,13 @@ def read_obstacles(
         placed = (name, center, velocity, rotation_matrix(turn))
         shape = entry.get("shape", "box")
         if shape == "box":
-            bodies.append(Box(*placed, half=np.broadcast_to(np.asarray(entry["size"], dtype=float), 3) / 2))
+            bodies.append(
+                BoxBody(*placed, half=np.broadcast_to(np.asarray(entry["size"], dtype=float), 3) / 2)
+            )
         elif shape == "sphere":
-            bodies.append(Ball(*placed, radius=float(entry["radius"])))
+            bodies.append(BallBody(*placed, radius=float(entry["radius"])))
         elif shape == "cylinder":
-            bodies.append(Cylinder(*placed, float(entry["radius"]), float(entry["height"]) / 2))
+            bodies.append(CylinderBody(*placed, float(entry["radius"]), float(entry["height"]) / 2))
         elif shape == "mesh":
             body, complaint = _read_mesh(placed, entry, meshes.get(name), directory)
             if complaint:
@@ -233,7 +235,7 @@ def _read_mesh(
     entry: Mapping[str, Any],
     record: Mapping[str, Any] | None,
     directory: Path,
-) -> tuple[Mesh | None, str]:
+) -> tuple[MeshBody | None, str]:
     """Return the mesh, and what is wrong with its file."""
     import trimesh
 
@@ -256,4 +258,4 @@ def _read_mesh(
     else:
         complaint = ""
     scaled = triangles * float(entry.get("scale") or 1.0)
-    return Mesh(*placed, triangles=scaled @ rotation.T, closed=bool(surface.is_watertight)), complaint
+    return MeshBody(*placed, triangles=scaled @ rotation.T, closed=bool(surface.is_watertight)), complaint

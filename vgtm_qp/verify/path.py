@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 from vgtm_qp.verify.obstacles import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -26,21 +26,21 @@ class PathCheck:
 
     Attributes
     ----------
-    maneuver : Maneuver
+    maneuver : Result
         Holds the targets.
     axes : tuple of int
         The tracked coordinates of the position.
     tracks_pointing, tracks_orientation : bool
         Whether a direction or the whole attitude was tracked.
     is_elastic : bool
-        Whether the tip may leave its targets, at a price.
+        Whether the tip may leave its targets at a cost.
     target_error : (T,) or None
         Distance of each position target from the path, m.
     contradictions, notes : tuple of str
         As in the certificate.
     """
 
-    maneuver: Maneuver
+    maneuver: Result
     axes: tuple[int, ...]
     tracks_pointing: bool
     tracks_orientation: bool
@@ -66,7 +66,7 @@ class PathCheck:
         return np.max(errors, axis=0) if errors else None
 
 
-def check_path(maneuver: Maneuver, tip: Array) -> PathCheck:
+def check_path(maneuver: Result, tip: Array) -> PathCheck:
     """Return what the problem of `maneuver` asks of the tip, whose positions (T, 3), m, are `tip`."""
     manifest = maneuver.manifest
     problem = manifest["problem"]
@@ -113,7 +113,7 @@ def check_path(maneuver: Maneuver, tip: Array) -> PathCheck:
 
 
 def _corners(manifest: Mapping[str, Any], home: Array) -> Array | None:
-    """Return (C, 3) the corners of the path, from the home tip on; None where no position is asked for."""
+    """Return (C, 3) the corners of the path, from the home tip on; None if no position is asked for."""
     wanted = manifest["problem"].get("maneuver") or {}
     points: Any
     if manifest.get("path"):
@@ -139,7 +139,7 @@ def _to_polyline(points: Array, corners: Array) -> Array:
     return best
 
 
-def _last_direction(maneuver: Maneuver, wanted: Mapping[str, Any], track: tuple[str, ...]) -> list[str]:
+def _last_direction(maneuver: Result, wanted: Mapping[str, Any], track: tuple[str, ...]) -> list[str]:
     """Return whether a solved maneuver ends in another direction than the last waypoint that names one."""
     if maneuver.status != "solved":
         return []

@@ -17,10 +17,10 @@ Array = NDArray[np.float64]
 def excuse_recovering(
     record: Any, encounters: Iterable[tuple[Encounters, float]], tolerance: float, tolerance_between: float
 ) -> tuple[list[str], list[str]]:
-    """Return what is wrong with pairs that recover, one line each, and a note of what they did.
+    """Return the faults of recovering pairs, one line each, and a note that sums them up.
 
-    The encounters no longer count these pairs at states, and on the ways from states, before they have reached their
-    distance. Until then a pair may not be nearer than at the state before.
+    The encounters ignore a recovering pair until it has reached its clearance. Until then its distance may not
+    decrease from one state to the next.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def excuse_recovering(
             group.held_from.update(dict.fromkeys(pairs, since))
             until, states = max(until, since), len(distance)
     if found < len(wanted):
-        wrong.append("manifest.recovered names pairs that are none of this arm and its obstacles")
+        wrong.append("manifest.recovered names pairs that this arm and its obstacles do not have")
     return wrong, [_note(wanted, until, states)] if wanted else []
 
 
@@ -104,9 +104,9 @@ def _nearer(
                 f"recovered: {name} is {distance[state + 1]:.9g} m apart at state {state + 1} after {least:.9g} m"
             )
         limit, bound = group.divide(state, index, Least(), Least())
-        way = min(limit.value, bound.value)
-        if way < least - tolerance_between:
+        least_between = min(limit.value, bound.value)
+        if least_between < least - tolerance_between:
             wrong.append(
-                f"recovered: {name} comes as near as {way:.9g} m in step {state + 1} from {least:.9g} m"
+                f"recovered: {name} comes as near as {least_between:.9g} m in step {state + 1} from {least:.9g} m"
             )
     return wrong

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.curve.families import make_family
-from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.problem import Problem
+from vgtm_qp.result.result import Result
 from vgtm_qp.step.path import rotation_from_vector
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import RecordedArm
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -25,7 +25,7 @@ CURVE_COLOUR = (0.0, 0.45, 0.34)
 POLYGON_COLOUR = (0.35, 0.62, 0.53)
 PATH_COLOUR = (0.10, 0.10, 0.12)
 _STROKE_COLOURS = np.array([(0.05, 0.30, 0.80), (0.66, 0.48, 0.72), (0.84, 0.10, 0.12)])
-"""Shortest, middle and longest; told apart by the colour-blind, and from the fixed grey."""
+"""Shortest, middle and longest; distinct for the colour-blind, and from the grey of fixed members."""
 
 _CURVE_POINTS = 49
 _SURROUNDINGS = 0.25
@@ -64,7 +64,7 @@ class Drawing:
     Attributes
     ----------
     name : str
-    arm : Arm
+    arm : RecordedArm
         Member ends, radii and strokes.
     curve_weights : (K, V)
         Weights of points along the curve; V = 0 where there is no curve.
@@ -72,7 +72,7 @@ class Drawing:
     """
 
     name: str
-    arm: Arm
+    arm: RecordedArm
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
 
@@ -106,7 +106,7 @@ def stroke_colours(share: Array) -> Array:
     return np.stack([np.interp(share, knots, channel) for channel in _STROKE_COLOURS.T], axis=-1)
 
 
-def drawing_of_maneuver(maneuver: Maneuver) -> Drawing:
+def drawing_of_maneuver(maneuver: Result) -> Drawing:
     """Return the drawing of a result, from its manifest.
 
     Raises
@@ -117,7 +117,7 @@ def drawing_of_maneuver(maneuver: Maneuver) -> Drawing:
     manifest = maneuver.manifest
     return _drawing(
         manifest["problem"],
-        Arm(manifest["arm"], maneuver.members),
+        RecordedArm(manifest["arm"], maneuver.members),
         maneuver.control_vertices.shape[1],
         Path(manifest.get("directory") or "."),
     )
@@ -126,10 +126,10 @@ def drawing_of_maneuver(maneuver: Maneuver) -> Drawing:
 def drawing_of_problem(problem: Problem, record: Mapping[str, Any], members: Index, vertices: int) -> Drawing:
     """Return the drawing of a problem from the `arm_record` of its arm and number of control vertices."""
     directory = problem.source.parent if problem.source else Path.cwd()
-    return _drawing(problem.to_dict(), Arm(record, members), vertices, directory)
+    return _drawing(problem.to_dict(), RecordedArm(record, members), vertices, directory)
 
 
-def _drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory: Path) -> Drawing:
+def _drawing(problem: Mapping[str, Any], arm: RecordedArm, vertices: int, directory: Path) -> Drawing:
     weights = np.zeros((0, vertices))
     spec = problem.get("curve")
     if vertices and spec:
@@ -190,7 +190,7 @@ class Camera:
 
 
 def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
-    """Return a camera on the arm in all states (T, N, 3) and what is near it, across the way of the tip (T, 3).
+    """Return a camera on the arm in all states (T, N, 3) and what is near it, across the path of the tip (T, 3).
 
     Of four sides it is the one from which obstacles hide least of the arm.
     """
@@ -218,12 +218,12 @@ def _direction(azimuth: float, elevation: float) -> Array:
 
 def _hidden(obstacles: Sequence[ObstacleMesh], eye: Array, points: Array) -> int:
     """Return how many of points (K, 3) are behind the box round an obstacle, seen from `eye` (3,)."""
-    ways = points - eye
-    ways = np.where(np.abs(ways) < 1e-12, 1e-12, ways)
+    rays = points - eye
+    rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     behind = np.zeros(len(points), dtype=bool)
     for mesh in obstacles:
         walls = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) + mesh.center - eye
-        crossings = np.sort(walls[:, None] / ways, axis=0)
+        crossings = np.sort(walls[:, None] / rays, axis=0)
         enters, leaves = crossings[0].max(axis=1), crossings[1].min(axis=1)
         behind |= (enters < leaves) & (enters < 1.0) & (leaves > 0.0)
     return int(behind.sum())

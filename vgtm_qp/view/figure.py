@@ -20,7 +20,7 @@ from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError, VgtmError
-from vgtm_qp.maneuver.result import Maneuver
+from vgtm_qp.result.result import Result
 from vgtm_qp.view.drawing import (
     CURVE_COLOUR,
     FIXED_COLOUR,
@@ -31,7 +31,7 @@ from vgtm_qp.view.drawing import (
     drawing_of_maneuver,
     stroke_colours,
 )
-from vgtm_qp.view.projection import Projection, Surface, layers, pieces
+from vgtm_qp.view.projection import ProjectedMesh, Projection, layers, pieces
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ _GOAL: dict[str, Any] = {"marker": "x", "markersize": 4.5, "markeredgewidth": 1.
 
 
 def plot_frames(
-    maneuver: Maneuver,
+    maneuver: Result,
     *,
     frames: int | Sequence[int] = 6,
     azimuth: float | None = None,
@@ -66,7 +66,7 @@ def plot_frames(
     """Return a figure of states of a maneuver side by side, all in the same view and scale.
 
     Members are drawn as thick as they are, grey where fixed and coloured by length where actuated; with them
-    the reference curve, its control polygon, the obstacles, the tip's way so far and the rest of its path.
+    the reference curve, its control polygon, the obstacles, the tip's path so far and the rest of it.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def plot_frames(
     frames
         How many states, evenly spread, or which ones.
     azimuth, elevation
-        Where the view is taken from, rad; by default across the way of the tip.
+        Where the view is taken from, rad; by default across the path of the tip.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def plot_frames(
     drawing = drawing_of_maneuver(maneuver)
     rows = _rows(maneuver, frames)
     projection = Projection.looking(_across(maneuver) if azimuth is None else azimuth, elevation)
-    surfaces = [Surface(mesh, projection) for mesh in drawing.obstacles]
+    surfaces = [ProjectedMesh(mesh, projection) for mesh in drawing.obstacles]
     view = _view(maneuver, drawing, rows, projection, surfaces)
     columns = min(3, len(rows)) if len(rows) != 4 else 4
     with mpl.rc_context(_STYLE):
@@ -103,7 +103,7 @@ def plot_frames(
 
 
 def each_frame(
-    maneuver: Maneuver, rows: Sequence[int], *, azimuth: float | None = None, elevation: float = 0.21
+    maneuver: Result, rows: Sequence[int], *, azimuth: float | None = None, elevation: float = 0.21
 ) -> Iterator[Figure]:
     """Yield one figure for each of the states `rows`, all in the view that holds the whole maneuver.
 
@@ -114,7 +114,7 @@ def each_frame(
     """
     drawing = drawing_of_maneuver(maneuver)
     projection = Projection.looking(_across(maneuver) if azimuth is None else azimuth, elevation)
-    surfaces = [Surface(mesh, projection) for mesh in drawing.obstacles]
+    surfaces = [ProjectedMesh(mesh, projection) for mesh in drawing.obstacles]
     view = _view(maneuver, drawing, list(range(len(maneuver.time))), projection, surfaces)
     for row in _rows(maneuver, rows):
         with mpl.rc_context(_STYLE):
@@ -176,7 +176,7 @@ class _View:
     step: float
 
 
-def _rows(maneuver: Maneuver, frames: int | Sequence[int]) -> list[int]:
+def _rows(maneuver: Result, frames: int | Sequence[int]) -> list[int]:
     count = len(maneuver.time)
     if isinstance(frames, int):
         if frames < 1:
@@ -188,7 +188,7 @@ def _rows(maneuver: Maneuver, frames: int | Sequence[int]) -> list[int]:
     return [int(row) for row in frames]
 
 
-def _across(maneuver: Maneuver) -> float:
+def _across(maneuver: Result) -> float:
     """Return the azimuth, rad, from which the tip goes to the right and a little towards the viewer."""
     way = maneuver.tip_position - maneuver.tip_position[0]
     farthest = way[int(np.argmax(np.linalg.norm(way[:, :2], axis=1)))]
@@ -197,7 +197,7 @@ def _across(maneuver: Maneuver) -> float:
 
 
 def _view(
-    maneuver: Maneuver, drawing: Drawing, rows: list[int], projection: Projection, surfaces: list[Surface]
+    maneuver: Result, drawing: Drawing, rows: list[int], projection: Projection, surfaces: list[ProjectedMesh]
 ) -> _View:
     """Return what holds the arm in all frames and, of the obstacles, what is near it."""
     arm = maneuver.nodes[rows].reshape(-1, 3)
@@ -305,11 +305,11 @@ def _label(axes: Axes, name: str, values: Array, places: Array, scale: float) ->
 
 def _draw_state(
     axes: Axes,
-    maneuver: Maneuver,
+    maneuver: Result,
     drawing: Drawing,
     row: int,
     projection: Projection,
-    surfaces: list[Surface],
+    surfaces: list[ProjectedMesh],
     scale: float,
 ) -> None:
     """Draw arm and obstacles, farthest first."""
@@ -361,7 +361,7 @@ def _draw_state(
         axes.plot(*curve.T, color=CURVE_COLOUR, linewidth=1.4, zorder=_ABOVE + 1, path_effects=effects)
 
 
-def _draw_surface(axes: Axes, surface: Surface, time: float, zorder: float) -> None:
+def _draw_surface(axes: Axes, surface: ProjectedMesh, time: float, zorder: float) -> None:
     polygons = surface.polygons(time)
     axes.add_collection(
         PolyCollection(polygons, facecolors=[OBSTACLE_COLOUR], alpha=0.30, linewidths=0.0, zorder=zorder)
@@ -379,7 +379,7 @@ def _draw_surface(axes: Axes, surface: Surface, time: float, zorder: float) -> N
         axes.add_collection(outline)
 
 
-def _draw_tip(axes: Axes, maneuver: Maneuver, row: int, projection: Projection) -> None:
+def _draw_tip(axes: Axes, maneuver: Result, row: int, projection: Projection) -> None:
     ahead = projection.flat(maneuver.tip_target_position[row:])
     behind = projection.flat(maneuver.tip_position[: row + 1])
     axes.plot(*ahead.T, color=PATH_COLOUR, linewidth=0.9, linestyle=(0, (1, 1.6)), zorder=_ABOVE + 2)

@@ -15,15 +15,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.result.result import Result
+from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.check import TIP_TOLERANCE
 from vgtm_qp.verify.path import check_path
 
 Array = NDArray[np.float64]
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Told apart in every common form of colour blindness (Okabe and Ito, 2008)."""
+"""Distinct in every common form of colour blindness (Okabe and Ito, 2008)."""
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)))
 _FORBIDDEN: Any = {
     "facecolor": "#f3d7d2",
@@ -47,7 +47,7 @@ def _on(axes: Axes | None) -> Iterator[Axes]:
         yield axes
 
 
-def plot_clearance(maneuver: Maneuver, *, axes: Axes | None = None) -> Figure:
+def plot_clearance(maneuver: Result, *, axes: Axes | None = None) -> Figure:
     """Plot the least distances to obstacles and between members over time, mm."""
     safe = 1000.0 * float(maneuver.manifest["problem"]["clearance"]["safe"])
     with _on(axes) as axes:
@@ -64,13 +64,13 @@ def plot_clearance(maneuver: Maneuver, *, axes: Axes | None = None) -> Figure:
     return _figure(axes)
 
 
-def plot_strokes(maneuver: Maneuver, *, axes: Axes | None = None) -> Figure:
+def plot_strokes(maneuver: Result, *, axes: Axes | None = None) -> Figure:
     """Plot the lengths of the actuated members over time, between their limits.
 
     In m where all have the same stroke, as parts of it, %, where not. The members that come nearest to a limit
     are named; the others are grey.
     """
-    arm = Arm(maneuver.manifest["arm"], maneuver.members)
+    arm = RecordedArm(maneuver.manifest["arm"], maneuver.members)
     actuators = np.flatnonzero(arm.actuated)
     low, high = arm.stroke[actuators].T
     lengths = maneuver.member_lengths[:, actuators]
@@ -94,7 +94,7 @@ def plot_strokes(maneuver: Maneuver, *, axes: Axes | None = None) -> Figure:
     return _figure(axes)
 
 
-def plot_tip_error(maneuver: Maneuver, *, axes: Axes | None = None) -> Figure:
+def plot_tip_error(maneuver: Result, *, axes: Axes | None = None) -> Figure:
     """Plot the distance of the tip from its target over the tracked axes, m."""
     error = check_path(maneuver, maneuver.tip_position).tip_error(maneuver.tip_position)
     with _on(axes) as axes:
@@ -109,7 +109,7 @@ def plot_tip_error(maneuver: Maneuver, *, axes: Axes | None = None) -> Figure:
     return _figure(axes)
 
 
-def plot_step_time(maneuver: Maneuver, *, axes: Axes | None = None) -> Figure:
+def plot_step_time(maneuver: Result, *, axes: Axes | None = None) -> Figure:
     """Plot the computing time of each step by phase, ms, and median and 99th percentile of the whole."""
     with _on(axes) as axes:
         steps = np.arange(1, len(maneuver.time))
@@ -140,6 +140,6 @@ def _figure(axes: Axes) -> Figure:
     return figure
 
 
-def _set_time(axes: Axes, maneuver: Maneuver) -> None:
+def _set_time(axes: Axes, maneuver: Result) -> None:
     if len(maneuver.time) > 1:
         axes.set_xlim(maneuver.time[0], maneuver.time[-1])

@@ -51,7 +51,7 @@ class Projection:
         return np.asarray(points @ self.axes[2])
 
 
-class Surface:
+class ProjectedMesh:
     """An obstacle's surface as it is drawn: outline, edges seen and hidden, and what is in front of it."""
 
     def __init__(self, mesh: ObstacleMesh, projection: Projection) -> None:
@@ -109,7 +109,7 @@ class Surface:
         return np.asarray((shifted @ normals.T > np.einsum("fc,fc->f", normals, corners)).any(axis=1))
 
 
-def layers(points: Array, surfaces: list[Surface], time: float) -> Index:
+def layers(points: Array, surfaces: list[ProjectedMesh], time: float) -> Index:
     """Return (K,) how many of the surfaces, farthest first, have been drawn before each point (K, 3) is."""
     order = np.zeros(len(points), dtype=np.int64)
     for k, surface in enumerate(surfaces, start=1):

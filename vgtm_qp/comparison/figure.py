@@ -1,7 +1,8 @@
-"""One figure for a comparison: where every method ends, and what it keeps on the way."""
+"""One figure for a comparison: the end state of every method, and its clearance and drift along the path."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from vgtm_qp.maneuver.result import Maneuver
-from vgtm_qp.methods.compare import Report, Row
+from vgtm_qp.comparison.row import Row
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.view.drawing import obstacle_meshes
 
 Array = NDArray[np.float64]
@@ -23,21 +24,20 @@ _COLUMNS = 5
 _FLOOR = 1e-16
 
 
-def plot_comparison(report: Report) -> Figure:
+def plot_comparison(rows: Sequence[Row], maneuvers: Mapping[tuple[str, str], Maneuver]) -> Figure:
     """Return the figure: one panel a maneuver with its start, middle and end; below, clearance and drift."""
-    keys = [(row.problem, row.method) for row in report.rows]
-    rows = dict(zip(keys, report.rows, strict=True))
+    keys = [(row.problem, row.method) for row in rows]
     lines = -(-len(keys) // _COLUMNS)
     figure = Figure(figsize=(11.0, 3.1 * lines + 3.0), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[3.1 * lines, 3.0]).ravel()
     panels = upper.subplots(lines, min(_COLUMNS, len(keys)), squeeze=False).ravel()
     for axes in panels[len(keys) :]:
         axes.set_axis_off()
-    limits = _limits(list(report.maneuvers.values()))
-    for axes, key in zip(panels, keys, strict=False):
-        _draw_maneuver(axes, rows[key], report.maneuvers.get(key), limits)
+    limits = _limits(list(maneuvers.values()))
+    for axes, key, row in zip(panels, keys, rows, strict=False):
+        _draw_maneuver(axes, row, maneuvers.get(key), limits)
     several = len({problem for problem, _ in keys}) > 1
-    _draw_curves(lower, report, several)
+    _draw_curves(lower, rows, maneuvers, several)
     return figure
 
 
@@ -69,11 +69,13 @@ def _draw_maneuver(axes: Axes, row: Row, maneuver: Maneuver | None, limits: tupl
         axes.set_xlabel(_folded(row.reason), fontsize=6.0)
 
 
-def _draw_curves(area: Any, report: Report, several: bool) -> None:
+def _draw_curves(
+    area: Any, rows: Sequence[Row], maneuvers: Mapping[tuple[str, str], Maneuver], several: bool
+) -> None:
     clearance, drift = area.subplots(1, 2)
     handles = []
-    for k, row in enumerate(report.rows):
-        maneuver = report.maneuvers.get((row.problem, row.method))
+    for k, row in enumerate(rows):
+        maneuver = maneuvers.get((row.problem, row.method))
         if maneuver is None:
             continue
         style: dict[str, Any] = {

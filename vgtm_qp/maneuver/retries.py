@@ -1,7 +1,7 @@
-"""Ways out of a dead end: the same maneuver once more from home, its redundancy resolved otherwise.
+"""Retries after a dead end: the same maneuver once more from home, with the redundancy resolved differently.
 
 A path that is blocked for one shape of the arm may be open for another, and the null-space terms decide which shape it
-takes. The ways stand in the order of what they bought over random scenes (``vgtm study robustness``; README, section
+takes. The retries stand in the order of their success over random scenes (``vgtm study robustness``; README, section
 Robustness).
 """
 
@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 _HOPELESS = (StopKind.INTERRUPTED, StopKind.SINGULAR, StopKind.OUT_OF_REACH, StopKind.LOCKED)
 
 _BULGE, _SLIGHT_BULGE = 0.3, 0.1
-"""How far the middle of a bulged curve is drawn sideways, as a part of the arm's height."""
+"""Sideways displacement of the middle of a bulged curve, as a share of the arm's height."""
 _FIRM_TRACKING = 1.0
-"""The least weight of tracking with which the arm takes the shape of a bulged curve."""
+"""Least weight of tracking in a retry with a bulged curve."""
 _MORE_VERTICES = 3
 
 _SIDES = {"to its left": 1, "to its right": 3, "away from what blocks it": 0, "towards it": 2}
@@ -45,7 +45,7 @@ class DeadEnd:
     height : float
         Of the arm at home, m.
     heading : (3,)
-        Where the path goes on from there.
+        Direction of the path from there on.
     """
 
     stop: Stop
@@ -57,11 +57,11 @@ class DeadEnd:
 Changes = dict[str, Any]
 
 
-def ways_out(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]]:
-    """Yield name and problem of each way that is worth trying; none where retries are off."""
+def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]]:
+    """Yield name and changed problem of each retry that applies; nothing if retries are off."""
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
-    for name, change in _WAYS.items():
+    for name, change in _CHANGES.items():
         changes = change(problem, dead_end)
         if not changes:
             continue
@@ -90,7 +90,7 @@ def _actuator_rates(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: AR
 
 
 def _no_curve(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    # Who wants the faces on the curve exactly does not want to be without one.
+    # Hard tracking asks for the curve, so there is no retry without it.
     if problem.method.tracking == "none" or problem.method.hard_tracking:
         return {}
     return {"method.tracking": "none"}
@@ -103,7 +103,7 @@ def _more_vertices(problem: Problem, dead_end: DeadEnd) -> Changes:
 
 
 def _bulged(quarter: int, size: float = _BULGE) -> Callable[[Problem, DeadEnd], Changes]:
-    """Return the way that bulges the curve to one of its four sides."""
+    """Return the change that bulges the curve to one of its four sides."""
 
     def change(problem: Problem, dead_end: DeadEnd) -> Changes:
         vertices = len(dead_end.control_vertices)
@@ -121,10 +121,10 @@ def _bulged(quarter: int, size: float = _BULGE) -> Callable[[Problem, DeadEnd], 
 
 
 def bulge(dead_end: DeadEnd, quarter: int, size: float = _BULGE) -> Array:
-    """Return (V, 3) the control vertices where the arm stopped, drawn sideways like half a wave, m.
+    """Return (V, 3) the control vertices where the arm stopped, displaced sideways by half a sine wave, m.
 
     The middle moves by about `size` times the arm's height. `quarter` counts right angles about the chord from the
-    direction away from what blocks the arm; where no obstacle does, from the one in which its path goes on.
+    direction away from what blocks the arm; if no obstacle does, from the direction of the path.
     """
     vertices = dead_end.control_vertices
     chord = vertices[-1] - vertices[0]
@@ -145,7 +145,7 @@ def _across(axis: Array, *wanted: Array) -> Array:
     raise AssertionError("no axis is along all of x, y and z")
 
 
-_WAYS: dict[str, Callable[[Problem, DeadEnd], Changes]] = {
+_CHANGES: dict[str, Callable[[Problem, DeadEnd], Changes]] = {
     "actuators drawn to their home lengths": _drawn_home,
     **{f"curve bulged {side}": _bulged(quarter) for side, quarter in _SIDES.items()},
     "curve bulged a little away from what blocks it": _bulged(0, _SLIGHT_BULGE),

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.maneuver.manifest import arm_record
+from vgtm_qp.maneuver.arm_record import arm_record
+from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
@@ -28,7 +29,7 @@ _RETRY_AFTER = 10
 
 @dataclass(frozen=True)
 class Reading:
-    """What the instruments show.
+    """Outcome, active constraints, clearances and step time, as the page shows them.
 
     Attributes
     ----------
@@ -177,7 +178,7 @@ class Session:
         return moved > 1e-9
 
     def reading(self) -> Reading:
-        """Return what the instruments show now."""
+        """Return the readings of the present state."""
         monitor, state = self._resolver.arm.monitor, self.state
         clearance, pair = monitor.least(state.nodes, state.time, among="obstacles")
         last = self._last
@@ -199,6 +200,4 @@ class Session:
 def _make_resolver(problem: Problem) -> Any:
     if problem.method.name == "qp":
         return Resolver(problem)
-    from vgtm_qp.methods import make_resolver
-
     return make_resolver(problem)

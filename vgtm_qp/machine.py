@@ -1,4 +1,7 @@
-"""What a measurement was taken on; NumPy is not imported, since its BLAS reads the number of threads then."""
+"""The machine and the versions that a measured time belongs to.
+
+NumPy is not imported: its BLAS reads the number of threads when it is loaded.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -17,7 +21,7 @@ _THREADS = (
     "BLIS_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
-_PACKAGES = ("vgtm-qp", "numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl")
+_TIMED = ("vgtm-qp", "numpy", "scipy", "casadi", "daqp")
 
 
 def pin_threads() -> bool:
@@ -31,8 +35,8 @@ def pin_threads() -> bool:
     return not late
 
 
-def describe_machine() -> dict[str, Any]:
-    """Return processor, cores, load, system, Python and C compiler."""
+def machine_record() -> dict[str, Any]:
+    """Return as JSON data: processor, cores, load, system, Python and C compiler."""
     from vgtm_qp.compiled import compiler
 
     return {
@@ -45,10 +49,27 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
-def versions() -> dict[str, str | None]:
-    """Return the versions of the packages that count, None where one is not installed."""
+def machine() -> dict[str, str]:
+    """Return processor, cores, system, BLAS threads and versions as text, for the foot of a table."""
+    return {
+        "processor": _processor(),
+        "cores": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "BLAS threads": os.environ.get("OPENBLAS_NUM_THREADS", "not set"),
+        **{name: found or "not installed" for name, found in versions(_TIMED).items()},
+    }
+
+
+def sentence(found: Mapping[str, str]) -> str:
+    """Return what `machine` found as one sentence."""
+    return ", ".join(f"{name} {value}" for name, value in found.items())
+
+
+def versions(packages: Iterable[str]) -> dict[str, str | None]:
+    """Return the versions of `packages`, None where one is not installed."""
     found: dict[str, str | None] = {}
-    for name in _PACKAGES:
+    for name in packages:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
@@ -58,7 +79,7 @@ def versions() -> dict[str, str | None]:
 
 def commit() -> str | None:
     """Return the commit of the source tree that this runs from, with "+" if changed since; None elsewhere."""
-    root = Path(__file__).resolve().parents[2]
+    root = Path(__file__).resolve().parents[1]
     if not (root / ".git").exists():
         return None
     try:

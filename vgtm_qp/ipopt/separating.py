@@ -1,7 +1,7 @@
-"""The yardstick: each step as a nonlinear program over the node positions, solved by CasADi and IPOPT.
+"""The program with exact distances: a separating direction for each near pair, for the robustness study.
 
-Distances to boxes and between members enter through their dual, a separating direction for each near pair, which is
-smooth and exact. Nothing else of this package's resolver is used, but for which pairs are near.
+Distances to boxes and between members enter through their dual, which is smooth and exact. It uses nothing of
+this package's resolver except the search for near pairs.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import joint_frame
 from vgtm_qp.geometry.clearance import NearPairs
+from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
 from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.arm import Arm
 from vgtm_qp.step.path import PathPoint
@@ -24,43 +24,26 @@ from vgtm_qp.step.state import State, frozen
 Array = NDArray[np.float64]
 
 BETWEEN = 0.01
-"""What it may pass `safe` by between two states, m: it sees the states alone."""
+"""How far it may fall short of `safe` between two states, m: the program knows the states only."""
 
 _MARGIN = 1e-6
 _RESOLVES = 3
 _OPTIONS: dict[str, Any] = {
-    "print_time": False,
-    "ipopt.print_level": 0,
-    "ipopt.sb": "yes",
-    "ipopt.tol": 1e-9,
-    "ipopt.constr_viol_tol": 1e-10,
+    **OPTIONS,
     "ipopt.acceptable_constr_viol_tol": 1e-9,
     "ipopt.max_iter": 150,
     "ipopt.max_cpu_time": 10.0,
     "ipopt.mu_init": 1e-3,
-    "ipopt.bound_relax_factor": 0.0,
     "ipopt.honor_original_bounds": "yes",
 }
 
 
 class IpoptStepper:
-    """Solves steps of an arm among boxes; elastic and scaled goals are not its business."""
+    """Solves steps of an arm among boxes; it knows neither elastic nor scaled goals."""
 
     def __init__(self, arm: Arm) -> None:
         self.arm = arm
-        truss = arm.truss
-        self._columns = {int(node): 3 * k for k, node in enumerate(truss.free)}
-        self._x = ca.SX.sym("x", 3 * len(truss.free))
-        nodes: list[ca.SX] = [
-            self._x[self._columns[n] : self._columns[n] + 3]
-            if n in self._columns
-            else ca.SX(ca.DM(truss.home[n]))
-            for n in range(truss.node_count)
-        ]
-        self._nodes = nodes
-        self._ends = _member_ends(arm, nodes)
-        self._lengths = ca.vertcat(*(ca.norm_2(a - b) for a, b in self._ends))
-        self._tip = sum(w * nodes[n] for w, n in zip(truss.tip_weights, truss.tip, strict=True))
+        self._symbols = truss_symbols(arm.truss)
 
     def run(self, plan: Plan, halvings: int = 2, budget: float = 120.0) -> tuple[list[State], list[float]]:
         """Return the states along `plan` and the path values they stand at, up to where a step fails.
@@ -121,8 +104,8 @@ class IpoptStepper:
         lower[actuators] = np.maximum(truss.stroke[actuators, 0], state.lengths[actuators] - room) + 1e-10
         upper[actuators] = np.minimum(truss.stroke[actuators, 1], state.lengths[actuators] + room) - 1e-10
         target, zero = self._goal_rows(goal)
-        g, lbg, ubg = [self._lengths, target], [lower, zero], [upper, zero]
-        variables, first = [self._x], [start]
+        g, lbg, ubg = [self._symbols.lengths, target], [lower, zero], [upper, zero]
+        variables, first = [self._symbols.x], [start]
         for k in range(len(pairs)):
             v, v0, rows, bounds = self._pair(pairs, k, state.time + duration)
             variables.append(v)
@@ -130,8 +113,8 @@ class IpoptStepper:
             g.append(rows)
             lbg.append(bounds)
             ubg.append(np.full(len(bounds), np.inf))
-        change = self._x - start
-        home = self._lengths[actuators.tolist()] - arm.home_lengths[actuators]
+        change = self._symbols.x - start
+        home = self._symbols.lengths[actuators.tolist()] - arm.home_lengths[actuators]
         objective = 0.5 * ca.dot(change, change) + 0.01 * ca.dot(home, home)
         problem = {"x": ca.vertcat(*variables), "f": objective, "g": ca.vertcat(*g)}
         solver = ca.nlpsol("step", "ipopt", problem, _OPTIONS)
@@ -144,12 +127,11 @@ class IpoptStepper:
 
     def _goal_rows(self, goal: PathPoint) -> tuple[ca.SX, Array]:
         task = self.arm.task
-        rows = [(self._tip - goal.position)[task.axes.tolist()]]
+        rows = [(self._symbols.tip - goal.position)[task.axes.tolist()]]
         count = len(task.axes)
         if task.turns:
             # The frame's normal is that of the tip's triangle in every module.
-            corner = [self._nodes[n] for n in self.arm.truss.tip]
-            normal = ca.cross(corner[1] - corner[0], corner[2] - corner[0])
+            normal = self._symbols.tip_normal(self.arm.truss)
             home = self.arm.truss.home[self.arm.truss.tip]
             wanted = (
                 goal.rotation @ self.arm.truss.tip_frame.T @ np.cross(home[1] - home[0], home[2] - home[0])
@@ -164,11 +146,11 @@ class IpoptStepper:
         """Return the dual variables of a pair, their first values, and rows with their lower bounds."""
         arm, truss = self.arm, self.arm.truss
         member, other = int(pairs.member[k]), int(pairs.other[k])
-        a = self._ends[member]
+        a = self._symbols.ends[member]
         if pairs.is_self[k]:
             n = ca.SX.sym("n", 3)
             gap = arm.self_safe + truss.radius[member] + truss.radius[other] + _MARGIN
-            rows = [ca.dot(n, p - q) for p in a for q in self._ends[other]]
+            rows = [ca.dot(n, p - q) for p in a for q in self._symbols.ends[other]]
             return n, pairs.normal[k], ca.vertcat(*rows, 1.0 - ca.dot(n, n)), np.r_[np.full(4, gap), 0.0]
         piece = arm.monitor.pieces.at(time)[other]
         center, half, rotation = _box(piece)
@@ -197,20 +179,6 @@ class IpoptStepper:
             except np.linalg.LinAlgError:
                 return False
         return False
-
-
-def _member_ends(arm: Arm, nodes: list[ca.SX]) -> list[tuple[ca.SX, ca.SX]]:
-    truss = arm.truss
-    if truss.joints is None:
-        return [(nodes[i], nodes[j]) for i, j in truss.members]
-    frames = [joint_frame(*(nodes[n] for n in corner)) for corner in truss.joints.triangle]
-    return [
-        (
-            nodes[i] + ca.mtimes(frames[i], ca.DM(truss.joints.offset[m, 0])),
-            nodes[j] + ca.mtimes(frames[j], ca.DM(truss.joints.offset[m, 1])),
-        )
-        for m, (i, j) in enumerate(truss.members)
-    ]
 
 
 def _box(piece: Array) -> tuple[Array, Array, Array]:

@@ -4,27 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.maneuver.certificate import Certificate
-
-if TYPE_CHECKING:
-    from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.machine import versions
+from vgtm_qp.result.certificate import Certificate
 
 SCHEMA_VERSION = 1
 """Version of the result file that this package writes and reads."""
 
 STATUSES = ("solved", "blocked", "infeasible")
 
+_PACKAGES = (
+    "vgtm-qp",
+    "numpy",
+    "casadi",
+    "daqp",
+    "osqp",
+    "piqp",
+    "python-fcl",
+    "qpsolvers",
+    "trimesh",
+)
 _MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "blocked_by", "versions")
 
 
@@ -56,15 +62,15 @@ def make_manifest(
     status : str
         One of `STATUSES`.
     reached : float
-        How far along the path, 0 to 1.
+        Share of the path covered, 0 to 1.
     blocked_by : iterable of str
         Names of what stopped it.
     stop : mapping, optional
         What ``Stop.to_dict`` returns.
     way_out : str
-        How the redundancy was resolved where the problem's own way came to a dead end earlier.
+        The change of the problem with which a retry came further, empty if there was none.
     recovered : mapping, optional
-        Pairs that were nearer at home than they may be, ``member / obstacle`` or ``member / member``, and their
+        Pairs below their clearance in the home pose, ``member / obstacle`` or ``member / member``, and their
         distances there, m.
     method : str
         As in the problem's ``[method]``.
@@ -102,68 +108,17 @@ def make_manifest(
     }
 
 
-def arm_record(truss: Truss) -> dict[str, Any]:
-    """Return what verification needs to know of `truss`, as JSON data; no limit is None.
-
-    Keys: ``module``, ``bays``, ``node_names``, ``home`` (N, 3), ``base`` (indices of given nodes),
-    ``member_names``, ``actuated``, ``length`` (M, at home), ``stroke`` (M, 2), ``rate``, ``acceleration``,
-    ``radius`` (M), ``tip`` (``nodes``, ``weights``, ``frame`` at home) and ``joints``
-    (``triangle``, ``offset``, see ``truss.Joints``; None for pin joints). Lengths in m.
-    """
-    joints = truss.joints
-    ends = truss.home[truss.members]
-    pin_lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    return {
-        "module": truss.module,
-        "bays": truss.bays,
-        "node_names": list(truss.node_names),
-        "home": truss.home.tolist(),
-        "base": np.flatnonzero(truss.base).tolist(),
-        "member_names": list(truss.member_names),
-        "actuated": truss.actuated.tolist(),
-        "length": (pin_lengths if joints is None else truss.home_lengths).tolist(),
-        "stroke": truss.stroke.tolist(),
-        "rate": _or_none(truss.rate),
-        "acceleration": _or_none(truss.acceleration),
-        "radius": truss.radius.tolist(),
-        "tip": {
-            "nodes": truss.tip.tolist(),
-            "weights": truss.tip_weights.tolist(),
-            "frame": truss.tip_frame.tolist(),
-        },
-        "joints": None
-        if joints is None
-        else {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
-    }
-
-
 def mesh_record(path: str | Path, triangles: int) -> dict[str, Any]:
     """Return what ties a result to a mesh file: its SHA-256 and the number of its triangles."""
     return {"sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(), "triangles": int(triangles)}
 
 
-def _or_none(limits: NDArray[np.float64]) -> list[float | None]:
-    return [limit if math.isfinite(limit) else None for limit in limits.tolist()]
-
-
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
-    for package in (
-        "vgtm-qp",
-        "numpy",
-        "casadi",
-        "daqp",
-        "osqp",
-        "piqp",
-        "python-fcl",
-        "qpsolvers",
-        "trimesh",
-    ):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+    return {
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        **{name: found or "not installed" for name, found in versions(_PACKAGES).items()},
+    }
 
 
 def check_manifest(manifest: Any) -> dict[str, Any]:
@@ -197,7 +152,7 @@ def check_manifest(manifest: Any) -> dict[str, Any]:
 
 
 def dump_manifest(manifest: Mapping[str, Any]) -> str:
-    """Return the one text of `manifest`; ResultError where strict JSON cannot hold it."""
+    """Return the canonical text of `manifest`; ResultError if strict JSON cannot hold it."""
     try:
         return json.dumps(
             manifest, allow_nan=False, sort_keys=True, separators=(",", ":"), ensure_ascii=False
@@ -207,7 +162,7 @@ def dump_manifest(manifest: Mapping[str, Any]) -> str:
 
 
 def parse_manifest(array: NDArray[Any]) -> Any:
-    """Return the JSON data in the ``manifest`` array of a result file; ResultError where it is none."""
+    """Return the JSON data in the ``manifest`` array of a result file; ResultError if it is not JSON."""
     if array.dtype.kind != "U" or array.ndim != 0:
         raise ResultError("the manifest is not one string")
 

@@ -6,8 +6,8 @@ from html import escape
 
 import numpy as np
 
+from vgtm_qp.live.session import Session
 from vgtm_qp.view.drawing import stroke_colours
-from vgtm_qp.view.session import Session
 
 _COLOURS = {"at rest": "#6b7280", "moving": "#0b7a5b", "slowed": "#b45309", "blocked": "#b91c1c"}
 _MOST_ACTIVE = 6

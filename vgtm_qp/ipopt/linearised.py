@@ -1,8 +1,7 @@
-"""The baseline of general-purpose optimisation: a nonlinear program a step over the node positions, by IPOPT.
+"""The program whose structure is fixed: built once, started from the last answer, for the benchmark.
 
-Its structure is fixed, so that it is built once and started from the last answer; clearances enter
-linearised, as they do in the QP. With exact distances, and rebuilt when the near pairs change, it would take
-several times as long.
+Clearances enter linearised, as they do in the QP. With exact distances, and rebuilt when the near pairs change, it
+would take several times as long.
 """
 
 from __future__ import annotations
@@ -13,8 +12,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
+from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.limits import length_box
 from vgtm_qp.step.linearise import clearance_rows
 from vgtm_qp.step.path import Path
@@ -24,43 +24,32 @@ Array = NDArray[np.float64]
 
 _PAIRS = 24
 _OPTIONS: dict[str, Any] = {
-    "print_time": False,
-    "ipopt.print_level": 0,
-    "ipopt.sb": "yes",
-    "ipopt.tol": 1e-9,
-    "ipopt.constr_viol_tol": 1e-10,
+    **OPTIONS,
     "ipopt.max_iter": 200,
     "ipopt.warm_start_init_point": "yes",
     "ipopt.warm_start_bound_push": 1e-6,
     "ipopt.warm_start_slack_bound_push": 1e-6,
     "ipopt.warm_start_mult_bound_push": 1e-6,
     "ipopt.mu_init": 1e-4,
-    "ipopt.bound_relax_factor": 0.0,
 }
 
 
 class NonlinearStep:
-    """Steps of a truss with pin joints and a base at rest: exact lengths and tip, the QP's truss terms."""
+    """Steps of a truss whose base is at rest: exact lengths and tip, the QP's truss terms."""
 
     def __init__(self, problem: Problem) -> None:
-        # Any solver serves that makes no kernels, for none is asked.
-        changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
-        self._arm = arm = build_arm(problem.replace(changes))
+        self._arm = arm = arm_without_curve(problem)
         truss, weights = arm.truss, problem.method.weights
         free = 3 * len(truss.free)
-        x, x0 = ca.SX.sym("x", free), ca.SX.sym("x0", free)
+        symbols = truss_symbols(truss)
+        x, x0, lengths = symbols.x, ca.SX.sym("x0", free), symbols.lengths
         goal, across = ca.SX.sym("goal", 3), ca.SX.sym("across", 2, 3)
         rows = ca.SX.sym("rows", _PAIRS, free)
-        column = arm.layout.node_column
-        nodes = [x[c : c + 3] if c >= 0 else ca.DM(home) for c, home in zip(column, truss.home, strict=True)]
-        lengths = ca.vertcat(*(ca.norm_2(nodes[i] - nodes[j]) for i, j in truss.members))
         before = ca.substitute(lengths, x, x0)
-        tip = sum(weight * nodes[n] for weight, n in zip(truss.tip_weights, truss.tip, strict=True))
-        ends = [(tip - goal)[arm.task.axes.tolist()]]
+        ends = [(symbols.tip - goal)[arm.task.axes.tolist()]]
         if arm.task.turns:
             # The normal of the tip's triangle is the z-axis of its frame.
-            a, b, c = (nodes[n] for n in truss.tip[:3])
-            ends.append(ca.mtimes(across, ca.cross(b - a, c - a)))
+            ends.append(ca.mtimes(across, symbols.tip_normal(truss)))
         end = ca.vertcat(*ends)
         actuators = truss.actuators.tolist()
         changed = (lengths - before)[actuators]
@@ -112,7 +101,7 @@ class NonlinearStep:
         return True
 
     def _clearances(self, state: State) -> Array:
-        """Write the rows of the nearest pairs; return their lower bounds (24,), m. Rows may ask nothing."""
+        """Write the rows of the nearest pairs; return their lower bounds (24,), m. Unused rows are zero."""
         arm = self._arm
         pairs = arm.monitor.near(state.nodes, state.time, arm.influence, use_fcl=False)
         found = clearance_rows(arm.monitor, pairs, arm.safe, arm.self_safe)

@@ -18,11 +18,11 @@ class Measure:
     Attributes
     ----------
     value : float or None
-        The worst value over the maneuver; None where there is nothing to measure (no obstacle, not tracked).
+        The worst value over the maneuver; None if there is nothing to measure (no obstacle, not tracked).
     unit : str
         Its unit.
     bound : float or None
-        What it is held against; None where it is only reported.
+        The tolerance; None if the value is only reported.
     side : "most" or "least"
         Whether `bound` is the greatest or the least value allowed.
     where : str
@@ -36,7 +36,7 @@ class Measure:
     where: str = ""
 
     def __post_init__(self) -> None:
-        """Keep `value` finite: an infinite clearance is nothing to measure, all else is a failure."""
+        """Replace an infinite clearance by None, and any other value that is not finite by the worst float."""
         if self.value is None or math.isfinite(self.value):
             return
         nothing_near = self.side == "least" and self.value > 0.0

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import VgtmError
+from vgtm_qp.live.read_out import read_out
+from vgtm_qp.live.session import METHODS, Session
+from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.maneuver.result import Maneuver
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled
-from vgtm_qp.view.read_out import read_out
 from vgtm_qp.view.scene import ArmScene, viser_server
-from vgtm_qp.view.session import METHODS, Session
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def view(
 
 
 class _Page:
-    """Widgets and loop. Callbacks only leave notes in the inbox; the loop alone touches the session."""
+    """Widgets and loop. Callbacks only put actions into the inbox; the loop alone touches the session."""
 
     def __init__(self, server: Any, session: Session, maneuver: Maneuver | None) -> None:
         self._server, self._session, self._maneuver = server, session, maneuver
@@ -289,7 +289,7 @@ class _Page:
         self._put(self._moment)
 
     def _put(self, moment: float) -> None:
-        """Show the arm at `moment` on its straight way between two states, and leave it to the hand there."""
+        """Show the arm at `moment` on the straight line between two states, from where it can be dragged."""
         maneuver = self._maneuver
         assert maneuver is not None
         at = np.array([moment])

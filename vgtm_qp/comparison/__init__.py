@@ -1,0 +1,1 @@
+"""The same maneuver by several methods, in one report."""

@@ -1,0 +1,87 @@
+"""One method on one problem: what the maneuver kept, in numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vgtm_qp.maneuver.maneuver import Maneuver
+
+MEMBER_TOLERANCE = 1e-3
+TIP_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one problem. Lengths in m, times in s; None if there was nothing to measure.
+
+    Attributes
+    ----------
+    solved : bool
+        The maneuver reached the end of its path and passed verification.
+    kept : bool
+        It reached the end and kept every limit and clearance, with a tolerance of 1 mm for members and tip: the
+        standard for methods without drift correction.
+    status : str
+        ``solved``, ``blocked`` or ``refused`` (the method cannot be set up for this arm).
+    reached : float
+        Share of the path covered, 0 to 1.
+    reason : str
+        Step and reason of a breakdown, or the first tolerance that verification found broken.
+    actuator_travel : float
+        Sum over actuators and steps of the changes of length.
+    rank : int or None
+        Of the Jacobian of eq. (26) in the last step, where the method reveals it.
+    """
+
+    problem: str
+    method: str
+    solved: bool
+    kept: bool
+    status: str
+    reached: float
+    steps: int
+    reason: str
+    tip_error: float | None = None
+    member_drift: float | None = None
+    least_clearance: float | None = None
+    stroke_violation: float | None = None
+    rate_violation: float | None = None
+    actuator_travel: float | None = None
+    step_time: float | None = None
+    setup_time: float | None = None
+    rank: int | None = None
+
+
+def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
+    """Return the row of a verified maneuver."""
+    certificate = maneuver.certificate
+    assert certificate is not None, "a maneuver is verified before it is compared"
+    summary, failures = maneuver.summary(), certificate.failures()
+    done = maneuver.status == "solved"
+    member, tip = certificate.member_error.value or 0.0, certificate.tip_error.value or 0.0
+    drifting = member <= MEMBER_TOLERANCE and tip <= TIP_TOLERANCE
+    others = [line for line in failures if not line.startswith(("member error", "tip error"))]
+    between = certificate.clearance_between.value
+    travel = np.abs(np.diff(maneuver.member_lengths[:, maneuver.member_actuated], axis=0)).sum()
+    reason = ", ".join(maneuver.blocked_by[:3]) if not done else next(iter([*others, *failures]), "")
+    return Row(
+        problem=problem,
+        method=method,
+        solved=done and certificate.ok,
+        kept=done and drifting and not others,
+        status=maneuver.status,
+        reached=maneuver.reached,
+        steps=maneuver.steps,
+        reason=reason,
+        tip_error=certificate.tip_error.value,
+        member_drift=member,
+        least_clearance=between,
+        stroke_violation=certificate.stroke_violation.value,
+        rate_violation=certificate.rate_violation.value,
+        actuator_travel=float(travel),
+        step_time=summary["step_time"]["median"],
+        setup_time=summary["setup_time"],
+        rank=maneuver.manifest.get("jacobian_rank"),
+    )

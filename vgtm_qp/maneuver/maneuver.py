@@ -1,0 +1,57 @@
+"""What `solve` returns: a result that can be plotted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vgtm_qp.result.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+class Maneuver(Result):
+    """A :class:`~vgtm_qp.result.result.Result` with its plots; matplotlib is imported by the first of them."""
+
+    def plot(self, **options: Any) -> Figure:
+        """Return a figure of states side by side; see `vgtm_qp.view.figure.plot_frames` for the options."""
+        from vgtm_qp.view.figure import plot_frames
+
+        return plot_frames(self, **options)
+
+    def plot_clearance(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the least distances to obstacles and between members over time."""
+        from vgtm_qp.view.plots import plot_clearance
+
+        return plot_clearance(self, axes=axes)
+
+    def plot_strokes(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the lengths of the actuated members over time, between their limits."""
+        from vgtm_qp.view.plots import plot_strokes
+
+        return plot_strokes(self, axes=axes)
+
+    def plot_tip_error(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the distance of the tip from its target over time."""
+        from vgtm_qp.view.plots import plot_tip_error
+
+        return plot_tip_error(self, axes=axes)
+
+    def plot_step_time(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the computing time of each step by phase."""
+        from vgtm_qp.view.plots import plot_step_time
+
+        return plot_step_time(self, axes=axes)
+
+
+def load_result(path: str | Path) -> Maneuver:
+    """Read a result file, without pickle, and check all of it.
+
+    Raises
+    ------
+    ResultError
+        There is no such file, it is cut or altered, of another version, or an array is missing or malformed.
+    """
+    return Maneuver.load(path)

@@ -1,0 +1,213 @@
+"""The result of a maneuver as data: every accepted state, and the manifest that says what they belong to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.result.certificate import Certificate
+from vgtm_qp.result.file import read_result, write_result
+from vgtm_qp.result.layout import LAYOUTS, check_arrays, frozen, plain
+from vgtm_qp.result.manifest import check_manifest
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result:
+    """Every accepted state of a maneuver; row 0 is the home pose. The arrays are read-only.
+
+    Attributes
+    ----------
+    time : (T,)
+        Seconds, increasing.
+    nodes : (T, N, 3)
+        Node positions, m.
+    members, member_names, member_actuated : (M, 2), (M,), (M,)
+        The nodes, name and kind of each member.
+    member_lengths : (T, M)
+        m.
+    control_vertices : (T, V, 3)
+        Control vertices of the reference curve, m; V = 0 without a curve.
+    tip_position, tip_rotation, tip_target_position : (T, 3), (T, 3, 3), (T, 3)
+        Pose of the end effector and the target that each state was accepted for, m.
+    clearance, self_clearance : (T,)
+        Least distance to obstacles, and between members that share no node, m; infinite if nothing is near.
+    progress : (T,)
+        Share of the path covered, 0 to 1.
+    step_time, phase_names, phase_time : (T,), (P,), (T, P)
+        Computing time of each step and of its phases, s; 0 in row 0.
+    manifest : dict
+        Plain data, see `make_manifest`.
+    tip_target_rotation, tip_target_pointing : (T, 3, 3) or None, (T, 3) or None
+        Targets of orientation or direction where they were tracked.
+
+    Raises
+    ------
+    ResultError
+        An array has another shape or kind than this, holds a NaN, or the manifest is not strict JSON.
+    """
+
+    time: Array
+    nodes: Array
+    members: NDArray[np.int64]
+    member_names: NDArray[np.str_]
+    member_actuated: NDArray[np.bool_]
+    member_lengths: Array
+    control_vertices: Array
+    tip_position: Array
+    tip_rotation: Array
+    tip_target_position: Array
+    clearance: Array
+    self_clearance: Array
+    progress: Array
+    step_time: Array
+    phase_names: NDArray[np.str_]
+    phase_time: Array
+    manifest: dict[str, Any]
+    tip_target_rotation: Array | None = None
+    tip_target_pointing: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Check shapes and kinds; freeze copies of the arrays."""
+        arrays = {name: plain(getattr(self, name)) for name in LAYOUTS if getattr(self, name) is not None}
+        check_arrays(arrays)
+        for name, array in arrays.items():
+            object.__setattr__(self, name, frozen(array))
+        object.__setattr__(self, "manifest", check_manifest(self.manifest))
+
+    def __str__(self) -> str:
+        """Return one paragraph: name, status, steps, what stopped it, what verification found."""
+        text = f"{self._name}: {self.status}, {100.0 * self.reached:.4g} % of the path in {self.steps} steps."
+        if way := self.manifest.get("way_out"):
+            text += f" The problem as given was a dead end; this is the retry with {way}."
+        if self.blocked_by:
+            text += f" Stopped by {', '.join(self.blocked_by[:4])}."
+        certificate = self.certificate
+        if certificate is None:
+            return f"{text} Not verified yet."
+        if certificate.ok:
+            return f"{text} Verified."
+        return f"{text} VERIFICATION FAILED: {'; '.join(certificate.failures()[:4])}."
+
+    def __repr__(self) -> str:
+        kind, share = type(self).__name__, 100.0 * self.reached
+        return f"<{kind} {self._name!r}: {self.status}, {self.steps} steps, {share:.4g} %>"
+
+    @property
+    def _name(self) -> str:
+        return str(self.manifest["problem"].get("name", "unnamed"))
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of the result file by name, those that this maneuver has."""
+        return {name: array for name in LAYOUTS if (array := getattr(self, name)) is not None}
+
+    @property
+    def status(self) -> str:
+        """``"solved"``, ``"blocked"`` or ``"infeasible"``."""
+        return str(self.manifest["status"])
+
+    @property
+    def reached(self) -> float:
+        """Share of the path that the arm covered, 0 to 1."""
+        return float(self.manifest["reached"])
+
+    @property
+    def blocked_by(self) -> tuple[str, ...]:
+        """Names of the obstacles, members and limits that stopped it."""
+        return tuple(self.manifest["blocked_by"])
+
+    @property
+    def steps(self) -> int:
+        """Number of accepted steps."""
+        return len(self.time) - 1
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """What verification found; None before it."""
+        data = self.manifest.get("certificate")
+        return None if data is None else Certificate.from_dict(data)
+
+    def with_certificate(self, certificate: Certificate) -> Self:
+        """Return this result with `certificate` in its manifest."""
+        return replace(self, manifest={**self.manifest, "certificate": certificate.to_dict()})
+
+    def summary(self, result: str | Path | None = None) -> dict[str, Any]:
+        """Return what ``vgtm solve --json`` prints, as strict JSON data; `result` is the path of the file.
+
+        Entries that come from the certificate are None before verification. A certificate measures penetration
+        no deeper than a member's radius; beyond that the clearance at the states replaces the one between them.
+        """
+        certificate = self.certificate
+        manifest = self.manifest
+        finite = self.clearance[np.isfinite(self.clearance)]
+        least = float(finite.min()) if len(finite) else None
+
+        def worst(name: str) -> float | None:
+            return None if certificate is None else certificate.measures[name].value
+
+        between = worst("clearance_between")
+        if between is not None and least is not None:
+            between = min(between, least)
+        return {
+            "name": manifest["problem"].get("name", ""),
+            "status": self.status,
+            "reached": self.reached,
+            "steps": self.steps,
+            "bays": manifest["arm"].get("bays"),
+            "method": manifest.get("method"),
+            "solver": manifest.get("solver"),
+            "min_clearance": least,
+            "min_clearance_between": between,
+            "min_self_clearance": worst("self_clearance"),
+            "max_member_error": worst("member_error"),
+            "max_stroke_violation": worst("stroke_violation"),
+            "max_rate_violation": worst("rate_violation"),
+            "max_tip_error": worst("tip_error"),
+            "max_tip_direction_error": worst("tip_direction_error"),
+            "step_time": self._step_time(),
+            "setup_time": manifest.get("setup_time"),
+            "blocked_by": list(self.blocked_by),
+            "way_out": str(self.manifest.get("way_out", "")),
+            "verified": None if certificate is None else certificate.ok,
+            "failures": [] if certificate is None else list(certificate.failures()),
+            "result": None if result is None else str(result),
+        }
+
+    def _step_time(self) -> dict[str, Any]:
+        """Median and percentiles of the steps, median of each phase, s; the home pose took no step."""
+        times = self.step_time[1:]
+        if not len(times):
+            return {"median": None, "p95": None, "p99": None, "phases": {}}
+        median, p95, p99 = (float(value) for value in np.percentile(times, (50, 95, 99)))
+        phases = np.median(self.phase_time[1:], axis=0)
+        named = {str(name): float(value) for name, value in zip(self.phase_names, phases, strict=True)}
+        return {"median": median, "p95": p95, "p99": p99, "phases": named}
+
+    def save(self, path: str | Path) -> Path:
+        """Write the result file and return its path; a process killed meanwhile leaves the old or the new.
+
+        Raises
+        ------
+        ResultError
+            The file cannot be written.
+        """
+        write_result(Path(path), self.arrays, self.manifest)
+        return Path(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a result file, without pickle, and check all of it.
+
+        Raises
+        ------
+        ResultError
+            There is no such file, it is cut or altered, of another version, or an array is missing or malformed.
+        """
+        arrays, manifest = read_result(Path(path))
+        return cls(**arrays, manifest=manifest)
