@@ -18,20 +18,20 @@ def check(
     """Check a problem file: its keys and values, its truss, its obstacles and goals at the home pose."""
     from dataclasses import asdict
 
-    from vgtm_qp.arm.truss.mobility import describe
+    from vgtm_qp.setup.truss.mobility import describe
     from vgtm_qp.errors import ProblemError
     from vgtm_qp.problem import load_problem
-    from vgtm_qp.step.arm import build_arm
+    from vgtm_qp.step.build import build_arm
     from vgtm_qp.step.checks import check_problem, find_warnings
 
     loaded = load_problem(problem)
     source = str(loaded.source or loaded.name)
-    arm = build_arm(loaded)
-    mistakes = check_problem(loaded, arm)
+    setup = build_arm(loaded)
+    mistakes = check_problem(loaded, setup)
     if mistakes:
         raise ProblemError(source, mistakes)
-    warnings = find_warnings(loaded, arm)
-    truss = describe(arm.truss)
+    warnings = find_warnings(loaded, setup)
+    truss = describe(setup.truss)
     for warning in warnings:
         note(f"{source}: warning: {warning}")
     if json:

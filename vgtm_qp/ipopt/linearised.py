@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.limits import length_box
+from vgtm_qp.rows.limits import actuator_box
 from vgtm_qp.step.linearise import clearance_rows
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State
@@ -78,8 +78,8 @@ class NonlinearStep:
         here, goal = state.nodes[truss.free].reshape(-1), path.at(end)
         lower, upper = arm.home_lengths.copy(), arm.home_lengths.copy()
         limits = truss.stroke[actuators], truss.rate[actuators], truss.acceleration[actuators]
-        lower[actuators], upper[actuators] = length_box(
-            state.lengths[actuators], state.length_rates[actuators], *limits, dt, state.duration or None
+        lower[actuators], upper[actuators] = actuator_box(
+            state.quantities[actuators], state.rates[actuators], *limits, dt, state.duration or None
         )
         floors = self._clearances(state)
         zero = np.zeros(self._ends)

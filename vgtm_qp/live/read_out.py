@@ -59,7 +59,7 @@ def _distance(distance: float, least: float) -> str:
 
 def _strokes(session: Session) -> str:
     """Return a bar for each actuator: how much of its stroke is out."""
-    share = session.drawing.stroke_share(session.state.lengths)
+    share = session.drawing.stroke_share(session.state.quantities)
     names = [
         name
         for name, moving in zip(session.drawing.arm.member_names, ~np.isnan(share), strict=True)

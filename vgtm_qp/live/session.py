@@ -62,7 +62,7 @@ class Session:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._resolver = _make_resolver(problem)
-        truss = self._resolver.arm.truss
+        truss = self._resolver.setup.truss
         self.drawing: Drawing = drawing_of_problem(
             problem, arm_record(truss), truss.members, len(self.state.control_vertices)
         )
@@ -109,11 +109,11 @@ class Session:
 
     def go_home(self) -> None:
         """Put the arm into its home pose, at rest, and want nothing else."""
-        self._put(self._resolver.arm.home_state())
+        self._put(self._resolver.setup.home_state())
 
     def put_at(self, time: float, nodes: Array, control_vertices: Array) -> None:
         """Put the arm at rest at `nodes` (N, 3) and `control_vertices` (V, 3), m; want nothing else."""
-        home: State = self._resolver.arm.home_state()
+        home: State = self._resolver.setup.home_state()
         self._put(
             replace(
                 home,
@@ -179,7 +179,7 @@ class Session:
 
     def reading(self) -> Reading:
         """Return the readings of the present state."""
-        monitor, state = self._resolver.arm.monitor, self.state
+        monitor, state = self._resolver.setup.monitor, self.state
         clearance, pair = monitor.least(state.nodes, state.time, among="obstacles")
         last = self._last
         outcome = "at rest"

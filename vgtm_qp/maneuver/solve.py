@@ -20,7 +20,8 @@ from vgtm_qp.methods import AnyResolver, make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.result.manifest import make_manifest, mesh_record
-from vgtm_qp.step.arm import Arm, build_arm
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
 from vgtm_qp.step.separation import Distances, Separation
@@ -71,7 +72,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     check_is_problem(problem)
     started = perf_counter()
     resolver = make_resolver(problem)
-    mistakes = check_problem(problem, resolver.arm)
+    mistakes = check_problem(problem, resolver.setup)
     if mistakes:
         raise ProblemError(str(problem.source or problem.name), mistakes)
     plan = make_plan(problem, *resolver.tip())
@@ -87,7 +88,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
             dead_end = DeadEnd(
                 stop,
                 resolver.state.control_vertices,
-                resolver.arm.truss.height,
+                resolver.setup.truss.height,
                 plan.path.at(value).velocity,
             )
             way, record, stop = _retry(problem, record, dead_end, progress)
@@ -120,7 +121,7 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
     """Step along the plan; return why the arm stopped for good, or None if it reached the end."""
     value, start, end = plan.path.start, plan.path.start, plan.path.end
     stalled, last = 0, float(plan.marks[-1])
-    keeps_moving = bool(np.isfinite(resolver.arm.truss.acceleration[resolver.arm.truss.actuators]).any())
+    keeps_moving = bool(np.isfinite(resolver.setup.truss.acceleration[resolver.setup.truss.actuators]).any())
     while value < last:
         aim, dt = plan.next_mark(value, keeps_moving=keeps_moving)
         before, known, clock = resolver.state, dict(resolver.phases), perf_counter()
@@ -153,7 +154,7 @@ def _given_up(
 
     A hard tip may not be late, so braking ends it; any tip but an elastic one ends when it leaves the path.
     """
-    mode = resolver.arm.tip_mode
+    mode = resolver.setup.tip_mode
     if not step.braked or not isinstance(resolver, Resolver) or mode == "elastic":
         return None
     if mode != "hard" and not step.left_path:
@@ -183,20 +184,20 @@ def _stop(resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: floa
 def _add_state(
     record: _Record, resolver: AnyResolver, plan: Plan, value: float, seconds: float, phases: dict[str, float]
 ) -> None:
-    state, arm = resolver.state, resolver.arm
+    state, arm = resolver.state, resolver.setup
     position, rotation = resolver.tip()
     target = plan.path.at(value)
     record.add(
         time=state.time,
         nodes=state.nodes,
-        member_lengths=state.lengths,
+        member_lengths=state.quantities,
         control_vertices=state.control_vertices,
         tip_position=position,
         tip_rotation=rotation,
         tip_target_position=target.position,
         tip_target_rotation=target.rotation,
-        clearance=arm.least_clearance(state.nodes, state.time, "obstacles"),
-        self_clearance=arm.least_clearance(state.nodes, state.time, "members"),
+        clearance=setup.least_clearance(state.nodes, state.time, "obstacles"),
+        self_clearance=setup.least_clearance(state.nodes, state.time, "members"),
         progress=(value - plan.path.start) / (plan.path.end - plan.path.start),
         step_time=seconds,
         phase_time=list(phases.values()),
@@ -211,10 +212,10 @@ def _assemble(
     setup_time: float,
     way: str,
 ) -> Maneuver:
-    truss, task = resolver.arm.truss, resolver.arm.task
+    truss, task = resolver.setup.truss, resolver.setup.task
     meshes = {
         obstacle.name: mesh_record(obstacle.file, len(pieces.pieces))
-        for obstacle, pieces in zip(problem.obstacle, resolver.arm.monitor.obstacles, strict=True)
+        for obstacle, pieces in zip(problem.obstacle, resolver.setup.monitor.obstacles, strict=True)
         if obstacle.shape == "mesh"
     }
     reached = float(record.rows["progress"][-1])
@@ -226,11 +227,11 @@ def _assemble(
         blocked_by=() if stop is None else stop.names,
         stop=None if stop is None else stop.to_dict(),
         way_out=way,
-        recovered=_too_near(resolver.arm, record.rows["nodes"][0])
+        recovered=_too_near(resolver.setup, record.rows["nodes"][0])
         if isinstance(resolver, Resolver)
         else None,
         method=problem.method.name,
-        solver=resolver.arm.solver if isinstance(resolver, Resolver) else resolver.solver,
+        solver=resolver.setup.solver if isinstance(resolver, Resolver) else resolver.solver,
         setup_time=setup_time,
         directory=Path(problem.source).parent if problem.source else Path.cwd(),
         meshes=meshes,
@@ -262,11 +263,11 @@ def _assemble(
     )
 
 
-def _too_near(arm: Arm, X: Array) -> dict[str, float]:
+def _too_near(setup: Setup, X: Array) -> dict[str, float]:
     """Return the pairs below their clearance in the home pose `X` (N, 3), and their distances, m."""
-    kept = Separation(arm.truss, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence))
+    kept = Separation(setup.truss, setup.monitor, Distances(setup.safe, setup.self_safe, setup.influence))
     found: dict[str, float] = {}
     for pair, distance in kept.shortfall(X, 0.0).items():
-        name = arm.monitor.names.clearance(pair).removeprefix("clearance: member ").replace("/ member ", "/ ")
+        name = setup.monitor.names.clearance(pair).removeprefix("clearance: member ").replace("/ member ", "/ ")
         found[name] = min(found.get(name, np.inf), distance)
     return found

@@ -37,7 +37,7 @@ class DenseSolution:
 
     def __init__(self, layout: Layout, method: Method) -> None:
         self._layout, self._method = layout, method
-        self._lengths = np.zeros((layout.truss.member_count, layout.node_columns))
+        self._lengths = np.zeros((truss_of(layout.arm).member_count, layout.node_columns))
         self._tip, self._present = tip_columns(layout)
         self.rank: int | None = None
 
@@ -60,7 +60,7 @@ class DenseSolution:
         J = np.zeros((len(x), layout.node_columns))
         J[: len(tip), self._tip] = tip[:, self._present]
         J[len(tip) :] = lengths[layout.fixed]
-        actuated = lengths[layout.truss.actuators]
+        actuated = lengths[truss_of(layout.arm).actuators]
         hessian = terms.actuator * actuated.T @ actuated
         hessian[np.diag_indices_from(hessian)] += terms.node
         if terms.blocks is not None:
@@ -95,7 +95,7 @@ class SparseSolution:
     """
 
     def __init__(self, layout: Layout, method: Method) -> None:
-        truss = layout.truss
+        truss = truss_of(layout.arm)
         self._layout = layout
         self._damping = method.damping**2 if method.variant == "damped" else 0.0
         self._tip, self._present = tip_columns(layout)
@@ -172,16 +172,16 @@ class ConventionalResolver(MethodResolver):
         method = problem.method
         super().__init__(arm_without_curve(problem), method.step_limit)
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
-        self._objective = TrussObjective(names, method.weights, self.arm)
-        layout = self.arm.layout
+        self._objective = TrussObjective(names, method.weights, self.setup)
+        layout = self.setup.layout
         sparse = method.algebra == "sparse"
         self._solution = SparseSolution(layout, method) if sparse else DenseSolution(layout, method)
         self._correct = method.correct
-        self._home_fixed = self.arm.home_lengths[layout.fixed]
+        self._home_fixed = self.setup.arm.home_quantities[layout.fixed]
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
-        arm, state = self.arm, self.state
-        kinematics, task, free = arm.kinematics, arm.task, arm.truss.free
+        setup, state = self.setup, self.state
+        kinematics, task, free = setup.kinematics, setup.task, setup.truss.free
         here, goal = path.at(start), path.at(end)
         X = np.array(state.nodes)
         kinematics.evaluate(X)
@@ -190,16 +190,16 @@ class ConventionalResolver(MethodResolver):
         x_e = [moved[task.axes]]
         if task.turns:
             x_e.append(turned if task.turns == "orientation" else kinematics.tip_rotation[:, :2].T @ turned)
-        base_rate = np.zeros(arm.truss.member_count)
-        if arm.base_motion is not None:
-            motion = np.where(arm.truss.base[:, None], arm.base_motion.nodes(state.time + dt) - X, 0.0)
-            base_rate = arm.layout.base_length_rate(kinematics.gradient, motion)
+        base_rate = np.zeros(setup.truss.member_count)
+        if setup.base_motion is not None:
+            motion = np.where(setup.truss.base[:, None], setup.base_motion.nodes(state.time + dt) - X, 0.0)
+            base_rate = setup.layout.base_length_rate(kinematics.gradient, motion)
             X += motion
-        x = np.concatenate([*x_e, -base_rate[arm.layout.fixed]])
+        x = np.concatenate([*x_e, -base_rate[setup.layout.fixed]])
         if self._correct:
-            gap = self._home_fixed - kinematics.lengths[arm.layout.fixed]
-            x = np.concatenate([tip.error, gap - base_rate[arm.layout.fixed]])
-        terms = self._objective.at(X, kinematics.lengths, state.time)
+            gap = self._home_fixed - kinematics.quantities[setup.layout.fixed]
+            x = np.concatenate([tip.error, gap - base_rate[setup.layout.fixed]])
+        terms = self._objective.at(X, kinematics.quantities, state.time)
         self.spend("kinematics")
         X[free] += self._solution.displacement(kinematics.gradient, tip.jacobian, x, terms).reshape(-1, 3)
         self.rank = self._solution.rank
@@ -211,12 +211,12 @@ class ConventionalResolver(MethodResolver):
 
     def _newton(self, X: Array, path: Path, end: float) -> None:
         """Correct fixed members and tip in place: Newton's method by the same pseudoinverse, without gradients."""
-        arm, goal = self.arm, path.at(end)
-        kinematics, free = arm.kinematics, arm.truss.free
+        arm, goal = self.setup, path.at(end)
+        kinematics, free = setup.kinematics, setup.truss.free
         for _ in range(MAX_CORRECTIONS):
             kinematics.evaluate(X)
-            tip = arm.task.rows(X, goal)
-            gap = self._home_fixed - kinematics.lengths[arm.layout.fixed]
+            tip = setup.task.rows(X, goal)
+            gap = self._home_fixed - kinematics.quantities[setup.layout.fixed]
             worst = float(np.max(np.abs(gap), initial=0.0))
             if worst <= LENGTH_TOLERANCE and float(np.max(np.abs(tip.error))) <= TIP_TOLERANCE:
                 return
@@ -225,8 +225,8 @@ class ConventionalResolver(MethodResolver):
             terms = Terms(
                 self._objective.node,
                 self._objective.actuator,
-                np.zeros(len(arm.truss.actuators)),
-                np.zeros(arm.layout.node_columns),
+                np.zeros(len(setup.truss.actuators)),
+                np.zeros(setup.layout.node_columns),
             )
             x = np.concatenate([tip.error, gap])
             X[free] += self._solution.displacement(kinematics.gradient, tip.jacobian, x, terms).reshape(-1, 3)
@@ -235,6 +235,6 @@ class ConventionalResolver(MethodResolver):
 
 def tip_columns(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the columns of the tip's free nodes, and which columns of the tip's Jacobian those are."""
-    first = layout.node_column[layout.truss.tip]
+    first = layout.node_column[truss_of(layout.arm).tip]
     present = np.repeat(first >= 0, 3)
     return (first[:, None] + np.arange(3)).reshape(-1)[present], present

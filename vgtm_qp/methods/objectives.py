@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import nearest
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem.method import TRUSS_TERMS, Weights
-from vgtm_qp.step.arm import Arm
+from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class TrussObjective:
         A term is unknown.
     """
 
-    def __init__(self, names: tuple[str, ...], weights: Weights, arm: Arm) -> None:
+    def __init__(self, names: tuple[str, ...], weights: Weights, setup: Setup) -> None:
         for name in names:
             if name not in TRUSS_TERMS:
                 raise ValueError(
@@ -64,12 +64,12 @@ class TrussObjective:
     def at(self, X: Array, lengths: Array, time: float) -> Terms:
         """Return the terms at node positions `X` (N, 3) with member `lengths` (M,)."""
         arm = self._arm
-        actuators = arm.truss.actuators
-        centring = self._centring * (lengths[actuators] - arm.home_lengths[actuators])
+        actuators = setup.truss.actuators
+        centring = self._centring * (lengths[actuators] - setup.arm.home_quantities[actuators])
         if not self._potential:
-            return Terms(self.node, self.actuator, centring, np.zeros(arm.layout.node_columns))
-        field, blocks = potential_field(arm.monitor, X, time, arm.influence)
-        free = arm.truss.free
+            return Terms(self.node, self.actuator, centring, np.zeros(setup.layout.node_columns))
+        field, blocks = potential_field(setup.monitor, X, time, setup.influence)
+        free = setup.truss.free
         gradient = self._potential * field[free].reshape(-1)
         return Terms(self.node, self.actuator, centring, gradient, self._potential * blocks[free])
 

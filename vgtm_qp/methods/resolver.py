@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.arm import Arm, build_arm
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.path import Path, PathPoint, vector_from_rotation
 from vgtm_qp.step.resolver import Step, StepStatus
 from vgtm_qp.step.state import State, frozen
@@ -26,9 +27,9 @@ MAX_CORRECTIONS = 30
 class MethodResolver(ABC):
     """Moves an arm step by step, as :class:`vgtm_qp.step.resolver.Resolver` does, by one of the other methods."""
 
-    def __init__(self, arm: Arm, step_limit: float | None) -> None:
-        self.arm = arm
-        self.state = arm.home_state()
+    def __init__(self, setup: Setup, step_limit: float | None) -> None:
+        self.setup = setup
+        self.state = setup.home_state()
         self.phases = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
         self.rank: int | None = None
         """Rank of the Jacobian in the last step, None where the method does not reveal it."""
@@ -40,13 +41,13 @@ class MethodResolver(ABC):
 
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
-        kinematics = self.arm.kinematics
+        kinematics = self.setup.kinematics
         kinematics.evaluate(self.state.nodes)
         return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` to `end` in one step; a blocked step has its reason."""
-        dt = self.arm.dt if dt is None else dt
+        dt = self.setup.dt if dt is None else dt
         self._steps += 1
         self._mark = perf_counter()
         try:
@@ -55,16 +56,16 @@ class MethodResolver(ABC):
         except (SolverError, CurveError, np.linalg.LinAlgError) as error:
             reason = f"step {self._steps}: {error}"
             return _step(StepStatus.BLOCKED, 0.0, self.state, reason)
-        kinematics = self.arm.kinematics
+        kinematics = self.setup.kinematics
         kinematics.evaluate(nodes)
-        lengths = frozen(kinematics.lengths)
+        lengths = frozen(kinematics.quantities)
         before = self.state
         self.state = State(
             time=before.time + dt,
             nodes=frozen(nodes),
             control_vertices=frozen(vertices),
             lengths=lengths,
-            length_rates=frozen((lengths - before.lengths) / dt),
+            rates=frozen((lengths - before.quantities) / dt),
             motion=frozen(nodes - before.nodes),
             duration=dt,
         )
@@ -83,7 +84,7 @@ class MethodResolver(ABC):
         """Return node positions, control vertices and progress after the step, or raise SolverError."""
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
-        truss, lengths = self.arm.truss, self.arm.home_lengths
+        truss, lengths = self.setup.truss, self.setup.arm.home_quantities
         asked = float(np.linalg.norm(path.at(end).position - path.at(start).position))
         limit = self._limit or 0.5 * float(lengths.min()) + 3.0 * asked
         moved = float(np.max(np.abs(nodes - self.state.nodes)))
@@ -96,7 +97,7 @@ class MethodResolver(ABC):
             raise SolverError(f"member {truss.member_names[int(np.argmin(ratio))]} collapsed to a point")
 
 
-def arm_without_curve(problem: Problem) -> Arm:
+def arm_without_curve(problem: Problem) -> Setup:
     """Return the arm of a problem without its curve, for methods that solve no QP of this package.
 
     Raises

@@ -20,7 +20,7 @@ class Entries:
     """Where the values of one segment's kernel stand in its matrix (rows, own columns then those before)."""
 
     def __init__(self, layout: Layout, segment: Segment) -> None:
-        truss = layout.truss
+        truss = truss_of(layout.arm)
         column = layout.node_column[layout.member_nodes[segment.fixed]]
         row, slot = np.nonzero(column >= 0)
         axis = np.arange(3)
@@ -62,7 +62,7 @@ class SegmentSystem:
     def __init__(
         self, layout: Layout, segment: Segment, home_lengths: Array, kernels: dict[tuple[int, bool], Kernel]
     ) -> None:
-        truss = layout.truss
+        truss = truss_of(layout.arm)
         self.segment = segment
         self._nodes = layout.member_nodes[segment.fixed].ravel()
         self._home = home_lengths[segment.fixed]
@@ -137,11 +137,11 @@ def _function(layout: Layout, members: int, turns: bool) -> ca.Function:
     frame = [ca.MX.sym("cosines", 3), ca.MX.sym("sines", 3), ca.MX.sym("alignment", 3, 3)] if turns else []
     inputs += frame
     arguments = [nodes]
-    if layout.truss.joints is not None:
+    if truss_of(layout.arm).joints is not None:
         offsets = ca.MX.sym("offsets", 3, 2 * members)
         inputs.append(offsets)
         arguments.append(offsets)
-    outputs += list(member_function(layout.truss).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
+    outputs += list(member_function(truss_of(layout.arm)).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
     if turns:
         outputs += list(frame_function(3)(face, *frame))
     return ca.Function("segment", inputs, outputs)

@@ -73,7 +73,7 @@ def make_segments(layout: Layout, turns: str | None) -> tuple[Segment, ...]:
     CurveError
         The truss has no faces, does not end in its end effector, or a segment has more equations than motions.
     """
-    truss = layout.truss
+    truss = truss_of(layout.arm)
     faces = len(truss.faces)
     if faces < 2:
         raise CurveError("a truss without faces cannot track a curve")
@@ -93,7 +93,7 @@ def make_segments(layout: Layout, turns: str | None) -> tuple[Segment, ...]:
 
 
 def _segments(layout: Layout, partition: list[tuple[int, str]]) -> list[Segment]:
-    truss = layout.truss
+    truss = truss_of(layout.arm)
     last_stage = [int(truss.stage[truss.faces[face]].max()) for face, _ in partition]
     last_stage[-1] = int(truss.stage.max())
     latest = truss.stage[layout.member_nodes].max(axis=1)

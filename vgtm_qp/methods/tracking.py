@@ -44,7 +44,7 @@ class Tracker:
         parallel: bool,
     ) -> None:
         self.segments = tuple(segments)
-        self._free, self._columns = layout.truss.free, layout.node_columns
+        self._free, self._columns = truss_of(layout.arm).free, layout.node_columns
         self._kinematics = kinematics
         self._furthest = 2.0 * float(home_lengths.max())
         self._condensation: Condensation | None = None

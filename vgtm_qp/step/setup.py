@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm, Kinematics, Pose
+from vgtm_qp.arm.truss.arm import truss_of
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.base import BaseMotion
@@ -78,6 +80,11 @@ class Setup:
     jams: tuple[tuple[str, float], ...] = ()
     slow_approach: bool = True
     measure: Clearance | None = None
+
+    @property
+    def truss(self) -> Truss:
+        """The truss, for what knows trusses alone; TrussError for any other arm."""
+        return truss_of(self.arm)
 
     def least_clearance(self, q: Array, time: float, among: str = "all") -> float:
         """Return the exact least surface distance at a configuration, m; see ``Clearance.least``."""

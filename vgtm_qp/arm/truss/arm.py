@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Label, MotionPattern, Pose, Stations, Tip
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.kinematics import TrussKinematics
 from vgtm_qp.arm.truss.lengths import LengthRows
 from vgtm_qp.arm.truss.symbols import TrussSymbols
 from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
+from vgtm_qp.errors import TrussError
 
 
 class TrussArm:
@@ -168,3 +169,16 @@ class TrussArm:
         """See ``arm.Arm``: gradients (3 Q M,) and right-hand sides (M,)."""
         gradient, rhs = values
         return LengthRows(self.truss, gradient.reshape(len(rhs), -1, 3), rhs)
+
+
+def truss_of(arm: Arm) -> Truss:
+    """Return the truss of an arm, for methods that know trusses alone.
+
+    Raises
+    ------
+    TrussError
+        It is another arm.
+    """
+    if not isinstance(arm, TrussArm):
+        raise TrussError(f"a {arm.kind} arm is no truss; expected [truss]")
+    return arm.truss

@@ -114,6 +114,11 @@ class Truss:
         return np.flatnonzero(self.actuated)
 
     @cached_property
+    def fixed(self) -> Index:
+        """(n_l,) indices of the fixed members."""
+        return np.flatnonzero(~self.actuated)
+
+    @cached_property
     def member_nodes(self) -> Index:
         """(M, Q) nodes that each member's length depends on: two for pin joints, six for offset joints."""
         if self.joints is None:
