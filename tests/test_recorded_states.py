@@ -1,0 +1,53 @@
+"""A change of the package's inside changes no state: cases of every kind against states on record."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import pytest
+from recorded_states import CASES, Recording, differences, load, record
+
+WRONG_WITHOUT_A_COMPILER = {
+    "loop longeron 5, accelerations, no curve",
+    "loop octahedral 5",
+    "loop octahedral 6, locks",
+    "loop octahedral 6, pointing",
+}
+"""Where an interpreted function fails, and what it returned is taken for an answer all the same; to be mended."""
+
+
+def _has_compiler() -> bool:
+    wanted = os.environ.get("VGTM_CC")
+    if wanted is not None:
+        return wanted not in ("", "none") and shutil.which(wanted) is not None
+    return any(shutil.which(name) for name in ("cc", "gcc", "clang"))
+
+
+@pytest.fixture(scope="module")
+def recorded() -> dict[str, Recording]:
+    return load()
+
+
+def test_each_case_is_on_record(recorded):
+    assert set(recorded) == set(CASES)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_states_are_those_on_record(name, recorded):
+    lines = differences(CASES[name], recorded[name], record(CASES[name]))
+    if lines and name in WRONG_WITHOUT_A_COMPILER and not _has_compiler():
+        pytest.xfail("return codes of interpreted functions are not heeded yet")
+    assert not lines, "\n".join([name, *lines])
+
+
+def test_what_differs_is_found(recorded):
+    name = "bundled five_bay_free"
+    there = recorded[name]
+    nodes = there.arrays["nodes"].copy()
+    nodes[2, 4, 1] += 2e-9
+    moved = Recording({**there.arrays, "nodes": nodes}, there.facts)
+    assert not differences(CASES[name], there, there)
+    assert differences(CASES[name], there, moved)[0].startswith("nodes[2, 4, 1] differs by 2e-09")
+    ended = Recording(there.arrays, {**there.facts, "status": "blocked"})
+    assert differences(CASES[name], there, ended) == ["status: 'blocked', on record 'solved'"]
