@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.scatter import LengthScatter
 from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.geometry.bodies import Bodies
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -310,6 +311,10 @@ class Arm(Protocol):
     motion_pattern : MotionPattern
     bays : Bays or None
         What the arm's own structure offers for speed.
+    bodies : Bodies
+        Spanned by the points of :meth:`points`.
+    segments : int
+        Number of bays or joints.
     """
 
     kind: str
@@ -350,6 +355,10 @@ class Arm(Protocol):
     def motion_pattern(self) -> MotionPattern: ...
     @property
     def bays(self) -> Bays | None: ...
+    @property
+    def bodies(self) -> Bodies: ...
+    @property
+    def segments(self) -> int: ...
 
     def nodes(self, q: Array) -> Array:
         """Return (N, 3) the nodes at a configuration, m."""
@@ -382,6 +391,22 @@ class Arm(Protocol):
 
     def points(self, q: Array) -> Array:
         """Return (P, 3) the points that span the bodies, m."""
+        ...
+
+    def deviation(self, start: Array, end: Array) -> float:
+        """Return a bound of how far points leave their chords between two configurations, m, between which q is straight."""
+        ...
+
+    def reach(self) -> Array:
+        """Return (N_c,) a bound of the distance from each base node to the tip in any pose, m."""
+        ...
+
+    def hollow(self) -> float:
+        """Return a bound of the distance from the tip to the nearest point on the axis of a body, m."""
+        ...
+
+    def unreachable(self) -> tuple[str, ...]:
+        """Return in words the tip motions that no actuator can start at home."""
         ...
 
     def travel(self, motion: Array) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.banded import BandedSystem
 from vgtm_qp.methods.objectives import DEFAULT_TERMS, Terms, TrussObjective

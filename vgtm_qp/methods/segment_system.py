@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.kinematics import frame_constants, frame_function, member_function
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment

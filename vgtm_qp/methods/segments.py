@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import CurveError
 from vgtm_qp.qp.layout import Layout
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError

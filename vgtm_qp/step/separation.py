@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.geometry.clearance import BetweenReport, Clearance, NearPairs, Pair
 from vgtm_qp.geometry.pairs import certified
 from vgtm_qp.geometry.watch import Contacts, Watch
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.joint_ways import chord_deviation
-from vgtm_qp.step.linearise import clearance_rows
+from vgtm_qp.arm.truss.chords import chord_deviation
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -66,10 +64,10 @@ class Distances:
 class Separation:
     """Rows, checks and proofs of clearance for the steps of one arm."""
 
-    def __init__(self, truss: Truss, monitor: Clearance, distances: Distances) -> None:
+    def __init__(self, arm, monitor: Clearance, distances: Distances) -> None:
         self.monitor = monitor
         self.distances = distances
-        self.truss = truss
+        self.truss = truss = arm.truss
         self._ends = None if truss.joints is None else EndKinematics(truss)
         self._watch = Watch(monitor) if Watch.serves(monitor) else None
         self._corners = (
@@ -237,7 +235,7 @@ class Separation:
 
     def _angles(self, X: Array) -> tuple[Array, Array, Array]:
         """Return angles (K,), rad, and the two members' vectors (K, 3) away from the node they share, m."""
-        ends = member_ends(self.truss, X)
+        ends = self.truss.member_ends(X)
         along = ends[:, 1] - ends[:, 0]
         first, second = (
             np.where(self._corners[:, e, 1, None] == 0, 1.0, -1.0) * along[self._corners[:, e, 0]]
@@ -283,3 +281,22 @@ def _corners(truss: Truss) -> Index:
             at.setdefault(node, []).append((member, end))
     found = [(a, b) for meeting in at.values() for k, a in enumerate(meeting) for b in meeting[k + 1 :]]
     return np.array(found, dtype=np.int64).reshape(-1, 2, 2)
+
+
+def clearance_rows(
+    monitor: Clearance, pairs: NearPairs, safe: float, self_safe: float, fraction: float = 1.0
+) -> ClearanceRows:
+    ends = monitor.members[pairs.member]
+    nodes = np.concatenate((ends, ends), axis=1)
+    coefficients = np.zeros((len(pairs.distance), 4, 3))
+    pull = fraction * pairs.normal
+    coefficients[:, 1] = pairs.t[:, None] * pull
+    coefficients[:, 0] = pull - coefficients[:, 1]
+    lower = safe - pairs.distance
+    mutual = np.flatnonzero(pairs.is_self)
+    if len(mutual):
+        nodes[mutual, 2:] = monitor.members[pairs.other[mutual]]
+        coefficients[mutual, 3] = -pairs.t_other[mutual, None] * pull[mutual]
+        coefficients[mutual, 2] = -pull[mutual] - coefficients[mutual, 3]
+        lower[mutual] += self_safe - safe
+    return ClearanceRows(nodes, coefficients, lower, pairs.name)

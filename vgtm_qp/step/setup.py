@@ -12,6 +12,7 @@ from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.solvers import DEFAULT_SOLVER
 from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.state import State, frozen
@@ -88,7 +89,7 @@ class Setup:
 
     def least_clearance(self, q: Array, time: float, among: str = "all") -> float:
         """Return the exact least surface distance at a configuration, m; see ``Clearance.least``."""
-        points = self.arm.points(q)
+        points = self.arm.nodes(q)
         if self.measure is None:
             return self.monitor.least(points, time, among=among)[0]
         return self.measure.least(points, time, among=among)[0]

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.setup.truss.kinematics import Kinematics
 from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.solve import solve

@@ -10,11 +10,15 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
 from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.arm.truss.kinematics import TrussKinematics
 from vgtm_qp.arm.truss.lengths import LengthRows
+from vgtm_qp.arm.truss.mobility import describe
+from vgtm_qp.arm.truss.reach import hollow, longest_ways
 from vgtm_qp.arm.truss.symbols import TrussSymbols
 from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
 from vgtm_qp.errors import TrussError
+from vgtm_qp.geometry.bodies import Bodies, capsules
 
 
 class TrussArm:
@@ -156,6 +160,37 @@ class TrussArm:
     def travel(self, motion: Array) -> float:
         """See ``arm.Arm``."""
         return float(np.abs(motion).max())
+
+    def reach(self) -> Array:
+        """See ``arm.Arm``."""
+        tip = self.end_effector
+        return np.asarray(
+            longest_ways(self.truss, np.flatnonzero(self.truss.base))[:, tip.nodes] @ np.abs(tip.weights)
+        )
+
+    def hollow(self) -> float:
+        """See ``arm.Arm``."""
+        return hollow(self.truss)
+
+    def unreachable(self) -> tuple[str, ...]:
+        """See ``arm.Arm``."""
+        return describe(self.truss).unreachable
+
+    def deviation(self, start: Array, end: Array) -> float:
+        """See ``arm.Arm``: offset joints turn on the way."""
+        return 2.0 * chord_deviation(self.truss, start, end)
+
+    @property
+    def segments(self) -> int:
+        """Number of bays."""
+        return self.truss.bays
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """The members, between their nodes or, in offset joints, between ends of their own."""
+        truss = self.truss
+        points = truss.members if truss.joints is None else np.arange(2 * truss.member_count).reshape(-1, 2)
+        return capsules(points, truss.radius, truss.member_names, joints=truss.members)
 
     def kinematics(self, *, compiled: bool = True) -> TrussKinematics:
         """See ``arm.Arm``."""
