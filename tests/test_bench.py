@@ -12,6 +12,7 @@ from typing import Any, get_args
 import jsonschema
 import numpy as np
 import pytest
+from vgtm_qp.step.arm import build_arm
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.joints import member_ends
@@ -24,7 +25,6 @@ from vgtm_qp.cli import bench as command
 from vgtm_qp.cli import main
 from vgtm_qp.ipopt.linearised import NonlinearStep
 from vgtm_qp.maneuver.plan import Plan, make_plan
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
 from vgtm_qp.step.path import Path as TipPath
 from vgtm_qp.step.state import State

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from arms import make_layout
 from test_engines import assert_same_answer, make_step, pressing
+from vgtm_qp.step.linearise import Linearisation, QPInput
 
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.build import lock_members
@@ -21,7 +22,6 @@ from vgtm_qp.qp.long.values import PeriodValues
 from vgtm_qp.step import arm as arm_module
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import Accuracy, PlainEngine
-from vgtm_qp.step.linearise import Linearisation, QPInput
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, StepStatus
 

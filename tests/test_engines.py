@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import TRUSSES, make_layout, random_pose
+from vgtm_qp.step.linearise import Linearisation, QPInput, Target
 
 from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.curve.families import make_family
@@ -16,9 +17,9 @@ from vgtm_qp.qp.graph import elimination_stages
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.shape import CurveShape, turn_rows
 from vgtm_qp.qp.solvers import make_solver
+from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.engine import Accuracy, FusedEngine, PlainEngine
-from vgtm_qp.step.linearise import Linearisation, QPInput, Target
-from vgtm_qp.step.path import Path, rotation_from_vector
+from vgtm_qp.step.path import Path
 
 ELIMINABLE = [name for name in TRUSSES if name != "graph"]
 TRACKS = {"hexapod": ("position", "orientation"), "longeron": ("x", "pointing")}

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from vgtm_qp.step.arm import build_arm
 
 import vgtm_qp as vq
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.engine import FusedEngine, PlainEngine
 
 SCENES = [

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.linearise import Linearisation, Target
 
 import vgtm_qp as vq
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.solvers import _Piqp, make_solver
-from vgtm_qp.step.arm import build_arm
-from vgtm_qp.step.linearise import Linearisation, Target
 from vgtm_qp.step.path import Path
 
 

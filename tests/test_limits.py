@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from vgtm_qp.step.limits import braking_speed, length_box
 
 positive = st.floats(0.01, 10.0)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from method_problems import MODULES, free_problem, run
+from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.linearise import Linearisation, Target
 
 import vgtm_qp as vq
 from vgtm_qp.errors import CurveError
@@ -17,8 +19,6 @@ from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.arm import build_arm
-from vgtm_qp.step.linearise import Linearisation, Target
 
 ALL_TERMS = ["node_rate", "actuator_rate", "stroke_centring"]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from arms import TRUSSES, arm_problem, central_differences, random_pose
+from vgtm_qp.step.arm import build_arm
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.errors import TrussError
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.study.scenes import random_scene
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
+from vgtm_qp.step.arm import build_arm
 
 from vgtm_qp.ipopt.separating import IpoptStepper
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.study import Study
 from vgtm_qp.study.robustness import run, tasks, text
 from vgtm_qp.study.scenes import MODULES, SAFE, random_scene

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from arms import arm_problem
 from scipy.spatial.transform import Rotation
+from vgtm_qp.step.arm import build_arm
 
 import vgtm_qp as vq
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.errors import CurveError, GoalError, ProblemError
 from vgtm_qp.qp.shape import turn_rows
-from vgtm_qp.step.arm import build_arm
 from vgtm_qp.step.checks import find_warnings
 from vgtm_qp.step.resolver import Resolver, StepStatus
 

@@ -10,6 +10,7 @@ import pytest
 from arms import make_layout, mast, random_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vgtm_qp.step.linearise import Linearisation, Target
 
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.build import lock_members
@@ -29,8 +30,8 @@ from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import make_solver
-from vgtm_qp.step.linearise import Linearisation, Target
-from vgtm_qp.step.path import Path, rotation_from_vector
+from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.step.path import Path
 
 MODULES = {
     "octahedral": lambda **kw: modules.octahedral(4, **kw),

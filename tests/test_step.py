@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from arms import TRUSSES, arm_problem, central_differences, make_layout, random_pose
 from scipy.spatial.transform import Rotation
+from vgtm_qp.step.linearise import Linearisation, Target, clearance_rows
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.joints import member_ends
@@ -17,8 +18,8 @@ from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.linearise import Linearisation, Target, clearance_rows
-from vgtm_qp.step.path import Path, turn_between, vector_from_rotation
+from vgtm_qp.rotation import turn_between, vector_from_rotation
+from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, StepStatus
 from vgtm_qp.step.task import TipTask
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from vgtm_qp.geometry.clearance import NearPairs
 from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
 from vgtm_qp.maneuver.plan import Plan
-from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.path import PathPoint
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 
 Array = NDArray[np.float64]

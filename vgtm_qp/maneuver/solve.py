@@ -21,10 +21,10 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.result.manifest import make_manifest, mesh_record
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.resolver import Resolver, Step, StepStatus
 from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.verify import verify as check

@@ -13,8 +13,8 @@ from vgtm_qp.methods.resolver import MethodResolver
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.methods.tracking import Tracker
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.build import build_arm
 from vgtm_qp.rows.limits import actuator_box
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
 
 Array = NDArray[np.float64]

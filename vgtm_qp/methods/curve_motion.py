@@ -16,8 +16,9 @@ from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE, pose_displacement
 from vgtm_qp.problem import Problem
+from vgtm_qp.rotation import turn_between, vector_from_rotation
+from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.path import PathPoint, turn_between, vector_from_rotation
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.problem import Problem
+from vgtm_qp.rotation import vector_from_rotation
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.path import Path, PathPoint, vector_from_rotation
+from vgtm_qp.step.path import Path, PathPoint
 from vgtm_qp.step.resolver import Step, StepStatus
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 
 Array = NDArray[np.float64]

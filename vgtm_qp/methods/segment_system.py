@@ -11,7 +11,7 @@ from vgtm_qp.arm.truss.kinematics import frame_constants, frame_function, member
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.step.path import turn_between, vector_from_rotation
+from vgtm_qp.rotation import turn_between, vector_from_rotation
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

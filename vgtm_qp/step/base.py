@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arm.arm import Pose
-from vgtm_qp.step.path import Path, rotation_from_vector
+from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.step.path import Path
 
 
 class _TimedPose(Protocol):

@@ -24,11 +24,11 @@ from vgtm_qp.qp.long.select import STAGED_ACTUATORS
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
+from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.curve import home_curve
 from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
-from vgtm_qp.step.path import rotation_from_vector
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import TipTask
 

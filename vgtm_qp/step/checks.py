@@ -14,8 +14,8 @@ from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.problem.table import Place, shown
-from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.path import PathPoint
+from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.errors import GoalError
-from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
+from vgtm_qp.rotation import rotation_from_vector, turn_between
+from vgtm_qp.step.path import Path
 from vgtm_qp.step.task import TipTask
 
 Array = NDArray[np.float64]

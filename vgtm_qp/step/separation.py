@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.geometry.clearance import BetweenReport, Clearance, NearPairs, Pair
 from vgtm_qp.geometry.pairs import certified
 from vgtm_qp.geometry.watch import Contacts, Watch
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.arm.truss.chords import chord_deviation
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

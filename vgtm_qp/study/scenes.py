@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem
+from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.path import rotation_from_vector
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.problem import Problem
 from vgtm_qp.result.result import Result
-from vgtm_qp.step.path import rotation_from_vector
+from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.verify.arm import RecordedArm
 
 Array = NDArray[np.float64]

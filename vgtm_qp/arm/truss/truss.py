@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.joints import Joints, joint_ends
 from vgtm_qp.arm.scatter import LengthScatter
+from vgtm_qp.arm.truss.joints import Joints, joint_ends
 from vgtm_qp.errors import TrussError, nearest
 
 Array = NDArray[np.float64]
