@@ -11,9 +11,9 @@ from arms import mast
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss import modules
+from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.cli import main
-from vgtm_qp.step.joint_ways import chord_deviation
 from vgtm_qp.step.resolver import Resolver
 
 BASE = {

@@ -270,7 +270,7 @@ def _assemble(
 
 def _too_near(arm: Arm, X: Array) -> dict[str, float]:
     """Return the pairs that are nearer than they may be at home, at `X` (N, 3), and their distances, m."""
-    kept = Separation(arm.truss, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence))
+    kept = Separation(arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence), arm.body_points)
     found: dict[str, float] = {}
     for pair, distance in kept.shortfall(X, 0.0).items():
         name = arm.monitor.names.clearance(pair).removeprefix("clearance: member ").replace("/ member ", "/ ")

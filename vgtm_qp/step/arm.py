@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.bodies import OffsetEnds, member_bodies
 from vgtm_qp.arm.truss.build import LockError, build_truss
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.compiled import finish_compiling
@@ -35,6 +34,7 @@ from vgtm_qp.step.curve import home_curve
 from vgtm_qp.step.engine import ElasticEngine, Engine, FusedEngine, PlainEngine
 from vgtm_qp.step.linearise import Linearisation
 from vgtm_qp.step.path import rotation_from_vector
+from vgtm_qp.step.separation import BodyPoints
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
 
@@ -83,6 +83,8 @@ class Arm:
         Whether members slow down before they touch, and actuators before the ends of their strokes.
     measure : Clearance or None
         What the clearance of a state is measured with where the monitor does not see pairs of members.
+    body_points : BodyPoints or None
+        Where the members end; None where they end in the nodes.
     """
 
     truss: Truss
@@ -107,12 +109,15 @@ class Arm:
     jams: tuple[tuple[str, float], ...] = ()
     slow_approach: bool = True
     measure: Clearance | None = None
+    body_points: BodyPoints | None = None
+
+    def points(self, X: Array) -> Array:
+        """Return the points (P, 3) that span the monitor's bodies at node positions `X` (N, 3), m."""
+        return X if self.body_points is None else self.body_points.points(X)
 
     def least_clearance(self, X: Array, time: float, among: str = "all") -> float:
         """Return the exact least surface distance at node positions `X` (N, 3), m; see ``Clearance.least``."""
-        if self.measure is None:
-            return self.monitor.least(X, time, among=among)[0]
-        return self.measure.least(X, time, among=among)[0]
+        return (self.measure or self.monitor).least(self.points(X), time, among=among)[0]
 
     def base_at(self, time: float) -> tuple[Array | None, Array | None]:
         """Return positions (N, 3), m, whose rows at base nodes are theirs at `time`, and the base's rotation (3, 3).
@@ -165,12 +170,11 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
         "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
         "safe": clearance.safe,
         "influence": clearance.influence,
-        "member_names": truss.member_names,
     }
-    if truss.joints is not None:
-        options["ends"] = partial(member_ends, truss)
     engine = make_engine(problem.method.solver, layout, kinematics, task, compiled=compiled)
-    monitor = Clearance(truss.members, truss.radius, self_collision=clearance.self_collision, **options)
+    bodies = member_bodies(truss)
+    body_points = None if truss.joints is None else OffsetEnds(truss, compiled=compiled)
+    monitor = Clearance(bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
     return Arm(
         truss=truss,
@@ -194,7 +198,8 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Arm:
         base_motion=BaseMotion(spec.base_motion, truss) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
-        measure=None if clearance.self_collision else Clearance(truss.members, truss.radius, **options),
+        measure=None if clearance.self_collision else Clearance(bodies, **options),
+        body_points=body_points,
     )
 
 

@@ -164,6 +164,7 @@ class Attempt:
         tracking: HardTracking | None = None,
         tolerances: Tolerances | None = None,
         max_qps: int = 8,
+        height: float,
     ) -> None:
         self.engine = engine
         self.tracking = tracking
@@ -173,7 +174,7 @@ class Attempt:
         self.max_qps = max_qps
         self.phases = Phases()
         kept = self.tolerances
-        self._accuracy = Accuracy(kept.member, kept.tip, kept.settling * separation.truss.height)
+        self._accuracy = Accuracy(kept.member, kept.tip, kept.settling * height)
 
     def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Outcome:
         """Return the outcome of moving from `state` along the target's piece of path; no state is changed.

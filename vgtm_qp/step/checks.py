@@ -14,6 +14,7 @@ from vgtm_qp.arm.truss.mobility import RANK_TOLERANCE, actuator_response, descri
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
 from vgtm_qp.errors import Mistake
+from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
@@ -106,14 +107,14 @@ def _at_home(problem: Problem, arm: Arm) -> Iterator[tuple[float, Mistake]]:
     rules = problem.clearance
     safe = rules.safe
     self_safe = safe if rules.self_safe is None else rules.self_safe
-    pairs = arm.monitor.near(arm.truss.home, 0.0, reach=safe, self_reach=self_safe)
+    pairs = arm.monitor.near(arm.points(arm.truss.home), 0.0, reach=safe, self_reach=self_safe)
     names = arm.truss.member_names
     owner = np.where(pairs.is_self, -1, 0)
     owner[~pairs.is_self] = arm.monitor.pieces.obstacle[pairs.other[~pairs.is_self]]
     for index in np.unique(owner):
         rows = np.flatnonzero(owner == index)
         k = rows[np.argmin(pairs.distance[rows])]
-        distance, member = float(pairs.distance[k]), names[pairs.member[k]]
+        distance, member = float(pairs.distance[k]), names[pairs.body[k]]
         place: Place
         if index < 0:
             place, needed = ("truss", "member_radius"), self_safe
@@ -163,7 +164,7 @@ def _inside_obstacles(problem: Problem, arm: Arm, hollow: float) -> Iterator[Mis
     truss, safe = arm.truss, problem.clearance.safe
     at_tip = np.isin(truss.members, truss.tip).any(axis=1)
     needed = safe + float(truss.radius[at_tip].min())
-    point = Clearance([[0, 1]], [0.0], obstacles, safe=safe, influence=needed, self_collision=False)
+    point = Clearance(capsules([[0, 1]], 0.0), obstacles, safe=safe, influence=needed, self_collision=False)
     for target, key, value in _targets(problem):
         distance, pair = point.least(np.stack([target, target + _POINT / 2]))
         if pair is not None and distance + hollow + _POINT < needed:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.arm.truss.truss import Truss
-from vgtm_qp.geometry.clearance import Clearance, NearPairs
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers, progress_scale
 from vgtm_qp.qp.shape import turn_rows
@@ -237,27 +236,3 @@ def base_frame(truss: Truss, rotation: Array | None) -> Array:
     """Return (3, 3) the frame of the base face where the base is rotated by `rotation` (3, 3), or rests."""
     home = truss.face_frames[0]
     return home if rotation is None else np.asarray(rotation @ home)
-
-
-def clearance_rows(
-    monitor: Clearance, pairs: NearPairs, safe: float, self_safe: float, fraction: float = 1.0
-) -> ClearanceRows:
-    """Return the rows n . d(witness) >= safe - distance for near `pairs`, with `self_safe` between members.
-
-    `fraction` is where on the straight way to the end of the step the pairs were found: a displacement of the end state
-    moves that point by so much of it. A pair that is already too near may not come nearer, but is not asked to jump.
-    """
-    ends = monitor.members[pairs.member]
-    nodes = np.concatenate((ends, ends), axis=1)
-    coefficients = np.zeros((len(pairs.distance), 4, 3))
-    pull = fraction * pairs.normal
-    coefficients[:, 1] = pairs.t[:, None] * pull
-    coefficients[:, 0] = pull - coefficients[:, 1]
-    lower = safe - pairs.distance
-    mutual = np.flatnonzero(pairs.is_self)
-    if len(mutual):
-        nodes[mutual, 2:] = monitor.members[pairs.other[mutual]]
-        coefficients[mutual, 3] = -pairs.t_other[mutual, None] * pull[mutual]
-        coefficients[mutual, 2] = -pull[mutual] - coefficients[mutual, 3]
-        lower[mutual] += self_safe - safe
-    return ClearanceRows(nodes, coefficients, lower, pairs.name)

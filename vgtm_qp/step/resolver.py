@@ -90,7 +90,7 @@ class Resolver:
             arm.minimum_angle,
             approach=_APPROACH if self._slows_down else 1.0,
         )
-        self._separation = Separation(arm.truss, arm.monitor, distances)
+        self._separation = Separation(arm.monitor, distances, arm.body_points)
         truss = arm.truss
         self._starts_at_once = bool(np.isinf(truss.acceleration[truss.actuators]).all())
         # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
@@ -101,6 +101,7 @@ class Resolver:
             self._separation,
             tracking=_hard_tracking(arm),
             tolerances=Tolerances(member=member),
+            height=truss.height,
         )
         self._state = arm.home_state()
         self._actuator_names = tuple(truss.member_names[k] for k in truss.actuators)

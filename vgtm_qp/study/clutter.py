@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from vgtm_qp.arm.truss.bodies import member_bodies
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.methods.compare import markdown_table, run_method
@@ -58,6 +59,7 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
     goal = (aside * np.cos(azimuth), aside * np.sin(azimuth), -random.uniform(0.3, 0.7) * aside)
     problem = bending_problem(_BAYS, steps=steps, goal=goal)
     truss = built_truss(problem)
+    bodies = member_bodies(truss)
     target = np.array(problem.maneuver.waypoint[0].position)  # type: ignore[union-attr]
     found: list[dict[str, Any]] = []
     for _ in range(_TRIES):
@@ -69,7 +71,7 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
         if np.linalg.norm(np.maximum(np.abs(target - center) - edge / 2, 0.0)) < 0.6:
             continue
         cube = shapes.box("cube", center, edge)
-        home = Clearance(truss.members, truss.radius, [cube], safe=_SAFE, influence=0.5, self_collision=False)
+        home = Clearance(bodies, [cube], safe=_SAFE, influence=0.5, self_collision=False)
         if home.least(truss.home)[0] < _SAFE + 0.02:
             continue
         name = f"cube {len(found) + 1}"

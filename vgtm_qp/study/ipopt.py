@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.kinematics import joint_frame
-from vgtm_qp.geometry.clearance import NearPairs
+from vgtm_qp.geometry.clearance import Contacts
 from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.arm import Arm
 from vgtm_qp.step.path import PathPoint
@@ -95,14 +95,19 @@ class IpoptStepper:
         time = state.time + duration
         for _ in range(_RESOLVES):
             pairs = monitor.near(
-                state.nodes, state.time, arm.safe + reach, use_fcl=False, self_reach=arm.self_safe + reach
+                arm.points(state.nodes),
+                state.time,
+                arm.safe + reach,
+                self_reach=arm.self_safe + reach,
+                fcl_reach=0.0,
             )
             X = self._solve(state, goal, duration, pairs)
             if X is None or not self._close(X):
                 return None
-            if monitor.keeps(X, time, arm.safe - 1e-9, arm.self_safe - 1e-9):
+            if monitor.keeps(arm.points(X), time, arm.safe - 1e-9, arm.self_safe - 1e-9):
                 floors = (arm.safe - BETWEEN, arm.self_safe - BETWEEN)
-                if not monitor.between(state.nodes, X, state.time, time, *floors).certified:
+                way = arm.points(state.nodes), arm.points(X)
+                if not monitor.between(*way, state.time, time, *floors).certified:
                     return None
                 arm.kinematics.evaluate(X)
                 lengths = frozen(arm.kinematics.lengths)
@@ -111,7 +116,7 @@ class IpoptStepper:
             reach *= 2.0
         return None
 
-    def _solve(self, state: State, goal: PathPoint, duration: float, pairs: NearPairs) -> Array | None:
+    def _solve(self, state: State, goal: PathPoint, duration: float, pairs: Contacts) -> Array | None:
         arm = self.arm
         truss = arm.truss
         actuators = truss.actuators
@@ -160,10 +165,10 @@ class IpoptStepper:
             count += 2
         return ca.vertcat(*rows), np.zeros(count)
 
-    def _pair(self, pairs: NearPairs, k: int, time: float) -> tuple[ca.SX, Array, ca.SX, Array]:
+    def _pair(self, pairs: Contacts, k: int, time: float) -> tuple[ca.SX, Array, ca.SX, Array]:
         """Return the dual variables of a pair, their first values, and rows with their lower bounds."""
         arm, truss = self.arm, self.arm.truss
-        member, other = int(pairs.member[k]), int(pairs.other[k])
+        member, other = int(pairs.body[k]), int(pairs.other[k])
         a = self._ends[member]
         if pairs.is_self[k]:
             n = ca.SX.sym("n", 3)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry import shapes
+from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.arm import Arm, build_arm
@@ -117,7 +118,7 @@ def random_shape(arm: Arm, random: np.random.Generator) -> Array:
             goal[actuators] += share * (wanted - goal[actuators])
             if not _newton(arm, X, goal, singular):
                 break
-            if arm.monitor.least(X, among="members")[0] < SAFE:
+            if arm.monitor.least(arm.points(X), among="members")[0] < SAFE:
                 break
             good = X.copy()
             if _tip_motion(arm, good) > most:
@@ -213,7 +214,6 @@ def _cubes(arm: Arm, random: np.random.Generator, shape: Array | None, count: in
 
 def _distance(arm: Arm, obstacle: shapes.Obstacle, X: Array) -> float:
     truss = arm.truss
-    monitor = Clearance(
-        truss.members, truss.radius, [obstacle], safe=SAFE, influence=0.5, self_collision=False
-    )
+    between_nodes = capsules(truss.members, truss.radius)
+    monitor = Clearance(between_nodes, [obstacle], safe=SAFE, influence=0.5, self_collision=False)
     return monitor.least(X)[0]

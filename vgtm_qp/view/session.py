@@ -178,8 +178,9 @@ class Session:
 
     def reading(self) -> Reading:
         """Return what the instruments show now."""
-        monitor, state = self._resolver.arm.monitor, self.state
-        clearance, pair = monitor.least(state.nodes, state.time, among="obstacles")
+        arm, state = self._resolver.arm, self.state
+        monitor, points = arm.monitor, arm.points(state.nodes)
+        clearance, pair = monitor.least(points, state.time, among="obstacles")
         last = self._last
         outcome = "at rest"
         if last is not None:
@@ -190,7 +191,7 @@ class Session:
             stopped_by=self._held_by,
             active=last.active if last is not None else (),
             clearance=clearance,
-            self_clearance=monitor.least(state.nodes, state.time, among="members")[0],
+            self_clearance=monitor.least(points, state.time, among="members")[0],
             nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),
             step_time=self._step_time,
         )

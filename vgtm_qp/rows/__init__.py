@@ -1,0 +1,1 @@
+"""Rows of the QP: one file a kind."""
