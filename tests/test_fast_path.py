@@ -24,9 +24,9 @@ def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, cha
     fast, plain = vq.Resolver(problem), vq.Resolver(build_arm(problem, compiled=False))
     assert isinstance(fast.arm.engine, FusedEngine)
     assert isinstance(plain.arm.engine, PlainEngine)
-    watched = fast._separation._watch is not None
+    watched = fast.arm.monitor._watch is not None
     assert watched == (fast.arm.monitor.self_collision or bool(problem.obstacle))
-    plain._separation._watch = None
+    plain.arm.monitor._watch = None
     plan = make_plan(problem, *fast.tip())
     value, compared, furthest = plan.path.start, 0, 0.0
     for mark in plan.marks.tolist():

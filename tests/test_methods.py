@@ -247,7 +247,7 @@ def test_the_potential_gradient_is_that_of_the_potential() -> None:
         distance = arm.monitor.near(nodes, 0.0, arm.influence).distance
         return float(np.sum(0.5 * (arm.influence / distance - 1.0) ** 2))
 
-    gradient, blocks = potential_field(arm.monitor, X, 0.0, arm.influence)
+    gradient, blocks = potential_field(arm, X, 0.0)
     assert np.abs(gradient).max() > 0.1
     assert np.linalg.eigvalsh(blocks).min() > -1e-9
     for _ in range(5):

@@ -47,7 +47,9 @@ def beside_a_cube(joint_offset=0.1, **more):
 
 
 def separation_of(arm):
-    return Separation(arm.truss, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence, margin=0.0))
+    return Separation(
+        arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence, margin=0.0), arm.body_points
+    )
 
 
 def test_clearance_rows_are_the_derivatives_of_the_distances():
@@ -63,7 +65,7 @@ def test_clearance_rows_are_the_derivatives_of_the_distances():
     change = np.einsum("rsc,rsc->r", rows.coefficients, step[rows.nodes])
 
     def distances(Y):
-        pairs = monitor.near(Y, 0.0, 0.6, use_fcl=False)
+        pairs = monitor.near(arm.points(Y), 0.0, 0.6, fcl_reach=0.0)
         found = {}
         for k in range(len(pairs)):
             found[pairs.name(k)] = min(found.get(pairs.name(k), np.inf), float(pairs.distance[k]))
@@ -98,14 +100,15 @@ def test_a_proof_of_the_way_holds_at_every_instant_of_it():
         start, end = (truss.home + 0.05 * rng.normal(size=truss.home.shape) for _ in range(2))
         end = start + 0.5 * (end - start)
         least = min(
-            monitor.least(start + s * (end - start), 0.0, among="obstacles")[0] for s in np.linspace(0, 1, 41)
+            arm.least_clearance(start + s * (end - start), 0.0, among="obstacles")
+            for s in np.linspace(0, 1, 41)
         )
         report = separation.between(start, end, 0.0, 0.0, {})
         if report.certified:
             certified += 1
             assert least >= arm.safe - 5e-5 - 1e-9
         else:
-            assert least < arm.safe + 1e-3 or not monitor.keeps(end, 0.0, 0.0, arm.self_safe)
+            assert least < arm.safe + 1e-3 or not monitor.keeps(arm.points(end), 0.0, 0.0, arm.self_safe)
             assert np.all((report.fraction >= 0.0) & (report.fraction <= 1.0))
     assert certified > 0
 

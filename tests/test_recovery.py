@@ -12,6 +12,7 @@ from vgtm_qp.step.joint_ways import chord_deviation
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss import modules
+from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver

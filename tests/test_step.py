@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from vgtm_qp.step.linearise import Linearisation, Target, clearance_rows
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.bodies import member_bodies
 from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.errors import GoalError, ProblemError, VgtmError
@@ -211,7 +212,7 @@ def obstacles():
 def pair_distance(monitor, member, other, is_self, X):
     """The exact surface distance of one pair, by asking for all near pairs."""
     pairs = monitor.near(X, 0.0, 3.0, self_reach=3.0)
-    chosen = (pairs.member == member) & (pairs.other == other) & (pairs.is_self == is_self)
+    chosen = (pairs.body == member) & (pairs.other == other) & (pairs.is_self == is_self)
     return float(np.min(pairs.distance[chosen]))
 
 
@@ -222,28 +223,28 @@ def test_clearance_rows_are_the_derivatives_of_the_exact_distances(name, fractio
     truss = TRUSSES[name](member_radius=0.02)
     rng = np.random.default_rng(5)
     state, end = random_pose(truss, rng, 0.03), random_pose(truss, rng, 0.03)
-    monitor = Clearance(
-        truss.members, truss.radius, obstacles(), safe=0.05, influence=0.6, member_names=truss.member_names
-    )
+    monitor = Clearance(member_bodies(truss), obstacles(), safe=0.05, influence=0.6)
     safe, self_safe = 0.07, 0.03
 
     def between(X):
         return state + fraction * (X - state)
 
     pairs = monitor.near(between(end), 0.0, 0.6, self_reach=1.0)
-    rows = clearance_rows(monitor, pairs, safe, self_safe, fraction)
-    assert len(rows) == len(pairs) > 10
+    coefficients, lower = clearance_rows(
+        pairs.distance, pairs.normal, pairs.weights, pairs.is_self, safe, self_safe, fraction=fraction
+    )
+    assert len(lower) == len(pairs) > 10
     assert pairs.is_self.any()
     assert (~pairs.is_self).any()
     floor = np.where(pairs.is_self, self_safe, safe)
-    np.testing.assert_allclose(rows.lower, floor - pairs.distance, atol=1e-14)
+    np.testing.assert_allclose(lower, floor - pairs.distance, atol=1e-14)
     compared = 0
-    for k in range(len(rows)):
-        member, other, is_self = int(pairs.member[k]), int(pairs.other[k]), bool(pairs.is_self[k])
-        if np.sum((pairs.member == member) & (pairs.other == other) & (pairs.is_self == is_self)) > 1:
+    for k in range(len(lower)):
+        member, other, is_self = int(pairs.body[k]), int(pairs.other[k]), bool(pairs.is_self[k])
+        if np.sum((pairs.body == member) & (pairs.other == other) & (pairs.is_self == is_self)) > 1:
             continue
         gradient = np.zeros_like(end)
-        np.add.at(gradient, rows.nodes[k], rows.coefficients[k])
+        np.add.at(gradient, pairs.points[k], coefficients[k])
         step = rng.normal(size=end.shape)
         h = 1e-6
         here = pair_distance(monitor, member, other, is_self, between(end))
@@ -255,9 +256,9 @@ def test_clearance_rows_are_the_derivatives_of_the_exact_distances(name, fractio
         if smooth:
             compared += 1
             assert float(np.sum(gradient * step)) == pytest.approx((ahead - behind) / (2 * h), abs=2e-5), (
-                rows.name(k)
+                pairs.name(k)
             )
-    assert compared > 0.8 * len(rows)
+    assert compared > 0.8 * len(lower)
 
 
 def test_joined_clearance_rows_keep_their_names():

@@ -315,6 +315,8 @@ class Arm(Protocol):
         Spanned by the points of :meth:`points`.
     segments : int
         Number of bays or joints.
+    leaves_chords : bool
+        Whether points do not move on straight lines where the configuration does, see :meth:`deviation`.
     """
 
     kind: str
@@ -359,6 +361,8 @@ class Arm(Protocol):
     def bodies(self) -> Bodies: ...
     @property
     def segments(self) -> int: ...
+    @property
+    def leaves_chords(self) -> bool: ...
 
     def nodes(self, q: Array) -> Array:
         """Return (N, 3) the nodes at a configuration, m."""
@@ -394,7 +398,7 @@ class Arm(Protocol):
         ...
 
     def deviation(self, start: Array, end: Array) -> float:
-        """Return a bound of how far points leave their chords between two configurations, m, between which q is straight."""
+        """Return a bound of how much nearer two points come than their chords do, m, where q moves straight."""
         ...
 
     def reach(self) -> Array:
@@ -407,6 +411,13 @@ class Arm(Protocol):
 
     def unreachable(self) -> tuple[str, ...]:
         """Return in words the tip motions that no actuator can start at home."""
+        ...
+
+    def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:
+        """Return nodes (R, S) and coefficients (R, S, 3) of rows over the displacements of points.
+
+        Given are `points` (R, 4) and `coefficients` (R, 4, 3).
+        """
         ...
 
     def travel(self, motion: Array) -> float:

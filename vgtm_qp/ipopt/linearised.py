@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
+from vgtm_qp.rows.clearance import clearance_rows
 from vgtm_qp.rows.limits import actuator_box
-from vgtm_qp.step.linearise import clearance_rows
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State
 
@@ -103,14 +103,16 @@ class NonlinearStep:
     def _clearances(self, state: State) -> Array:
         """Write the rows of the nearest pairs; return their lower bounds (24,), m. Unused rows are zero."""
         arm = self._arm
-        pairs = arm.monitor.near(state.nodes, state.time, arm.influence, use_fcl=False)
-        found = clearance_rows(arm.monitor, pairs, arm.safe, arm.self_safe)
-        nearest = np.argsort(-found.lower)[:_PAIRS]
+        near = arm.monitor.near(arm.points(state.nodes), state.time, arm.influence, fcl_reach=0.0)
+        coefficients, lower = clearance_rows(
+            near.distance, near.normal, near.weights, near.is_self, arm.safe, arm.self_safe
+        )
+        nearest = np.argsort(-lower)[:_PAIRS]
         self._rows[:] = 0.0
         floors = np.full(_PAIRS, -1.0)
-        floors[: len(nearest)] = np.minimum(found.lower[nearest], 0.0)
-        first = arm.layout.node_column[found.nodes[nearest]]
+        floors[: len(nearest)] = np.minimum(lower[nearest], 0.0)
+        first = arm.layout.node_column[near.points[nearest]]
         row, slot = np.nonzero(first >= 0)
         columns = first[row, slot][:, None] + np.arange(3)
-        np.add.at(self._rows, (row[:, None], columns), found.coefficients[nearest[row], slot])
+        np.add.at(self._rows, (row[:, None], columns), coefficients[nearest[row], slot])
         return floors

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.geometry.clearance import NearPairs
+from vgtm_qp.geometry.clearance import Contacts
 from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
 from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.path import PathPoint
@@ -78,14 +78,20 @@ class IpoptStepper:
         time = state.time + duration
         for _ in range(_RESOLVES):
             pairs = monitor.near(
-                state.nodes, state.time, setup.safe + reach, use_fcl=False, self_reach=setup.self_safe + reach
+                setup.arm.points(state.q),
+                state.time,
+                setup.safe + reach,
+                self_reach=setup.self_safe + reach,
+                fcl_reach=0.0,
             )
             X = self._solve(state, goal, duration, pairs)
             if X is None or not self._close(X):
                 return None
-            if monitor.keeps(X, time, setup.safe - 1e-9, setup.self_safe - 1e-9):
+            points = setup.arm.points(X)
+            if monitor.keeps(points, time, setup.safe - 1e-9, setup.self_safe - 1e-9):
                 floors = (setup.safe - BETWEEN, setup.self_safe - BETWEEN)
-                if not monitor.between(state.nodes, X, state.time, time, *floors).certified:
+                before = setup.arm.points(state.q)
+                if not monitor.between(before, points, state.time, time, *floors).certified:
                     return None
                 setup.kinematics.evaluate(X)
                 lengths = frozen(setup.kinematics.quantities)
@@ -94,7 +100,7 @@ class IpoptStepper:
             reach *= 2.0
         return None
 
-    def _solve(self, state: State, goal: PathPoint, duration: float, pairs: NearPairs) -> Array | None:
+    def _solve(self, state: State, goal: PathPoint, duration: float, pairs: Contacts) -> Array | None:
         setup = self.setup
         truss = setup.truss
         actuators = truss.actuators
@@ -142,10 +148,10 @@ class IpoptStepper:
             count += 2
         return ca.vertcat(*rows), np.zeros(count)
 
-    def _pair(self, pairs: NearPairs, k: int, time: float) -> tuple[ca.SX, Array, ca.SX, Array]:
+    def _pair(self, pairs: Contacts, k: int, time: float) -> tuple[ca.SX, Array, ca.SX, Array]:
         """Return the dual variables of a pair, their first values, and rows with their lower bounds."""
         setup, truss = self.setup, self.setup.truss
-        member, other = int(pairs.member[k]), int(pairs.other[k])
+        member, other = int(pairs.body[k]), int(pairs.other[k])
         a = self._symbols.ends[member]
         if pairs.is_self[k]:
             n = ca.SX.sym("n", 3)

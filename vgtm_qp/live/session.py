@@ -179,8 +179,9 @@ class Session:
 
     def reading(self) -> Reading:
         """Return the readings of the present state."""
-        monitor, state = self._resolver.setup.monitor, self.state
-        clearance, pair = monitor.least(state.nodes, state.time, among="obstacles")
+        setup, state = self._resolver.setup, self.state
+        monitor, points = setup.monitor, setup.arm.points(state.q)
+        clearance, pair = monitor.least(points, state.time, among="obstacles")
         last = self._last
         outcome = "at rest"
         if last is not None:
@@ -191,7 +192,7 @@ class Session:
             stopped_by=self._held_by,
             active=last.active if last is not None else (),
             clearance=clearance,
-            self_clearance=monitor.least(state.nodes, state.time, among="members")[0],
+            self_clearance=monitor.least(points, state.time, among="members")[0],
             nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),
             step_time=self._step_time,
         )

@@ -263,11 +263,11 @@ def _assemble(
     )
 
 
-def _too_near(setup: Setup, X: Array) -> dict[str, float]:
-    """Return the pairs below their clearance in the home pose `X` (N, 3), and their distances, m."""
-    kept = Separation(setup.truss, setup.monitor, Distances(setup.safe, setup.self_safe, setup.influence))
+def _too_near(setup: Setup, q: Array) -> dict[str, float]:
+    """Return the pairs below their clearance in the home pose `q`, and their distances, m."""
+    kept = Separation(setup.arm, setup.monitor, Distances(setup.safe, setup.self_safe, setup.influence))
     found: dict[str, float] = {}
-    for pair, distance in kept.shortfall(X, 0.0).items():
+    for pair, distance in kept.shortfall(q, 0.0).items():
         name = setup.monitor.names.clearance(pair).removeprefix("clearance: member ").replace("/ member ", "/ ")
         found[name] = min(found.get(name, np.inf), distance)
     return found

@@ -132,10 +132,10 @@ class CurveFirstResolver(MethodResolver):
         worst = int(np.argmax(beyond))
         if beyond[worst] > _SLACK:
             return f"stroke or rate: {truss.member_names[actuators[worst]]}, {beyond[worst]:.2g} m beyond"
-        time = state.time + dt
-        if not monitor.keeps(X, time, setup.safe - _SLACK, setup.self_safe - _SLACK):
+        time, points = state.time + dt, setup.arm.points(X)
+        if not monitor.keeps(points, time, setup.safe - _SLACK, setup.self_safe - _SLACK):
             return "clearance at the end of the step"
         floors = setup.safe - _BETWEEN, max(setup.self_safe - _BETWEEN, 0.0)
-        if not monitor.between(state.nodes, X, state.time, time, *floors).certified:
+        if not monitor.between(setup.arm.points(state.q), points, state.time, time, *floors).certified:
             return "clearance between the states"
         return ""

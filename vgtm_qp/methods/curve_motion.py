@@ -246,10 +246,10 @@ class CurveMotion:
     def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array, list[str]]:
         """Return rows (R, 3 V) of d distance / d p, distances (R,), m, and names of the members near obstacles."""
         arm = self._arm
-        pairs = setup.monitor.near(X, time, setup.influence)
+        pairs = setup.monitor.near(setup.arm.points(X), time, setup.influence)
         with_obstacle = np.flatnonzero(~pairs.is_self)
-        members = setup.monitor.members[pairs.member[with_obstacle]]
-        t, normal = pairs.t[with_obstacle], pairs.normal[with_obstacle]
+        members = setup.truss.members[pairs.body[with_obstacle]]
+        t, normal = pairs.weights[with_obstacle, 1], pairs.normal[with_obstacle]
         s = np.clip((1.0 - t) * self._node_s[members[:, 0]] + t * self._node_s[members[:, 1]], 0.0, 1.0)
         witness = (1.0 - t)[:, None] * X[members[:, 0]] + t[:, None] * X[members[:, 1]]
         first = curve.derivative(s)

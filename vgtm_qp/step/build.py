@@ -66,11 +66,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "influence": clearance.influence,
     }
     engine = make_engine(problem.method.solver, layout, kinematics, task, compiled=compiled)
-    from functools import partial
-    truss = arm.truss
-    options["member_names"] = truss.member_names
-    if truss.joints is not None: options["ends"] = truss.member_ends
-    monitor = Clearance(truss.members, truss.radius, self_collision=clearance.self_collision, **options)
+    monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
     spec = problem.truss or problem.arm
     assert spec is not None
@@ -95,7 +91,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         base_motion=BaseMotion(spec.base_motion) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
-        measure=None if clearance.self_collision else Clearance(truss.members, truss.radius, **options),
+        measure=None if clearance.self_collision else Clearance(arm.bodies, **options),
     )
 
 

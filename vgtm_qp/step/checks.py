@@ -92,19 +92,19 @@ def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
     rules = problem.clearance
     safe = rules.safe
     self_safe = safe if rules.self_safe is None else rules.self_safe
-    pairs = setup.monitor.near(setup.arm.home, 0.0, reach=safe, self_reach=self_safe)
+    pairs = setup.monitor.near(setup.arm.points(setup.arm.home_configuration), 0.0, reach=safe, self_reach=self_safe)
     bodies = setup.arm.bodies
     owner = np.where(pairs.is_self, -1, 0)
     owner[~pairs.is_self] = setup.monitor.pieces.obstacle[pairs.other[~pairs.is_self]]
     for index in np.unique(owner):
         rows = np.flatnonzero(owner == index)
         k = rows[np.argmin(pairs.distance[rows])]
-        distance, body = float(pairs.distance[k]), bodies.called(int(pairs.member[k]))
+        distance, body = float(pairs.distance[k]), bodies.called(int(pairs.body[k]))
         place: Place
         if index < 0:
             place, needed = ("truss", "member_radius"), self_safe
             other = bodies.names[int(pairs.other[k])]
-            what = f"{bodies.kind}s {bodies.names[int(pairs.member[k])]} and {other}, which share no node,"
+            what = f"{bodies.kind}s {bodies.names[int(pairs.body[k])]} and {other}, which share no node,"
         else:
             place, needed = ("obstacle", int(index), "center"), safe
             what = f"it and {body}"
@@ -150,7 +150,7 @@ def _inside_obstacles(problem: Problem, setup: Setup, hollow: float) -> Iterator
     at_tip = np.isin(arm.bodies.joints, arm.end_effector.nodes).any(axis=1)
     needed = safe + float(arm.bodies.radius[at_tip].min())
     spot = capsules([[0, 1]], 0.0)
-    point = Clearance(spot.points, spot.radius, obstacles, safe=safe, influence=needed, self_collision=False)
+    point = Clearance(spot, obstacles, safe=safe, influence=needed, self_collision=False)
     for target, key, value in _targets(problem):
         distance, pair = point.least(np.stack([target, target + _POINT / 2]))
         if pair is not None and distance + hollow + _POINT < needed:

@@ -89,7 +89,7 @@ class Setup:
 
     def least_clearance(self, q: Array, time: float, among: str = "all") -> float:
         """Return the exact least surface distance at a configuration, m; see ``Clearance.least``."""
-        points = self.arm.nodes(q)
+        points = self.arm.points(q)
         if self.measure is None:
             return self.monitor.least(points, time, among=among)[0]
         return self.measure.least(points, time, among=among)[0]

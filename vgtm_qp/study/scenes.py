@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry import shapes
+from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import rotation_from_vector
@@ -118,7 +119,7 @@ def random_shape(setup: Setup, random: np.random.Generator) -> Array:
             goal[actuators] += share * (wanted - goal[actuators])
             if not _newton(setup, X, goal, singular):
                 break
-            if setup.monitor.least(X, among="members")[0] < SAFE:
+            if setup.monitor.least(setup.arm.points(X), among="members")[0] < SAFE:
                 break
             good = X.copy()
             if _tip_motion(setup, good) > most:
@@ -214,7 +215,6 @@ def _cubes(setup: Setup, random: np.random.Generator, shape: Array | None, count
 
 def _distance(setup: Setup, obstacle: shapes.Obstacle, X: Array) -> float:
     truss = setup.truss
-    monitor = Clearance(
-        truss.members, truss.radius, [obstacle], safe=SAFE, influence=0.5, self_collision=False
-    )
+    between_nodes = capsules(truss.members, truss.radius)
+    monitor = Clearance(between_nodes, [obstacle], safe=SAFE, influence=0.5, self_collision=False)
     return monitor.least(X)[0]

@@ -11,7 +11,7 @@ import numpy as np
 from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.chords import chord_deviation
-from vgtm_qp.arm.truss.kinematics import TrussKinematics
+from vgtm_qp.arm.truss.kinematics import EndKinematics, TrussKinematics
 from vgtm_qp.arm.truss.lengths import LengthRows
 from vgtm_qp.arm.truss.mobility import describe
 from vgtm_qp.arm.truss.reach import hollow, longest_ways
@@ -27,6 +27,7 @@ class TrussArm:
     def __init__(self, truss: Truss) -> None:
         self.truss = truss
         self.kind = truss.module
+        self.leaves_chords = truss.joints is not None
 
     @property
     def node_names(self) -> tuple[str, ...]:
@@ -156,6 +157,20 @@ class TrussArm:
     def points(self, q: Array) -> Array:
         """Return the nodes; in offset joints the ends of all members, two of each."""
         return q if self.truss.joints is None else self.truss.member_ends(q).reshape(-1, 3)
+
+    def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:
+        """See ``arm.Arm``: an end in an offset joint is moved by the three nodes that orient that."""
+        if self._ends is None:
+            return points, coefficients
+        ends, (count, slots) = self._ends, points.shape
+        ends.evaluate(q)
+        member, end = points >> 1, points & 1
+        by_nodes = np.einsum("rsc,rscn->rsn", coefficients, ends.jacobian[member, end])
+        return ends.nodes[member, end].reshape(count, 3 * slots), by_nodes.reshape(count, 3 * slots, 3)
+
+    @cached_property
+    def _ends(self) -> EndKinematics | None:
+        return None if self.truss.joints is None else EndKinematics(self.truss)
 
     def travel(self, motion: Array) -> float:
         """See ``arm.Arm``."""
