@@ -88,7 +88,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
             dead_end = DeadEnd(
                 stop,
                 resolver.state.control_vertices,
-                resolver.setup.truss.height,
+                resolver.setup.arm.height,
                 plan.path.at(value).velocity,
             )
             way, record, stop = _retry(problem, record, dead_end, progress)
@@ -121,7 +121,7 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
     """Step along the plan; return why the arm stopped for good, or None if it reached the end."""
     value, start, end = plan.path.start, plan.path.start, plan.path.end
     stalled, last = 0, float(plan.marks[-1])
-    keeps_moving = bool(np.isfinite(resolver.setup.truss.acceleration[resolver.setup.truss.actuators]).any())
+    keeps_moving = bool(np.isfinite(resolver.setup.arm.acceleration[resolver.setup.arm.actuators]).any())
     while value < last:
         aim, dt = plan.next_mark(value, keeps_moving=keeps_moving)
         before, known, clock = resolver.state, dict(resolver.phases), perf_counter()
@@ -184,7 +184,7 @@ def _stop(resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: floa
 def _add_state(
     record: _Record, resolver: AnyResolver, plan: Plan, value: float, seconds: float, phases: dict[str, float]
 ) -> None:
-    state, arm = resolver.state, resolver.setup
+    state, setup = resolver.state, resolver.setup
     position, rotation = resolver.tip()
     target = plan.path.at(value)
     record.add(
@@ -196,8 +196,8 @@ def _add_state(
         tip_rotation=rotation,
         tip_target_position=target.position,
         tip_target_rotation=target.rotation,
-        clearance=setup.least_clearance(state.nodes, state.time, "obstacles"),
-        self_clearance=setup.least_clearance(state.nodes, state.time, "members"),
+        clearance=setup.least_clearance(state.q, state.time, "obstacles"),
+        self_clearance=setup.least_clearance(state.q, state.time, "members"),
         progress=(value - plan.path.start) / (plan.path.end - plan.path.start),
         step_time=seconds,
         phase_time=list(phases.values()),

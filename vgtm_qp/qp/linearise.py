@@ -122,7 +122,7 @@ class Linearisation:
         if not (moves or layout.hard_turns):
             turn = np.zeros_like(turn)
         face = face.reshape(count, 9, turns).transpose(0, 2, 1)
-        curve = curve.reshape(count, -1, turns).transpose(0, 2, 1)
+        curve = curve.reshape(count, curve.size // max(count * turns, 1), turns).transpose(0, 2, 1)
         general = None
         if asked.curve is not None:
             spacing = asked.curve.spacing
