@@ -61,7 +61,7 @@ class StepQP:
         return norm(self.P @ z + self.q + self.A.T @ row_multipliers + column_multipliers)
 
     def complementarity_residual(self, z: Array, row_multipliers: Array, column_multipliers: Array) -> float:
-        """Return the norm of min(|multiplier|, slack of its bound): what multipliers press on nothing.
+        """Return the norm of |multiplier| times slack of its bound, at most 1: what multipliers press on nothing.
 
         A multiplier of the wrong sign has the slack of the other bound, one of a free row an infinite slack.
         """
@@ -72,7 +72,7 @@ class StepQP:
         parts = []
         for multiplier, x, lower, upper in pairs:
             slack = np.where(multiplier > 0.0, upper - x, x - lower)
-            parts.append(np.maximum(np.minimum(np.abs(multiplier), slack), 0.0))
+            parts.append(np.abs(multiplier) * np.clip(slack, 0.0, 1.0))
         return norm(np.concatenate(parts))
 
     def violated(self, z: Array, tolerance: float = 1e-9) -> list[tuple[str, float]]:
