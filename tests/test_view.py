@@ -276,7 +276,7 @@ def test_a_blocked_drag_names_the_obstacle(tab: Any, page_of: Any):
 
 def test_a_result_plays_back_and_goes_home(tab: Any, page_of: Any, maneuver: vq.Maneuver):
     open_page(tab, page_of(maneuver))
-    # The button says Pause only while the arm moves: a busy browser may never get to show that. What stays is waited for.
+    # The button says Pause only while the arm moves, and a busy browser may never show that: what stays is waited for.
     tab.get_by_role("button", name="Play", exact=True).click()
     wait_for_strokes(tab, "> 1")
     tab.get_by_role("button", name="Home", exact=True).click()
