@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.fcl_queries import FclQueries
+from vgtm_qp.geometry.formulas import FURTHEST
 from vgtm_qp.geometry.groups import Contacts, Group, Kernels, Members, Motion
 from vgtm_qp.geometry.pairs import BetweenReport, Names, NearPairs, Pair, join
 from vgtm_qp.geometry.shapes import GeometryError, Obstacle, Pieces
@@ -130,10 +131,10 @@ class Clearance:
             limit = self_reach if group.is_self else reach
             rows = np.flatnonzero(group.lower(motion, limit)[0] < limit)
             if len(rows):
-                contacts = self._contacts(group, X, time, rows, min(limit, fcl_reach))
+                contacts, two = self._contacts(group, X, time, rows, min(limit, fcl_reach))
                 first = np.flatnonzero(contacts.distance < limit)
                 candidates.waste(group, len(rows) - len(first))
-                second = first[contacts.two()[first] & (contacts.distance_second[first] < limit)]
+                second = first[two[first] & (contacts.distance_second[first] < limit)]
                 part = self._pairs(group, rows, contacts, first, second)
                 parts.append(self._distinct(part) if group.shape == "triangle" else part)
         candidates.tire(X, time)
@@ -162,13 +163,17 @@ class Clearance:
         """Return the points that members end at, from node positions (N, 3)."""
         return X if self._ends is None else self._ends(X).reshape(-1, 3)
 
-    def _contacts(self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float) -> Contacts:
+    def _contacts(
+        self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float
+    ) -> tuple[Contacts, NDArray[np.bool_]]:
+        """Return the contacts of `rows`, and which have a second one: by the closed form, whatever FCL says (K,)."""
         segments, others = group.segments(X, rows), group.others(X, time, rows)
         contacts = group.contacts_of(segments, others, rows)
+        two = contacts.two()
         if fcl_reach > 0.0 and group.shape in FclQueries.SHAPES:
             asked = np.flatnonzero(contacts.distance < fcl_reach)
-            self.fcl.improve(group.other[rows], group.radius[rows], segments, others, contacts, asked)
-        return contacts
+            self.fcl.improve(group.other[rows], group.radius[rows], segments, others, contacts, asked, two)
+        return contacts, two
 
     def _pairs(self, group: Group, rows: Index, contacts: Contacts, first: Index, second: Index) -> NearPairs:
         """Return the rows `first` by their witness points and `second` by their other contacts."""
@@ -393,7 +398,7 @@ class Clearance:
             if far >= reach and far_self >= self_reach:
                 return candidates, motion
         # What is not a number fails the comparisons above and comes here.
-        if not (np.isfinite(X).all() and (end is None or np.isfinite(end).all())):
+        if not all(np.abs(at).max(initial=0.0) < FURTHEST for at in (X, X if end is None else end)):
             raise GeometryError("node positions must be finite numbers")
         travel = 0.0 if end is None else float(np.sqrt(((end - X) ** 2).sum(axis=1).max(initial=0.0)))
         drift = 0.0 if end_time is None else self.pieces.fastest * abs(end_time - time)

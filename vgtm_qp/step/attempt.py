@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import SolverError
+from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.condensed import AnswerError, InfeasibleStepError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.qp.settle import LEFT
-from vgtm_qp.step.engine import Accuracy, Engine, FusedEngine
+from vgtm_qp.step.acceptance import Acceptance
+from vgtm_qp.step.engine import Accuracy, ElasticEngine, Engine, FusedEngine
 from vgtm_qp.step.linearise import QPInput, Target
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.separation import Separation, Shortfall
@@ -27,6 +28,9 @@ Array = NDArray[np.float64]
 
 _MOTION_MARGIN = 2.5
 """A member may move by so many times what is expected of it before a pair that matters can be missed."""
+
+_TOO_FAR = 1e3
+"""No answer of a QP that moves a node by so many times the arm's length means anything: the pose is singular."""
 
 _DEVIATION = 0.1
 """An offset joint that may take a member's end further from its chord turns too far in one step, m."""
@@ -160,6 +164,7 @@ class Attempt:
         engine: Engine,
         task: TipTask,
         separation: Separation,
+        acceptance: Acceptance,
         *,
         tracking: HardTracking | None = None,
         tolerances: Tolerances | None = None,
@@ -169,10 +174,12 @@ class Attempt:
         self.tracking = tracking
         self.task = task
         self.separation = separation
+        self.acceptance = acceptance
         self.tolerances = tolerances or Tolerances()
         self.max_qps = max_qps
         self.phases = Phases()
         kept = self.tolerances
+        self._too_far = _TOO_FAR * separation.truss.height
         self._accuracy = Accuracy(kept.member, kept.tip, kept.settling * separation.truss.height)
 
     def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Outcome:
@@ -230,7 +237,7 @@ class Attempt:
             try:
                 at = Y if motion else X
                 move = self._move(QPInput(X, at, vertices, torsion, target, goal, progress, rows, motion))
-            except AnswerError as error:
+            except (AnswerError, EvaluationError) as error:
                 return replace(outcome(str(error), count), solver_failed=True)
             except InfeasibleStepError:
                 return outcome("no displacement keeps all limits and clearances", count)
@@ -241,12 +248,17 @@ class Attempt:
             if motion:
                 first, first_rows = move.solution, rows
             X, vertices, torsion, progress = move.X, move.vertices, move.torsion, move.progress
-            if not move.furthest < np.inf:
+            if not move.furthest < self._too_far:
                 return outcome("singular pose", count)
             # A pair that one correction pushes away must still be there in the next, or two of them take turns.
             reach = max(reach, move.furthest)
             if move.closed is None:
+                if not np.isfinite(X).all():
+                    return outcome("singular pose", count)
                 continue
+            flaw = self._flaw(state, target, move)
+            if flaw:
+                return replace(outcome(flaw, count), solver_failed=True)
             closed, X = move.closed, move.closed.X
             if self.tracking is not None:
                 gap = self.tracking.error(X, vertices, torsion, target.base_rotation)
@@ -265,6 +277,24 @@ class Attempt:
             if len(stations) > 8:
                 return outcome("clearance between the states", count)
         return outcome("no convergence", self.max_qps)
+
+    def _flaw(self, state: State, target: Target, move: _Move) -> str:
+        """Return what is wrong with where a `move` leads from `state`, found anew; empty where nothing is."""
+        assert move.closed is not None
+        goal: PathPoint | None = None
+        # An elastic tip that had to leave its path is where the QP put it.
+        if not (isinstance(self.engine, ElasticEngine) and move.solution.tip_slack > self.tolerances.tip):
+            goal = target.path.at(target.start + move.progress * (target.end - target.start))
+        return self.acceptance.flaw(
+            move.closed,
+            state.nodes,
+            target.base,
+            target.lower,
+            target.upper,
+            goal,
+            move.vertices,
+            move.torsion,
+        )
 
     def _move(self, asked: QPInput) -> _Move:
         """Return where the answer of a QP leads, settled where that needs no other one."""
@@ -304,7 +334,11 @@ class Attempt:
         self.phases.add("qp")
         if take is None:
             return None
-        taken, accuracy = take(), self._accuracy
+        try:
+            taken, accuracy = take(), self._accuracy
+        except EvaluationError:
+            # The answer may still be good, and be settled by other steps.
+            return None
         closed: Closed | None = taken.closed
         if not (
             taken.closed.error <= accuracy.member

@@ -249,6 +249,9 @@ class Brakes:
         after = separation.holds(closed.X, then, short, proven=report.certified)
         if after is None or not report.certified:
             return None
+        moved, _ = arm.base_at(then)
+        if self.attempt.acceptance.flaw(closed, state.nodes, moved, *limits, None, vertices, state.torsion):
+            return None
         return Outcome(True, closed, vertices, 1.0, "", shortfall=after, torsion=state.torsion, time=then)
 
     def _closed(self, X: Array, wanted: Array, solver: LengthSolver) -> Closed | None:

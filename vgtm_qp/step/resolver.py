@@ -19,6 +19,7 @@ from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.lengths import LengthSolver
+from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.arm import Arm, build_arm, reshaped
 from vgtm_qp.step.attempt import Attempt, Outcome, Tolerances
 from vgtm_qp.step.braking import Brakes, Braking
@@ -95,12 +96,16 @@ class Resolver:
         self._starts_at_once = bool(np.isinf(truss.acceleration[truss.actuators]).all())
         # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
         member = 1e-10 if self._starts_at_once else max(1e-12, 32.0 * _ROUNDING * truss.height)
+        tolerances = Tolerances(member=member)
         self._attempt = Attempt(
             arm.engine,
             arm.task,
             self._separation,
+            Acceptance(
+                arm.kinematics, arm.home_lengths, arm.task, member=tolerances.member, tip=tolerances.tip
+            ),
             tracking=_hard_tracking(arm),
-            tolerances=Tolerances(member=member),
+            tolerances=tolerances,
         )
         self._state = arm.home_state()
         self._actuator_names = tuple(truss.member_names[k] for k in truss.actuators)

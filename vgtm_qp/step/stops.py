@@ -22,6 +22,7 @@ from scipy import sparse
 from scipy.optimize import linprog
 from scipy.sparse.linalg import splu
 
+from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.arm import Arm
 from vgtm_qp.step.path import Path
@@ -71,7 +72,8 @@ class Stop:
     ----------
     kind : StopKind
         ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
-        where the tip cannot start in that direction whatever the limits; ``out of reach`` where the arm is stretched
+        where the tip cannot start in that direction whatever the limits, or the lengths of the members do not
+        determine the nodes; ``out of reach`` where the arm is stretched
         towards a goal further away; ``nonlinear`` where no row forbids the step to first order, and ``acceleration``
         if it is one after which the arm could not brake; ``solver`` where none does and the QP solver gave no good
         answer.
@@ -144,7 +146,10 @@ def explain(
 
     Where no rows forbid it to first order, what was `pressing` on the last step is told, and the `reason` it gave.
     """
-    program = _Program(arm, separation, state, path, start, end, limits)
+    try:
+        program = _Program(arm, separation, state, path, start, end, limits)
+    except SolverError:
+        return Stop(StopKind.SINGULAR, reason=reason)
     share, costs = program.solve(np.ones(program.count, dtype=bool))
     if solver_failed and share > _BLOCKED:
         return Stop(StopKind.SOLVER, reason=reason)
@@ -199,8 +204,25 @@ def _kind(name: str) -> StopKind:
     return StopKind(first)
 
 
+def _response(jacobian: sparse.csc_matrix, lengths: Array) -> Array:
+    """Return the node displacements (M, n_a) for changes of the lengths (M, n_a); raise `SolverError` without any."""
+    try:
+        response = np.asarray(splu(jacobian).solve(lengths))
+    except RuntimeError as error:
+        raise SolverError("the member lengths do not determine the nodes there") from error
+    if not np.all(np.isfinite(response)):
+        raise SolverError("the member lengths do not determine the nodes there")
+    return response
+
+
 class _Program:
-    """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits."""
+    """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits.
+
+    Raises
+    ------
+    SolverError
+        The pose is singular: the members' lengths do not determine how its nodes move.
+    """
 
     def __init__(
         self,
@@ -222,7 +244,7 @@ class _Program:
         )
         selection = np.zeros((size, len(truss.actuators)))
         selection[truss.actuators, np.arange(len(truss.actuators))] = 1.0
-        response = splu(jacobian).solve(selection)
+        response = _response(jacobian, selection)
         padded = np.zeros((truss.node_count, 3, len(truss.actuators)))
         padded[truss.free] = response.reshape(-1, 3, len(truss.actuators))
 
