@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from queue import Queue
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ FLAGS = [
 ]
 PERIOD = 1.0 / 30.0
 SCENE_WIDTH = 600
+PATIENCE = 300.0
+"""Seconds that a busy machine may take for what an idle one does at once; every wait ends with what is waited for."""
 
 
 @pytest.fixture(scope="module")
@@ -165,12 +168,12 @@ def page_of() -> Iterator[Any]:
         )
         thread.start()
         threads.append(thread)
-        return addresses.get(timeout=60)
+        return addresses.get(timeout=PATIENCE)
 
     yield serve
     stop.set()
     for thread in threads:
-        thread.join(timeout=30)
+        thread.join(timeout=PATIENCE)
         assert not thread.is_alive()
 
 
@@ -189,7 +192,7 @@ def browser() -> Iterator[Any]:
 def tab(browser: Any) -> Iterator[Any]:
     """Give a tab that notes every error and every request that leaves this machine."""
     context = browser.new_context(viewport={"width": 1000, "height": 640})
-    context.set_default_timeout(90_000)
+    context.set_default_timeout(1000.0 * PATIENCE)
     tab = context.new_page()
     tab.errors, tab.strangers = [], []
     tab.on("console", lambda message: tab.errors.append(message.text) if message.type == "error" else None)
@@ -211,12 +214,13 @@ def picture_of(tab: Any) -> NDArray[np.int64]:
 
 
 def pixels(tab: Any, wanted: Callable[[NDArray[np.int64]], NDArray[np.bool_]]) -> NDArray[np.int64]:
-    """Return rows and columns (2, K) of pixels of a kind, once there are some: a page fades in."""
-    for _ in range(120):
+    """Return rows and columns (2, K) of pixels of a kind, once there are more than 20: a page fades in."""
+    end = monotonic() + PATIENCE
+    while monotonic() < end:
         found = np.array(np.nonzero(wanted(picture_of(tab))))
         if found.shape[1] > 20:
             return found
-        tab.wait_for_timeout(500)
+        tab.wait_for_timeout(100)
     raise AssertionError("the page does not show it")
 
 
@@ -272,8 +276,8 @@ def test_a_blocked_drag_names_the_obstacle(tab: Any, page_of: Any):
 
 def test_a_result_plays_back_and_goes_home(tab: Any, page_of: Any, maneuver: vq.Maneuver):
     open_page(tab, page_of(maneuver))
+    # The button says Pause only while the arm moves, and a busy browser may never show that: what stays is waited for.
     tab.get_by_role("button", name="Play", exact=True).click()
-    tab.get_by_role("button", name="Pause", exact=True).wait_for()
     wait_for_strokes(tab, "> 1")
     tab.get_by_role("button", name="Home", exact=True).click()
     tab.get_by_role("button", name="Play", exact=True).wait_for()
@@ -289,8 +293,10 @@ def test_the_exported_page_plays_from_disk_with_the_network_off(
     tab.goto(path.as_uri())
     pixels(tab, is_amber)
     first = picture_of(tab)
-    tab.wait_for_timeout(2000)
-    assert (picture_of(tab) != first).any(axis=2).sum() > 500
+    end = monotonic() + PATIENCE
+    while (picture_of(tab) != first).any(axis=2).sum() <= 500:
+        assert monotonic() < end, "the page does not move"
+        tab.wait_for_timeout(100)
     assert tab.errors == []
     assert tab.strangers == []
 
@@ -316,4 +322,4 @@ def test_the_command_serves_this_machine_alone_and_ends_when_interrupted():
         with pytest.raises(OSError, match="refused"):
             socket.create_connection(("127.0.0.2", port), timeout=5)
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=PATIENCE) == 0

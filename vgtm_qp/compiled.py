@@ -7,6 +7,9 @@ compiler the CasADi virtual machine evaluates the same graph, 4 to 10 times slow
 The first time, the compiler's time is what an arm waits for. The straight-line functions that a kernel maps or calls
 are compiled by themselves, once for all kernels that use them, by several processes at a time, and a kernel waits for
 its own when it is called first.
+
+A function tells by its return code that it could not be evaluated, and then leaves its outputs as they were. Every call
+reads that code, in half a microsecond: outputs of an earlier call never pass as those of this one.
 """
 
 from __future__ import annotations
@@ -29,6 +32,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+
+from vgtm_qp.errors import EvaluationError
 
 Array = NDArray[np.float64]
 
@@ -342,6 +347,7 @@ class Kernel:
         self.outputs: list[Array] = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
         # Until it is called first, when this is replaced by the evaluation itself.
         self._evaluate: Callable[[], None] = self._evaluate_first
+        self._code: Callable[[], int] = self._code_of_none
         if not compiled:
             self._resolve()
         elif not for_later:
@@ -357,6 +363,7 @@ class Kernel:
                 self._compiling = None
                 _waiting.discard(self)
                 self._buffer, self._evaluate = self._found.buffer()
+                self._code = self._buffer.ret
                 for i, array in enumerate(self.inputs):
                     self._buffer.set_arg(i, array.reshape(-1).data)
                 for i, array in enumerate(self.outputs):
@@ -366,6 +373,15 @@ class Kernel:
     def _evaluate_first(self) -> None:
         self._resolve()
         self._evaluate()
+
+    def _code_of_none(self) -> int:
+        raise AssertionError("a kernel that was never evaluated has no return code")
+
+    def _refuse(self) -> None:
+        """Leave nothing in the outputs that could be read as an answer, and raise."""
+        for array in self.outputs:
+            array.fill(np.nan)
+        raise EvaluationError(f'the function "{self._given.name()}" has no value at its arguments')
 
     @property
     def compiling(self) -> Compiling | None:
@@ -383,8 +399,16 @@ class Kernel:
         return self._resolve() is not self._given
 
     def __call__(self) -> None:
-        """Evaluate: read `inputs`, overwrite `outputs`."""
+        """Evaluate: read `inputs`, overwrite `outputs`.
+
+        Raises
+        ------
+        EvaluationError
+            The function could not be evaluated, at a singular matrix say; all outputs are NaN.
+        """
         self._evaluate()
+        if self._code():
+            self._refuse()
 
     def bind_input(self, index: int, array: Array) -> None:
         """Let argument `index` be read from `array` (C-contiguous float64, of its size), which the kernel keeps."""

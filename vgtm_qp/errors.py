@@ -52,6 +52,10 @@ class SolverError(VgtmError):
     """A QP solver is unknown or not installed, or its answer failed the residual check."""
 
 
+class EvaluationError(SolverError):
+    """A function of the arm could not be evaluated at its arguments, at a singular matrix for one."""
+
+
 class ResultError(VgtmError):
     """A result file is cut, altered, or of another version."""
 

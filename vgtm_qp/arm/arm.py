@@ -169,8 +169,8 @@ class Kinematics(Protocol):
         """Overwrite quantities and tip alone, at less cost."""
         ...
 
-    def motion(self, missing: Array | None = None) -> MotionRows:
-        """Return how the nodes move at the configuration evaluated last, quantities changing by `missing` (M,) too."""
+    def motion(self) -> MotionRows:
+        """Return how the nodes move at the configuration evaluated last."""
         ...
 
 
@@ -366,6 +366,10 @@ class Arm(Protocol):
 
     def nodes(self, q: Array) -> Array:
         """Return (N, 3) the nodes at a configuration, m."""
+        ...
+
+    def measured(self, q: Array) -> Array:
+        """Return (M,) the quantities by plain arithmetic, which shares nothing with :meth:`symbols` and kinematics."""
         ...
 
     def based(self, q: Array, pose: Pose) -> Array:

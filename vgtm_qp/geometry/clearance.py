@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.fcl_queries import FclQueries
+from vgtm_qp.geometry.formulas import FURTHEST
 from vgtm_qp.geometry.groups import Displacements, Group, PairDistances, ShapeKernels
 from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, PairNames, join, no_contacts
 from vgtm_qp.geometry.shapes import GeometryError, Obstacle, Pieces
@@ -139,10 +140,10 @@ class Clearance:
             limit = self_reach if group.is_self else reach
             rows = np.flatnonzero(group.lower(motion, limit)[0] < limit)
             if len(rows):
-                answer = self._distances(group, X, time, rows, min(limit, fcl_reach))
+                answer, two = self._distances(group, X, time, rows, min(limit, fcl_reach))
                 first = np.flatnonzero(answer.distance < limit)
                 candidates.count_unneeded(group, len(rows) - len(first))
-                second = first[answer.two()[first] & (answer.distance_second[first] < limit)]
+                second = first[two[first] & (answer.distance_second[first] < limit)]
                 part = self._contacts(group, rows, answer, first, second)
                 parts.append(self._distinct(part) if group.shape == "triangle" else part)
         candidates.refresh_where_due(X, time)
@@ -153,13 +154,17 @@ class Clearance:
         horizon = np.inf if self.self_collision else None
         return Candidates(self.bodies, self.pieces, self._kernels, X, 0.0, np.inf, horizon).groups
 
-    def _distances(self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float) -> PairDistances:
+    def _distances(
+        self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float
+    ) -> tuple[PairDistances, NDArray[np.bool_]]:
+        """Return the distances of `rows`, and which have a second contact (K,): by the closed form, whatever FCL says."""
         segments, others = group.segments(X, rows), group.others(X, time, rows)
         answer = group.distances_of(segments, others, rows)
+        two = answer.two()
         if fcl_reach > 0.0 and group.shape in FclQueries.SHAPES:
             asked = np.flatnonzero(answer.distance < fcl_reach)
-            self.fcl.improve(group.other[rows], group.radius[rows], segments, others, answer, asked)
-        return answer
+            self.fcl.improve(group.other[rows], group.radius[rows], segments, others, answer, asked, two)
+        return answer, two
 
     def _contacts(
         self, group: Group, rows: Index, answer: PairDistances, first: Index, second: Index
@@ -402,7 +407,7 @@ class Clearance:
             if far >= reach and far_self >= self_reach:
                 return candidates, motion
         # NaN fails the comparisons above and comes here.
-        if not (np.isfinite(X).all() and (end is None or np.isfinite(end).all())):
+        if not all(np.abs(at).max(initial=0.0) < FURTHEST for at in (X, X if end is None else end)):
             raise GeometryError("node positions must be finite numbers")
         travel = 0.0 if end is None else float(np.sqrt(((end - X) ** 2).sum(axis=1).max(initial=0.0)))
         drift = 0.0 if end_time is None else self.pieces.fastest * abs(end_time - time)

@@ -2,8 +2,8 @@
 
 FCL's distance from a capsule to a box is always too large, and for bodies parallel to edges on round
 coordinates too large by up to a metre (FCL issue 508). So the capsule has radius zero, the radius is subtracted,
-and an answer counts only where the closed form agrees. FCL's signed distance is never asked for: it can end the
-process.
+and an answer counts only where the closed form agrees and the two are apart. FCL's signed distance is never asked for:
+it can end the process.
 """
 
 from __future__ import annotations
@@ -22,6 +22,13 @@ Index = NDArray[np.int64]
 
 _AGREEMENT = 1e-9
 """How far FCL and the closed form may be apart, m."""
+
+_APART = 1e-3
+"""The normal is the way between FCL's two nearest points, which are as exact as its distance. Of an axis that is nearer
+than this to a surface, or touches it, the way is mostly rounding, and the answer is refused, m."""
+
+_UNIT = 1e-6
+"""How far the length of FCL's normal may be from 1."""
 
 
 class FclQueries:
@@ -71,6 +78,7 @@ class FclQueries:
         parameters: Array,
         contacts: PairDistances,
         rows: Index,
+        two: NDArray[np.bool_],
     ) -> None:
         """Ask FCL for `rows`, which should be few, and write the answers that agree into `contacts`.
 
@@ -80,15 +88,15 @@ class FclQueries:
             Piece indices (K,), radii (K,), m, ends (K, 6), m, and parameters (K, 15) at this time.
         contacts
             Exact, from surface to surface; they stay where FCL's answer is refused.
+        two
+            (K,) whether the nearest point is not unique: FCL may give one between the two ends of the contact.
         """
-        # Where the nearest point is not unique, FCL may give one between the two ends of the contact.
-        unique = ~contacts.two()
         for k in rows.tolist():
             piece = int(pieces[k])
             if self._pieces.moving:
                 self._object(piece).setTranslation(parameters[k, :3])
             found = self.witness(piece, segments[k].tolist(), float(contacts.distance[k] + radius[k]))
-            if found is not None and unique[k]:
+            if found is not None and not two[k]:
                 contacts.t[k], contacts.normal[k] = found
 
     def witness(
@@ -96,7 +104,8 @@ class FclQueries:
     ) -> tuple[float, tuple[float, float, float]] | None:
         """Return where FCL finds a segment nearest to a piece: the parameter on the segment, and the normal (3).
 
-        None where FCL's distance is not the `distance`, m, of the closed form: the answer is refused.
+        None where its answer is refused: its distance is not the `distance`, m, of the closed form, or the segment is
+        too near for the points to have a direction.
         """
         other = self._object(piece)
         ax, ay, az, bx, by, bz = ends
@@ -110,13 +119,17 @@ class FclQueries:
         result = self._fcl.DistanceResult()
         found = self._fcl.distance(self._body, other, self._request, result)
         self.asked += 1
-        if not (found > 0.0 and abs(found - distance) <= _AGREEMENT):
+        if not (found > _APART and abs(found - distance) <= _AGREEMENT):
             self.replaced += 1
             return None
         point, witness = result.nearest_points
         (px, py, pz), (wx, wy, wz) = point.tolist(), witness.tolist()
+        nx, ny, nz = (px - wx) / found, (py - wy) / found, (pz - wz) / found
+        if not abs(sqrt(nx * nx + ny * ny + nz * nz) - 1.0) <= _UNIT:
+            self.replaced += 1
+            return None
         along = (x * (px - ax) + y * (py - ay) + z * (pz - az)) / (length * length)
-        return min(max(along, 0.0), 1.0), ((px - wx) / found, (py - wy) / found, (pz - wz) / found)
+        return min(max(along, 0.0), 1.0), (nx, ny, nz)
 
 
 def _quaternion(x: float, y: float, z: float, length: float) -> list[float]:

@@ -32,6 +32,9 @@ PARALLEL = 0.02
 
 FAR = 1e30
 
+FURTHEST = 1e60
+"""Positions this far away, m, are not finite numbers: their fourth powers overflow, and no bound holds."""
+
 
 class Contact(NamedTuple):
     """What is known of a segment and a piece; scalars and vectors (3) of SX.

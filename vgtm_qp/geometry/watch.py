@@ -8,7 +8,6 @@ in every state, and all of them are covered in a dozen array operations.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -20,7 +19,7 @@ from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.exact import CONTACT, WIDTH
 from vgtm_qp.geometry.fcl_queries import FclQueries
-from vgtm_qp.geometry.formulas import FAR
+from vgtm_qp.geometry.formulas import FAR, FURTHEST
 from vgtm_qp.geometry.groups import FOLLOWED, Group
 from vgtm_qp.geometry.pairs import Contacts, PairNames, join, no_contacts
 from vgtm_qp.geometry.shapes import GeometryError, Pieces
@@ -176,7 +175,7 @@ class Watch:
         self._places[:, 3:] = X
         bounds()
         *least, motion = lowest.tolist()
-        if not motion < math.inf:
+        if not motion < FURTHEST:
             raise GeometryError("node positions must be finite numbers")
         for k, pairs in enumerate(self._groups):
             nearer_than = self_limit if pairs.is_self else limit

@@ -150,7 +150,9 @@ def _gain(gram: ca.MX, stiffness: ca.MX, tip: ca.MX, free: ca.MX) -> ca.MX:
     reached = tip * ca.repmat(mask, 1, rows)
     answer = ca.solve(hessian, reached, "ldl")
     normal = reached.T @ answer
-    shares = ca.inv(normal)
+    # Left to itself, the virtual machine gives up the whole function at a matrix that is nearly singular, where the
+    # compiled one goes on with infinite shares. Both go on here: `usable` is false for those.
+    shares = ca.inv(normal, "qr", {"eps": 0.0})
     usable = ca.logic_and(
         ca.norm_inf(ca.vec(shares)) * ca.norm_inf(ca.vec(normal)) < WORST_CONDITION, ca.sum1(mask) >= rows
     )

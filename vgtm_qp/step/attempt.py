@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm
-from vgtm_qp.errors import SolverError
+from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
-from vgtm_qp.step.engine import Accuracy, Engine
+from vgtm_qp.step.acceptance import Acceptance
+from vgtm_qp.step.engine import Accuracy, Engine, Move
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.state import State, sealed
@@ -25,6 +26,9 @@ Array = NDArray[np.float64]
 
 _MOTION_MARGIN = 2.5
 """A member may move by so many times what is expected of it before a pair that matters can be missed."""
+
+_TOO_FAR = 1e3
+"""No answer of a QP that moves a node by so many times the arm's length means anything: the pose is singular."""
 
 _DEVIATION = 0.1
 """An offset joint that may take a member's end further from its chord turns too far in one step, m."""
@@ -139,6 +143,7 @@ class Attempt:
         arm: Arm,
         engine: Engine,
         separation: Separation,
+        acceptance: Acceptance,
         *,
         tracking: TrackingError | None = None,
         tolerances: Tolerances | None = None,
@@ -148,6 +153,7 @@ class Attempt:
         self.engine = engine
         self.tracking = tracking
         self.separation = separation
+        self.acceptance = acceptance
         self.tolerances = tolerances or Tolerances()
         self.max_qps = max_qps
         self.phases = Phases()
@@ -222,6 +228,8 @@ class Attempt:
                 move = self.engine.move(asked, self._accuracy, phases.add)
             except AnswerError as error:
                 return replace(outcome(str(error), count), solver_failed=True, failure=error)
+            except EvaluationError as error:
+                return replace(outcome(str(error), count), solver_failed=True)
             except InfeasibleStepError as error:
                 return replace(
                     outcome("no displacement keeps all limits and clearances", count), failure=error
@@ -233,12 +241,15 @@ class Attempt:
             if count == 1:
                 first, first_rows = move.solution, asked.rows
             q, vertices, torsion, progress = move.q, move.vertices, move.torsion, move.progress
-            if not move.furthest < np.inf:
+            if not move.furthest < _TOO_FAR * self.arm.height or not np.isfinite(q).all():
                 return outcome("singular pose", count)
             # A pair that one correction pushes away must still be there in the next, or two of them take turns.
             reach = max(reach, move.furthest)
             if move.closed is None:
                 continue
+            flaw = self._flaw(state, target, move)
+            if flaw:
+                return replace(outcome(flaw, count), solver_failed=True)
             closed, q = move.closed, move.closed.q
             if self.tracking is not None:
                 gap = self.tracking.greatest(q, vertices, torsion, target.base)
@@ -257,6 +268,15 @@ class Attempt:
             if len(fractions) > 8:
                 return outcome("clearance between the states", count)
         return outcome("no convergence", self.max_qps)
+
+    def _flaw(self, state: State, target: Target, move: Move) -> str:
+        """Return what is wrong with where a `move` leads from `state`, found anew; empty where nothing is."""
+        assert move.closed is not None
+        # An elastic tip that had to leave its path is where the QP put it.
+        on_path = move.solution.tip_slack <= self.tolerances.tip
+        goal = target.goal(move.progress) if on_path else None
+        box, curve = (target.lower, target.upper), (move.vertices, move.torsion)
+        return self.acceptance.flaw(move.closed, state.q, target.base, *box, goal, *curve)
 
     def _expected(self, target: Target, goal: PathPoint, guess: Array) -> float:
         """Return about how far a node moves in the step, m; anything where the arm was at rest."""

@@ -245,4 +245,7 @@ class Brakes:
         found = separation.holds(closed.q, then, short, proven=report.certified)
         if found is None or not report.certified:
             return None
+        moved = None if base is None else base.pose(then)
+        if self.attempt.acceptance.flaw(closed, state.q, moved, *limits, None, vertices, state.torsion):
+            return None
         return Outcome(True, closed, vertices, 1.0, "", shortfall=found, torsion=state.torsion, time=then)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.symbols import Constants
-from vgtm_qp.errors import SolverError
+from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.fused import Closed, FusedSolver
 from vgtm_qp.qp.fused_settle import NEAR
@@ -348,6 +348,9 @@ class FusedEngine(Engine):
         spent("qp")
         try:
             taken = self._solver.take(answer, near)
+        except EvaluationError:
+            # The answer may still be good, and be settled by other steps.
+            return super().move(asked, accuracy, spent)
         except FailedStepError as error:
             error.build = lambda: self.qp(asked)
             raise

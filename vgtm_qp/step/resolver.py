@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from vgtm_qp.errors import GoalError, ProblemError
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
+from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation, Box
 from vgtm_qp.step.advance import ANY_RANK, Advance, Advancer, Piece
 from vgtm_qp.step.attempt import Attempt, Tolerances
@@ -74,12 +75,14 @@ class Resolver:
         self._shaping = Shaping(setup)
         # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
         exact = max(1e-12, 32.0 * _ROUNDING * setup.arm.height)
+        kept = Tolerances(member=1e-10 if self._actuation.starts_at_once else exact)
         self._attempt = Attempt(
             setup.arm,
             setup.engine,
             self._separation,
+            Acceptance(setup.arm, setup.kinematics, setup.task, member=kept.member, tip=kept.tip),
             tracking=_tracking_error(setup),
-            tolerances=Tolerances(member=1e-10 if self._actuation.starts_at_once else exact),
+            tolerances=kept,
         )
         self._advancer = Advancer(
             self._attempt, self._actuation, self._brakes, self._target, setup.tip_mode

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from vgtm_qp.arm.arm import Arm
+from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.separation import Separation
@@ -70,7 +71,8 @@ class Stop:
     ----------
     kind : StopKind
         ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
-        where the tip cannot start in that direction whatever the limits; ``out of reach`` where the arm is stretched
+        where the tip cannot start in that direction whatever the limits, or the fixed quantities do not determine the
+        nodes; ``out of reach`` where the arm is stretched
         towards a goal further away; ``nonlinear`` where no row forbids the step to first order, and ``acceleration``
         if it is one after which the arm could not brake; ``solver`` where none does and the QP solver gave no good
         answer.
@@ -143,7 +145,10 @@ def explain(
 
     Where no rows forbid it to first order, what was `pressing` on the last step is told, and the `reason` it gave.
     """
-    program = _Program(setup, separation, state, path, start, end, limits)
+    try:
+        program = _Program(setup, separation, state, path, start, end, limits)
+    except SolverError:
+        return Stop(StopKind.SINGULAR, reason=reason)
     share, costs = program.solve(np.ones(program.count, dtype=bool))
     if solver_failed and share > _BLOCKED:
         return Stop(StopKind.SOLVER, reason=reason)
@@ -199,7 +204,13 @@ def _kind(name: str) -> StopKind:
 
 
 class _Program:
-    """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits."""
+    """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits.
+
+    Raises
+    ------
+    SolverError
+        The pose is singular: the quantities do not determine how the nodes move.
+    """
 
     def __init__(
         self,

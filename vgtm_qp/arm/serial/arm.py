@@ -227,6 +227,10 @@ class SerialArm:
 
     points = nodes
 
+    def measured(self, q: Array) -> Array:
+        """See ``arm.Arm``."""
+        return np.array(q[:-6])
+
     def based(self, q: Array, pose: Pose) -> Array:
         """See ``arm.Arm``."""
         return np.concatenate([q[:-6], pose.position, vector_from_rotation(pose.rotation)])

@@ -136,6 +136,12 @@ class TrussArm:
         """Return the configuration itself."""
         return q
 
+    def measured(self, q: Array) -> Array:
+        """See ``arm.Arm``: the distances of the members' ends."""
+        ends = self.truss.member_ends(q)
+        way = ends[:, 0] - ends[:, 1]
+        return np.asarray(np.sqrt(np.einsum("mc,mc->m", way, way)))
+
     def based(self, q: Array, pose: Pose) -> Array:
         """See ``arm.Arm``."""
         return np.where(self.truss.base[:, None], self.truss.home @ pose.rotation.T + pose.position, q)

@@ -51,6 +51,10 @@ def member_function(truss: Truss) -> ca.Function:
     return ca.Function("member", [nodes, offsets], [length, ca.gradient(length, nodes)])
 
 
+_FEW_FACES = 20
+"""Another compiled function without the faces does not pay for so few."""
+
+
 class EndKinematics:
     """The ends r_ik of members in offset joints and their Jacobians, eqs. (13), (20) and (21), at one configuration.
 
@@ -127,14 +131,13 @@ class TrussKinematics:
 
     def evaluate_quantities(self, X: Array) -> None:
         """Overwrite lengths, gradient and tip alone, at a quarter of the cost for a long arm; `X` (N, 3), m."""
-        kernel = self._without_faces
+        kernel = self._kernel if len(self.truss.faces) <= _FEW_FACES else self._without_faces
         kernel.inputs[0][:] = X.reshape(-1)
         kernel()
 
-    def motion(self, missing: Array | None = None) -> LengthRows:
+    def motion(self) -> LengthRows:
         """Return how the nodes move at the configuration evaluated last; see ``arm.Kinematics``."""
-        rhs = np.zeros(self.truss.member_count) if missing is None else missing
-        return LengthRows(self.truss, self.gradient.copy(), rhs)
+        return LengthRows(self.truss, self.gradient.copy(), np.zeros(self.truss.member_count))
 
 
 def _whole(truss: Truss, *, faces: bool = True) -> ca.Function:

@@ -1,0 +1,192 @@
+"""What a function cannot evaluate never passes as its answer, compiled or not."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy import sparse
+
+import vgtm_qp as vq
+from vgtm_qp.compiled import Kernel, compiler
+from vgtm_qp.errors import EvaluationError, SolverError
+from vgtm_qp.qp.fused import FusedSolver
+from vgtm_qp.qp.fused_settle import _gain
+from vgtm_qp.step import stops
+from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.stops import StopKind
+
+needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
+
+
+def inverse() -> Kernel:
+    A = ca.MX.sym("A", 2, 2)
+    return Kernel(ca.Function("inverse", [A], [ca.inv(A, "qr"), A + 1.0]), compiled=False)
+
+
+def test_a_function_without_a_value_raises_and_leaves_no_earlier_answer():
+    kernel = inverse()
+    kernel.inputs[0][:] = (2.0, 0.0, 0.0, 4.0)
+    kernel()
+    np.testing.assert_allclose(kernel.outputs[0], (0.5, 0.0, 0.0, 0.25))
+    kernel.inputs[0][:] = (1.0, 1.0, 1.0, 1.0)
+    with pytest.raises(EvaluationError, match="inverse"):
+        kernel()
+    assert all(np.isnan(output).all() for output in kernel.outputs)
+    kernel.inputs[0][:] = (1.0, 0.0, 0.0, 1.0)
+    kernel()
+    np.testing.assert_allclose(kernel.outputs[0], (1.0, 0.0, 0.0, 1.0))
+
+
+def test_a_function_without_a_value_at_its_first_call_raises():
+    with pytest.raises(EvaluationError):
+        inverse()()
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_the_gain_of_a_tip_that_cannot_be_moved_is_zero(compiled, tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    count, rows = 4, 3
+    gram, tip, free = ca.MX.sym("gram", count, count), ca.MX.sym("tip", count, rows), ca.MX.sym("free", count)
+    kernel = Kernel(
+        ca.Function("gain", [gram, tip, free], [ca.densify(_gain(gram, ca.MX(1.0), tip, free > 0.5))]),
+        compiled=compiled,
+    )
+    rng = np.random.default_rng(0)
+    kernel.inputs[0][:] = np.eye(count).reshape(-1)
+    kernel.inputs[1][:] = rng.normal(size=count * rows)
+    kernel.inputs[2][:] = 1.0
+    kernel()
+    usual = kernel.outputs[0].copy()
+    assert np.abs(usual).max() > 0.1
+    for held in ((1, 1, 0, 0), (0, 0, 0, 0)):
+        kernel.inputs[2][:] = held
+        kernel()
+        assert not kernel.outputs[0].any()
+    kernel.inputs[2][:] = 1.0
+    kernel()
+    np.testing.assert_array_equal(kernel.outputs[0], usual)
+
+
+def lie(monkeypatch, change):
+    """Let the settling of every fused solver give what `change` makes of the configuration."""
+    take = FusedSolver.take
+
+    def wrong(self, *arguments):
+        taken = take(self, *arguments)
+        return taken._replace(closed=change(taken.closed))
+
+    monkeypatch.setattr(FusedSolver, "take", wrong)
+
+
+def moved(closed, nodes, way):
+    X = closed.X.copy()
+    X[nodes] += way
+    return replace(closed, X=X)
+
+
+LIES = {
+    "the base": lambda closed: moved(closed, 0, (1e-8, 0.0, 0.0)),
+    "all of it": lambda closed: moved(closed, slice(None), (0.03, 0.0, 0.0)),
+    "a member": lambda closed: moved(closed, 7, (0.0, 1e-6, 0.0)),
+    "a length": lambda closed: replace(closed, lengths=closed.lengths + 1e-6),
+    "nothing finite": lambda closed: moved(closed, 9, (np.nan, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("what", LIES)
+def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(monkeypatch, what):
+    resolver = Resolver(vq.load_problem("five_bay_free"))
+    before = resolver.state
+    goal = resolver.tip()[0] + np.array([0.05, 0.0, -0.02])
+    with monkeypatch.context() as patch:
+        lie(patch, LIES[what])
+        step = resolver.step(position=goal)
+        assert step.status is StepStatus.BLOCKED
+        assert resolver.state is before
+    assert resolver.step(position=goal).status is StepStatus.REACHED
+
+
+def test_a_state_of_an_earlier_call_is_refused(monkeypatch):
+    resolver = Resolver(vq.load_problem("five_bay_free"))
+    kept = []
+
+    def earlier(closed):
+        kept.append(closed)
+        return kept[0]
+
+    lie(monkeypatch, earlier)
+    start, way = resolver.tip()[0], np.array([0.02, 0.0, -0.01])
+    statuses = [resolver.step(position=start + k * way).status for k in (1, 2)]
+    assert statuses == [StepStatus.REACHED, StepStatus.BLOCKED]
+    assert "tip" in resolver.step(position=start + 3 * way).reason
+
+
+def test_an_attempt_whose_function_has_no_value_falls_back_or_is_refused(monkeypatch):
+    resolver = Resolver(vq.load_problem("five_bay_free"))
+    goal = resolver.tip()[0] + np.array([0.05, 0.0, -0.02])
+
+    def fail(*_):
+        raise EvaluationError("no value")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FusedSolver, "_settle", fail)
+        step = resolver.step(position=goal)
+        assert step.status is StepStatus.BLOCKED
+        assert step.solver_failed
+    monkeypatch.setattr(FusedSolver, "take", fail)
+    assert resolver.step(position=goal).status is StepStatus.REACHED
+
+
+def test_why_an_arm_stops_is_told_of_a_pose_whose_lengths_do_not_determine_it(monkeypatch):
+    def singular(*_):
+        raise SolverError("singular")
+
+    with pytest.raises(SolverError, match="determine"):
+        stops._response(sparse.csc_matrix(np.diag([1.0, 0.0])), np.eye(2))
+    monkeypatch.setattr(stops, "_Program", singular)
+    stop = stops.explain(*([None] * 7), "because", {})
+    assert stop.kind is StopKind.SINGULAR
+    assert stop.reason == "because"
+
+
+SCENES = """
+import json, sys, warnings
+warnings.simplefilter("ignore")
+from vgtm_qp.maneuver.solve import solve
+from vgtm_qp.study.scenes import random_scene
+for seed, number in json.loads(sys.argv[1]):
+    maneuver = solve(random_scene(seed, number).problem)
+    failures = list(maneuver.certificate.failures())
+    nodes = maneuver.nodes[-1].tolist()
+    print(json.dumps([maneuver.manifest["status"], failures, len(maneuver.time), nodes]), flush=True)
+"""
+SEEDS = range(3)
+BEFORE = [[1991, 24], [1991, 98], [1991, 170], [1991, 263]]
+"""Scenes in which the interpreted settling once gave the outputs of earlier calls; the last ended in a traceback."""
+
+
+def solved(scenes, **environment):
+    """Return status, failures of the certificate, states and last nodes of each scene, solved by another process."""
+    command = [sys.executable, "-c", SCENES, json.dumps(scenes)]
+    done = subprocess.run(
+        command, env=os.environ | environment, capture_output=True, text=True, check=True, timeout=600
+    )
+    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+
+
+@needs_compiler
+def test_random_scenes_end_alike_with_and_without_a_compiler():
+    scenes = [*BEFORE, *([seed, 0] for seed in SEEDS)]
+    interpreted, compiled = solved(scenes, VGTM_CC="none"), solved(scenes)
+    assert len(interpreted) == len(compiled) == len(scenes)
+    for scene, (status, failures, states, nodes), told in zip(scenes, interpreted, compiled, strict=True):
+        assert (status, failures, states) == tuple(told[:3]), scene
+        assert failures == [], scene
+        np.testing.assert_allclose(nodes, told[3], atol=1e-6, err_msg=str(scene))
