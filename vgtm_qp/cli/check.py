@@ -20,7 +20,7 @@ def check(
 
     from vgtm_qp.errors import ProblemError
     from vgtm_qp.problem import load_problem
-    from vgtm_qp.setup.truss.mobility import describe
+    from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.step.build import build_arm
     from vgtm_qp.step.checks import check_problem, find_warnings
 

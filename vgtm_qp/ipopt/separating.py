@@ -96,7 +96,7 @@ class IpoptStepper:
                 setup.kinematics.evaluate(X)
                 lengths = frozen(setup.kinematics.quantities)
                 rates = frozen((lengths - state.quantities) / duration)
-                return replace(state, time=time, nodes=frozen(X), lengths=lengths, rates=rates)
+                return replace(state, time=time, q=(q := frozen(X)), nodes=q, quantities=lengths, rates=rates)
             reach *= 2.0
         return None
 
@@ -179,7 +179,7 @@ class IpoptStepper:
             error = wanted - setup.kinematics.quantities
             if float(np.max(np.abs(error))) < 1e-10:
                 return True
-            jacobian = setup.layout.length_jacobian(setup.kinematics.gradient)
+            jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
             try:
                 X[setup.truss.free] += np.linalg.solve(jacobian, error).reshape(-1, 3)
             except np.linalg.LinAlgError:

@@ -118,9 +118,10 @@ class Session:
             replace(
                 home,
                 time=float(time),
-                nodes=frozen(nodes),
+                q=(q := frozen(nodes)),
+                nodes=q,
                 control_vertices=frozen(control_vertices),
-                lengths=frozen(self.drawing.arm.lengths(nodes)),
+                quantities=frozen(self.drawing.arm.lengths(nodes)),
             )
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.segment_system import Entries
 from vgtm_qp.methods.segments import Segment
@@ -47,7 +47,7 @@ class _Group:
         entries = [Entries(layout, segment) for segment in own]
         self.shape = (len(own), *entries[0].shape)
         size = self.shape[1] * self.shape[2]
-        per_member = 3 * layout.member_nodes.shape[1]
+        per_member = 3 * truss.member_nodes.shape[1]
         weights = truss.member_count * per_member
         turns = weights + truss.face_weights.size
         source, target = [], []
@@ -107,7 +107,7 @@ class Condensation:
     def residuals(self, X: Array, nodes: CurveNodes) -> list[Array]:
         """Return what is missing in each group, (K, r), at node positions `X`, where the kinematics was evaluated."""
         kinematics = self._kinematics
-        centres = kinematics.face_centres(X)
+        centres = self._layout.arm.stations.centres(X)
         found = []
         for group in self._groups:
             lengths = self._home[group.fixed] - kinematics.quantities[group.fixed]

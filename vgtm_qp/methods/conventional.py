@@ -57,10 +57,10 @@ class DenseSolution:
             Null-space terms.
         """
         layout, method = self._layout, self._method
-        lengths = layout.length_jacobian(gradient, self._lengths)
+        lengths = truss_of(layout.arm).scatter.dense(gradient, self._lengths)
         J = np.zeros((len(x), layout.node_columns))
         J[: len(tip), self._tip] = tip[:, self._present]
-        J[len(tip) :] = lengths[layout.fixed]
+        J[len(tip) :] = lengths[truss_of(layout.arm).fixed]
         actuated = lengths[truss_of(layout.arm).actuators]
         hessian = terms.actuator * actuated.T @ actuated
         hessian[np.diag_indices_from(hessian)] += terms.node
@@ -108,7 +108,8 @@ class SparseSolution:
         )
         self._parts = np.cumsum([0, nodes, actuators, members, tips])
         a, y, u = self._parts[1:4]
-        member, flat, column = layout.length_scatter
+        scatter = truss.scatter
+        member, flat, column = scatter.member, scatter.flat, scatter.column
         self._flat = flat
         tip_row = np.repeat(np.arange(tips), len(self._tip))
         tip_column = np.tile(self._tip, tips)
@@ -140,7 +141,7 @@ class SparseSolution:
         ]
         self._system = BandedSystem(np.concatenate(rows), np.concatenate(columns), int(self._parts[-1]))
         self._damped = np.zeros(members + tips)
-        self._damped[layout.fixed] = self._damped[members:] = -self._damping
+        self._damped[truss_of(layout.arm).fixed] = self._damped[members:] = -self._damping
         self.rank: int | None = members - actuators + tips
 
     def displacement(self, gradient: Array, tip: Array, x: Array, terms: Terms) -> Array:
@@ -155,7 +156,7 @@ class SparseSolution:
         values = np.concatenate([blocks, diagonal, lengths, lengths, ones, ones, ends, ends])
         rhs = np.zeros(u)
         rhs[:nodes], rhs[nodes:a] = -terms.node_gradient, -terms.actuator_gradient
-        rhs[a + self._layout.fixed] = x[len(tip) :]
+        rhs[a + truss_of(self._layout.arm).fixed] = x[len(tip) :]
         rhs[y:] = x[: len(tip)]
         return self._system.solve(values, rhs)[:nodes]
 
@@ -178,7 +179,7 @@ class ConventionalResolver(MethodResolver):
         sparse = method.algebra == "sparse"
         self._solution = SparseSolution(layout, method) if sparse else DenseSolution(layout, method)
         self._correct = method.correct
-        self._home_fixed = self.setup.arm.home_quantities[layout.fixed]
+        self._home_fixed = self.setup.arm.home_quantities[truss_of(layout.arm).fixed]
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
         setup, state = self.setup, self.state
@@ -186,20 +187,20 @@ class ConventionalResolver(MethodResolver):
         here, goal = path.at(start), path.at(end)
         X = np.array(state.nodes)
         kinematics.evaluate(X)
-        tip = task.rows(X, goal)
+        tip = task.rows(X, kinematics, goal)
         moved, turned = pose_displacement(here, goal)
         x_e = [moved[task.axes]]
         if task.turns:
             x_e.append(turned if task.turns == "orientation" else kinematics.tip_rotation[:, :2].T @ turned)
         base_rate = np.zeros(setup.truss.member_count)
         if setup.base_motion is not None:
-            motion = np.where(setup.truss.base[:, None], setup.base_motion.nodes(state.time + dt) - X, 0.0)
-            base_rate = setup.layout.base_length_rate(kinematics.gradient, motion)
+            motion = setup.arm.based(X, setup.base_motion.pose(state.time + dt)) - X
+            base_rate = setup.truss.scatter.base_rate(kinematics.gradient, motion)
             X += motion
-        x = np.concatenate([*x_e, -base_rate[setup.layout.fixed]])
+        x = np.concatenate([*x_e, -base_rate[setup.truss.fixed]])
         if self._correct:
-            gap = self._home_fixed - kinematics.quantities[setup.layout.fixed]
-            x = np.concatenate([tip.error, gap - base_rate[setup.layout.fixed]])
+            gap = self._home_fixed - kinematics.quantities[setup.truss.fixed]
+            x = np.concatenate([tip.error, gap - base_rate[setup.truss.fixed]])
         terms = self._objective.at(X, kinematics.quantities, state.time)
         self.spend("kinematics")
         X[free] += self._solution.displacement(kinematics.gradient, tip.jacobian, x, terms).reshape(-1, 3)
@@ -212,12 +213,12 @@ class ConventionalResolver(MethodResolver):
 
     def _newton(self, X: Array, path: Path, end: float) -> None:
         """Correct fixed members and tip in place: Newton's method by the same pseudoinverse, without gradients."""
-        arm, goal = self.setup, path.at(end)
+        setup, goal = self.setup, path.at(end)
         kinematics, free = setup.kinematics, setup.truss.free
         for _ in range(MAX_CORRECTIONS):
             kinematics.evaluate(X)
-            tip = setup.task.rows(X, goal)
-            gap = self._home_fixed - kinematics.quantities[setup.layout.fixed]
+            tip = setup.task.rows(X, kinematics, goal)
+            gap = self._home_fixed - kinematics.quantities[setup.truss.fixed]
             worst = float(np.max(np.abs(gap), initial=0.0))
             if worst <= LENGTH_TOLERANCE and float(np.max(np.abs(tip.error))) <= TIP_TOLERANCE:
                 return

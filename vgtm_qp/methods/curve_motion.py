@@ -52,7 +52,7 @@ class CurveMotion:
             raise CurveError("this method needs a reference curve and a truss with faces")
         family = setup.layout.family
         assert family is not None, "an arm with faces and a curve is laid out with its family"
-        self._arm, self._task = arm, setup.task
+        self._setup, self._task = setup, setup.task
         spare = degree_of_redundancy(spec.control_vertices, len(setup.task.row_names), spec.torsion_vertices)
         if spare < 0:
             raise CurveError(
@@ -145,9 +145,9 @@ class CurveMotion:
             gradient[:vertices] += gain * self._bending @ p.ravel()
         if gain := self._terms.get("obstacle_potential"):
             rows, distance, _ = self._near(curve, X, time)
-            stiffness = gain * potential_curvature(distance, self._arm.influence)
+            stiffness = gain * potential_curvature(distance, self._setup.influence)
             hessian[:vertices, :vertices] += (rows.T * stiffness) @ rows
-            gradient[:vertices] += gain * potential_slope(distance, self._arm.influence) @ rows
+            gradient[:vertices] += gain * potential_slope(distance, self._setup.influence) @ rows
         return Objective(hessian, gradient)
 
     def follow_qp(
@@ -195,7 +195,7 @@ class CurveMotion:
         H = np.zeros((size + 1, size + 1))
         H[:size, :size] = objective.hessian
         H[-1, -1] = curvature
-        f, room = np.zeros(size + 1), self._arm.safe + _MARGIN - distance
+        f, room = np.zeros(size + 1), self._setup.safe + _MARGIN - distance
         bounds = -progress, 0.0
         if progress == 0.0:
             f, bounds = np.append(objective.gradient, -2.0 * curvature), (0.0, 1.0)
@@ -245,7 +245,7 @@ class CurveMotion:
 
     def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array, list[str]]:
         """Return rows (R, 3 V) of d distance / d p, distances (R,), m, and names of the members near obstacles."""
-        arm = self._arm
+        setup = self._setup
         pairs = setup.monitor.near(setup.arm.points(X), time, setup.influence)
         with_obstacle = np.flatnonzero(~pairs.is_self)
         members = setup.truss.members[pairs.body[with_obstacle]]

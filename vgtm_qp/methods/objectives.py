@@ -50,7 +50,7 @@ class TrussObjective:
                     f'no null-space term "{name}"{nearest(name, TRUSS_TERMS)}; choices: {", ".join(TRUSS_TERMS)}'
                 )
         self.names = names
-        self._arm = arm
+        self._setup = setup
         self._centring = weights.stroke_centring if "stroke_centring" in names else 0.0
         self._potential = weights.obstacle_potential if "obstacle_potential" in names else 0.0
         actuator = self._centring + (weights.actuator_rate if "actuator_rate" in names else 0.0)
@@ -62,7 +62,7 @@ class TrussObjective:
 
     def at(self, X: Array, lengths: Array, time: float) -> Terms:
         """Return the terms at node positions `X` (N, 3) with member `lengths` (M,)."""
-        arm = self._arm
+        setup = self._setup
         actuators = setup.truss.actuators
         centring = self._centring * (lengths[actuators] - setup.arm.home_quantities[actuators])
         if not self._potential:

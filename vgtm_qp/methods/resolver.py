@@ -44,7 +44,7 @@ class MethodResolver(ABC):
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
         kinematics = self.setup.kinematics
         kinematics.evaluate(self.state.nodes)
-        return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
+        return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` to `end` in one step; a blocked step has its reason."""
@@ -63,9 +63,10 @@ class MethodResolver(ABC):
         before = self.state
         self.state = State(
             time=before.time + dt,
-            nodes=frozen(nodes),
+            q=(q := frozen(nodes)),
+            nodes=q,
             control_vertices=frozen(vertices),
-            lengths=lengths,
+            quantities=lengths,
             rates=frozen((lengths - before.quantities) / dt),
             motion=frozen(nodes - before.nodes),
             duration=dt,
@@ -117,4 +118,4 @@ def pose_displacement(start: PathPoint, end: PathPoint) -> tuple[Array, Array]:
 
 
 def _step(status: StepStatus, progress: float, state: State, reason: str) -> Step:
-    return Step(status, progress, state, reason, 0, lambda k, upper: "")  # noqa: ARG005
+    return Step(status, progress, state, reason, 0)

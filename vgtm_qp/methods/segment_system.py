@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arm.truss.kinematics import frame_constants, frame_function, member_function
+from vgtm_qp.arm.frames import frame_constants, frame_function
+from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
@@ -22,7 +23,7 @@ class Entries:
 
     def __init__(self, layout: Layout, segment: Segment) -> None:
         truss = truss_of(layout.arm)
-        column = layout.node_column[layout.member_nodes[segment.fixed]]
+        column = layout.node_column[truss_of(layout.arm).member_nodes[segment.fixed]]
         row, slot = np.nonzero(column >= 0)
         axis = np.arange(3)
         self.member_source = ((row * column.shape[1] + slot)[:, None] * 3 + axis).ravel()
@@ -65,7 +66,7 @@ class SegmentSystem:
     ) -> None:
         truss = truss_of(layout.arm)
         self.segment = segment
-        self._nodes = layout.member_nodes[segment.fixed].ravel()
+        self._nodes = truss_of(layout.arm).member_nodes[segment.fixed].ravel()
         self._home = home_lengths[segment.fixed]
         self._face, self._weights = truss.faces[segment.face], truss.face_weights[segment.face]
         self._entries = Entries(layout, segment)
@@ -132,7 +133,7 @@ class SegmentSystem:
 
 def _function(layout: Layout, members: int, turns: bool) -> ca.Function:
     """Return (member nodes (3, Q m), face nodes, constants) -> lengths, gradients and, if it turns, frame and spin."""
-    slots = layout.member_nodes.shape[1]
+    slots = truss_of(layout.arm).member_nodes.shape[1]
     nodes, face = ca.MX.sym("nodes", 3, slots * members), ca.MX.sym("face", 3, 3)
     inputs, outputs = [nodes, face], []
     frame = [ca.MX.sym("cosines", 3), ca.MX.sym("sines", 3), ca.MX.sym("alignment", 3, 3)] if turns else []

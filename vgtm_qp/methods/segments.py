@@ -97,12 +97,12 @@ def _segments(layout: Layout, partition: list[tuple[int, str]]) -> list[Segment]
     truss = truss_of(layout.arm)
     last_stage = [int(truss.stage[truss.faces[face]].max()) for face, _ in partition]
     last_stage[-1] = int(truss.stage.max())
-    latest = truss.stage[layout.member_nodes].max(axis=1)
+    latest = truss.stage[truss.member_nodes].max(axis=1)
     segments, before = [], -1
     for (face, tracks), last in zip(partition, last_stage, strict=True):
         nodes = truss.free[(truss.stage[truss.free] > before) & (truss.stage[truss.free] <= last)]
-        members = layout.fixed[(latest[layout.fixed] > before) & (latest[layout.fixed] <= last)]
-        touched = np.concatenate([layout.member_nodes[members].ravel(), truss.faces[face]])
+        members = truss.fixed[(latest[truss.fixed] > before) & (latest[truss.fixed] <= last)]
+        touched = np.concatenate([truss.member_nodes[members].ravel(), truss.faces[face]])
         columns = layout.node_column[touched]
         start = int(layout.node_column[nodes].min(initial=layout.node_columns))
         first = int(np.min(columns[columns >= 0], initial=start))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
@@ -203,7 +205,7 @@ class StationSymbols:
         )
 
     @property
-    def curve(self) -> ca.SX:
+    def curve(self) -> Any:
         """Rows of the turns over the curve: (2, 3) over the slope r', or (R, 3 V + T) over all coordinates."""
         return self.slope if self._is_tabled else self._turned
 

@@ -61,7 +61,7 @@ def run(module: str, bays: int, steps: int) -> Row:
     nodes, truss, curve = resolver.state.nodes, resolver.setup.truss, resolver.curve
     resolver.setup.kinematics.evaluate(nodes)
     points = curve.position(np.linspace(0.0, 1.0, 4001))
-    centres = resolver.setup.kinematics.face_centres(nodes)
+    centres = resolver.setup.arm.stations.centres(nodes)
     middle = np.linspace(0.0, 1.0, 9)[None, :, None]
     axis = (centres[:-1, None] + middle * np.diff(centres, axis=0)[:, None]).reshape(-1, 3)
     normals = resolver.setup.kinematics.station_rotation[:, :, 2]

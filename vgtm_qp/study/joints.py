@@ -13,7 +13,7 @@ from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import load_problem
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.setup.truss.kinematics import Kinematics
+from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.study.drawing import MARKS, label, panels
 from vgtm_qp.study.workers import Row, Task
@@ -47,7 +47,7 @@ def run(problem: str, offset: float) -> Row:
         change = maneuver.member_lengths[row] - maneuver.member_lengths[0]
         if not _place(kinematics, setup.layout, X, setup.arm.home_quantities + change):
             break
-        errors.append(float(np.linalg.norm(kinematics.tip_position(X) - maneuver.tip_position[row])))
+        errors.append(float(np.linalg.norm(setup.arm.end_effector.position(X) - maneuver.tip_position[row])))
     return {"tip_error": max(errors), "posed": len(errors) - 1, "steps": maneuver.steps}
 
 
@@ -60,7 +60,7 @@ def _place(kinematics: Kinematics, layout: Layout, X: Array, lengths: Array) -> 
         worst = float(np.abs(error).max())
         if worst < _TOLERANCE:
             return True
-        J = layout.length_jacobian(kinematics.gradient)
+        J = truss_of(layout.arm).scatter.dense(kinematics.gradient)
         X[free] += min(1.0, 0.2 / worst) * np.linalg.solve(J, error).reshape(-1, 3)
     return False
 

@@ -73,7 +73,7 @@ def run(bays: int, method: str, cubes: bool) -> Row:
             value = (
                 float(mark) if step.progress >= 1.0 - 1e-9 else value + step.progress * (float(mark) - value)
             )
-    fixed = resolver.setup.layout.fixed
+    fixed = resolver.setup.truss.fixed
     drift = np.abs(resolver.state.quantities - resolver.setup.arm.home_quantities)[fixed].max()
     return {
         "time": _STEPS * float(np.median(times)),

@@ -70,7 +70,7 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
     kinematics = setup.kinematics
     if reachable:
         kinematics.evaluate(shape)
-        waypoint["position"] = kinematics.tip_position(shape).tolist()
+        waypoint["position"] = setup.arm.end_effector.position(shape).tolist()
         if directed:
             waypoint["pointing"] = kinematics.tip_rotation[:, 2].tolist()
     else:
@@ -133,7 +133,7 @@ def random_shape(setup: Setup, random: np.random.Generator) -> Array:
 
 
 def _tip_motion(setup: Setup, X: Array) -> float:
-    return float(np.linalg.norm(setup.kinematics.tip_position(X) - setup.kinematics.tip_position(setup.truss.home)))
+    return float(np.linalg.norm(setup.arm.end_effector.position(X) - setup.arm.end_effector.position(setup.truss.home)))
 
 
 def _random_lengths(setup: Setup, random: np.random.Generator) -> Array:
@@ -154,7 +154,7 @@ def _random_lengths(setup: Setup, random: np.random.Generator) -> Array:
 
 
 def _least_singular_value(setup: Setup) -> float:
-    jacobian = setup.layout.length_jacobian(setup.kinematics.gradient)
+    jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
     if not np.all(np.isfinite(jacobian)):
         return 0.0
     return float(np.linalg.svd(jacobian, compute_uv=False)[-1])
@@ -170,7 +170,7 @@ def _newton(setup: Setup, X: Array, lengths: Array, singular: float) -> bool:
             return True
         if _least_singular_value(setup) < singular:
             return False
-        jacobian = setup.layout.length_jacobian(setup.kinematics.gradient)
+        jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
         X[free] += np.linalg.solve(jacobian, error).reshape(-1, 3)
     return False
 

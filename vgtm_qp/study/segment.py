@@ -51,7 +51,7 @@ def run(module: str, steps: int) -> Row:
         segments = resolver.tracker.segments
         faces = np.array([segment.face for segment in segments])
         s = resolver.motion.s[faces]
-        centres = resolver.setup.kinematics.face_centres(resolver.state.nodes)[faces]
+        centres = resolver.setup.arm.stations.centres(resolver.state.nodes)[faces]
         gap = max(gap, float(np.abs(centres - resolver.curve.position(s)).max()))
         normals = resolver.setup.kinematics.station_rotation[faces][:, :, 2]
         cosine = np.einsum("kc,kc->k", normals, resolver.curve.tangent(s))

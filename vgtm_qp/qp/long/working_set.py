@@ -260,7 +260,7 @@ def dual_solution(
         free = np.abs(value) >= UNBOUNDED
         bounds.append(np.where(free, value, (value - values[kept]) * scale))
     sense = np.where(equal[kept], daqp.EQUALITY, 0).astype(np.int32)
-    answer = daqp.ask(np.eye(rank), np.zeros(rank), rows, *bounds, sense)
+    answer = daqp.ask(np.eye(rank), np.zeros(rank), rows, bounds[0], bounds[1], sense)
     if answer.flag < 1:
         raise SolverError(f"daqp ended with exit flag {answer.flag}")
     multipliers[kept] = answer.multipliers * scale
