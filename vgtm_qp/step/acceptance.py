@@ -6,6 +6,8 @@ configuration is the only thing taken from it here, and quantities and tip are f
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,6 +44,7 @@ class Acceptance:
     def __init__(self, arm: Arm, kinematics: Kinematics, task: TipTask, *, member: float, tip: float) -> None:
         self._arm, self._kinematics, self._task = arm, kinematics, task
         self._base, self._actuators = np.flatnonzero(arm.base), arm.actuators
+        self._least, self._greatest = arm.home_quantities.copy(), arm.home_quantities.copy()
         self._member, self._tip = _LOOSER * member, _LOOSER * tip
 
     def flaw(
@@ -69,31 +72,41 @@ class Acceptance:
         curve
             Whatever else has to be finite.
         """
-        arm, q = self._arm, closed.q
-        # NaN passes no comparison with `<=`.
-        size = float(np.abs(q).max())
-        if not size < np.inf or not all(np.isfinite(part).all() for part in curve):
+        arm, q, quantities = self._arm, closed.q, closed.quantities
+        # NaN passes no comparison with `<=`, and is in every sum.
+        size = _greatest(q)
+        if not size < np.inf or not all(math.isfinite(part.sum()) for part in curve):
             return "the new state is not finite"
         rounding = _ROUNDING * size
-        X = arm.nodes(q)
+        X, at = arm.nodes(q), arm.nodes(before if base is None else arm.based(q, base))
         # A base that rests is left alone by everything, so that it cannot drift either.
-        at, spare = (before, 0.0) if base is None else (arm.based(q, base), self._member + rounding)
-        off = X.take(self._base, axis=0) - arm.nodes(at).take(self._base, axis=0)
-        if not np.abs(off).max(initial=0.0) <= spare:
-            return f"the new state has its base {np.abs(off).max():.3g} m from where it is"
-        values, wanted = arm.measured(q), arm.home_quantities.copy()
-        actuated = values[self._actuators]
-        wanted[self._actuators] = np.minimum(np.maximum(actuated, lower), upper)
-        worst = float(np.abs(values - wanted).max())
-        if not worst <= self._member + rounding:
-            return f"the new state has a member {worst:.3g} m from the lengths it may have"
-        worst = float(np.abs(values - closed.quantities).max())
-        if not worst <= self._member + rounding:
-            return f"the new state has a member {worst:.3g} m from the length that it is said to have"
+        spare = 0.0 if base is None else self._member + rounding
+        off = _greatest(X.take(self._base, axis=0) - at.take(self._base, axis=0))
+        if not off <= spare:
+            return f"the new state has its base {off:.3g} m from where it is"
+        values, enough = arm.measured(q), self._member + rounding
+        self._least[self._actuators], self._greatest[self._actuators] = lower, upper
+        off = max(float((self._least - values).max()), float((values - self._greatest).max()))
+        if not off <= enough:
+            return f"the new state has a member {off:.3g} m from the lengths it may have"
+        off = _greatest(values - quantities)
+        if not off <= enough:
+            return f"the new state has a member {off:.3g} m from the length that it is said to have"
         if goal is not None:
-            if self._task.turns is not None:
-                self._kinematics.evaluate_quantities(q)
-            worst = self._task.error(arm.end_effector.position(X), self._kinematics.tip_rotation, goal)
-            if not worst <= self._tip + rounding:
-                return f"the new state has its tip {worst:.3g} m or rad from its goal"
+            off = self._tip_error(q, X, goal)
+            if not off <= self._tip + rounding:
+                return f"the new state has its tip {off:.3g} m or rad from its goal"
         return ""
+
+    def _tip_error(self, q: Array, X: Array, goal: PathPoint) -> float:
+        """Return the greatest error of the tip, m or rad."""
+        position, task = self._arm.end_effector.position(X), self._task
+        if task.turns is None:
+            return _greatest((goal.position - position)[task.axes])
+        self._kinematics.evaluate_quantities(q)
+        return task.error(position, self._kinematics.tip_rotation, goal)
+
+
+def _greatest(values: Array) -> float:
+    """Return the greatest absolute value; NaN where there is one."""
+    return float(np.abs(values).max(initial=0.0))

@@ -138,9 +138,13 @@ class TrussArm:
 
     def measured(self, q: Array) -> Array:
         """See ``arm.Arm``: the distances of the members' ends."""
-        ends = self.truss.member_ends(q)
-        way = ends[:, 0] - ends[:, 1]
+        points, (first, last) = self.points(q), self._ends_of_bodies
+        way = points.take(first, axis=0) - points.take(last, axis=0)
         return np.asarray(np.sqrt(np.einsum("mc,mc->m", way, way)))
+
+    @cached_property
+    def _ends_of_bodies(self) -> Array:
+        return np.ascontiguousarray(self.bodies.points.T)
 
     def based(self, q: Array, pose: Pose) -> Array:
         """See ``arm.Arm``."""
