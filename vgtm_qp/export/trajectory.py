@@ -49,12 +49,12 @@ uint32 nanosec"""
 
 def actuator_names(maneuver: Result) -> list[str]:
     """Return the names of the actuated members, the joints of every trajectory here."""
-    return [str(name) for name in maneuver.member_names[maneuver.member_actuated]]
+    return list(maneuver.actuator_names)
 
 
 def actuator_lengths(maneuver: Result) -> Array:
     """Return (T, n_a) lengths of the actuated members, m."""
-    return maneuver.member_lengths[:, maneuver.member_actuated]
+    return maneuver.actuator_values
 
 
 def step_rates(maneuver: Result) -> Array:

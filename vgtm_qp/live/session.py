@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.maneuver.arm_record import arm_record
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.path import Path
@@ -62,9 +61,9 @@ class Session:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._resolver = _make_resolver(problem)
-        truss = self._resolver.setup.truss
+        arm = self._resolver.setup.arm
         self.drawing: Drawing = drawing_of_problem(
-            problem, arm_record(truss), truss.members, len(self.state.control_vertices)
+            problem, arm.record(), arm.bodies.joints, len(self.state.control_vertices)
         )
         self.target: Array = self.tip
         self.vertex_goals: dict[int, Array] = {}
@@ -111,17 +110,17 @@ class Session:
         """Put the arm into its home pose, at rest, and want nothing else."""
         self._put(self._resolver.setup.home_state())
 
-    def put_at(self, time: float, nodes: Array, control_vertices: Array) -> None:
-        """Put the arm at rest at `nodes` (N, 3) and `control_vertices` (V, 3), m; want nothing else."""
-        home: State = self._resolver.setup.home_state()
+    def put_at(self, time: float, q: Array, control_vertices: Array) -> None:
+        """Put the arm at rest in configuration `q` and at `control_vertices` (V, 3), m; want nothing else."""
+        arm, home = self._resolver.setup.arm, self._resolver.setup.home_state()
         self._put(
             replace(
                 home,
                 time=float(time),
-                q=(q := frozen(nodes)),
-                nodes=q,
+                q=frozen(q),
+                nodes=frozen(arm.nodes(q)),
                 control_vertices=frozen(control_vertices),
-                quantities=frozen(self.drawing.arm.lengths(nodes)),
+                quantities=frozen(arm.measured(q)),
             )
         )
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
-from vgtm_qp.maneuver.arm_record import arm_record
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.retries import DeadEnd, retries
@@ -70,10 +69,6 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
         The problem cannot be set up, or is not a Problem; no step was made.
     """
     check_is_problem(problem)
-    if problem.arm is not None:
-        expected = "[truss]: a Resolver steps serial arms, but result files and certificates take trusses alone in this version"
-        mistake = problem.mistake(("arm",), expected)
-        raise ProblemError(str(problem.source or problem.name), [mistake])
     started = perf_counter()
     resolver = make_resolver(problem)
     mistakes = check_problem(problem, resolver.setup)
@@ -193,8 +188,8 @@ def _add_state(
     target = plan.path.at(value)
     record.add(
         time=state.time,
-        nodes=state.nodes,
-        member_lengths=state.quantities,
+        configuration=state.q,
+        quantities=state.quantities,
         control_vertices=state.control_vertices,
         tip_position=position,
         tip_rotation=rotation,
@@ -216,7 +211,7 @@ def _assemble(
     setup_time: float,
     way: str,
 ) -> Maneuver:
-    truss, task = resolver.setup.truss, resolver.setup.task
+    arm, task = resolver.setup.arm, resolver.setup.task
     meshes = {
         obstacle.name: mesh_record(obstacle.file, len(pieces.pieces))
         for obstacle, pieces in zip(problem.obstacle, resolver.setup.monitor.obstacles, strict=True)
@@ -225,13 +220,13 @@ def _assemble(
     reached = float(record.rows["progress"][-1])
     manifest = make_manifest(
         problem.to_dict(),
-        arm_record(truss),
+        arm.record(),
         status="solved" if stop is None else "blocked",
         reached=reached,
         blocked_by=() if stop is None else stop.names,
         stop=None if stop is None else stop.to_dict(),
         way_out=way,
-        recovered=_too_near(resolver.setup, record.rows["nodes"][0])
+        recovered=_too_near(resolver.setup, record.rows["configuration"][0])
         if isinstance(resolver, Resolver)
         else None,
         method=problem.method.name,
@@ -246,11 +241,6 @@ def _assemble(
     count = len(record.rows["time"])
     return Maneuver(
         time=record.array("time"),
-        nodes=record.array("nodes"),
-        members=truss.members,
-        member_names=np.array(truss.member_names),
-        member_actuated=truss.actuated,
-        member_lengths=record.array("member_lengths"),
         control_vertices=record.array("control_vertices").reshape(count, -1, 3),
         tip_position=record.array("tip_position"),
         tip_rotation=record.array("tip_rotation"),
@@ -264,6 +254,7 @@ def _assemble(
         manifest=manifest,
         tip_target_rotation=rotation if task.turns == "orientation" else None,
         tip_target_pointing=rotation[:, :, 2] if task.turns == "pointing" else None,
+        **arm.recorded(record.array("configuration"), record.array("quantities")),
     )
 
 
