@@ -27,6 +27,8 @@ class RecordedChain:
         Joints, and links.
     actuated, home_quantities, stroke, rate, acceleration : (J,), (J,), (J, 2), (J,), (J,)
         Of the joints; infinite where there is no limit.
+    base : (1,) int
+        The point that the problem places.
     links, members : (B, 2) int
         The points of each link, counted from the base over the joints to the tip; and its ends, of which neighbours
         have one in common.
@@ -34,7 +36,7 @@ class RecordedChain:
         Of the links, m.
     """
 
-    unit = "rad or m"
+    unit, rigid_body = "rad or m", "link"
     has_pin_joints = False
 
     def __init__(self, record: Mapping[str, Any]) -> None:
@@ -65,12 +67,17 @@ class RecordedChain:
             raise ResultError(f"manifest.arm does not describe {joints} joints")
         if links and not (self.links.min() >= 0 and self.links.max() < joints + 2):
             raise ResultError(f"manifest.arm.links names a point outside 0..{joints + 1}")
-        self.free = self.base = np.zeros(0, dtype=np.int64)
+        self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
         home = np.concatenate([self.home_quantities, np.zeros(6)])[None]
         points, _, frames = self.placed(home)
         self.home, self._home_tip = points[0], frames[0]
         self.length = np.linalg.norm(np.diff(self.home[self.links], axis=1)[:, 0], axis=1)
         self._reaches = self._greatest_reaches()
+
+    @property
+    def stretches(self) -> NDArray[np.bool_]:
+        """(B,) bodies that are drawn as changing their lengths: none."""
+        return np.zeros(len(self.links), dtype=np.bool_)
 
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
         """Return points (P, J + 2, 3), m, axes (P, J, 3) and last frames (P, 3, 3) at configurations (P, J + 6)."""

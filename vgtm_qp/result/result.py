@@ -127,7 +127,7 @@ class Result:
 
     @property
     def configurations(self) -> Array:
-        """(T, N, 3) the nodes, m; of a serial arm (T, J + 6) its joints, and position and rotation vector of its base."""
+        """(T, N, 3) the nodes, m; of a serial arm (T, J + 6) joints, then position and rotation vector of its base."""
         if self.joints is None:
             return self.nodes
         return np.concatenate([self.joints, base_poses(self.manifest["problem"], self.time)], axis=1)
@@ -145,6 +145,14 @@ class Result:
         if self.joints is None:
             return self.member_lengths[:, self.member_actuated]
         return self.joints[:, self._moving_joints]
+
+    @property
+    def actuator_units(self) -> tuple[str, ...]:
+        """``"m"`` or ``"rad"``."""
+        if self.joints is None:
+            return ("m",) * int(self.member_actuated.sum())
+        turns = np.asarray(self.manifest["arm"]["revolute"], dtype=np.bool_)[self._moving_joints]
+        return tuple("rad" if turn else "m" for turn in turns)
 
     @property
     def _moving_joints(self) -> NDArray[np.bool_]:

@@ -79,12 +79,17 @@ class RecordedArm:
         self.free = np.setdiff1d(np.arange(nodes), self.base)
         self._tip_fit = polygon_frame(self.home[self.tip], None) if self.has_tip_frame else None
 
-    unit = "m"
+    unit, rigid_body = "m", "fixed member"
 
     @property
     def quantity_names(self) -> tuple[str, ...]:
         """Names of what moves the arm and of what is fixed: its members."""
         return self.member_names
+
+    @property
+    def stretches(self) -> NDArray[np.bool_]:
+        """(M,) bodies that change their lengths."""
+        return np.asarray(self.actuated)
 
     @property
     def home_quantities(self) -> Array:

@@ -194,14 +194,15 @@ class SerialArm:
     @cached_property
     def bodies(self) -> Bodies:
         """Links between successive origins; those of joints in one place are joined as if they were one."""
-        chain = self.chain
-        first = np.arange(1, len(chain) + 1)
-        place = np.concatenate([[0], np.cumsum(chain.lengths[1:] > 0.0)])
-        kept = np.flatnonzero(chain.lengths[1:] > 0.0)
-        points = np.stack([first, first + 1], axis=1)[kept]
+        chain, count = self.chain, len(self.chain)
+        apart = (chain.lengths[1:] > 0.0) | ~chain.revolute
+        place = np.arange(count + 2)
+        for node in range(count, 0, -1):
+            place[node] = node if apart[node - 1] else place[node + 1]
+        kept = np.flatnonzero(apart)
+        points = np.stack([kept + 1, kept + 2], axis=1)
         names = [chain.names[j] for j in kept]
-        joints = np.stack([place[:-1], place[1:]], axis=1)[kept]
-        return capsules(points, chain.radius, names, joints=joints, kind="link")
+        return capsules(points, chain.radius, names, joints=place[points], kind="link")
 
     @cached_property
     def motion_pattern(self) -> MotionPattern:
