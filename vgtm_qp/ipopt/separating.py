@@ -72,8 +72,8 @@ class IpoptStepper:
 
     def _step(self, state: State, goal: PathPoint, duration: float) -> State | None:
         setup = self.setup
-        truss, monitor = setup.truss, setup.monitor
-        tip = truss.tip_weights @ state.nodes[truss.tip]
+        monitor = setup.monitor
+        tip = setup.arm.end_effector.position(state.nodes)
         reach = 1.5 * float(np.linalg.norm(goal.position - tip)) + 0.1
         time = state.time + duration
         for _ in range(_RESOLVES):
