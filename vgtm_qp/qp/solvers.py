@@ -108,9 +108,7 @@ class FullSolver:
             raise InfeasibleStepError("a lower bound is above its upper bound")
         z, y, w, iterations = self._answer(qp, same_structure=same)
         scale = relative(1.0, qp.q, y)
-        dual = max(
-            scale * qp.dual_residual(z, y, w), qp.complementarity_residual(z, scale * y, scale * w)
-        )
+        dual = max(scale * qp.dual_residual(z, y, w), qp.complementarity_residual(z, scale * y, scale * w))
         refuse_large(qp.primal_residual(z), dual, self._name)
         # Only a good answer is a warm start: NaN would stay in the solver for ever.
         self._structure = self.builder.structure
