@@ -144,13 +144,7 @@ def _function(truss: Truss, members: int, turns: bool) -> ca.Function:
         offsets = ca.MX.sym("offsets", 3, 2 * members)
         inputs.append(offsets)
         arguments.append(offsets)
-<<<<<<< HEAD
     outputs += list(member_function(truss).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
-=======
-    outputs += (
-        list(member_function(truss_of(layout.arm)).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
-    )
->>>>>>> door
     if turns:
         outputs += list(frame_function(3)(face, *frame))
     return ca.Function("segment", inputs, outputs)
