@@ -427,6 +427,10 @@ class Arm(Protocol):
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
         ...
 
+    def record(self) -> dict[str, Any]:
+        """Return what verification needs to know of the arm, as JSON data for a result file."""
+        ...
+
     def motion_rows(self, *values: Array) -> MotionRows:
         """Return the rows from the values of ``ArmSymbols.motion``."""
         ...

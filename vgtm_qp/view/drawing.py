@@ -124,7 +124,7 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
 
 
 def drawing_of_problem(problem: Problem, record: Mapping[str, Any], members: Index, vertices: int) -> Drawing:
-    """Return the drawing of a problem from the `arm_record` of its arm and number of control vertices."""
+    """Return the drawing of a problem from the ``record`` of its ``arm.Arm`` and the number of control vertices."""
     directory = problem.source.parent if problem.source else Path.cwd()
     return _drawing(problem.to_dict(), RecordedArm(record, members), vertices, directory)
 

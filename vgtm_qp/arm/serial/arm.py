@@ -15,6 +15,7 @@ from vgtm_qp.arm.frames import frames_at
 from vgtm_qp.arm.serial.chain import Array, Chain, Index, Mask, chain_function
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.compiled import Kernel
+from vgtm_qp.errors import TrussError
 from vgtm_qp.geometry.bodies import Bodies, capsules
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 
@@ -298,6 +299,18 @@ class SerialArm:
     def symbols(self, constants: Constants) -> ChainSymbols:
         """See ``arm.Arm``."""
         return ChainSymbols(self, constants)
+
+    def record(self) -> dict[str, Any]:
+        """See ``arm.Arm``.
+
+        Raises
+        ------
+        TrussError
+            Always: result files hold trusses alone.
+        """
+        raise TrussError(
+            f"a {self.kind} arm is no truss, and result files hold trusses alone; expected [truss]"
+        )
 
     def motion_rows(self, *values: Array) -> ChainRows:
         """See ``arm.Arm``: K column by column, and r."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from vgtm_qp.arm.truss.kinematics import EndKinematics, TrussKinematics
 from vgtm_qp.arm.truss.lengths import LengthRows
 from vgtm_qp.arm.truss.mobility import describe
 from vgtm_qp.arm.truss.reach import hollow, longest_ways
+from vgtm_qp.arm.truss.record import arm_record
 from vgtm_qp.arm.truss.symbols import TrussSymbols
 from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
 from vgtm_qp.errors import TrussError
@@ -223,6 +225,10 @@ class TrussArm:
     def symbols(self, constants: Constants) -> TrussSymbols:
         """See ``arm.Arm``."""
         return TrussSymbols(self.truss, constants)
+
+    def record(self) -> dict[str, Any]:
+        """See ``arm.Arm``."""
+        return arm_record(self.truss)
 
     def motion_rows(self, *values: Array) -> LengthRows:
         """See ``arm.Arm``: gradients (3 Q M,) and right-hand sides (M,)."""
