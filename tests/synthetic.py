@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.joints import Joints
-from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arm.truss.record import arm_record
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.result.manifest import make_manifest
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from method_problems import MODULES, free_problem, run
-from vgtm_qp.step.arm import build_arm
-from vgtm_qp.step.linearise import Linearisation, Target
 
 import vgtm_qp as vq
 from vgtm_qp.errors import CurveError
@@ -18,7 +16,10 @@ from vgtm_qp.methods.objectives import potential_curvature, potential_field, pot
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.condensed import CondensedSolver
+from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.target import QPInput, Target
 
 ALL_TERMS = ["node_rate", "actuator_rate", "stroke_centring"]
 
@@ -41,20 +42,21 @@ def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra:
         }
     )
     resolver = ConventionalResolver(problem)
-    arm = resolver.arm
+    setup = resolver.setup
     plan = make_plan(problem, *resolver.tip())
     resolver.state = there.state
     start, end = float(plan.marks[11]), float(plan.marks[12])
     step = resolver.follow(plan.path, start, end)
     assert step.progress == 1.0, step.reason
 
-    unlimited = np.full(len(arm.truss.actuators), 1e9)
+    unlimited = np.full(len(setup.truss.actuators), 1e9)
     target = Target(plan.path, start, end, -unlimited, unlimited, there.state.time + 0.05)
-    linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
-    numbers = linearisation.numbers(
-        np.array(there.state.nodes), np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True
-    )
-    answer = CondensedSolver(arm.layout).solve(numbers)
+    here = np.array(there.state.nodes)
+    asked = QPInput(
+        here, here, np.zeros((0, 3)), np.zeros(0), target, target.goal(0.0), 0.0, ClearanceRows(), motion=True
+    ).linear(setup.layout)
+    numbers = Linearisation(setup.layout).numbers(asked, ClearanceRows())
+    answer = CondensedSolver(setup.layout).solve(numbers)
     assert answer.progress == pytest.approx(1.0, abs=1e-12)
     moved = resolver.state.nodes - there.state.nodes
     assert np.abs(moved).max() > 1e-3
@@ -87,9 +89,9 @@ def test_corrected_methods_keep_lengths_and_tip(module: str, name: str) -> None:
     problem = free_problem(module, name=name, tracking="recursive", correct=True)
     resolver = make_resolver(problem)
     run(resolver, problem)
-    arm = resolver.arm
-    fixed = arm.layout.fixed
-    np.testing.assert_allclose(resolver.state.lengths[fixed], arm.home_lengths[fixed], atol=1e-10)
+    setup = resolver.setup
+    fixed = setup.truss.fixed
+    np.testing.assert_allclose(resolver.state.quantities[fixed], setup.arm.home_quantities[fixed], atol=1e-10)
     np.testing.assert_allclose(resolver.tip()[0], problem.maneuver.waypoint[0].position, atol=1e-9)
 
 
@@ -100,8 +102,8 @@ def test_faithful_methods_drift_by_the_square_of_the_step(name: str) -> None:
         problem = free_problem("octahedral", steps=steps, name=name, tracking="recursive")
         resolver = make_resolver(problem)
         run(resolver, problem)
-        fixed = resolver.arm.layout.fixed
-        drift.append(np.abs(resolver.state.lengths - resolver.arm.home_lengths)[fixed].max())
+        fixed = resolver.setup.truss.fixed
+        drift.append(np.abs(resolver.state.quantities - resolver.setup.arm.home_quantities)[fixed].max())
     # Squares of half the displacement, twice as often.
     assert drift[0] / drift[1] == pytest.approx(2.0, abs=0.2)
 
@@ -125,7 +127,7 @@ def test_damping_and_truncation_change_the_answer_and_the_rank() -> None:
         return found
 
     plain = resolver()
-    rows = len(plain.arm.layout.fixed) + 3
+    rows = len(plain.setup.truss.fixed) + 3
     assert plain.rank == rows
     damped = resolver(variant="damped", damping=0.3)
     assert np.abs(damped.state.nodes - plain.state.nodes).max() > 1e-4
@@ -195,7 +197,7 @@ def test_torsion_coordinates_let_the_curve_steer_roll() -> None:
     rolled = Problem.from_dict(data)
     resolver = make_resolver(rolled)
     run(resolver, rolled)
-    np.testing.assert_allclose(resolver.arm.truss.tip_frame, np.eye(3))
+    np.testing.assert_allclose(resolver.setup.truss.tip_frame, np.eye(3))
     expected = make_plan(rolled, *resolver.tip()).path.at(1e9).rotation
     np.testing.assert_allclose(resolver.tip()[1], expected, atol=1e-9)
 
@@ -239,15 +241,15 @@ def test_the_curve_qp_keeps_every_limit_up_to_where_it_stops(tracking: str) -> N
 
 def test_the_potential_gradient_is_that_of_the_potential() -> None:
     problem = vq.load_problem("five_bay_two_cubes").replace({"method.solver": "piqp"})
-    arm = build_arm(problem)
+    setup = build_arm(problem)
     random = np.random.default_rng(0)
-    X = arm.truss.home + random.normal(scale=0.02, size=arm.truss.home.shape)
+    X = setup.truss.home + random.normal(scale=0.02, size=setup.truss.home.shape)
 
     def potential(nodes: np.ndarray) -> float:
-        distance = arm.monitor.near(nodes, 0.0, arm.influence).distance
-        return float(np.sum(0.5 * (arm.influence / distance - 1.0) ** 2))
+        distance = setup.monitor.near(nodes, 0.0, setup.influence).distance
+        return float(np.sum(0.5 * (setup.influence / distance - 1.0) ** 2))
 
-    gradient, blocks = potential_field(arm, X, 0.0)
+    gradient, blocks = potential_field(setup, X, 0.0)
     assert np.abs(gradient).max() > 0.1
     assert np.linalg.eigvalsh(blocks).min() > -1e-9
     for _ in range(5):
@@ -291,10 +293,12 @@ def test_a_moving_base_enters_the_conventional_solution() -> None:
     moving = Problem.from_dict(data)
     resolver = make_resolver(moving)
     states = run(resolver, moving)
-    base = resolver.arm.truss.base
+    base = resolver.setup.truss.base
     np.testing.assert_allclose(states[-1][base] - states[0][base], [[0.095, 0.0, 0.0475]] * 3, atol=2e-3)
-    fixed = resolver.arm.layout.fixed
-    np.testing.assert_allclose(resolver.state.lengths[fixed], resolver.arm.home_lengths[fixed], atol=1e-10)
+    fixed = resolver.setup.truss.fixed
+    np.testing.assert_allclose(
+        resolver.state.quantities[fixed], resolver.setup.arm.home_quantities[fixed], atol=1e-10
+    )
     data["method"] |= {"name": "curve-pseudoinverse", "tracking": "recursive"}
     with pytest.raises(CurveError, match="moving base"):
         make_resolver(Problem.from_dict(data))
