@@ -302,3 +302,51 @@ def test_a_moving_base_enters_the_conventional_solution() -> None:
     data["method"] |= {"name": "curve-pseudoinverse", "tracking": "recursive"}
     with pytest.raises(CurveError, match="moving base"):
         make_resolver(Problem.from_dict(data))
+
+
+METHODS = {
+    "qp": {},
+    "qp, parallel": {"tracking": "parallel"},
+    "pseudoinverse": {"name": "pseudoinverse"},
+    "curve-pseudoinverse": {"name": "curve-pseudoinverse"},
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_tells_what_it_cannot_do_through_one_interface(method: str) -> None:
+    problem = free_problem("octahedral", **METHODS[method])
+    mover = make_resolver(problem)
+    plan = make_plan(problem, *mover.tip())
+    home = mover.state
+    step = mover.follow(plan.path, 0.0, float(plan.marks[0]))
+    assert step.state is mover.state
+    assert set(mover.phases.values()) != {0.0}
+    assert mover.brake(plan.path, 0.0, 1.0) is None
+    assert mover.too_near(home) == {}
+    stop = mover.explain(plan.path, 0.0, float(plan.marks[0]), last=step, state=home)
+    assert stop.names
+    assert mover.state is step.state
+    is_coupled = method == "qp"
+    assert mover.draws_vertices == is_coupled
+    assert (mover.again(problem) is not None) == is_coupled
+    assert (mover.solver is None) == ("pseudoinverse" in method)
+    assert (mover.rank is not None) == (method == "pseudoinverse")
+    mover.control_vertex_goals = {}
+    assert mover.control_vertex_goals == {}
+    if not is_coupled:
+        with pytest.raises(vq.GoalError, match="draws no control vertices"):
+            mover.control_vertex_goals = {3: [0.0, 0.0, 1.0]}
+
+
+@pytest.mark.parametrize("correct", [False, True])
+def test_a_curve_that_is_put_into_a_state_moves_on_from_there(correct: bool) -> None:
+    problem = free_problem("octahedral", name="curve-pseudoinverse", correct=correct)
+    resolver, other = CurveFirstResolver(problem), CurveFirstResolver(problem)
+    plan = make_plan(problem, *resolver.tip())
+    first, second = (float(mark) for mark in plan.marks[:2])
+    resolver.follow(plan.path, 0.0, first)
+    other.state = resolver.state
+    found = [mover.follow(plan.path, first, second).state.nodes for mover in (resolver, other)]
+    np.testing.assert_allclose(*found, atol=1e-12)
+    resolver.state = resolver.setup.home_state()
+    np.testing.assert_allclose(resolver.curve.position(1.0), resolver.tip()[0], atol=1e-12)
