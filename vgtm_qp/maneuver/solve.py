@@ -68,7 +68,10 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     """
     check_is_problem(problem)
     if problem.arm is not None:
-        expected = "[truss]: a Resolver steps serial arms, but result files and certificates take trusses alone in this version"
+        expected = (
+            "[truss]: a Resolver steps serial arms, but result files and certificates take trusses alone in "
+            "this version"
+        )
         mistake = problem.mistake(("arm",), expected)
         raise ProblemError(str(problem.source or problem.name), [mistake])
     started = perf_counter()
