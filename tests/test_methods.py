@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from method_problems import MODULES, free_problem, run
-from vgtm_qp.step.arm import build_arm
-from vgtm_qp.step.linearise import Linearisation, Target
+from steps import numbers_at
 
 import vgtm_qp as vq
 from vgtm_qp.errors import CurveError
@@ -19,6 +18,8 @@ from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.target import Target
 
 ALL_TERMS = ["node_rate", "actuator_rate", "stroke_centring"]
 
@@ -41,7 +42,7 @@ def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra:
         }
     )
     resolver = ConventionalResolver(problem)
-    arm = resolver.arm
+    arm = resolver.setup
     plan = make_plan(problem, *resolver.tip())
     resolver.state = there.state
     start, end = float(plan.marks[11]), float(plan.marks[12])
@@ -50,10 +51,8 @@ def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra:
 
     unlimited = np.full(len(arm.truss.actuators), 1e9)
     target = Target(plan.path, start, end, -unlimited, unlimited, there.state.time + 0.05)
-    linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
-    numbers = linearisation.numbers(
-        np.array(there.state.nodes), np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True
-    )
+    q = np.array(there.state.nodes)
+    numbers = numbers_at(arm, q, np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True)
     answer = CondensedSolver(arm.layout).solve(numbers)
     assert answer.progress == pytest.approx(1.0, abs=1e-12)
     moved = resolver.state.nodes - there.state.nodes
@@ -87,9 +86,9 @@ def test_corrected_methods_keep_lengths_and_tip(module: str, name: str) -> None:
     problem = free_problem(module, name=name, tracking="recursive", correct=True)
     resolver = make_resolver(problem)
     run(resolver, problem)
-    arm = resolver.arm
-    fixed = arm.layout.fixed
-    np.testing.assert_allclose(resolver.state.lengths[fixed], arm.home_lengths[fixed], atol=1e-10)
+    arm = resolver.setup
+    fixed = arm.truss.fixed
+    np.testing.assert_allclose(resolver.state.quantities[fixed], arm.truss.home_lengths[fixed], atol=1e-10)
     np.testing.assert_allclose(resolver.tip()[0], problem.maneuver.waypoint[0].position, atol=1e-9)
 
 
@@ -100,8 +99,8 @@ def test_faithful_methods_drift_by_the_square_of_the_step(name: str) -> None:
         problem = free_problem("octahedral", steps=steps, name=name, tracking="recursive")
         resolver = make_resolver(problem)
         run(resolver, problem)
-        fixed = resolver.arm.layout.fixed
-        drift.append(np.abs(resolver.state.lengths - resolver.arm.home_lengths)[fixed].max())
+        fixed = resolver.setup.truss.fixed
+        drift.append(np.abs(resolver.state.quantities - resolver.setup.arm.home_quantities)[fixed].max())
     # Squares of half the displacement, twice as often.
     assert drift[0] / drift[1] == pytest.approx(2.0, abs=0.2)
 
@@ -125,7 +124,7 @@ def test_damping_and_truncation_change_the_answer_and_the_rank() -> None:
         return found
 
     plain = resolver()
-    rows = len(plain.arm.layout.fixed) + 3
+    rows = len(plain.setup.truss.fixed) + 3
     assert plain.rank == rows
     damped = resolver(variant="damped", damping=0.3)
     assert np.abs(damped.state.nodes - plain.state.nodes).max() > 1e-4
@@ -195,7 +194,7 @@ def test_torsion_coordinates_let_the_curve_steer_roll() -> None:
     rolled = Problem.from_dict(data)
     resolver = make_resolver(rolled)
     run(resolver, rolled)
-    np.testing.assert_allclose(resolver.arm.truss.tip_frame, np.eye(3))
+    np.testing.assert_allclose(resolver.setup.truss.tip_frame, np.eye(3))
     expected = make_plan(rolled, *resolver.tip()).path.at(1e9).rotation
     np.testing.assert_allclose(resolver.tip()[1], expected, atol=1e-9)
 
@@ -291,10 +290,12 @@ def test_a_moving_base_enters_the_conventional_solution() -> None:
     moving = Problem.from_dict(data)
     resolver = make_resolver(moving)
     states = run(resolver, moving)
-    base = resolver.arm.truss.base
+    base = resolver.setup.truss.base
     np.testing.assert_allclose(states[-1][base] - states[0][base], [[0.095, 0.0, 0.0475]] * 3, atol=2e-3)
-    fixed = resolver.arm.layout.fixed
-    np.testing.assert_allclose(resolver.state.lengths[fixed], resolver.arm.home_lengths[fixed], atol=1e-10)
+    fixed = resolver.setup.truss.fixed
+    np.testing.assert_allclose(
+        resolver.state.quantities[fixed], resolver.setup.arm.home_quantities[fixed], atol=1e-10
+    )
     data["method"] |= {"name": "curve-pseudoinverse", "tracking": "recursive"}
     with pytest.raises(CurveError, match="moving base"):
         make_resolver(Problem.from_dict(data))

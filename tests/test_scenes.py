@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from vgtm_qp.step.arm import build_arm
 
 from vgtm_qp.ipopt.separating import IpoptStepper
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.study import Study
 from vgtm_qp.study.robustness import run, tasks, text
 from vgtm_qp.study.scenes import MODULES, SAFE, random_scene
@@ -18,10 +18,10 @@ def test_a_scene_is_the_same_each_time_and_its_goal_is_a_clear_shape_of_its_arm(
         states.append(scene.shape)
         goal = scene.problem.maneuver.waypoint[0]
         arm.kinematics.evaluate(scene.shape)
-        np.testing.assert_allclose(arm.kinematics.tip_position(scene.shape), goal.position, atol=1e-12)
+        np.testing.assert_allclose(arm.arm.end_effector.position(scene.shape), goal.position, atol=1e-12)
         actuated = arm.truss.actuated
-        lengths = arm.kinematics.lengths
-        np.testing.assert_allclose(lengths[~actuated], arm.home_lengths[~actuated], atol=1e-9)
+        lengths = arm.kinematics.quantities
+        np.testing.assert_allclose(lengths[~actuated], arm.truss.home_lengths[~actuated], atol=1e-9)
         assert np.all(lengths >= arm.truss.stroke[:, 0] - 1e-9)
         assert np.all(lengths <= arm.truss.stroke[:, 1] + 1e-9)
     for X in states:
@@ -44,17 +44,17 @@ def test_the_yardstick_keeps_lengths_strokes_and_clearance_and_meets_the_path():
 
     scene = random_scene(0, 19, steps=6)
     resolver = Resolver(build_arm(scene.problem, compiled=False))
-    arm = resolver.arm
+    arm = resolver.setup
     plan = make_plan(scene.problem, *resolver.tip())
     states, values = IpoptStepper(arm).run(plan)
     assert values[-1] == pytest.approx(plan.path.end)
     for state, value in zip(states[1:], values[1:], strict=True):
         fixed = ~arm.truss.actuated
-        assert np.abs(state.lengths - arm.home_lengths)[fixed].max(initial=0.0) < 1e-9
-        assert np.all(state.lengths <= arm.truss.stroke[:, 1] + 1e-8)
+        assert np.abs(state.quantities - arm.truss.home_lengths)[fixed].max(initial=0.0) < 1e-9
+        assert np.all(state.quantities <= arm.truss.stroke[:, 1] + 1e-8)
         assert arm.least_clearance(state.nodes, state.time, "obstacles") >= arm.safe - 1e-8
         assert arm.least_clearance(state.nodes, state.time, "members") >= arm.self_safe - 1e-8
-        tip = arm.kinematics.tip_position(state.nodes)
+        tip = arm.arm.end_effector.position(state.nodes)
         np.testing.assert_allclose(tip, plan.path.at(value).position, atol=1e-7)
 
 
