@@ -172,7 +172,7 @@ def test_rows_of_tip_and_stations_are_the_derivatives_of_their_residuals(arm, tr
 def test_rows_of_clearances_are_the_derivatives_of_the_distances(arm):
     q, rng = bent(arm, 7), np.random.default_rng(2)
     points = arm.points(q)
-    beside = points[arm.bodies.points[len(arm.bodies) // 2]].mean(axis=0) + [0.31, 0.17, 0.05]
+    beside = points[arm.bodies.points[len(arm.bodies) // 2]].mean(axis=0) + np.array([0.31, 0.17, 0.05])
     monitor = Clearance(arm.bodies, [sphere("ball", beside, 0.1)], safe=0.05, influence=1.0)
     strokes = rng.normal(size=len(arm.actuators))
 

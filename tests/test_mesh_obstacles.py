@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from test_recovery import problem
+from recovery_problems import problem
 
 import vgtm_qp as vq
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from method_problems import MODULES, free_problem, run
+from steps import numbers_at
 
 import vgtm_qp as vq
 from vgtm_qp.errors import CurveError
@@ -16,10 +17,9 @@ from vgtm_qp.methods.objectives import potential_curvature, potential_field, pot
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.condensed import CondensedSolver
-from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.target import QPInput, Target
+from vgtm_qp.step.target import Target
 
 ALL_TERMS = ["node_rate", "actuator_rate", "stroke_centring"]
 
@@ -51,11 +51,8 @@ def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra:
 
     unlimited = np.full(len(setup.truss.actuators), 1e9)
     target = Target(plan.path, start, end, -unlimited, unlimited, there.state.time + 0.05)
-    here = np.array(there.state.nodes)
-    asked = QPInput(
-        here, here, np.zeros((0, 3)), np.zeros(0), target, target.goal(0.0), 0.0, ClearanceRows(), motion=True
-    ).linear(setup.layout)
-    numbers = Linearisation(setup.layout).numbers(asked, ClearanceRows())
+    q = np.array(there.state.nodes)
+    numbers = numbers_at(setup, q, np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True)
     answer = CondensedSolver(setup.layout).solve(numbers)
     assert answer.progress == pytest.approx(1.0, abs=1e-12)
     moved = resolver.state.nodes - there.state.nodes

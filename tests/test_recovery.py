@@ -8,30 +8,13 @@ import json
 import numpy as np
 import pytest
 from arms import mast
+from recovery_problems import BASE, box, problem
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver
-
-BASE = {
-    "name": "three bays",
-    "truss": {"module": "octahedral", "bays": 3, "stroke": [0.6, 1.5]},
-    "curve": {"control_vertices": 4},
-    "maneuver": {"steps": 20, "waypoint": [{"time": 4.0, "position": [0.0, 0.5, 2.2]}]},
-    "clearance": {"safe": 0.08, "influence": 0.5},
-    "method": {"retries": False},
-}
-
-
-def problem(**changes):
-    found = vq.Problem.from_dict(BASE)
-    return found.replace(changes) if changes else found
-
-
-def box(name, center, size, **more):
-    return {"name": name, "shape": "box", "center": center, "size": size, **more}
 
 
 def beside(gap):
