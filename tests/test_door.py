@@ -423,5 +423,7 @@ def test_a_recorded_chain_bends_no_more_than_its_bound():
 def test_a_serial_maneuver_is_drawn_and_exported(form, maneuvers, tmp_path):
     from vgtm_qp.export.formats import export_maneuver
 
-    path = export_maneuver(maneuvers["serial"], tmp_path / f"snake.{'yaml' if form == 'ros' else form}", to=form)
+    path = export_maneuver(
+        maneuvers["serial"], tmp_path / f"snake.{'yaml' if form == 'ros' else form}", to=form
+    )
     assert path.stat().st_size > 500

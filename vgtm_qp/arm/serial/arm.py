@@ -14,7 +14,7 @@ import numpy as np
 from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
 from vgtm_qp.arm.frames import frames_at
 from vgtm_qp.arm.record import or_none
-from vgtm_qp.arm.serial.chain import Array, Chain, Index, Mask, chain_function
+from vgtm_qp.arm.serial.chain import Array, Index, Mask, SerialChain, chain_function
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies, capsules
@@ -140,7 +140,7 @@ class SerialArm:
     bays = None
     leaves_chords = True
 
-    def __init__(self, chain: Chain) -> None:
+    def __init__(self, chain: SerialChain) -> None:
         self.chain = chain
         self.node_names, self.quantity_names = chain.node_names, chain.names
         self.stroke, self.rate, self.acceleration = chain.limits, chain.rate, chain.acceleration
