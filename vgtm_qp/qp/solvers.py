@@ -107,6 +107,8 @@ class FullSolver:
         if np.any(qp.row_lower > qp.row_upper) or np.any(qp.column_lower > qp.column_upper):
             raise InfeasibleStepError("a lower bound is above its upper bound")
         z, y, w, iterations = self._answer(qp, same_structure=same)
+        if not all(np.isfinite(part).all() for part in (z, y, w)):
+            refuse_large(np.nan, np.nan, self._name)
         scale = relative(1.0, qp.q, y)
         dual = max(scale * qp.dual_residual(z, y, w), qp.complementarity_residual(z, scale * y, scale * w))
         refuse_large(qp.primal_residual(z), dual, self._name)

@@ -94,11 +94,22 @@ def error(rows: Sequence[str], position: Any, rotation: Any, goal: Any, turned: 
     elif "tip rotation x" in rows:
         relative = turned @ rotation.T
         twist, cosine = ca.inv_skew((relative - relative.T) / 2), (ca.trace(relative) - 1) / 2
+        half = ca.logic_and(ca.dot(twist, twist) < _PARALLEL**2, cosine < 0)
+        twist = ca.if_else(half, _PARALLEL * _half_turn_axis(relative), twist)
     else:
         return (goal - position)[axes(rows)]
     sine = ca.sqrt(ca.dot(twist, twist) + TINY)
     turn = twist * (ca.atan2(sine, cosine) / sine)
     return ca.vertcat((goal - position)[axes(rows)], turned_axes(rows, rotation) @ turn)
+
+
+def _half_turn_axis(relative: Any) -> Any:
+    """Return the axis (3, 1) of a rotation by half a turn, whose antisymmetric part says nothing of it."""
+    columns = (relative + ca.DM.eye(3)) / 2
+    first, second, third = (columns[k, k] for k in range(3))
+    axis = ca.if_else(second > first, columns[:, 1], columns[:, 0])
+    axis = ca.if_else(third > ca.fmax(first, second), columns[:, 2], axis)
+    return axis / ca.norm_2(axis)
 
 
 def worth_closing(error: Any, motion: Any) -> Any:
