@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.arm import Arm
 from vgtm_qp.arm.truss import modules
+from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.graph import graph_truss
-from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.curve.families import bezier
 from vgtm_qp.problem import Problem
@@ -64,25 +65,25 @@ def random_pose(truss: Truss, rng: np.random.Generator, size: float = 0.05) -> A
 
 
 def make_layout(
-    truss: Truss,
-    kinematics: Kinematics,
+    truss: Truss | Arm,
     track: tuple[str, ...] = ("position",),
     *,
     vertices: int = 5,
     hard_tracking: bool = False,
     weights: Weights | None = None,
 ) -> tuple[Layout, TipTask]:
-    """Layout and tip task; no curve where `vertices` is 0."""
-    task = TipTask(track, kinematics)
+    """Layout and tip task of an arm; no curve where `vertices` is 0."""
+    arm = TrussArm(truss) if isinstance(truss, Truss) else truss
+    task = TipTask(track, arm)
     weights = weights or Weights()
     if not vertices:
         none = np.zeros((0, 0))
-        return Layout(truss, none, none, np.zeros(0, dtype=np.int64), task.row_names, weights), task
+        return Layout(arm, none, none, np.zeros(0, dtype=np.int64), task.row_names, weights), task
     family = bezier(vertices)
-    tracked = np.arange(1, len(truss.faces))
+    tracked = np.arange(1, len(arm.stations.nodes))
     s = tracked / tracked[-1]
     layout = Layout(
-        truss,
+        arm,
         family.weights(s),
         family.weights(s, 1),
         tracked,

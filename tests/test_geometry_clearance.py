@@ -5,6 +5,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
 
@@ -21,16 +22,16 @@ def piece_at(clearance, piece, time):
 
 def brute_force(clearance, X, time):
     """Surface distance of each pair (member, other, is_self); minus the radii where axes intersect."""
-    ends = X[clearance.members].reshape(-1, 6)
+    ends = X[clearance.bodies.points].reshape(-1, 6)
     distances = {}
-    for m, radius in enumerate(clearance.radius):
+    for m, radius in enumerate(clearance.bodies.radius):
         for p, shape in enumerate(clearance.pieces.shape):
             axis = segment_distance(str(shape), ends[m], piece_at(clearance, p, time))
             distances[m, p, False] = axis - radius
-        for k in range(m + 1, len(clearance.radius) if clearance.self_collision else 0):
-            if not set(clearance.members[m]) & set(clearance.members[k]):
+        for k in range(m + 1, len(clearance.bodies.radius) if clearance.self_collision else 0):
+            if not set(clearance.bodies.points[m]) & set(clearance.bodies.points[k]):
                 axis = segment_distance("segment", ends[m], ends[k])
-                distances[m, k, True] = axis - radius - clearance.radius[k]
+                distances[m, k, True] = axis - radius - clearance.bodies.radius[k]
     return distances
 
 
@@ -55,7 +56,7 @@ def random_scene(rng, *, still=False, round_numbers=False):
         cylinder("post", vector(2.0), 0.25, 1.0, turn(), speed()),
         mesh("wedge", TETRAHEDRON, vector(2.0), turn(), 0.5, speed()),
     ]
-    return nodes, Clearance(members, 0.03, obstacles, safe=0.08, influence=0.5)
+    return nodes, Clearance(capsules(members, 0.03), obstacles, safe=0.08, influence=0.5)
 
 
 @settings(max_examples=25, deadline=None)
@@ -75,7 +76,7 @@ def test_near_pairs_and_least_distances_along_a_walk(seed, round_numbers):
                 assert found[key] >= distance - 1e-9 or distance <= -0.029
         # Of a mesh triangle only its second contact may have stayed.
         assert all(distance <= expected[key] + 1e-9 for key, distance in found.items() if key not in meshes)
-        for member in range(len(clearance.members)):
+        for member in range(len(clearance.bodies.points)):
             least = min(expected[key] for key in meshes if key[0] == member)
             if least < 0.5 - 1e-9:
                 nearest = min(d for key, d in found.items() if key in meshes and key[0] == member)
@@ -112,7 +113,7 @@ def test_carried_bounds_never_exceed_the_distance(seed):
             for limit in (0.1, np.inf):
                 lower, others = group.lower(motion, limit)
                 for k in range(len(group)):
-                    key = (int(group.member[k]), int(group.other[k]), group.is_self)
+                    key = (int(group.body[k]), int(group.other[k]), group.is_self)
                     listed.add(key)
                     assert (lower[k] if k < len(lower) else others) <= expected[key] + 1e-9
         far, far_self = candidates.beyond(motion)
@@ -147,7 +148,9 @@ def test_between_never_certifies_what_sampling_refutes(seed, size, floor):
 
 def test_between_certifies_what_is_clear_and_shows_where_it_is_not():
     X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
-    clearance = Clearance([(0, 1)], 0.03, [box("cube", (1.0, 0.0, 1.0), 0.4)], safe=0.08, influence=0.5)
+    clearance = Clearance(
+        capsules([(0, 1)], 0.03), [box("cube", (1.0, 0.0, 1.0), 0.4)], safe=0.08, influence=0.5
+    )
     aside, past = X + np.array([0.65, 0.0, 0.0]), X + np.array([2.0, 0.0, 0.0])
     assert clearance.between(X, aside, 0.0, 1.0, 0.0799).certified
     report = clearance.between(X, past, 0.0, 1.0, 0.08)
@@ -156,16 +159,14 @@ def test_between_certifies_what_is_clear_and_shows_where_it_is_not():
     assert report.fraction[0] == pytest.approx(0.5, abs=0.1)
     assert report.clearance < 0.0
     fleeing = Clearance(
-        [(0, 1)],
-        0.03,
+        capsules([(0, 1)], 0.03),
         [box("cube", (1.0, 0.0, 1.0), 0.4, velocity=(2.0, 0.0, 0.0))],
         safe=0.08,
         influence=0.5,
     )
     assert fleeing.between(X, past, 0.0, 1.0, 0.08).certified
     chasing = Clearance(
-        [(0, 1)],
-        0.03,
+        capsules([(0, 1)], 0.03),
         [box("cube", (1.0, 0.0, 1.0), 0.4, velocity=(-3.0, 0.0, 0.0))],
         safe=0.08,
         influence=0.5,
@@ -174,7 +175,9 @@ def test_between_certifies_what_is_clear_and_shows_where_it_is_not():
 
 
 def test_a_path_round_an_edge_is_certified_down_to_its_dip():
-    clearance = Clearance([(0, 1)], 0.03, [box("cube", (0.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5)
+    clearance = Clearance(
+        capsules([(0, 1)], 0.03), [box("cube", (0.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5
+    )
     axis = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     reach = 0.11
     angle = np.array([0.6, 0.9])
@@ -186,7 +189,9 @@ def test_a_path_round_an_edge_is_certified_down_to_its_dip():
 
 def test_what_is_not_a_number_is_refused():
     X, members = octahedral_arm(2)
-    clearance = Clearance(members, 0.03, [sphere("ball", (3.0, 0.0, 1.0), 0.5)], safe=0.08, influence=0.5)
+    clearance = Clearance(
+        capsules(members, 0.03), [sphere("ball", (3.0, 0.0, 1.0), 0.5)], safe=0.08, influence=0.5
+    )
     # Of the last the squares overflow, and bounds never meet.
     for value in (np.nan, np.inf, 1e160):
         bad = X.copy()
@@ -201,10 +206,10 @@ def test_straight_arm_beside_cubes_on_round_coordinates(bays):
     X, members = octahedral_arm(bays)
     X = np.round(4.0 * X) / 4.0
     cubes = [box("right", (1.25, 0.0, 0.75), 0.5), box("left", (-1.5, 0.25, 1.0), 0.5)]
-    clearance = Clearance(members, 0.03, cubes, safe=0.08, influence=2.0, fcl_reach=2.0)
+    clearance = Clearance(capsules(members, 0.03), cubes, safe=0.08, influence=2.0, fcl_reach=2.0)
     expected = brute_force(clearance, X, 0.0)
-    for use_fcl in (True, False):
-        near = clearance.near(X, reach=2.0, use_fcl=use_fcl)
+    for fcl_reach in (2.0, 0.0):
+        near = clearance.near(X, reach=2.0, fcl_reach=fcl_reach)
         for k in range(len(near)):
             if not near.is_self[k]:
                 assert near.distance[k] <= expected[near.pair(k)] + 0.02 * 1.5
@@ -218,7 +223,9 @@ def test_straight_arm_beside_cubes_on_round_coordinates(bays):
 
 def test_fcl_answers_that_do_not_hold_are_replaced():
     X = np.array([[1.0, 0.5, 0.0], [1.0, 2.0, 0.0]])
-    clearance = Clearance([(0, 1)], 0.0, [box("cube", (1.0, 0.0, 0.75), 0.5)], safe=0.3, influence=1.0)
+    clearance = Clearance(
+        capsules([(0, 1)], 0.0), [box("cube", (1.0, 0.0, 0.75), 0.5)], safe=0.3, influence=1.0
+    )
     near = clearance.near(X)
     assert near.distance[0] == pytest.approx(np.hypot(0.25, 0.5), abs=1e-12)
     assert (clearance.fcl.asked, clearance.fcl.replaced) == (1, 1)
@@ -241,25 +248,28 @@ def test_fcl_and_its_guard_agree_with_the_closed_form(seed, round_numbers, shape
         "sphere": sphere("o", (0.0, 0.0, 0.25), 0.5),
         "cylinder": cylinder("o", (0.0, 0.0, 0.25), 0.5, 1.0, turn),
     }[shape]
-    clearance = Clearance([(0, 1)], 0.0, [obstacle], safe=4.0, influence=5.0)
-    by_fcl, exact = clearance.near(X), clearance.near(X, use_fcl=False)
+    clearance = Clearance(capsules([(0, 1)], 0.0), [obstacle], safe=4.0, influence=5.0)
+    by_fcl, exact = clearance.near(X), clearance.near(X, fcl_reach=0.0)
     assert clearance.fcl.asked == 1
     assert by_fcl.distance[0] <= exact.distance[0] + 1e-9
     assert by_fcl.distance[0] == pytest.approx(exact.distance[0], abs=2e-9)
     # What has two rows is for the closed form to say; and a normal is one however near the two are.
     assert len(by_fcl) == len(exact)
     np.testing.assert_allclose(np.linalg.norm(by_fcl.normal, axis=1), 1.0, atol=1e-6)
-    reached = X[0] + by_fcl.t[:, None] * (X[1] - X[0])
+    reached = X[0] + by_fcl.weights[:, 1:2] * (X[1] - X[0])
     apart = by_fcl.distance > 0.0 if shape != "sphere" else np.ones(len(by_fcl), dtype=bool)
-    way = by_fcl.point + by_fcl.distance[:, None] * by_fcl.normal
-    np.testing.assert_allclose(way[apart], reached[apart], atol=1e-7)
+    for point in (reached - by_fcl.distance[:, None] * by_fcl.normal)[apart]:
+        on_surface = Clearance(capsules([(0, 1)], 0.0), [obstacle], safe=4.0, influence=5.0)
+        assert abs(on_surface.least(np.stack([point, point + 1e-9]))[0]) < 1e-7
 
 
 def test_parallel_member_has_two_rows():
     X = np.array([[-1.0, 0.0, 0.6], [1.0, 0.0, 0.6]])
-    clearance = Clearance([(0, 1)], 0.03, [box("cube", (0.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5)
+    clearance = Clearance(
+        capsules([(0, 1)], 0.03), [box("cube", (0.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5
+    )
     near = clearance.near(X)
-    assert sorted(near.t) == pytest.approx([0.25, 0.75])
+    assert sorted(near.weights[:, 1]) == pytest.approx([0.25, 0.75])
     assert near.distance == pytest.approx([0.07, 0.07])
     np.testing.assert_allclose(near.normal, [[0, 0, 1], [0, 0, 1]], atol=1e-12)
 
@@ -267,23 +277,19 @@ def test_parallel_member_has_two_rows():
 def test_rows_predict_the_change_of_distance():
     rng = np.random.default_rng(3)
     X, clearance = random_scene(rng)
-    near = clearance.near(X, 0.0, reach=1.5, self_reach=1.0, use_fcl=False)
+    near = clearance.near(X, 0.0, reach=1.5, self_reach=1.0, fcl_reach=0.0)
     step = 1e-6
     change = step * rng.normal(size=X.shape)
-    later = clearance.near(X + change, step, reach=1.6, self_reach=1.1, use_fcl=False)
+    later = clearance.near(X + change, step, reach=1.6, self_reach=1.1, fcl_reach=0.0)
     after = {}
     for k in range(len(later)):
-        after.setdefault((later.pair(k), round(float(later.t[k]), 3)), float(later.distance[k]))
+        after.setdefault((later.pair(k), round(float(later.weights[k, 1]), 3)), float(later.distance[k]))
     compared = 0
     for k in range(len(near)):
-        key = (near.pair(k), round(float(near.t[k]), 3))
+        key = (near.pair(k), round(float(near.weights[k, 1]), 3))
         if key not in after:
             continue
-        i, j = clearance.members[near.member[k]]
-        moved = (1.0 - near.t[k]) * change[i] + near.t[k] * change[j]
-        if near.is_self[k]:
-            i, j = clearance.members[near.other[k]]
-            moved = moved - (1.0 - near.t_other[k]) * change[i] - near.t_other[k] * change[j]
+        moved = near.weights[k] @ change[near.points[k]]
         expected = near.normal[k] @ moved - near.normal_speed[k] * step
         assert after[key] - near.distance[k] == pytest.approx(expected, abs=1e-3 * step)
         compared += 1
@@ -292,10 +298,12 @@ def test_rows_predict_the_change_of_distance():
 
 def test_far_and_absent_obstacles():
     X, members = octahedral_arm(1)
-    far = Clearance(members, 0.03, [sphere("moon", (1000.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5)
+    far = Clearance(
+        capsules(members, 0.03), [sphere("moon", (1000.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5
+    )
     expected = min(brute_force(far, X, 0.0)[m, 0, False] for m in range(len(members)))
     assert far.least(X, among="obstacles")[0] == pytest.approx(expected, abs=1e-9)
-    empty = Clearance(members, 0.03, safe=0.08, influence=0.5, self_collision=False)
+    empty = Clearance(capsules(members, 0.03), safe=0.08, influence=0.5, self_collision=False)
     assert empty.least(X) == (np.inf, None)
     assert len(empty.near(X)) == 0
     report = empty.between(X, X + 1.0, 0.0, 1.0, 0.08)
@@ -304,14 +312,9 @@ def test_far_and_absent_obstacles():
 
 
 def test_names():
-    clearance = Clearance(
-        [(0, 1), (2, 3)],
-        0.03,
-        [box("right cube", (0.3, 0.0, 0.5), 0.4)],
-        safe=0.08,
-        influence=0.5,
-        member_names=["L3-2", "B1-1"],
-    )
+    bodies = capsules([(0, 1), (2, 3)], 0.03, ["L3-2", "B1-1"])
+    cube = box("right cube", (0.3, 0.0, 0.5), 0.4)
+    clearance = Clearance(bodies, [cube], safe=0.08, influence=0.5)
     X = np.array([[0.0, 0, 0], [0, 0, 1], [0.0, 0.2, 0], [0, 0.2, 1]])
     near = clearance.near(X)
     names = {near.name(k) for k in range(len(near))}
@@ -320,6 +323,22 @@ def test_names():
         "clearance: member B1-1 / right cube",
         "clearance: member L3-2 / member B1-1",
     }
+    links = capsules([(0, 1), (2, 3)], 0.03, ["1", "2"], kind="link")
+    near = Clearance(links, [cube], safe=0.08, influence=0.5).near(X)
+    assert "clearance: link 1 / link 2" in [near.name(k) for k in range(len(near))]
+
+
+def test_neighbours_are_those_with_a_joint_in_common():
+    """Of three links with points of their own, the second of which is a neighbour of both others."""
+    X = np.array([[0.0, 0, 0], [0, 0, 1], [0.0, 0, 1.1], [0, 1, 1.1], [0.1, 1, 1], [0.1, 0, 0.5]])
+    points = [(0, 1), (2, 3), (4, 5)]
+    links = capsules(points, 0.03, joints=[(0, 1), (1, 2), (2, 3)], kind="link")
+    found = {
+        pair: Clearance(b, safe=0.08, influence=2.0, self_influence=2.0).near(X)
+        for pair, b in (("joints", links), ("points", capsules(points, 0.03)))
+    }
+    pairs = {key: {tuple(near.pair(k))[:2] for k in range(len(near))} for key, near in found.items()}
+    assert pairs == {"joints": {(0, 2)}, "points": {(0, 1), (0, 2), (1, 2)}}
 
 
 def test_closed_mesh_equals_the_box_it_bounds_and_is_solid():
@@ -327,8 +346,10 @@ def test_closed_mesh_equals_the_box_it_bounds_and_is_solid():
 
     surface = trimesh.creation.box((1.0, 0.8, 0.6))
     arrays = (surface.vertices, surface.faces)
-    solid = Clearance([(0, 1)], 0.02, [mesh("part", arrays)], safe=0.08, influence=2.0)
-    cube = Clearance([(0, 1)], 0.02, [box("part", (0, 0, 0), (1.0, 0.8, 0.6))], safe=0.08, influence=2.0)
+    solid = Clearance(capsules([(0, 1)], 0.02), [mesh("part", arrays)], safe=0.08, influence=2.0)
+    cube = Clearance(
+        capsules([(0, 1)], 0.02), [box("part", (0, 0, 0), (1.0, 0.8, 0.6))], safe=0.08, influence=2.0
+    )
     rng = np.random.default_rng(0)
     outside = 0
     for _ in range(60):
@@ -357,7 +378,7 @@ def test_mesh_from_a_file(tmp_path):
     obstacle = mesh("ball", path, center=(1.0, 0.0, 0.0), scale=2.0)
     assert obstacle.solid
     assert len(obstacle.pieces) == 320
-    clearance = Clearance([(0, 1)], 0.0, [obstacle], safe=0.08, influence=1.0)
+    clearance = Clearance(capsules([(0, 1)], 0.0), [obstacle], safe=0.08, influence=1.0)
     X = np.array([[-0.5, 0.0, -1.0], [-0.5, 0.0, 1.0]])
     assert clearance.least(X)[0] == pytest.approx(0.5, abs=0.02)
     near = clearance.near(X)
@@ -385,7 +406,9 @@ def test_wrong_obstacles(make, message, tmp_path):
 
 def test_long_arm_keeps_few_candidates():
     X, members = octahedral_arm(200)
-    clearance = Clearance(members, 0.03, [box("cube", (1.2, 0.0, 80.0), 0.5)], safe=0.08, influence=0.5)
+    clearance = Clearance(
+        capsules(members, 0.03), [box("cube", (1.2, 0.0, 80.0), 0.5)], safe=0.08, influence=0.5
+    )
     clearance.near(X)
     clearance.least(X)
     listed = sum(map(len, clearance._candidates.groups))

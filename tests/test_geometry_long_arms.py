@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import box, sphere
 
@@ -18,7 +19,7 @@ def long_arm(bays=BAYS):
     X, members = octahedral_arm(bays)
     height = float(X[:, 2].max())
     obstacles = [box("cube", (1.2, 0.0, 0.7 * height), 0.5), sphere("ball", (-1.5, 0.3, 0.4 * height), 0.4)]
-    return X, Clearance(members, 0.03, obstacles, safe=0.08, influence=0.5)
+    return X, Clearance(capsules(members, 0.03), obstacles, safe=0.08, influence=0.5)
 
 
 def turned(X, first, rotation):
@@ -32,8 +33,8 @@ def turned(X, first, rotation):
 def every_distance(monitor, X, time=0.0):
     """Distance of each pair (member, other, is_self), evaluated one by one."""
     distances = {}
-    for group in monitor.every_pair(X).groups:
-        for m, k, distance in zip(group.member, group.other, group.distance, strict=True):
+    for group in monitor.every_pair(X):
+        for m, k, distance in zip(group.body, group.other, group.distance, strict=True):
             distances[
                 (int(min(m, k)), int(max(m, k)), True) if group.is_self else (int(m), int(k), False)
             ] = float(distance)
@@ -68,7 +69,9 @@ def loose_rods(rng):
     middle = rng.uniform(0.0, 1.0, size=(160, 3)) * (1.5, 1.5, 12.0)
     X = np.stack([middle, middle + 0.1 * rng.normal(size=(160, 3))], axis=1).reshape(-1, 3)
     members = np.arange(320).reshape(-1, 2)
-    return X, Clearance(members, 0.001, [sphere("ball", (3.0, 0.0, 5.0), 0.5)], safe=0.08, influence=0.5)
+    return X, Clearance(
+        capsules(members, 0.001), [sphere("ball", (3.0, 0.0, 5.0), 0.5)], safe=0.08, influence=0.5
+    )
 
 
 def squeezes(rng, X, count):
@@ -96,8 +99,8 @@ def test_no_near_pair_of_what_bends_is_missed(seed, rods):
     for state in states:
         exact = every_distance(monitor, state)
         reach, self_reach = rng.choice([0.2, 0.5]), rng.choice([0.1, 0.22, 0.5])
-        near = monitor.near(state, 0.0, reach, use_fcl=False, self_reach=self_reach)
-        found = [key(*row) for row in zip(near.member, near.other, near.is_self, strict=True)]
+        near = monitor.near(state, 0.0, reach, fcl_reach=0.0, self_reach=self_reach)
+        found = [key(*row) for row in zip(near.body, near.other, near.is_self, strict=True)]
         expected = {pair for pair, distance in exact.items() if distance < (self_reach if pair[2] else reach)}
         assert set(found) == expected
         # A pair has two rows at most, however many lists there are.
@@ -113,7 +116,7 @@ def check_bounds(candidates, motion, exact):
     """Assert that no bound exceeds the distance it bounds."""
     listed = set()
     for group in candidates.groups:
-        pairs = [key(*pair, group.is_self) for pair in zip(group.member, group.other, strict=True)]
+        pairs = [key(*pair, group.is_self) for pair in zip(group.body, group.other, strict=True)]
         assert listed.isdisjoint(pairs)
         listed.update(pairs)
         distances = np.array([exact[pair] for pair in pairs])
@@ -164,14 +167,14 @@ def test_an_arm_that_is_carried_or_bends_in_one_place_is_compared_once(monkeypat
     X, monitor = long_arm()
     monitor.near(X)
     renewed = []
-    monkeypatch.setattr(monitor._candidates, "renew_members", lambda *arguments: renewed.append(arguments))
+    monkeypatch.setattr(monitor._candidates, "renew_bodies", lambda *arguments: renewed.append(arguments))
     nearer = 0
     for k in range(1, 40):
         state = X + np.array([0.3 * k, 0.1 * k, 0.0])
         if hinge is not None:
             state = turned(state, hinge, Rotation.from_rotvec((0.0, 0.06 * k, 0.0)))
-        near = monitor.near(state, use_fcl=False)
-        found = {key(*row) for row in zip(near.member, near.other, near.is_self, strict=True)}
+        near = monitor.near(state, fcl_reach=0.0)
+        found = {key(*row) for row in zip(near.body, near.other, near.is_self, strict=True)}
         exact = every_distance(monitor, state)
         assert found == {pair for pair, d in exact.items() if d < (0.22 if pair[2] else 0.5)}
         assert sum(map(len, monitor._candidates.groups)) < 5000

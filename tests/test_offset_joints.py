@@ -7,11 +7,10 @@ import pytest
 from arms import TRUSSES, arm_problem, central_differences, random_pose
 
 import vgtm_qp as vq
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.errors import TrussError
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.study.scenes import random_scene
 
@@ -22,8 +21,8 @@ def test_ends_and_their_jacobians_are_those_of_the_formulas(name):
     X = random_pose(truss, np.random.default_rng(1))
     kinematics = EndKinematics(truss, compiled=False)
     kinematics.evaluate(X)
-    np.testing.assert_allclose(kinematics.ends, member_ends(truss, X), atol=1e-14)
-    wanted = central_differences(lambda Y: member_ends(truss, Y), X)
+    np.testing.assert_allclose(kinematics.ends, truss.member_ends(X), atol=1e-14)
+    wanted = central_differences(truss.member_ends, X)
     found = np.zeros_like(wanted)
     for member, end, corner in np.ndindex(*kinematics.nodes.shape):
         node = kinematics.nodes[member, end, corner]
@@ -46,24 +45,25 @@ def beside_a_cube(joint_offset=0.1, **more):
     )
 
 
-def separation_of(arm):
-    return Separation(arm.truss, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence, margin=0.0))
+def separation_of(setup):
+    distances = Distances(setup.safe, setup.self_safe, setup.influence, margin=0.0)
+    return Separation(setup.arm, setup.monitor, distances)
 
 
 def test_clearance_rows_are_the_derivatives_of_the_distances():
     """Distances by their definition at moved nodes, against the rows: the joints' rotation is part of both."""
     rng = np.random.default_rng(2)
-    arm = build_arm(beside_a_cube())
-    truss, monitor = arm.truss, arm.monitor
+    setup = build_arm(beside_a_cube())
+    truss, monitor = setup.truss, setup.monitor
     X = truss.home + 0.02 * rng.normal(size=truss.home.shape)
-    rows = separation_of(arm).rows(X, 0.0, 0.0, 1.0, {}, 0.0)
+    rows = separation_of(setup).rows(X, 0.0, 0.0, 1.0, {}, 0.0)
     assert rows.nodes.shape[1] == 12
     step = rng.normal(size=X.shape)
     h, names = 1e-6, [rows.name(k) for k in range(len(rows))]
     change = np.einsum("rsc,rsc->r", rows.coefficients, step[rows.nodes])
 
     def distances(Y):
-        pairs = monitor.near(Y, 0.0, 0.6, use_fcl=False)
+        pairs = monitor.near(setup.arm.points(Y), 0.0, 0.6, fcl_reach=0.0)
         found = {}
         for k in range(len(pairs)):
             found[pairs.name(k)] = min(found.get(pairs.name(k), np.inf), float(pairs.distance[k]))
@@ -91,21 +91,24 @@ def test_rows_of_different_widths_join():
 
 def test_a_proof_of_the_way_holds_at_every_instant_of_it():
     rng = np.random.default_rng(4)
-    arm = build_arm(beside_a_cube())
-    separation, truss, monitor = separation_of(arm), arm.truss, arm.monitor
+    setup = build_arm(beside_a_cube())
+    separation, truss, monitor = separation_of(setup), setup.truss, setup.monitor
     certified = 0
     for _ in range(12):
         start, end = (truss.home + 0.05 * rng.normal(size=truss.home.shape) for _ in range(2))
         end = start + 0.5 * (end - start)
         least = min(
-            monitor.least(start + s * (end - start), 0.0, among="obstacles")[0] for s in np.linspace(0, 1, 41)
+            setup.least_clearance(start + s * (end - start), 0.0, among="obstacles")
+            for s in np.linspace(0, 1, 41)
         )
         report = separation.between(start, end, 0.0, 0.0, {})
         if report.certified:
             certified += 1
-            assert least >= arm.safe - 5e-5 - 1e-9
+            assert least >= setup.safe - 5e-5 - 1e-9
         else:
-            assert least < arm.safe + 1e-3 or not monitor.keeps(end, 0.0, 0.0, arm.self_safe)
+            assert least < setup.safe + 1e-3 or not monitor.keeps(
+                setup.arm.points(end), 0.0, 0.0, setup.self_safe
+            )
             assert np.all((report.fraction >= 0.0) & (report.fraction <= 1.0))
     assert certified > 0
 

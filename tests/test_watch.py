@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_geometry_clearance import brute_force
 
+from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
@@ -15,7 +16,7 @@ MEMBERS = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def scene(rng, *, round_numbers=False):
+def scene(rng, *, round_numbers=False, watch=True):
     """Nodes, and a monitor of their members among a box, a ball and a post at rest."""
 
     def vector(bound):
@@ -33,7 +34,12 @@ def scene(rng, *, round_numbers=False):
         cylinder("post", vector(2.0), 0.25, 1.0, turn()),
     ]
     nodes = np.array([vector(1.5) for _ in range(6)])
-    return nodes, Clearance(MEMBERS, 0.03, obstacles, safe=0.08, influence=0.5)
+    return nodes, Clearance(capsules(MEMBERS, 0.03), obstacles, safe=0.08, influence=0.5, watch=watch)
+
+
+def watch_of(monitor):
+    """A watch of its own, also for scenes that their monitor does not watch."""
+    return Watch(monitor.bodies, monitor.pieces, monitor.names, monitor.fcl, monitor.every_pair)
 
 
 def walk(X, rng, count, size):
@@ -59,7 +65,7 @@ def test_every_pair_nearer_than_the_limits_is_there_in_every_state(round_numbers
     for seed in range(8):
         rng = np.random.default_rng(seed)
         X, monitor = scene(rng, round_numbers=round_numbers)
-        watch = Watch(monitor)
+        watch = watch_of(monitor)
         for state in walk(X, rng, 25, 0.06):
             limits = {False: rng.uniform(0.2, 0.5), True: rng.uniform(0.1, 0.3)}
             every = brute_force(monitor, state, 0.0).items()
@@ -74,7 +80,7 @@ def test_every_pair_nearer_than_the_limits_is_there_in_every_state(round_numbers
                 continue
             assert nearest_by_name(found) == pytest.approx(wanted, abs=1e-9)
             compared += len(wanted)
-            along = np.einsum("rs,rsc,rc->r", found.weights, state[found.nodes], found.normal)
+            along = np.einsum("rs,rsc,rc->r", found.weights, state[found.points], found.normal)
             np.testing.assert_allclose(along[found.is_self], found.distance[found.is_self] + 0.06, atol=1e-9)
     assert compared >= 100
 
@@ -84,7 +90,7 @@ def test_what_is_proven_on_the_way_holds_at_every_instant():
     for seed in range(100, 110):
         rng = np.random.default_rng(seed)
         X, monitor = scene(rng)
-        watch = Watch(monitor)
+        watch = watch_of(monitor)
         for start, end in pairwise(walk(X, rng, 12, 0.05)):
             here = brute_force(monitor, start, 0.0).items()
             floors = [
@@ -103,9 +109,9 @@ def test_what_is_proven_on_the_way_holds_at_every_instant():
 
 def test_a_way_into_an_obstacle_is_not_proven():
     wall = box("wall", [1.0, 0.0, 0.0], [0.1, 4.0, 4.0])
-    monitor = Clearance([(0, 1)], 0.03, [wall], safe=0.08, influence=0.5, self_collision=False)
+    monitor = Clearance(capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False)
     start = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    watch = Watch(monitor)
+    watch = watch_of(monitor)
     assert watch.follow(start, start + 0.1 * FORWARD, 0.08, 0.0)
     assert not watch.follow(start, start + 0.9 * FORWARD, 0.08, 0.0)
     # Through the wall to where all is clear again: only the way tells.
@@ -121,7 +127,7 @@ def test_a_way_into_an_obstacle_is_not_proven():
 def test_a_way_from_a_state_that_was_left_is_bound_from_there():
     rng = np.random.default_rng(3)
     X, monitor = scene(rng)
-    watch, fresh = Watch(monitor), Watch(monitor)
+    watch, fresh = watch_of(monitor), watch_of(monitor)
     states = walk(X, rng, 10, 0.1)
     for state in states:
         watch.near(state, 0.4, 0.3, 0.0)
@@ -132,43 +138,75 @@ def test_a_way_from_a_state_that_was_left_is_bound_from_there():
             np.testing.assert_allclose(np.sort(found.distance), np.sort(wanted.distance), atol=1e-12)
 
 
-def test_scenes_that_it_serves():
-    def monitor(*obstacles, members=MEMBERS, **options):
-        return Clearance(members, 0.03, obstacles, safe=0.08, influence=0.5, **options)
+def test_scenes_that_are_watched():
+    def watched(*obstacles, members=MEMBERS, **options):
+        monitor = Clearance(capsules(members, 0.03), obstacles, safe=0.08, influence=0.5, **options)
+        return monitor.is_watched
 
     ball = sphere("ball", [5.0, 0.0, 0.0], 0.2)
     wedge = mesh(
         "wedge", ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     )
-    assert Watch.serves(monitor(ball))
-    assert Watch.serves(monitor())
-    assert not Watch.serves(monitor(wedge))
-    assert not Watch.serves(monitor(sphere("ball", [5.0, 0.0, 0.0], 0.2, [0.1, 0.0, 0.0])))
-    assert not Watch.serves(monitor(self_collision=False))
-    assert not Watch.serves(monitor(ball, ends=lambda X: X[np.array(MEMBERS)]))
-    assert not Watch.serves(monitor(members=[(k, k + 1) for k in range(200)]))
+    assert watched(ball)
+    assert watched()
+    assert not watched(wedge)
+    assert not watched(sphere("ball", [5.0, 0.0, 0.0], 0.2, [0.1, 0.0, 0.0]))
+    assert not watched(self_collision=False)
+    assert not watched(members=[(k, k + 1) for k in range(200)])
+
+
+def test_contacts_are_the_same_whichever_way_they_are_found():
+    """By the watch and from the lists, at positions that are overwritten in place."""
+    compared = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        X, watched = scene(rng)
+        _, listed = scene(np.random.default_rng(seed), watch=False)
+        Y = X.copy()
+        for state in walk(X, rng, 12, 0.05):
+            Y[:] = state
+            found = [monitor.near(Y, self_reach=0.3, fcl_reach=0.2) for monitor in (watched, listed)]
+            orders = [np.lexsort((c.weights[:, 1], c.other, c.body, c.is_self)) for c in found]
+            first, second = (c.select(order) for c, order in zip(found, orders, strict=True))
+            assert [first.name(k) for k in range(len(first))] == [second.name(k) for k in range(len(second))]
+            for column in ("distance", "normal", "points", "weights", "normal_speed"):
+                np.testing.assert_allclose(getattr(first, column), getattr(second, column), atol=1e-9)
+            compared += len(first)
+    assert compared > 100
+
+
+def test_a_motion_is_proven_from_where_it_starts_though_its_array_was_overwritten():
+    wall = box("wall", [1.0, 0.0, 0.0], [0.1, 4.0, 4.0])
+    monitor = Clearance(capsules([(0, 1), (2, 3)], 0.03), [wall], safe=0.08, influence=0.5)
+    X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, 1.0]])
+    assert monitor.between(X, X + 0.1 * FORWARD, 0.0, 0.0, 0.08).certified
+    X += 2.0 * FORWARD
+    assert not monitor.between(X, X - 2.0 * FORWARD, 0.0, 0.0, 0.08).certified
+    for number in (np.nan, np.inf):
+        with pytest.raises(GeometryError, match="finite"):
+            monitor.near(np.full(X.shape, number))
 
 
 def test_a_pair_whose_centres_coincide_at_first_is_watched_like_every_other():
     """A bound that multiplies the distance of the centres by an infinite reach is no number there."""
     ball = sphere("ball", [0.0, 0.0, 0.5], 0.05)
     members = [(0, 1), (2, 3)]
-    monitor = Clearance(members, 0.03, [ball], safe=0.08, influence=0.5)
+    monitor = Clearance(capsules(members, 0.03), [ball], safe=0.08, influence=0.5)
     X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [-0.5, 0.0, 0.5], [0.5, 0.0, 0.5]])
-    watch = Watch(monitor)
+    watch = watch_of(monitor)
     assert watch.near(X, 0.3, 0.3, 0.0) is None
     clear = X + np.array([[0.0, 0.5, 0.0]] * 2 + [[0.0, -0.5, 0.0]] * 2)
     watch.near(clear, 0.6, 1.2, 0.0)
     found = watch.near(clear, 0.6, 1.2, 0.0)
     assert sorted(found.is_self.tolist()) == [False, False, True]
     assert not watch.follow(clear, X, 0.08, 0.02)
-    assert len(monitor.every_pair(X).groups[0]) == 2
+    assert len(monitor.every_pair(X)[0]) == 2
 
 
 def test_members_that_all_meet_at_one_node_have_nothing_to_watch():
-    monitor = Clearance([(0, 3), (1, 3), (2, 3)], 0.03, [], safe=0.08, influence=0.5)
+    monitor = Clearance(capsules([(0, 3), (1, 3), (2, 3)], 0.03), [], safe=0.08, influence=0.5)
     X = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    watch = Watch(monitor)
+    watch = watch_of(monitor)
     assert not len(watch.near(X, 0.5, 0.5, 0.0).distance)
     assert watch.follow(X, X + 0.1 * FORWARD, 0.08, 0.02)
     with pytest.raises(GeometryError):
@@ -178,8 +216,10 @@ def test_members_that_all_meet_at_one_node_have_nothing_to_watch():
 @pytest.mark.parametrize("floor", [-0.05, -0.001, 0.0])
 def test_floors_below_zero_are_those_of_surfaces_that_overlap_already(floor):
     wall = box("wall", [1.0, 0.0, 0.0], [0.1, 4.0, 4.0])
-    monitor = Clearance([(0, 1), (1, 2)], 0.03, [wall], safe=0.08, influence=0.5, self_collision=False)
+    monitor = Clearance(
+        capsules([(0, 1), (1, 2)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False
+    )
     X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]) + 0.93 * FORWARD
-    watch = Watch(monitor)
+    watch = watch_of(monitor)
     assert not watch.follow(X, X + 0.2 * FORWARD, floor, floor)
     assert watch.follow(X - 0.2 * FORWARD, X - 0.1 * FORWARD, floor, floor)

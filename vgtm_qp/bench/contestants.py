@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.ipopt.linearised import NonlinearStep
-from vgtm_qp.methods import AnyResolver, make_resolver
-from vgtm_qp.methods.curve_first import CurveFirstResolver
+from vgtm_qp.methods import make_resolver
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
+from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import StepStatus
 from vgtm_qp.step.state import State
@@ -48,14 +48,14 @@ class BarePseudoinverse:
     """Eq. (28) alone: one dense J^+ by singular values; no null-space vector, limit, clearance or check."""
 
     def __init__(self, problem: Problem) -> None:
-        self._arm = arm = arm_without_curve(problem)
-        layout, task = arm.layout, arm.task
-        first = layout.node_column[arm.truss.tip]
+        self._setup = setup = arm_without_curve(problem)
+        layout, task, truss = setup.layout, setup.task, setup.truss
+        first = layout.node_column[truss.tip]
         self._tip = (first[:, None] + np.arange(3)).reshape(-1)
-        self._lengths = np.zeros((arm.truss.member_count, layout.node_columns))
-        self._J = np.zeros((len(task.row_names) + len(layout.fixed), layout.node_columns))
+        self._lengths = np.zeros((truss.member_count, layout.node_columns))
+        self._J = np.zeros((len(task.row_names) + len(truss.fixed), layout.node_columns))
         self._x = np.zeros(len(self._J))
-        self._nodes = arm.truss.home
+        self._nodes = truss.home
         self.reached = self._nodes
 
     def place(self, state: State) -> None:
@@ -64,15 +64,15 @@ class BarePseudoinverse:
 
     def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
         """See :class:`Contestant`."""
-        arm, J, x = self._arm, self._J, self._x
-        arm.kinematics.evaluate(self._nodes)
-        tip = arm.task.rows(self._nodes, path.at(end))
+        setup, truss, J, x = self._setup, self._setup.truss, self._J, self._x
+        setup.kinematics.evaluate(self._nodes)
+        tip = setup.task.rows(self._nodes, setup.kinematics, path.at(end))
         rows = len(tip.error)
         J[:rows, self._tip] = tip.jacobian
-        J[rows:] = arm.layout.length_jacobian(arm.kinematics.gradient, self._lengths)[arm.layout.fixed]
+        J[rows:] = truss.scatter.dense(setup.kinematics.gradient, self._lengths)[truss.fixed]
         x[:rows] = tip.error
         X = np.array(self._nodes)
-        X[arm.truss.free] += (np.linalg.pinv(J) @ x).reshape(-1, 3)
+        X[truss.free] += (np.linalg.pinv(J) @ x).reshape(-1, 3)
         self.reached = X
         return True
 
@@ -81,14 +81,12 @@ class ResolverStep:
     """A resolver of the package, with `changes` to the problem's method."""
 
     def __init__(self, problem: Problem, changes: dict[str, Any]) -> None:
-        self.resolver: AnyResolver = make_resolver(problem.replace(changes))
+        self.resolver: Mover = make_resolver(problem.replace(changes))
 
     def place(self, state: State) -> None:
         """See :class:`Contestant`."""
         resolver = self.resolver
-        if isinstance(resolver, CurveFirstResolver):
-            resolver.curve = replace(resolver.curve, control_vertices=state.control_vertices)
-        elif state.control_vertices.shape != resolver.state.control_vertices.shape:
+        if state.control_vertices.shape != resolver.state.control_vertices.shape:
             state = replace(state, control_vertices=resolver.state.control_vertices)
         resolver.state = state
 

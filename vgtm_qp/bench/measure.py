@@ -140,7 +140,7 @@ class _Walk:
     def restart(self) -> bool:
         """Go home; False if the arm was stuck at home, so that another attempt is useless."""
         hopeless = bool(self.stuck) and self.covered == 0.0
-        self._resolver.state = self._resolver.arm.home_state()
+        self._resolver.state = self._resolver.setup.home_state()
         self._value, self._index, self._stalled, self.stuck = self._plan.path.start, 0, 0, ""
         return not hopeless
 

@@ -106,7 +106,7 @@ def measure_scene(
         name: _against(scene, name, resolver, plan, seconds=seconds, steps=steps) for name in names
     }
     data = problem.to_dict()
-    truss = resolver.arm.truss
+    truss = resolver.setup.truss
     return SceneReport(
         name=scene.name,
         kind=scene.kind,

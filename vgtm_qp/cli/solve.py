@@ -103,7 +103,7 @@ def _changed(problem: Problem, changes: dict[str, Any]) -> Problem:
     try:
         changed = problem.replace(wanted)
         if "method.solver" in wanted:
-            from vgtm_qp.step.arm import check_solver
+            from vgtm_qp.step.build import check_solver
 
             check_solver(changed)
         return changed

@@ -1,1 +1,1 @@
-"""Distances between the members of an arm and obstacles, and between members."""
+"""Distances between the bodies of an arm and obstacles, and between bodies."""

@@ -1,92 +1,95 @@
-"""Clearance of an arm of capsules: near pairs, least distances, proofs between two states."""
+"""Clearance of an arm of capsules: near contacts, least distances, proofs between two states."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.formulas import FURTHEST
-from vgtm_qp.geometry.groups import Contacts, Group, Kernels, Members, Motion
-from vgtm_qp.geometry.pairs import BetweenReport, Names, NearPairs, Pair, join
+from vgtm_qp.geometry.groups import Displacements, Group, PairDistances, ShapeKernels
+from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, PairNames, join, no_contacts
 from vgtm_qp.geometry.shapes import GeometryError, Obstacle, Pieces
 from vgtm_qp.geometry.solids import Solid
-from vgtm_qp.geometry.sweep import Found, sweep_group
+from vgtm_qp.geometry.sweep import SweepResult, sweep_group
+from vgtm_qp.geometry.watch import Watch
 
-__all__ = ["BetweenReport", "Clearance", "NearPairs", "Pair"]
+__all__ = ["BetweenReport", "Clearance", "Contacts", "Pair"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _AMONG = {"all": (False, True), "obstacles": (False,), "members": (True,)}
-_FIRST = 16
 
+_FIRST = 16
+"""The least distance is looked for among so many pairs first: those that were nearest at the reference."""
 
 _FEW_PAIRS = 20_000
+"""Scenes with no more pairs list them all."""
+
 _MOST_WATCHED = 8000
+"""Scenes at rest with no more pairs are watched."""
 
 
 class Clearance:
-    """Keeps the candidate pairs of an arm; one thread at a time.
+    """Distances of an arm's bodies from obstacles and from each other; one thread at a time.
+
+    Positions ``X`` (P, 3) are those of the points that ``Bodies.points`` counts, m. Lists of the pairs that may be
+    near are kept from one call to the next. Small scenes at rest are watched besides, which is faster for states
+    that follow each other.
 
     Parameters
     ----------
-    members : (M, 2) int
-        Nodes of each member.
-    radius : (M,)
-        Capsule radii, m.
+    bodies
+        See :func:`vgtm_qp.geometry.bodies.capsules`.
     obstacles
         See :mod:`vgtm_qp.geometry.shapes`.
     safe, influence : float
         Surface distance to keep, and that from which a pair is near, m.
     self_collision : bool
-        Whether pairs of members that share no node count.
-    member_names
-        Default ``"0"``, ``"1"``...
+        Whether pairs of bodies that are not neighbours count.
     self_influence : float or None
-        The same as `influence` for two members; by default at most twice `safe` and the largest radius
+        The same as `influence` for two bodies; by default at most twice `safe` and the largest radius
         together.
     fcl_reach : float or None
         Pairs nearer than this are asked of FCL too; by default 2.5 `safe`.
-    ends : callable or None
-        From node positions (N, 3) to member ends (M, 2, 3), m, where those are not the nodes.
+    watch : bool
+        Whether small scenes at rest are watched; the answers are the same.
     """
 
     def __init__(
         self,
-        members: ArrayLike,
-        radius: ArrayLike,
+        bodies: Bodies,
         obstacles: Sequence[Obstacle] = (),
         *,
         safe: float,
         influence: float,
         self_collision: bool = True,
-        member_names: Sequence[str] | None = None,
         self_influence: float | None = None,
         fcl_reach: float | None = None,
-        ends: Callable[[Array], Array] | None = None,
+        watch: bool = True,
     ) -> None:
-        self.members = np.asarray(members, dtype=np.int64).reshape(-1, 2)
-        self.radius = np.broadcast_to(np.asarray(radius, dtype=float), len(self.members)).copy()
-        self.obstacles = tuple(obstacles)
+        self.bodies, self.obstacles = bodies, tuple(obstacles)
         self.safe, self.influence, self.self_collision = safe, influence, self_collision
-        widest = 2.0 * (safe + float(self.radius.max(initial=0.0)))
+        widest = 2.0 * (safe + float(bodies.radius.max(initial=0.0)))
         self.self_influence = min(influence, widest) if self_influence is None else self_influence
         self.fcl_reach = 2.5 * safe if fcl_reach is None else fcl_reach
         self.pieces = Pieces(self.obstacles)
-        names = tuple(member_names) if member_names is not None else tuple(map(str, range(len(self.members))))
-        self.names = Names(names, tuple(o.name for o in self.obstacles), tuple(self.pieces.obstacle.tolist()))
+        self.names = PairNames(
+            bodies, tuple(o.name for o in self.obstacles), tuple(self.pieces.obstacle.tolist())
+        )
         self.fcl = FclQueries(self.pieces)
-        self._ends = ends
-        points = self.members if ends is None else np.arange(2 * len(self.members)).reshape(-1, 2)
-        self._members = Members(points, self.radius, self.members)
-        self._kernels = Kernels()
+        self._none = no_contacts(self.names)
+        self._kernels = ShapeKernels()
         shapes = {*self.pieces.shape.tolist()} | ({"segment"} if self_collision else set())
-        self._kernels.prepare(sorted(shapes), rests=self.rests)
+        watched = watch and self._can_be_watched()
+        self._kernels.prepare(sorted(shapes), rests=watched)
+        self._watch = Watch(bodies, self.pieces, self.names, self.fcl, self.every_pair) if watched else None
         self._candidates: Candidates | None = None
         self._solids = {
             k: Solid(o.pieces[:, :9].reshape(-1, 3, 3), o.velocity)
@@ -94,120 +97,132 @@ class Clearance:
             if o.shape == "triangle" and o.solid
         }
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether pairs are followed from state to state."""
+        return self._watch is not None
+
+    def _can_be_watched(self) -> bool:
+        """Return whether nothing moves but the arm, there are no meshes, and there are not too many pairs."""
+        bodies, pieces = len(self.bodies), self.pieces
+        simple = not pieces.moving and "triangle" not in pieces.shape
+        count = bodies * len(pieces) + (bodies * (bodies - 1) // 2 if self.self_collision else 0)
+        return simple and bodies > 1 and 0 < count <= _MOST_WATCHED
+
     def near(
         self,
         X: Array,
         time: float = 0.0,
         reach: float | None = None,
-        use_fcl: bool = True,
+        *,
         self_reach: float | None = None,
         fcl_reach: float | None = None,
-    ) -> NearPairs:
-        """Return all pairs whose surfaces are nearer than `reach`, exact.
+    ) -> Contacts:
+        """Return all contacts of surfaces nearer than `reach`, exact.
 
-        A pair has two rows where the nearest point of a member is not unique. Of the triangles of a mesh
-        only those stay that differ in normal or in the part of the member they face.
+        A pair has two rows where the nearest point of a body is not unique. Of the triangles of a mesh
+        only those stay that differ in normal or in the part of the body they face.
 
         Parameters
         ----------
-        X : (N, 3)
-            Node positions, m.
+        X : (P, 3)
+            m.
         time : float
             s.
         reach, self_reach : float or None
             m; by default `influence` and the lesser of `reach` and `self_influence`.
-        use_fcl : bool
-            Ask python-fcl for the pairs nearer than `fcl_reach`; each answer is guarded.
         fcl_reach : float or None
-            m; by default that of this object.
+            Pairs nearer than this, m, are asked of python-fcl too, and each answer is checked; by default that of
+            this object, and none are where it is zero.
         """
         reach = self.influence if reach is None else reach
-        fcl_reach = (self.fcl_reach if fcl_reach is None else fcl_reach) if use_fcl else 0.0
+        fcl_reach = self.fcl_reach if fcl_reach is None else fcl_reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
-        X = self._points(X)
+        if self._watch is not None:
+            found = self._watch.near(X, reach, self_reach, fcl_reach)
+            if found is not None:
+                return found
         candidates, motion = self._covering(X, time, reach, self_reach)
         parts = []
         for group in candidates.groups:
             limit = self_reach if group.is_self else reach
             rows = np.flatnonzero(group.lower(motion, limit)[0] < limit)
             if len(rows):
-                contacts, two = self._contacts(group, X, time, rows, min(limit, fcl_reach))
-                first = np.flatnonzero(contacts.distance < limit)
-                candidates.waste(group, len(rows) - len(first))
-                second = first[two[first] & (contacts.distance_second[first] < limit)]
-                part = self._pairs(group, rows, contacts, first, second)
+                answer, two = self._distances(group, X, time, rows, min(limit, fcl_reach))
+                first = np.flatnonzero(answer.distance < limit)
+                candidates.count_unneeded(group, len(rows) - len(first))
+                second = first[two[first] & (answer.distance_second[first] < limit)]
+                part = self._contacts(group, rows, answer, first, second)
                 parts.append(self._distinct(part) if group.shape == "triangle" else part)
-        candidates.tire(X, time)
-        return self._with_enclosed(join(parts, self.names), X, time)
+        candidates.refresh_where_due(X, time)
+        return self._with_enclosed(join(parts, self._none), X, time)
 
-    @property
-    def rests(self) -> bool:
-        """Whether nothing moves but the arm, members end at their nodes, there are no meshes and not too many pairs."""
-        members, pieces = len(self.members), self.pieces
-        simple = not pieces.moving and self.ends_at_nodes and "triangle" not in pieces.shape
-        count = members * len(pieces) + (members * (members - 1) // 2 if self.self_collision else 0)
-        return simple and members > 1 and 0 < count <= _MOST_WATCHED
-
-    @property
-    def ends_at_nodes(self) -> bool:
-        """Whether members end at nodes: joints have no extent."""
-        return self._ends is None
-
-    def every_pair(self, X: Array) -> Candidates:
-        """Return the list of all pairs, with their distances at node positions `X` (N, 3) and time 0."""
+    def every_pair(self, X: Array) -> list[Group]:
+        """Return groups of all pairs, with their distances at `X` (P, 3) and time 0."""
         horizon = np.inf if self.self_collision else None
-        arm = (self._members, self.pieces, self._kernels)
-        return Candidates(*arm, self._points(X), 0.0, np.inf, horizon)
+        return Candidates(self.bodies, self.pieces, self._kernels, X, 0.0, np.inf, horizon).groups
 
-    def _points(self, X: Array) -> Array:
-        """Return the points that members end at, from node positions (N, 3)."""
-        return X if self._ends is None else self._ends(X).reshape(-1, 3)
+    def _distances(
+        self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float
+    ) -> tuple[PairDistances, NDArray[np.bool_]]:
+        """Return distances of `rows`, and which have a second contact (K,): by the closed form, whatever FCL says."""
+        segments, others = group.segments(X, rows), group.others(X, time, rows)
+        answer = group.distances_of(segments, others, rows)
+        two = answer.two()
+        if fcl_reach > 0.0 and group.shape in FclQueries.SHAPES:
+            asked = np.flatnonzero(answer.distance < fcl_reach)
+            self.fcl.improve(group.other[rows], group.radius[rows], segments, others, answer, asked, two)
+        return answer, two
 
     def _contacts(
-        self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float
-    ) -> tuple[Contacts, NDArray[np.bool_]]:
-        """Return the contacts of `rows`, and which have a second one: by the closed form, whatever FCL says (K,)."""
-        segments, others = group.segments(X, rows), group.others(X, time, rows)
-        contacts = group.contacts_of(segments, others, rows)
-        two = contacts.two()
-        if fcl_reach > 0.0 and group.shape in FclQueries.SHAPES:
-            asked = np.flatnonzero(contacts.distance < fcl_reach)
-            self.fcl.improve(group.other[rows], group.radius[rows], segments, others, contacts, asked, two)
-        return contacts, two
-
-    def _pairs(self, group: Group, rows: Index, contacts: Contacts, first: Index, second: Index) -> NearPairs:
+        self, group: Group, rows: Index, answer: PairDistances, first: Index, second: Index
+    ) -> Contacts:
         """Return the rows `first` by their witness points and `second` by their other contacts."""
-        c = contacts
-        distance, t, s = c.distance[first], c.t[first], c.s[first]
-        normal, point = c.normal[first], c.point[first]
+        distance, t, s, normal = (
+            answer.distance[first],
+            answer.t[first],
+            answer.s[first],
+            answer.normal[first],
+        )
         if len(second):
-            distance = np.concatenate([distance, c.distance_second[second]])
-            t, s = np.concatenate([t, c.t_second[second]]), np.concatenate([s, c.s_second[second]])
-            normal = np.concatenate([normal, c.normal_second[second]])
-            point = np.concatenate([point, c.point_second[second]])
+            distance = np.concatenate([distance, answer.distance_second[second]])
+            t = np.concatenate([t, answer.t_second[second]])
+            s = np.concatenate([s, answer.s_second[second]])
+            normal = np.concatenate([normal, answer.normal_second[second]])
             first = np.concatenate([first, second])
-        member, other = group.member[rows[first]], group.other[rows[first]]
-        speed = self._normal_speed(normal, other) if not group.is_self else np.zeros(len(first))
-        is_self = np.full(len(first), group.is_self)
-        return NearPairs(member, other, is_self, distance, normal, t, s, speed, point, self.names)
+        chosen = rows[first]
+        share = 1.0 if group.is_self else 0.0
+        return Contacts(
+            distance=distance,
+            normal=normal,
+            points=np.concatenate([group.points[chosen], group.other_points[chosen]], axis=1),
+            weights=np.stack([1.0 - t, t, share * (s - 1.0), -share * s], axis=1),
+            is_self=np.full(len(first), group.is_self),
+            normal_speed=np.zeros(len(first))
+            if group.is_self
+            else self._normal_speed(normal, group.other[chosen]),
+            body=group.body[chosen],
+            other=group.other[chosen],
+            names=self.names,
+        )
 
     def _normal_speed(self, normal: Array, piece: Index) -> Array:
         if not self.pieces.moving:
             return np.zeros(len(piece))
         return np.asarray(np.einsum("kc,kc->k", normal, self.pieces.velocity[piece]))
 
-    def _distinct(self, pairs: NearPairs) -> NearPairs:
-        """Return the nearest of the rows alike in member, mesh, normal and place on the member."""
-        order = np.argsort(pairs.distance, kind="stable")
+    def _distinct(self, contacts: Contacts) -> Contacts:
+        """Return the nearest of the rows alike in body, mesh, normal and place on the body."""
+        order = np.argsort(contacts.distance, kind="stable")
         like = np.column_stack(
             [
-                pairs.member[order],
-                self.pieces.obstacle[pairs.other[order]],
-                np.round(2.0 * pairs.normal[order]),
-                np.round(4.0 * pairs.t[order]),
+                contacts.body[order],
+                self.pieces.obstacle[contacts.other[order]],
+                np.round(2.0 * contacts.normal[order]),
+                np.round(4.0 * contacts.weights[order, 1]),
             ]
         )
-        return pairs.select(order[np.sort(np.unique(like, axis=0, return_index=True)[1])])
+        return contacts.select(order[np.sort(np.unique(like, axis=0, return_index=True)[1])])
 
     def least(self, X: Array, time: float = 0.0, *, among: str = "all") -> tuple[float, Pair | None]:
         """Return the exact least surface distance and its pair; ``(inf, None)`` where there is no pair.
@@ -215,9 +230,9 @@ class Clearance:
         Parameters
         ----------
         among : {"all", "obstacles", "members"}
-            Pairs with obstacles, pairs of members, or both.
+            Pairs with obstacles, pairs of bodies, or both.
         """
-        wanted, X = _AMONG[among], self._points(X)
+        wanted = _AMONG[among]
         best, pair = np.inf, None
         enclosed = self._enclosed(X, time) if False in wanted else None
         if enclosed is not None:
@@ -229,16 +244,16 @@ class Clearance:
             for group in candidates.groups:
                 if group.is_self in wanted:
                     distance, row, count = _least_of(group, motion, X, time, best)
-                    candidates.waste(group, count)
+                    candidates.count_unneeded(group, count)
                     if row >= 0:
                         best = distance
-                        pair = Pair(int(group.member[row]), int(group.other[row]), group.is_self)
+                        pair = Pair(int(group.body[row]), int(group.other[row]), group.is_self)
             far, far_self = candidates.beyond(motion)
             extent = self._extent(X, time) if best > min(far, far_self) else 0.0
             search = False in wanted and len(self.pieces) > 0 and far < min(best, extent)
             search_self = True in wanted and far_self < min(best, extent)
             if not (search or search_self):
-                candidates.tire(X, time)
+                candidates.refresh_where_due(X, time)
                 return best, pair
             reach = 2.0 * max(far, self.influence) if search else reach
             self_reach = 2.0 * max(far_self, self.self_influence) if search_self else self_reach
@@ -255,15 +270,14 @@ class Clearance:
         Parameters
         ----------
         floor, self_floor : float
-            For obstacles and, if it differs, between members, m.
+            For obstacles and, if it differs, between bodies, m.
         """
         self_floor = floor if self_floor is None else self_floor
-        X = self._points(X)
         candidates, motion = self._covering(X, time, max(floor, 0.0), max(self_floor, 0.0))
         for group in candidates.groups:
             least = self_floor if group.is_self else floor
             rows = np.flatnonzero(~(group.lower(motion, least)[0] >= least))
-            if len(rows) and not (group.contacts(X, time, rows).distance >= least).all():
+            if len(rows) and not (group.distances(X, time, rows).distance >= least).all():
                 return False
         return self._enclosed(X, time) is None
 
@@ -276,32 +290,34 @@ class Clearance:
         floor: float,
         self_floor: float | None = None,
     ) -> BetweenReport:
-        """Prove that no surface distance falls below its floor while the members' ends move on straight lines.
+        """Prove that no surface distance falls below its floor while the points move on straight lines.
 
-        Motion bounds first, then fixed separating planes, then halves of the time for the pairs that are
-        left. What is not proven after twelve halvings is refused: the answer may be a false alarm, never a
-        false proof.
+        The watch is asked first. Then motion bounds, then separating planes, then halves of the time for the pairs
+        that are left. A motion not proven after twelve halvings is refused: the answer may be a false alarm,
+        never a false proof.
 
         Parameters
         ----------
-        start, end : (N, 3)
-            Node positions, m.
+        start, end : (P, 3)
+            m.
         start_time, end_time : float
             s; the obstacles move meanwhile.
         floor, self_floor : float
-            For obstacles and, if it differs, between members, m; not negative.
+            For obstacles and, if it differs, between bodies, m. Below zero, where surfaces overlap already, only
+            the watch can prove them; without it they count as zero.
 
         Raises
         ------
         GeometryError
             A position is not finite; so do `near` and `least`.
         """
-        floor = max(floor, 0.0)
-        self_floor = floor if self_floor is None else max(self_floor, 0.0)
-        start, end = self._points(start), self._points(end)
+        self_floor = floor if self_floor is None else self_floor
+        if self._watch is not None and self._watch.follow(start, end, floor, self_floor):
+            return BetweenReport(True, min(floor, self_floor), np.zeros(0), self._none)
+        floor, self_floor = max(floor, 0.0), max(self_floor, 0.0)
         candidates, motion = self._covering(start, start_time, floor, self_floor, end, end_time)
         proven = min(candidates.beyond(motion))
-        found: list[tuple[Group, Found]] = []
+        found: list[tuple[Group, SweepResult]] = []
         for group in candidates.groups:
             least = self_floor if group.is_self else floor
             lower, others = group.lower(motion, least)
@@ -319,63 +335,64 @@ class Clearance:
         if enclosed is not None:
             parts.append(enclosed)
             fractions.append(np.full(len(enclosed), 1.0 / 32.0))
-        failing = join(parts, self.names)
+        failing = join(parts, self._none)
         least = min([proven, float(failing.distance.min(initial=np.inf)), *(r.worst for _, r in found)])
         return BetweenReport(not parts, least, np.concatenate([np.zeros(0), *fractions]), failing)
 
     def _failing(
-        self, group: Group, found: Found, start: Array, end: Array, start_time: float, end_time: float
-    ) -> NearPairs:
+        self, group: Group, found: SweepResult, start: Array, end: Array, start_time: float, end_time: float
+    ) -> Contacts:
         segments, others = found.placed(group, start, end, start_time, end_time)
         every = np.arange(len(found.rows))
-        contacts = group.contacts_of(segments, others, found.rows)
-        return self._pairs(group, found.rows, contacts, every, every[:0])
+        answer = group.distances_of(segments, others, found.rows)
+        return self._contacts(group, found.rows, answer, every, every[:0])
 
-    def _enclosed(self, X: Array, time: float) -> NearPairs | None:
-        """Return the members with an end inside a closed mesh, at minus their distance to its surface."""
+    def _enclosed(self, X: Array, time: float) -> Contacts | None:
+        """Return the bodies with an end inside a closed mesh, at minus their distance to its surface."""
         parts = []
         for obstacle, solid in self._solids.items():
             inside = solid.contains(X, time)
-            member = np.flatnonzero(inside[self._members.nodes].any(axis=1))
-            if not len(member):
+            body = np.flatnonzero(inside[self.bodies.points].any(axis=1))
+            if not len(body):
                 continue
             piece = np.flatnonzero(self.pieces.obstacle == obstacle)
             group = Group(
                 "triangle",
-                np.repeat(member, len(piece)),
-                np.tile(piece, len(member)),
-                self._members,
+                np.repeat(body, len(piece)),
+                np.tile(piece, len(body)),
+                self.bodies,
                 self.pieces,
                 self._kernels,
             )
-            contacts = group.contacts(X, time, np.arange(len(group.member)))
-            nearest = contacts.distance.reshape(len(member), -1).argmin(axis=1) + len(piece) * np.arange(
-                len(member)
+            every = np.arange(len(group))
+            answer = group.distances(X, time, every)
+            nearest = answer.distance.reshape(len(body), -1).argmin(axis=1) + len(piece) * np.arange(
+                len(body)
             )
-            pairs = self._pairs(group, np.arange(len(group.member)), contacts, nearest, nearest[:0])
-            radius = self.radius[member]
-            depth = pairs.distance + radius
+            contacts = self._contacts(group, every, answer, nearest, nearest[:0])
+            radius = self.bodies.radius[body]
+            depth = contacts.distance + radius
             outward = np.where(depth > 0.0, -1.0, 1.0)
             parts.append(
                 replace(
-                    pairs,
+                    contacts,
                     distance=-depth - radius,
-                    normal=outward[:, None] * pairs.normal,
-                    normal_speed=outward * pairs.normal_speed,
+                    normal=outward[:, None] * contacts.normal,
+                    normal_speed=outward * contacts.normal_speed,
                 )
             )
-        return join(parts, self.names) if parts else None
+        return join(parts, self._none) if parts else None
 
-    def _with_enclosed(self, pairs: NearPairs, X: Array, time: float) -> NearPairs:
-        """Return `pairs` with one row that leads out for each member inside a closed mesh."""
+    def _with_enclosed(self, contacts: Contacts, X: Array, time: float) -> Contacts:
+        """Return `contacts` with one row that leads out for each body inside a closed mesh."""
         enclosed = self._enclosed(X, time)
         if enclosed is None:
-            return pairs
-        inside = np.zeros((len(self.members), len(self.obstacles)), dtype=bool)
-        inside[enclosed.member, self.pieces.obstacle[enclosed.other]] = True
-        owner = self.pieces.obstacle[np.where(pairs.is_self, 0, pairs.other)]
-        kept = pairs.is_self | ~inside[pairs.member, owner]
-        return join([pairs.select(kept), enclosed], self.names)
+            return contacts
+        inside = np.zeros((len(self.bodies), len(self.obstacles)), dtype=bool)
+        inside[enclosed.body, self.pieces.obstacle[enclosed.other]] = True
+        owner = self.pieces.obstacle[np.where(contacts.is_self, 0, contacts.other)]
+        kept = contacts.is_self | ~inside[contacts.body, owner]
+        return join([contacts.select(kept), enclosed], self._none)
 
     def _covering(
         self,
@@ -385,10 +402,10 @@ class Clearance:
         self_reach: float,
         end: Array | None = None,
         end_time: float | None = None,
-    ) -> tuple[Candidates, Motion]:
-        """Return candidates with every pair nearer than the reaches, and the motion since their reference.
+    ) -> tuple[Candidates, Displacements]:
+        """Return candidates with every pair nearer than the reaches, and the displacements from their references.
 
-        With an `end` they hold on the whole straight way there, and the motion is the greatest on it.
+        With an `end` both hold on the whole straight path there.
         """
         candidates = self._candidates
         far = far_self = np.nan
@@ -397,19 +414,19 @@ class Clearance:
             far, far_self = candidates.beyond(motion)
             if far >= reach and far_self >= self_reach:
                 return candidates, motion
-        # What is not a number fails the comparisons above and comes here.
+        # NaN fails the comparisons above and comes here.
         if not all(np.abs(at).max(initial=0.0) < FURTHEST for at in (X, X if end is None else end)):
             raise GeometryError("node positions must be finite numbers")
         travel = 0.0 if end is None else float(np.sqrt(((end - X) ** 2).sum(axis=1).max(initial=0.0)))
         drift = 0.0 if end_time is None else self.pieces.fastest * abs(end_time - time)
         horizon = max(reach, self.influence) + self.influence + travel + drift
         self_horizon = max(self_reach, self.self_influence) + self.influence + 2.0 * travel
-        if len(self.members) * (len(self.members) + len(self.pieces)) <= _FEW_PAIRS:
-            # A list of all pairs never needs another broad phase, which would cost more than its tail does.
+        if len(self.bodies) * (len(self.bodies) + len(self.pieces)) <= _FEW_PAIRS:
+            # A list of all pairs never needs another broad phase, which would cost more than the far pairs in it.
             horizon = self_horizon = 2.0 * self._extent(X, time) + horizon + self_horizon
         if candidates is None:
             self._candidates = candidates = Candidates(
-                self._members,
+                self.bodies,
                 self.pieces,
                 self._kernels,
                 X,
@@ -421,20 +438,22 @@ class Clearance:
             if not far >= reach:
                 candidates.renew_pieces(X, time, horizon)
             if not far_self >= self_reach:
-                candidates.follow_members(X, time, self_reach, travel, self_horizon)
+                candidates.follow_bodies(X, time, self_reach, travel, self_horizon)
         return candidates, candidates.motion(X, time, end, end_time)
 
 
-def _least_of(group: Group, motion: Motion, X: Array, time: float, best: float) -> tuple[float, int, int]:
-    """Return the least distance below `best`, its row, and how many pairs the bounds left beside the first.
+def _least_of(
+    group: Group, motion: Displacements, X: Array, time: float, best: float
+) -> tuple[float, int, int]:
+    """Return the least distance below `best`, m, its row, and how many pairs were evaluated after the first few.
 
-    The row is -1 where none is below.
+    The row is -1 where no distance is below.
     """
     # The nearest pairs at the reference are likely to be so still; they make `best` small for the others.
     rows, row = np.arange(min(len(group), _FIRST)), -1
     for first in (True, False):
         if len(rows):
-            distance = group.contacts(X, time, rows).distance
+            distance = group.distances(X, time, rows).distance
             k = int(np.argmin(distance))
             if distance[k] < best:
                 best, row = float(distance[k]), int(rows[k])

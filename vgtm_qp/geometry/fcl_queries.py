@@ -1,6 +1,6 @@
-"""Distances by python-fcl, each held against the exact one; an answer that differs from it is not used.
+"""Distances by python-fcl, each compared with the exact one; an answer that differs from it is not used.
 
-FCL's distance from a capsule to a box is always too large, and for members parallel to edges on round
+FCL's distance from a capsule to a box is always too large, and for bodies parallel to edges on round
 coordinates too large by up to a metre (FCL issue 508). So the capsule has radius zero, the radius is subtracted,
 and an answer counts only where the closed form agrees and the two are apart. FCL's signed distance is never asked for:
 it can end the process.
@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.geometry.groups import Contacts
+from vgtm_qp.geometry.groups import PairDistances
 from vgtm_qp.geometry.shapes import Pieces
 
 Array = NDArray[np.float64]
@@ -46,18 +46,18 @@ class FclQueries:
         self.asked = self.replaced = 0
         self._pieces = pieces
         self._objects: dict[int, Any] = {}
-        self._member: Any = None
+        self._body: Any = None
 
     def _start(self) -> None:
         import fcl
 
         self._fcl = fcl
         self._capsule = fcl.Capsule(0.0, 1.0)
-        self._member = fcl.CollisionObject(self._capsule, fcl.Transform())
+        self._body = fcl.CollisionObject(self._capsule, fcl.Transform())
         self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
 
     def _object(self, piece: int) -> Any:
-        if self._member is None:
+        if self._body is None:
             self._start()
         if piece not in self._objects:
             fcl, shape, row = self._fcl, self._pieces.shape[piece], self._pieces.parameters[piece]
@@ -76,16 +76,16 @@ class FclQueries:
         radius: Array,
         segments: Array,
         parameters: Array,
-        contacts: Contacts,
+        contacts: PairDistances,
         rows: Index,
         two: NDArray[np.bool_],
     ) -> None:
-        """Ask FCL for `rows`, which should be few, and write the answers that hold into `contacts`.
+        """Ask FCL for `rows`, which should be few, and write the answers that agree into `contacts`.
 
         Parameters
         ----------
         pieces, radius, segments, parameters
-            (K,) piece indices, (K,) radii, (K, 6) ends, (K, 15) parameters at this time.
+            Piece indices (K,), radii (K,), m, ends (K, 6), m, and parameters (K, 15) at this time.
         contacts
             Exact, from surface to surface; they stay where FCL's answer is refused.
         two
@@ -97,12 +97,12 @@ class FclQueries:
                 self._object(piece).setTranslation(parameters[k, :3])
             found = self.witness(piece, segments[k].tolist(), float(contacts.distance[k] + radius[k]))
             if found is not None and not two[k]:
-                contacts.t[k], contacts.normal[k], contacts.point[k] = found
+                contacts.t[k], contacts.normal[k] = found
 
     def witness(
         self, piece: int, ends: list[float], distance: float
-    ) -> tuple[float, tuple[float, float, float], Array] | None:
-        """Return the parameter on a segment, normal (3) and point (3,) on the piece where FCL finds the two nearest.
+    ) -> tuple[float, tuple[float, float, float]] | None:
+        """Return where FCL finds a segment nearest to a piece: the parameter on the segment, and the normal (3).
 
         None where its answer is refused: its distance is not the `distance`, m, of the closed form, or the segment is
         too near for the points to have a direction.
@@ -114,10 +114,10 @@ class FclQueries:
         if not length > 0.0:
             return None
         self._capsule.lz = length
-        self._member.setQuatRotation(_quaternion(x, y, z, length))
-        self._member.setTranslation(np.array((0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz))))
+        self._body.setQuatRotation(_quaternion(x, y, z, length))
+        self._body.setTranslation(np.array((0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz))))
         result = self._fcl.DistanceResult()
-        found = self._fcl.distance(self._member, other, self._request, result)
+        found = self._fcl.distance(self._body, other, self._request, result)
         self.asked += 1
         if not (found > _APART and abs(found - distance) <= _AGREEMENT):
             self.replaced += 1
@@ -129,7 +129,7 @@ class FclQueries:
             self.replaced += 1
             return None
         along = (x * (px - ax) + y * (py - ay) + z * (pz - az)) / (length * length)
-        return min(max(along, 0.0), 1.0), (nx, ny, nz), witness
+        return min(max(along, 0.0), 1.0), (nx, ny, nz)
 
 
 def _quaternion(x: float, y: float, z: float, length: float) -> list[float]:

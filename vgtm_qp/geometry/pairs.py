@@ -1,4 +1,4 @@
-"""What is reported about pairs: near ones with their witness points, and proofs between two states."""
+"""What is reported about pairs: contacts with their witness points, and proofs between two states."""
 
 from __future__ import annotations
 
@@ -8,75 +8,76 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.geometry.bodies import Bodies
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_COLUMNS = ("member", "other", "is_self", "distance", "normal", "t", "t_other", "normal_speed", "point")
+_COLUMNS = ("distance", "normal", "points", "weights", "is_self", "normal_speed", "body", "other")
 
 
 class Pair(NamedTuple):
-    """A member and a piece of an obstacle, or another member."""
+    """A body and a piece of an obstacle, or another body."""
 
-    member: int
+    body: int
     other: int
     is_self: bool
 
 
-@dataclass(frozen=True)
-class Names:
-    """Names of members and of the obstacle that each piece belongs to."""
+@dataclass(frozen=True, eq=False)
+class PairNames:
+    """Names of bodies, and of the obstacle that each piece belongs to."""
 
-    members: tuple[str, ...]
+    bodies: Bodies
     obstacles: tuple[str, ...]
     owner: tuple[int, ...]
 
     def clearance(self, pair: Pair) -> str:
-        """Return the name of a clearance row."""
-        other = (
-            f"member {self.members[pair.other]}" if pair.is_self else self.obstacles[self.owner[pair.other]]
-        )
-        return f"clearance: member {self.members[pair.member]} / {other}"
+        """Return the name of a clearance row: ``"clearance: member L3-2 / right cube"``."""
+        other = self.bodies.called(pair.other) if pair.is_self else self.obstacles[self.owner[pair.other]]
+        return f"clearance: {self.bodies.called(pair.body)} / {other}"
 
 
 @dataclass(frozen=True, eq=False)
-class NearPairs:
-    """K near pairs of surfaces.
+class Contacts:
+    """R pairs of witness points of near surfaces; a pair has two rows where its nearest points are not unique.
+
+    The distance changes by ``normal . sum_k weights[k] d points[k]`` while obstacles rest.
 
     Attributes
     ----------
-    member : (K,) int
-    other : (K,) int
-        Piece index, or the other member.
-    is_self : (K,) bool
-    distance : (K,)
+    distance : (R,)
         From surface to surface, m; negative where they intersect.
-    normal : (K, 3)
-        Unit, from the obstacle or other member to the member: the gradient of `distance` with respect to the
-        witness point.
-    t, t_other : (K,)
-        Parameters of the witness points on the member and, for self pairs, on the other member (else 0).
-    normal_speed : (K,)
+    normal : (R, 3)
+        Unit, from the obstacle or other body to the body.
+    points : (R, 4) int
+        The points that span the body, then those of the other body, or the same again for an obstacle.
+    weights : (R, 4)
+        Of the velocities of `points` in that of the body's witness point relative to the other body's; the last
+        two are zero for an obstacle.
+    is_self : (R,) bool
+        Whether the other is a body of the arm too.
+    normal_speed : (R,)
         Velocity of the obstacle along `normal`, m/s.
-    point : (K, 3)
-        Witness point on the piece, or on the other member's axis, m.
-    names : Names
+    body, other : (R,) int
+        `other` is a piece of an obstacle or, where ``is_self``, a body.
+    names : PairNames
         What :meth:`name` reads.
     """
 
-    member: Index
-    other: Index
-    is_self: Mask
     distance: Array
     normal: Array
-    t: Array
-    t_other: Array
+    points: Index
+    weights: Array
+    is_self: Mask
     normal_speed: Array
-    point: Array
-    names: Names
+    body: Index
+    other: Index
+    names: PairNames
 
     def __len__(self) -> int:
-        return len(self.member)
+        return len(self.distance)
 
     def name(self, k: int) -> str:
         """Return the name of row `k`: ``"clearance: member L3-2 / right cube"``."""
@@ -84,22 +85,35 @@ class NearPairs:
 
     def pair(self, k: int) -> Pair:
         """Return which pair row `k` is about."""
-        return Pair(int(self.member[k]), int(self.other[k]), bool(self.is_self[k]))
+        return Pair(int(self.body[k]), int(self.other[k]), bool(self.is_self[k]))
 
-    def select(self, rows: Index | Mask) -> NearPairs:
+    def select(self, rows: Index | Mask) -> Contacts:
         """Return some of the rows."""
-        return NearPairs(**{key: getattr(self, key)[rows] for key in _COLUMNS}, names=self.names)
+        return Contacts(**{column: getattr(self, column)[rows] for column in _COLUMNS}, names=self.names)
 
 
-def join(parts: list[NearPairs], names: Names) -> NearPairs:
-    """Return all rows of `parts`."""
-    if len(parts) == 1:
-        return parts[0]
-    if not parts:
-        none, index, rows = np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        return NearPairs(index, index, np.zeros(0, dtype=bool), none, rows, none, none, none, rows, names)
-    columns = {key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS}
-    return NearPairs(**columns, names=names)
+def no_contacts(names: PairNames) -> Contacts:
+    """Return no rows."""
+    index, number = np.zeros(0, dtype=np.int64), np.zeros(0)
+    return Contacts(
+        distance=number,
+        normal=np.zeros((0, 3)),
+        points=np.zeros((0, 4), dtype=np.int64),
+        weights=np.zeros((0, 4)),
+        is_self=np.zeros(0, dtype=bool),
+        normal_speed=number,
+        body=index,
+        other=index,
+        names=names,
+    )
+
+
+def join(parts: list[Contacts], none: Contacts) -> Contacts:
+    """Return all rows of `parts`, one after the other, or `none` where there is no part."""
+    if len(parts) <= 1:
+        return parts[0] if parts else none
+    columns = {column: np.concatenate([getattr(part, column) for part in parts]) for column in _COLUMNS}
+    return Contacts(**columns, names=none.names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +129,14 @@ class BetweenReport:
         certified.
     fraction : (F,)
         For each failing pair, where on the motion (0 < s <= 1) the least distance was found.
-    failing : NearPairs
+    failing : Contacts
         The failing pairs there, one row each.
     """
 
     certified: bool
     clearance: float
     fraction: Array
-    failing: NearPairs
+    failing: Contacts
 
     def failing_parameters(self, apart: float = 0.05) -> list[float]:
         """Return the fractions, worst pair first, without those nearer than `apart` to a worse one."""
@@ -132,8 +146,3 @@ class BetweenReport:
             if all(abs(s - c) > apart for c in chosen):
                 chosen.append(s)
         return chosen
-
-
-def certified(clearance: float, names: Names) -> BetweenReport:
-    """Return the report of a motion over which no pair comes nearer than `clearance`, m."""
-    return BetweenReport(True, clearance, np.zeros(0), join([], names))

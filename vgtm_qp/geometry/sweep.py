@@ -1,4 +1,4 @@
-"""Proof of clearance over a straight motion: swept bounds, then halves of the time for what is left."""
+"""Proof of clearance over a straight motion: swept bounds, then halves of the time for the pairs that are left."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _SAMPLES = np.linspace(0.0, 1.0, 33)[1:-1]
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """What became of some pairs of a group over a motion.
+class SweepResult:
+    """Which pairs of a group were certified over a motion.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Found:
     fraction : (F,)
         Where on the motion each of those was found nearest, 0 < s <= 1.
     worst : float
-        Least distance found of those, m.
+        Least distance found of the pairs that were not certified, m.
     """
 
     proven: float
@@ -42,11 +42,11 @@ class Found:
         self, group: Group, start: Array, end: Array, start_time: float, end_time: float
     ) -> tuple[Array, Array]:
         """Return segments and parameters of the failing pairs at their fractions, in the base frame."""
-        motion = _Motion(group, self.rows, start, end, start_time, end_time)
+        motion = _RelativeMotion(group, self.rows, start, end, start_time, end_time)
         segments, others = motion.at(np.arange(len(self.rows)), self.fraction)
         if group.is_self:
             return segments, others
-        shift = group.displacement(end_time - start_time, self.rows) * self.fraction[:, None]
+        shift = group.obstacle_displacement(end_time - start_time, self.rows) * self.fraction[:, None]
         corners = _corners(group.shape)
         others = others.copy()
         others[:, : 3 * corners] += np.tile(shift, corners)
@@ -57,7 +57,7 @@ def _corners(shape: str) -> int:
     return 3 if shape == "triangle" else 1
 
 
-class _Motion:
+class _RelativeMotion:
     """The segments of some pairs over a motion, in the frame of the obstacle, which rests there."""
 
     def __init__(
@@ -70,7 +70,7 @@ class _Motion:
         if group.is_self:
             self.other_change = group.others(end, end_time, rows) - self.others
         elif group.moving:
-            self.change -= np.tile(group.displacement(end_time - start_time, rows), 2)
+            self.change -= np.tile(group.obstacle_displacement(end_time - start_time, rows), 2)
 
     def at(self, k: Index, fraction: Array) -> tuple[Array, Array]:
         """Return segments and parameters of the pairs `k` at their `fraction`."""
@@ -83,25 +83,25 @@ class _Motion:
 
 def sweep_group(
     group: Group, rows: Index, start: Array, end: Array, start_time: float, end_time: float, floor: float
-) -> Found:
+) -> SweepResult:
     """Return which of the pairs `rows` stay above `floor` over the motion, provably."""
-    motion = _Motion(group, rows, start, end, start_time, end_time)
+    motion = _RelativeMotion(group, rows, start, end, start_time, end_time)
     count = len(rows)
-    # Few pairs are cut at once as finely as costs no more than the whole motion does: one call instead of several.
+    # The motion of few pairs is cut at once, as finely as a call costs no more: one call instead of several.
     pieces = max(_PIECES // count, 1)
     k = np.repeat(np.arange(count), pieces)
     cuts = np.arange(pieces + 1) / pieces
     left, right = np.tile(cuts[:-1], count), np.tile(cuts[1:], count)
     answer = _swept(group, motion, rows, k, left, right)
     if (answer[:, 0] >= floor).all():
-        return Found(float(answer[:, 0].min()), rows[:0], left[:0])
+        return SweepResult(float(answer[:, 0].min()), rows[:0], left[:0])
     failed = np.zeros(count, dtype=bool)
     worst, proven = np.full(count, np.inf), np.full(count, np.inf)
     fraction = np.full(count, 0.5)
     for depth in range(_DEPTH + 1):
         if depth:
             answer = _swept(group, motion, rows, k, left, right)
-        # Negated comparisons also catch what is not a number.
+        # A negated comparison is true for NaN.
         open_ = ~(answer[:, 0] >= floor)
         np.minimum.at(proven, k[~open_], answer[~open_, 0])
         for distance, where in ((answer[:, 1], left), (answer[:, 2], right)):
@@ -121,10 +121,10 @@ def sweep_group(
     kept = float(proven[~failed].min(initial=np.inf))
     if len(chosen):
         fraction[chosen] = _nearest_fraction(group, motion, rows, chosen, worst[chosen], fraction[chosen])
-    return Found(kept, rows[chosen], fraction[chosen], float(worst[chosen].min(initial=np.inf)))
+    return SweepResult(kept, rows[chosen], fraction[chosen], float(worst[chosen].min(initial=np.inf)))
 
 
-def _swept(group: Group, motion: _Motion, rows: Index, k: Index, left: Array, right: Array) -> Array:
+def _swept(group: Group, motion: _RelativeMotion, rows: Index, k: Index, left: Array, right: Array) -> Array:
     """Return the sweep of the pairs `k` between the fractions `left` and `right` of the motion, (len(k), 3)."""
     a, other_a = motion.at(k, left)
     b, other_b = motion.at(k, right)
@@ -132,12 +132,12 @@ def _swept(group: Group, motion: _Motion, rows: Index, k: Index, left: Array, ri
 
 
 def _nearest_fraction(
-    group: Group, motion: _Motion, rows: Index, chosen: Index, worst: Array, fraction: Array
+    group: Group, motion: _RelativeMotion, rows: Index, chosen: Index, worst: Array, fraction: Array
 ) -> Array:
-    """Return where the `chosen` pairs are nearest: the best of the point known and of even samples."""
+    """Return where the `chosen` pairs are nearest: the better of the point known and of even samples."""
     k = np.repeat(chosen, len(_SAMPLES))
     segments, others = motion.at(k, np.tile(_SAMPLES, len(chosen)))
-    distance = group.contacts_of(segments, others, rows[k]).distance.reshape(len(chosen), -1)
+    distance = group.distances_of(segments, others, rows[k]).distance.reshape(len(chosen), -1)
     best = distance.argmin(axis=1)
     better = distance[np.arange(len(chosen)), best] < worst
     return np.asarray(np.maximum(np.where(better, _SAMPLES[best], fraction), _SAMPLES[0]))

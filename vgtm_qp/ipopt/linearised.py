@@ -12,11 +12,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
+from vgtm_qp.ipopt.symbols import OPTIONS, program_symbols
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.limits import length_box
-from vgtm_qp.step.linearise import clearance_rows
+from vgtm_qp.rows.clearance import clearance_rows
+from vgtm_qp.rows.limits import actuator_box
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State
 
@@ -38,22 +38,22 @@ class NonlinearStep:
     """Steps of a truss whose base is at rest: exact lengths and tip, the QP's truss terms."""
 
     def __init__(self, problem: Problem) -> None:
-        self._arm = arm = arm_without_curve(problem)
-        truss, weights = arm.truss, problem.method.weights
+        self._setup = setup = arm_without_curve(problem)
+        truss, weights = setup.truss, problem.method.weights
         free = 3 * len(truss.free)
-        symbols = truss_symbols(truss)
+        symbols = program_symbols(truss)
         x, x0, lengths = symbols.x, ca.SX.sym("x0", free), symbols.lengths
         goal, across = ca.SX.sym("goal", 3), ca.SX.sym("across", 2, 3)
         rows = ca.SX.sym("rows", _PAIRS, free)
         before = ca.substitute(lengths, x, x0)
-        ends = [(symbols.tip - goal)[arm.task.axes.tolist()]]
-        if arm.task.turns:
+        ends = [(symbols.tip - goal)[setup.task.axes.tolist()]]
+        if setup.task.turns:
             # The normal of the tip's triangle is the z-axis of its frame.
             ends.append(ca.mtimes(across, symbols.tip_normal(truss)))
         end = ca.vertcat(*ends)
         actuators = truss.actuators.tolist()
         changed = (lengths - before)[actuators]
-        off_home = lengths[actuators] - arm.home_lengths[truss.actuators]
+        off_home = lengths[actuators] - setup.arm.home_quantities[truss.actuators]
         objective = 0.5 * (
             weights.node_rate * ca.sumsqr(x - x0)
             + weights.actuator_rate * ca.sumsqr(changed)
@@ -65,7 +65,7 @@ class NonlinearStep:
         self._ends = int(end.numel())
         self._rows = np.zeros((_PAIRS, free))
         self._multipliers = np.zeros(free), np.zeros(int(g.numel()))
-        self._state = arm.home_state()
+        self._state = setup.home_state()
 
     def place(self, state: State) -> None:
         """Stand in `state`."""
@@ -73,13 +73,13 @@ class NonlinearStep:
 
     def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
         """Move to the value `end` of `path` in `dt` seconds; False where IPOPT fails."""
-        arm, state = self._arm, self._state
-        truss, actuators = arm.truss, arm.truss.actuators
+        setup, state = self._setup, self._state
+        truss, actuators = setup.truss, setup.truss.actuators
         here, goal = state.nodes[truss.free].reshape(-1), path.at(end)
-        lower, upper = arm.home_lengths.copy(), arm.home_lengths.copy()
+        lower, upper = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
         limits = truss.stroke[actuators], truss.rate[actuators], truss.acceleration[actuators]
-        lower[actuators], upper[actuators] = length_box(
-            state.lengths[actuators], state.length_rates[actuators], *limits, dt, state.duration or None
+        lower[actuators], upper[actuators] = actuator_box(
+            state.quantities[actuators], state.rates[actuators], *limits, dt, state.duration or None
         )
         floors = self._clearances(state)
         zero = np.zeros(self._ends)
@@ -102,15 +102,17 @@ class NonlinearStep:
 
     def _clearances(self, state: State) -> Array:
         """Write the rows of the nearest pairs; return their lower bounds (24,), m. Unused rows are zero."""
-        arm = self._arm
-        pairs = arm.monitor.near(state.nodes, state.time, arm.influence, use_fcl=False)
-        found = clearance_rows(arm.monitor, pairs, arm.safe, arm.self_safe)
-        nearest = np.argsort(-found.lower)[:_PAIRS]
+        setup = self._setup
+        near = setup.monitor.near(setup.arm.points(state.q), state.time, setup.influence, fcl_reach=0.0)
+        coefficients, lower = clearance_rows(
+            near.distance, near.normal, near.weights, near.is_self, setup.safe, setup.self_safe
+        )
+        nearest = np.argsort(-lower)[:_PAIRS]
         self._rows[:] = 0.0
         floors = np.full(_PAIRS, -1.0)
-        floors[: len(nearest)] = np.minimum(found.lower[nearest], 0.0)
-        first = arm.layout.node_column[found.nodes[nearest]]
+        floors[: len(nearest)] = np.minimum(lower[nearest], 0.0)
+        first = setup.layout.node_column[near.points[nearest]]
         row, slot = np.nonzero(first >= 0)
         columns = first[row, slot][:, None] + np.arange(3)
-        np.add.at(self._rows, (row[:, None], columns), found.coefficients[nearest[row], slot])
+        np.add.at(self._rows, (row[:, None], columns), coefficients[nearest[row], slot])
         return floors

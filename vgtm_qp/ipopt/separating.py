@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.geometry.clearance import NearPairs
-from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
+from vgtm_qp.geometry.clearance import Contacts
+from vgtm_qp.ipopt.symbols import OPTIONS, program_symbols
 from vgtm_qp.maneuver.plan import Plan
-from vgtm_qp.step.arm import Arm
 from vgtm_qp.step.path import PathPoint
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 
 Array = NDArray[np.float64]
@@ -41,9 +41,9 @@ _OPTIONS: dict[str, Any] = {
 class IpoptStepper:
     """Solves steps of an arm among boxes; it knows neither elastic nor scaled goals."""
 
-    def __init__(self, arm: Arm) -> None:
-        self.arm = arm
-        self._symbols = truss_symbols(arm.truss)
+    def __init__(self, setup: Setup) -> None:
+        self.setup = setup
+        self._symbols = program_symbols(setup.truss)
 
     def run(self, plan: Plan, halvings: int = 2, budget: float = 120.0) -> tuple[list[State], list[float]]:
         """Return the states along `plan` and the path values they stand at, up to where a step fails.
@@ -51,7 +51,7 @@ class IpoptStepper:
         `budget` is the CPU time, s, after which it gives up.
         """
         started = process_time()
-        state = self.arm.home_state()
+        state = self.setup.home_state()
         states, values = [state], [plan.path.start]
         for mark in plan.marks:
             while values[-1] < mark:
@@ -71,38 +71,44 @@ class IpoptStepper:
         return states, values
 
     def _step(self, state: State, goal: PathPoint, duration: float) -> State | None:
-        arm = self.arm
-        truss, monitor = arm.truss, arm.monitor
-        tip = truss.tip_weights @ state.nodes[truss.tip]
+        setup = self.setup
+        monitor = setup.monitor
+        tip = setup.arm.end_effector.position(state.nodes)
         reach = 1.5 * float(np.linalg.norm(goal.position - tip)) + 0.1
         time = state.time + duration
         for _ in range(_RESOLVES):
             pairs = monitor.near(
-                state.nodes, state.time, arm.safe + reach, use_fcl=False, self_reach=arm.self_safe + reach
+                setup.arm.points(state.q),
+                state.time,
+                setup.safe + reach,
+                self_reach=setup.self_safe + reach,
+                fcl_reach=0.0,
             )
             X = self._solve(state, goal, duration, pairs)
             if X is None or not self._close(X):
                 return None
-            if monitor.keeps(X, time, arm.safe - 1e-9, arm.self_safe - 1e-9):
-                floors = (arm.safe - BETWEEN, arm.self_safe - BETWEEN)
-                if not monitor.between(state.nodes, X, state.time, time, *floors).certified:
+            points = setup.arm.points(X)
+            if monitor.keeps(points, time, setup.safe - 1e-9, setup.self_safe - 1e-9):
+                floors = (setup.safe - BETWEEN, setup.self_safe - BETWEEN)
+                before = setup.arm.points(state.q)
+                if not monitor.between(before, points, state.time, time, *floors).certified:
                     return None
-                arm.kinematics.evaluate(X)
-                lengths = frozen(arm.kinematics.lengths)
-                rates = frozen((lengths - state.lengths) / duration)
-                return replace(state, time=time, nodes=frozen(X), lengths=lengths, length_rates=rates)
+                setup.kinematics.evaluate(X)
+                lengths = frozen(setup.kinematics.quantities)
+                rates = frozen((lengths - state.quantities) / duration)
+                return replace(state, time=time, q=(q := frozen(X)), nodes=q, quantities=lengths, rates=rates)
             reach *= 2.0
         return None
 
-    def _solve(self, state: State, goal: PathPoint, duration: float, pairs: NearPairs) -> Array | None:
-        arm = self.arm
-        truss = arm.truss
+    def _solve(self, state: State, goal: PathPoint, duration: float, pairs: Contacts) -> Array | None:
+        setup = self.setup
+        truss = setup.truss
         actuators = truss.actuators
         start = state.nodes[truss.free].reshape(-1)
-        lower, upper = arm.home_lengths.copy(), arm.home_lengths.copy()
+        lower, upper = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
         room = truss.rate[actuators] * duration
-        lower[actuators] = np.maximum(truss.stroke[actuators, 0], state.lengths[actuators] - room) + 1e-10
-        upper[actuators] = np.minimum(truss.stroke[actuators, 1], state.lengths[actuators] + room) - 1e-10
+        lower[actuators] = np.maximum(truss.stroke[actuators, 0], state.quantities[actuators] - room) + 1e-10
+        upper[actuators] = np.minimum(truss.stroke[actuators, 1], state.quantities[actuators] + room) - 1e-10
         target, zero = self._goal_rows(goal)
         g, lbg, ubg = [self._symbols.lengths, target], [lower, zero], [upper, zero]
         variables, first = [self._symbols.x], [start]
@@ -114,7 +120,7 @@ class IpoptStepper:
             lbg.append(bounds)
             ubg.append(np.full(len(bounds), np.inf))
         change = self._symbols.x - start
-        home = self._symbols.lengths[actuators.tolist()] - arm.home_lengths[actuators]
+        home = self._symbols.lengths[actuators.tolist()] - setup.arm.home_quantities[actuators]
         objective = 0.5 * ca.dot(change, change) + 0.01 * ca.dot(home, home)
         problem = {"x": ca.vertcat(*variables), "f": objective, "g": ca.vertcat(*g)}
         solver = ca.nlpsol("step", "ipopt", problem, _OPTIONS)
@@ -126,15 +132,15 @@ class IpoptStepper:
         return X
 
     def _goal_rows(self, goal: PathPoint) -> tuple[ca.SX, Array]:
-        task = self.arm.task
+        task = self.setup.task
         rows = [(self._symbols.tip - goal.position)[task.axes.tolist()]]
         count = len(task.axes)
         if task.turns:
             # The frame's normal is that of the tip's triangle in every module.
-            normal = self._symbols.tip_normal(self.arm.truss)
-            home = self.arm.truss.home[self.arm.truss.tip]
+            normal = self._symbols.tip_normal(self.setup.truss)
+            home = self.setup.truss.home[self.setup.truss.tip]
             wanted = (
-                goal.rotation @ self.arm.truss.tip_frame.T @ np.cross(home[1] - home[0], home[2] - home[0])
+                goal.rotation @ self.setup.truss.tip_frame.T @ np.cross(home[1] - home[0], home[2] - home[0])
             )
             wanted /= np.linalg.norm(wanted)
             across = np.linalg.svd(wanted[None])[2][1:]
@@ -142,17 +148,17 @@ class IpoptStepper:
             count += 2
         return ca.vertcat(*rows), np.zeros(count)
 
-    def _pair(self, pairs: NearPairs, k: int, time: float) -> tuple[ca.SX, Array, ca.SX, Array]:
+    def _pair(self, pairs: Contacts, k: int, time: float) -> tuple[ca.SX, Array, ca.SX, Array]:
         """Return the dual variables of a pair, their first values, and rows with their lower bounds."""
-        arm, truss = self.arm, self.arm.truss
-        member, other = int(pairs.member[k]), int(pairs.other[k])
+        setup, truss = self.setup, self.setup.truss
+        member, other = int(pairs.body[k]), int(pairs.other[k])
         a = self._symbols.ends[member]
         if pairs.is_self[k]:
             n = ca.SX.sym("n", 3)
-            gap = arm.self_safe + truss.radius[member] + truss.radius[other] + _MARGIN
+            gap = setup.self_safe + truss.radius[member] + truss.radius[other] + _MARGIN
             rows = [ca.dot(n, p - q) for p in a for q in self._symbols.ends[other]]
             return n, pairs.normal[k], ca.vertcat(*rows, 1.0 - ca.dot(n, n)), np.r_[np.full(4, gap), 0.0]
-        piece = arm.monitor.pieces.at(time)[other]
+        piece = setup.monitor.pieces.at(time)[other]
         center, half, rotation = _box(piece)
         v = ca.SX.sym("v", 6)
         n = v[:3] - v[3:]
@@ -160,22 +166,22 @@ class IpoptStepper:
         rows = [ca.dot(n, ca.DM(rotation.T) @ (p - center)) - support for p in a]
         local = rotation.T @ pairs.normal[k]
         first = np.concatenate([np.maximum(local, 0.0), np.maximum(-local, 0.0)]) + 1e-3
-        gap = arm.safe + truss.radius[member] + _MARGIN
+        gap = setup.safe + truss.radius[member] + _MARGIN
         return v, first, ca.vertcat(*rows, 1.0 - ca.dot(n, n), v), np.r_[gap, gap, np.zeros(7)]
 
     def _close(self, X: Array) -> bool:
         """Newton on the fixed lengths alone, the actuated ones kept; True where they close."""
-        arm = self.arm
-        wanted = arm.home_lengths.copy()
+        setup = self.setup
+        wanted = setup.arm.home_quantities.copy()
         for _ in range(4):
-            arm.kinematics.evaluate(X)
-            wanted[arm.truss.actuators] = arm.kinematics.lengths[arm.truss.actuators]
-            error = wanted - arm.kinematics.lengths
+            setup.kinematics.evaluate(X)
+            wanted[setup.truss.actuators] = setup.kinematics.quantities[setup.truss.actuators]
+            error = wanted - setup.kinematics.quantities
             if float(np.max(np.abs(error))) < 1e-10:
                 return True
-            jacobian = arm.layout.length_jacobian(arm.kinematics.gradient)
+            jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
             try:
-                X[arm.truss.free] += np.linalg.solve(jacobian, error).reshape(-1, 3)
+                X[setup.truss.free] += np.linalg.solve(jacobian, error).reshape(-1, 3)
             except np.linalg.LinAlgError:
                 return False
         return False

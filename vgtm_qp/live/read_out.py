@@ -59,10 +59,10 @@ def _distance(distance: float, least: float) -> str:
 
 def _strokes(session: Session) -> str:
     """Return a bar for each actuator: how much of its stroke is out."""
-    share = session.drawing.stroke_share(session.state.lengths)
+    share = session.drawing.stroke_share(session.state.quantities)
     names = [
         name
-        for name, moving in zip(session.drawing.arm.member_names, ~np.isnan(share), strict=True)
+        for name, moving in zip(session.drawing.arm.quantity_names, ~np.isnan(share), strict=True)
         if moving
     ]
     share = share[~np.isnan(share)]

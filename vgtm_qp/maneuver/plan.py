@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
-from vgtm_qp.step.path import Path, rotation_from_vector, turn_between
+from vgtm_qp.rotation import rotation_from_vector, turn_between
+from vgtm_qp.step.path import Path
 
 Array = NDArray[np.float64]
 

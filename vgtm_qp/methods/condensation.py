@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.arm import Kinematics
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.segment_system import Entries
 from vgtm_qp.methods.segments import Segment
@@ -35,7 +36,7 @@ class _Group:
     """Segments of one shape, with the map from the kernel's values to their stacked matrices."""
 
     def __init__(self, layout: Layout, segments: Sequence[Segment], members: list[int]) -> None:
-        truss = layout.truss
+        truss = truss_of(layout.arm)
         own = [segments[k] for k in members]
         self.members = np.array(members)
         self.tracks, self.columns = own[0].tracks, own[0].columns
@@ -46,7 +47,7 @@ class _Group:
         entries = [Entries(layout, segment) for segment in own]
         self.shape = (len(own), *entries[0].shape)
         size = self.shape[1] * self.shape[2]
-        per_member = 3 * layout.member_nodes.shape[1]
+        per_member = 3 * truss.member_nodes.shape[1]
         weights = truss.member_count * per_member
         turns = weights + truss.face_weights.size
         source, target = [], []
@@ -92,7 +93,7 @@ class Condensation:
             shapes.setdefault((segment.rows, segment.columns, before, segment.tracks), []).append(k)
         self._groups = [_Group(layout, segments, members) for members in shapes.values()]
         self.is_square = all(group.is_square for group in self._groups)
-        self._weights = layout.truss.face_weights.ravel()
+        self._weights = truss_of(layout.arm).face_weights.ravel()
 
     def rates(self, moved: Array, turned: Array) -> Array:
         """Return node displacements (3 (N - N_c),) for curve nodes that move and turn, (S, 3) each; lengths stay."""
@@ -106,13 +107,13 @@ class Condensation:
     def residuals(self, X: Array, nodes: CurveNodes) -> list[Array]:
         """Return what is missing in each group, (K, r), at node positions `X`, where the kinematics was evaluated."""
         kinematics = self._kinematics
-        centres = kinematics.face_centres(X)
+        centres = self._layout.arm.stations.centres(X)
         found = []
         for group in self._groups:
-            lengths = self._home[group.fixed] - kinematics.lengths[group.fixed]
+            lengths = self._home[group.fixed] - kinematics.quantities[group.fixed]
             gap = nodes.position[group.members] - centres[group.faces]
             turn = np.zeros((len(group.members), 3))
-            frames, wanted = kinematics.face_rotation[group.faces], nodes.frame[group.members]
+            frames, wanted = kinematics.station_rotation[group.faces], nodes.frame[group.members]
             if group.tracks == "orientation":
                 turn = rotation_vectors(wanted @ np.swapaxes(frames, 1, 2))
             elif group.tracks == "pointing":
@@ -128,15 +129,15 @@ class Condensation:
         """Return turns (K, 3) with their components along the faces' axes where a direction is tracked."""
         if group.tracks != "pointing":
             return turn
-        return np.asarray(np.einsum("kca,kc->ka", self._kinematics.face_rotation[group.faces], turn))
+        return np.asarray(np.einsum("kca,kc->ka", self._kinematics.station_rotation[group.faces], turn))
 
     def _chained(self, rhs: list[Array], travelled: Array | None) -> Array:
         kinematics = self._kinematics
-        spin = np.array(kinematics.face_spin)
+        spin = np.array(kinematics.station_spin)
         for group in self._groups:
             if group.tracks == "pointing":
-                axes = np.swapaxes(kinematics.face_rotation[group.faces], 1, 2)
-                spin[group.faces] = axes @ kinematics.face_spin[group.faces]
+                axes = np.swapaxes(kinematics.station_rotation[group.faces], 1, 2)
+                spin[group.faces] = axes @ kinematics.station_spin[group.faces]
         values = np.concatenate([kinematics.gradient.ravel(), self._weights, spin.ravel()])
         alone = np.zeros(self._layout.node_columns)
         passed: list[Array] = [np.zeros((0, 0))] * len(self._segments)

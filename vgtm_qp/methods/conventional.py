@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.banded import BandedSystem
 from vgtm_qp.methods.objectives import DEFAULT_TERMS, Terms, TrussObjective
@@ -36,8 +37,8 @@ class DenseSolution:
     """Eq. (28) with dense matrices, as the paper has it."""
 
     def __init__(self, layout: Layout, method: Method) -> None:
-        self._layout, self._method = layout, method
-        self._lengths = np.zeros((layout.truss.member_count, layout.node_columns))
+        self._layout, self._truss, self._method = layout, truss_of(layout.arm), method
+        self._lengths = np.zeros((self._truss.member_count, layout.node_columns))
         self._tip, self._present = tip_columns(layout)
         self.rank: int | None = None
 
@@ -55,12 +56,12 @@ class DenseSolution:
         terms
             Null-space terms.
         """
-        layout, method = self._layout, self._method
-        lengths = layout.length_jacobian(gradient, self._lengths)
+        layout, truss, method = self._layout, self._truss, self._method
+        lengths = truss.scatter.dense(gradient, self._lengths)
         J = np.zeros((len(x), layout.node_columns))
         J[: len(tip), self._tip] = tip[:, self._present]
-        J[len(tip) :] = lengths[layout.fixed]
-        actuated = lengths[layout.truss.actuators]
+        J[len(tip) :] = lengths[truss.fixed]
+        actuated = lengths[truss.actuators]
         hessian = terms.actuator * actuated.T @ actuated
         hessian[np.diag_indices_from(hessian)] += terms.node
         if terms.blocks is not None:
@@ -95,8 +96,8 @@ class SparseSolution:
     """
 
     def __init__(self, layout: Layout, method: Method) -> None:
-        truss = layout.truss
-        self._layout = layout
+        truss = truss_of(layout.arm)
+        self._fixed = truss.fixed
         self._damping = method.damping**2 if method.variant == "damped" else 0.0
         self._tip, self._present = tip_columns(layout)
         nodes, actuators, members, tips = (
@@ -107,7 +108,8 @@ class SparseSolution:
         )
         self._parts = np.cumsum([0, nodes, actuators, members, tips])
         a, y, u = self._parts[1:4]
-        member, flat, column = layout.length_scatter
+        scatter = truss.scatter
+        member, flat, column = scatter.member, scatter.flat, scatter.column
         self._flat = flat
         tip_row = np.repeat(np.arange(tips), len(self._tip))
         tip_column = np.tile(self._tip, tips)
@@ -139,7 +141,7 @@ class SparseSolution:
         ]
         self._system = BandedSystem(np.concatenate(rows), np.concatenate(columns), int(self._parts[-1]))
         self._damped = np.zeros(members + tips)
-        self._damped[layout.fixed] = self._damped[members:] = -self._damping
+        self._damped[truss.fixed] = self._damped[members:] = -self._damping
         self.rank: int | None = members - actuators + tips
 
     def displacement(self, gradient: Array, tip: Array, x: Array, terms: Terms) -> Array:
@@ -154,7 +156,7 @@ class SparseSolution:
         values = np.concatenate([blocks, diagonal, lengths, lengths, ones, ones, ends, ends])
         rhs = np.zeros(u)
         rhs[:nodes], rhs[nodes:a] = -terms.node_gradient, -terms.actuator_gradient
-        rhs[a + self._layout.fixed] = x[len(tip) :]
+        rhs[a + self._fixed] = x[len(tip) :]
         rhs[y:] = x[: len(tip)]
         return self._system.solve(values, rhs)[:nodes]
 
@@ -172,34 +174,34 @@ class ConventionalResolver(MethodResolver):
         method = problem.method
         super().__init__(arm_without_curve(problem), method.step_limit)
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
-        self._objective = TrussObjective(names, method.weights, self.arm)
-        layout = self.arm.layout
+        self._objective = TrussObjective(names, method.weights, self.setup)
+        layout = self.setup.layout
         sparse = method.algebra == "sparse"
         self._solution = SparseSolution(layout, method) if sparse else DenseSolution(layout, method)
         self._correct = method.correct
-        self._home_fixed = self.arm.home_lengths[layout.fixed]
+        self._home_fixed = self.setup.arm.home_quantities[self.setup.truss.fixed]
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
-        arm, state = self.arm, self.state
-        kinematics, task, free = arm.kinematics, arm.task, arm.truss.free
+        setup, state = self.setup, self.state
+        kinematics, task, free = setup.kinematics, setup.task, setup.truss.free
         here, goal = path.at(start), path.at(end)
         X = np.array(state.nodes)
         kinematics.evaluate(X)
-        tip = task.rows(X, goal)
+        tip = task.rows(X, kinematics, goal)
         moved, turned = pose_displacement(here, goal)
         x_e = [moved[task.axes]]
         if task.turns:
             x_e.append(turned if task.turns == "orientation" else kinematics.tip_rotation[:, :2].T @ turned)
-        base_rate = np.zeros(arm.truss.member_count)
-        if arm.base_motion is not None:
-            motion = np.where(arm.truss.base[:, None], arm.base_motion.nodes(state.time + dt) - X, 0.0)
-            base_rate = arm.layout.base_length_rate(kinematics.gradient, motion)
+        base_rate = np.zeros(setup.truss.member_count)
+        if setup.base_motion is not None:
+            motion = setup.arm.based(X, setup.base_motion.pose(state.time + dt)) - X
+            base_rate = setup.truss.scatter.base_rate(kinematics.gradient, motion)
             X += motion
-        x = np.concatenate([*x_e, -base_rate[arm.layout.fixed]])
+        x = np.concatenate([*x_e, -base_rate[setup.truss.fixed]])
         if self._correct:
-            gap = self._home_fixed - kinematics.lengths[arm.layout.fixed]
-            x = np.concatenate([tip.error, gap - base_rate[arm.layout.fixed]])
-        terms = self._objective.at(X, kinematics.lengths, state.time)
+            gap = self._home_fixed - kinematics.quantities[setup.truss.fixed]
+            x = np.concatenate([tip.error, gap - base_rate[setup.truss.fixed]])
+        terms = self._objective.at(X, kinematics.quantities, state.time)
         self.spend("kinematics")
         X[free] += self._solution.displacement(kinematics.gradient, tip.jacobian, x, terms).reshape(-1, 3)
         self.rank = self._solution.rank
@@ -211,12 +213,12 @@ class ConventionalResolver(MethodResolver):
 
     def _newton(self, X: Array, path: Path, end: float) -> None:
         """Correct fixed members and tip in place: Newton's method by the same pseudoinverse, without gradients."""
-        arm, goal = self.arm, path.at(end)
-        kinematics, free = arm.kinematics, arm.truss.free
+        setup, goal = self.setup, path.at(end)
+        kinematics, free = setup.kinematics, setup.truss.free
         for _ in range(MAX_CORRECTIONS):
             kinematics.evaluate(X)
-            tip = arm.task.rows(X, goal)
-            gap = self._home_fixed - kinematics.lengths[arm.layout.fixed]
+            tip = setup.task.rows(X, kinematics, goal)
+            gap = self._home_fixed - kinematics.quantities[setup.truss.fixed]
             worst = float(np.max(np.abs(gap), initial=0.0))
             if worst <= LENGTH_TOLERANCE and float(np.max(np.abs(tip.error))) <= TIP_TOLERANCE:
                 return
@@ -225,8 +227,8 @@ class ConventionalResolver(MethodResolver):
             terms = Terms(
                 self._objective.node,
                 self._objective.actuator,
-                np.zeros(len(arm.truss.actuators)),
-                np.zeros(arm.layout.node_columns),
+                np.zeros(len(setup.truss.actuators)),
+                np.zeros(setup.layout.node_columns),
             )
             x = np.concatenate([tip.error, gap])
             X[free] += self._solution.displacement(kinematics.gradient, tip.jacobian, x, terms).reshape(-1, 3)
@@ -235,6 +237,6 @@ class ConventionalResolver(MethodResolver):
 
 def tip_columns(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the columns of the tip's free nodes, and which columns of the tip's Jacobian those are."""
-    first = layout.node_column[layout.truss.tip]
+    first = layout.node_column[truss_of(layout.arm).tip]
     present = np.repeat(first >= 0, 3)
     return (first[:, None] + np.arange(3)).reshape(-1)[present], present

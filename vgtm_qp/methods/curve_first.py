@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,9 +15,10 @@ from vgtm_qp.methods.resolver import MethodResolver
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.methods.tracking import Tracker
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.arm import build_arm
-from vgtm_qp.step.limits import length_box
+from vgtm_qp.rows.limits import actuator_box
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
+from vgtm_qp.step.state import State
 
 Array = NDArray[np.float64]
 
@@ -43,21 +46,29 @@ class CurveFirstResolver(MethodResolver):
         method = problem.method
         changes = {"method.tracking": "coupled", "method.solver": "piqp"}
         super().__init__(build_arm(problem.replace(changes)), method.step_limit)
-        arm = self.arm
-        if arm.base_motion is not None:
+        setup = self.setup
+        if setup.base_motion is not None:
             raise CurveError(
                 'a moving base takes tracking = "coupled" or "none", or the method pseudoinverse'
             )
-        self.motion = CurveMotion(problem, arm)
+        self.motion = CurveMotion(problem, setup)
         self.curve: Curve = self.motion.home
-        segments = make_segments(arm.layout, arm.task.turns)
+        segments = make_segments(setup.layout, setup.task.turns)
         self.tracker = Tracker(
-            arm.layout, arm.kinematics, segments, arm.home_lengths, parallel=method.tracking == "parallel"
+            setup.layout,
+            setup.kinematics,
+            segments,
+            setup.arm.home_quantities,
+            parallel=method.tracking == "parallel",
         )
         self._faces = np.array([segment.face for segment in segments])
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._correct, self._is_qp = method.correct, method.name == "qp"
         self.solver = CURVE_SOLVER if self._is_qp else None
+
+    def _placed(self, state: State) -> None:
+        if state.control_vertices.shape == self.curve.control_vertices.shape:
+            self.curve = replace(self.curve, control_vertices=state.control_vertices)
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
         if self._is_qp:
@@ -114,28 +125,28 @@ class CurveFirstResolver(MethodResolver):
 
     def _broken(self, X: Array, dt: float) -> str:
         """Return which limit the step to node positions `X` would break, empty if none."""
-        arm, state = self.arm, self.state
-        truss, monitor = arm.truss, arm.monitor
+        setup, state = self.setup, self.state
+        truss, monitor = setup.truss, setup.monitor
         actuators = truss.actuators
-        lower, upper = length_box(
-            state.lengths[actuators],
-            state.length_rates[actuators],
+        lower, upper = actuator_box(
+            state.quantities[actuators],
+            state.rates[actuators],
             truss.stroke[actuators],
             truss.rate[actuators],
             truss.acceleration[actuators],
             dt,
             state.duration or None,
         )
-        arm.kinematics.evaluate(X)
-        lengths = arm.kinematics.lengths[actuators]
+        setup.kinematics.evaluate(X)
+        lengths = setup.kinematics.quantities[actuators]
         beyond = np.maximum(lower - lengths, lengths - upper)
         worst = int(np.argmax(beyond))
         if beyond[worst] > _SLACK:
             return f"stroke or rate: {truss.member_names[actuators[worst]]}, {beyond[worst]:.2g} m beyond"
-        time = state.time + dt
-        if not monitor.keeps(X, time, arm.safe - _SLACK, arm.self_safe - _SLACK):
+        time, points = state.time + dt, setup.arm.points(X)
+        if not monitor.keeps(points, time, setup.safe - _SLACK, setup.self_safe - _SLACK):
             return "clearance at the end of the step"
-        floors = arm.safe - _BETWEEN, max(arm.self_safe - _BETWEEN, 0.0)
-        if not monitor.between(state.nodes, X, state.time, time, *floors).certified:
+        floors = setup.safe - _BETWEEN, max(setup.self_safe - _BETWEEN, 0.0)
+        if not monitor.between(setup.arm.points(state.q), points, state.time, time, *floors).certified:
             return "clearance between the states"
         return ""

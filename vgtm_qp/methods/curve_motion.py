@@ -16,8 +16,9 @@ from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE, pose_displacement
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.arm import Arm
-from vgtm_qp.step.path import PathPoint, turn_between, vector_from_rotation
+from vgtm_qp.rotation import turn_between, vector_from_rotation
+from vgtm_qp.step.path import PathPoint
+from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
 
@@ -45,29 +46,31 @@ class CurveMotion:
         The curve has too few control vertices for its base and the end effector.
     """
 
-    def __init__(self, problem: Problem, arm: Arm) -> None:
-        method, spec, truss = problem.method, problem.curve, arm.truss
+    def __init__(self, problem: Problem, setup: Setup) -> None:
+        method, spec, truss = problem.method, problem.curve, setup.truss
         if spec is None or not len(truss.faces):
             raise CurveError("this method needs a reference curve and a truss with faces")
-        family = arm.layout.family
+        family = setup.layout.family
         assert family is not None, "an arm with faces and a curve is laid out with its family"
-        self._arm, self._task = arm, arm.task
-        spare = degree_of_redundancy(spec.control_vertices, len(arm.task.row_names), spec.torsion_vertices)
+        self._setup, self._task = setup, setup.task
+        spare = degree_of_redundancy(spec.control_vertices, len(setup.task.row_names), spec.torsion_vertices)
         if spare < 0:
             raise CurveError(
                 f"{spec.control_vertices} control vertices are {-spare} coordinates too few for base and tip"
             )
-        if arm.task.turns == "orientation" and not spec.torsion_vertices:
+        if setup.task.turns == "orientation" and not spec.torsion_vertices:
             raise CurveError("orientation at the tip takes curve.torsion_vertices of 1 or more")
-        centres = np.einsum("fk,fkc->fc", truss.face_weights, truss.home[truss.faces])
+        centres = setup.arm.stations.centres(truss.home)
         steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
         self.s = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
-        self.home = Curve(family, arm.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0])
+        self.home = Curve(
+            family, setup.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0]
+        )
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         gains = method.gains
         self._terms = {name: float(getattr(gains, name)) for name in names}
         self._weights = family.weights(self.s)
-        self._spacing = np.linalg.norm(np.diff(self._weights @ arm.control_vertices, axis=0), axis=1)
+        self._spacing = np.linalg.norm(np.diff(self._weights @ setup.control_vertices, axis=0), axis=1)
         vertices = spec.control_vertices
         second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
         self._bending = np.kron(second.T @ second, np.eye(3))
@@ -144,9 +147,9 @@ class CurveMotion:
             gradient[:vertices] += gain * self._bending @ p.ravel()
         if gain := self._terms.get("obstacle_potential"):
             rows, distance, _ = self._near(curve, X, time)
-            stiffness = gain * potential_curvature(distance, self._arm.influence)
+            stiffness = gain * potential_curvature(distance, self._setup.influence)
             hessian[:vertices, :vertices] += (rows.T * stiffness) @ rows
-            gradient[:vertices] += gain * potential_slope(distance, self._arm.influence) @ rows
+            gradient[:vertices] += gain * potential_slope(distance, self._setup.influence) @ rows
         return Objective(hessian, gradient)
 
     def follow_qp(
@@ -194,7 +197,7 @@ class CurveMotion:
         H = np.zeros((size + 1, size + 1))
         H[:size, :size] = objective.hessian
         H[-1, -1] = curvature
-        f, room = np.zeros(size + 1), self._arm.safe + _MARGIN - distance
+        f, room = np.zeros(size + 1), self._setup.safe + _MARGIN - distance
         bounds = -progress, 0.0
         if progress == 0.0:
             f, bounds = np.append(objective.gradient, -2.0 * curvature), (0.0, 1.0)
@@ -244,11 +247,11 @@ class CurveMotion:
 
     def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array, list[str]]:
         """Return rows (R, 3 V) of d distance / d p, distances (R,), m, and names of the members near obstacles."""
-        arm = self._arm
-        pairs = arm.monitor.near(X, time, arm.influence)
+        setup = self._setup
+        pairs = setup.monitor.near(setup.arm.points(X), time, setup.influence)
         with_obstacle = np.flatnonzero(~pairs.is_self)
-        members = arm.monitor.members[pairs.member[with_obstacle]]
-        t, normal = pairs.t[with_obstacle], pairs.normal[with_obstacle]
+        members = setup.truss.members[pairs.body[with_obstacle]]
+        t, normal = pairs.weights[with_obstacle, 1], pairs.normal[with_obstacle]
         s = np.clip((1.0 - t) * self._node_s[members[:, 0]] + t * self._node_s[members[:, 1]], 0.0, 1.0)
         witness = (1.0 - t)[:, None] * X[members[:, 0]] + t[:, None] * X[members[:, 1]]
         first = curve.derivative(s)

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import nearest
-from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem.method import TRUSS_TERMS, Weights
-from vgtm_qp.step.arm import Arm
+from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
 
@@ -44,14 +43,14 @@ class TrussObjective:
         A term is unknown.
     """
 
-    def __init__(self, names: tuple[str, ...], weights: Weights, arm: Arm) -> None:
+    def __init__(self, names: tuple[str, ...], weights: Weights, setup: Setup) -> None:
         for name in names:
             if name not in TRUSS_TERMS:
                 raise ValueError(
                     f'no null-space term "{name}"{nearest(name, TRUSS_TERMS)}; choices: {", ".join(TRUSS_TERMS)}'
                 )
         self.names = names
-        self._arm = arm
+        self._setup = setup
         self._centring = weights.stroke_centring if "stroke_centring" in names else 0.0
         self._potential = weights.obstacle_potential if "obstacle_potential" in names else 0.0
         actuator = self._centring + (weights.actuator_rate if "actuator_rate" in names else 0.0)
@@ -63,13 +62,13 @@ class TrussObjective:
 
     def at(self, X: Array, lengths: Array, time: float) -> Terms:
         """Return the terms at node positions `X` (N, 3) with member `lengths` (M,)."""
-        arm = self._arm
-        actuators = arm.truss.actuators
-        centring = self._centring * (lengths[actuators] - arm.home_lengths[actuators])
+        setup = self._setup
+        actuators = setup.truss.actuators
+        centring = self._centring * (lengths[actuators] - setup.arm.home_quantities[actuators])
         if not self._potential:
-            return Terms(self.node, self.actuator, centring, np.zeros(arm.layout.node_columns))
-        field, blocks = potential_field(arm.monitor, X, time, arm.influence)
-        free = arm.truss.free
+            return Terms(self.node, self.actuator, centring, np.zeros(setup.layout.node_columns))
+        field, blocks = potential_field(setup, X, time)
+        free = setup.truss.free
         gradient = self._potential * field[free].reshape(-1)
         return Terms(self.node, self.actuator, centring, gradient, self._potential * blocks[free])
 
@@ -87,26 +86,24 @@ def potential_curvature(distance: Array, influence: float) -> Array:
     return np.asarray(np.where(distance < influence, (3.0 * ratio - 2.0) * ratio / d**2, 0.0))
 
 
-def potential_field(monitor: Clearance, X: Array, time: float, influence: float) -> tuple[Array, Array]:
+def potential_field(setup: Setup, X: Array, time: float) -> tuple[Array, Array]:
     """Return the potential's gradient (N, 3), 1/m, by the nodes, and blocks (N, 3, 3), 1/m^2, above its Hessian.
 
     The plain gradient asks for steps that grow without end as a distance shrinks. With the curvature along the
     normals each pair asks for a part of its own distance. A block for each node is enough for a bound: the square of
     a mean of two displacements is at most the mean of their squares, and that of a difference twice their sum.
     """
-    pairs = monitor.near(X, time, influence)
+    influence, joints = setup.influence, setup.monitor.bodies.joints
+    pairs = setup.monitor.near(setup.arm.points(X), time, influence)
     gradient, blocks = np.zeros_like(X), np.zeros((len(X), 3, 3))
     slope = potential_slope(pairs.distance, influence)
     curvature = potential_curvature(pairs.distance, influence) * np.where(pairs.is_self, 2.0, 1.0)
     outer = curvature[:, None, None] * pairs.normal[:, :, None] * pairs.normal[:, None, :]
-
-    def add(members: NDArray[np.int64], t: Array, force: Array, stiffness: Array) -> None:
-        for end, share in ((0, 1.0 - t), (1, t)):
-            np.add.at(gradient, members[:, end], share[:, None] * force)
-            np.add.at(blocks, members[:, end], share[:, None, None] * stiffness)
-
     force = slope[:, None] * pairs.normal
-    add(monitor.members[pairs.member], pairs.t, force, outer)
     own = np.flatnonzero(pairs.is_self)
-    add(monitor.members[pairs.other[own]], pairs.t_other[own], -force[own], outer[own])
+    for rows, nodes, first in ((slice(None), joints[pairs.body], 0), (own, joints[pairs.other[own]], 2)):
+        for end in (0, 1):
+            weight = pairs.weights[rows, first + end]
+            np.add.at(gradient, nodes[:, end], weight[:, None] * force[rows])
+            np.add.at(blocks, nodes[:, end], np.abs(weight)[:, None, None] * outer[rows])
     return gradient, blocks

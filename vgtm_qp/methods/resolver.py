@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from vgtm_qp.errors import CurveError, SolverError
+from vgtm_qp.errors import CurveError, GoalError, SolverError
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.arm import Arm, build_arm
-from vgtm_qp.step.path import Path, PathPoint, vector_from_rotation
-from vgtm_qp.step.resolver import Step, StepStatus
+from vgtm_qp.rotation import vector_from_rotation
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.mover import Mover
+from vgtm_qp.step.path import Path, PathPoint
+from vgtm_qp.step.separation import Shortfall
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
+from vgtm_qp.step.step import Step, StepStatus
+from vgtm_qp.step.stops import Stop, StopKind
 
 Array = NDArray[np.float64]
 
@@ -24,11 +30,17 @@ MAX_CORRECTIONS = 30
 
 
 class MethodResolver(ABC):
-    """Moves an arm step by step, as :class:`vgtm_qp.step.resolver.Resolver` does, by one of the other methods."""
+    """Moves an arm step by step, see ``step.mover.Mover``, by one of the other methods.
 
-    def __init__(self, arm: Arm, step_limit: float | None) -> None:
-        self.arm = arm
-        self.state = arm.home_state()
+    It knows the arm's state after a step alone: nothing that brakes, drives pairs apart or follows control vertices.
+    """
+
+    draws_vertices = False
+    """Whether control vertices follow goals of their own."""
+
+    def __init__(self, setup: Setup, step_limit: float | None) -> None:
+        self.setup = setup
+        self._state = setup.home_state()
         self.phases = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
         self.rank: int | None = None
         """Rank of the Jacobian in the last step, None where the method does not reveal it."""
@@ -38,15 +50,35 @@ class MethodResolver(ABC):
         self._steps = 0
         self._mark = 0.0
 
+    @property
+    def state(self) -> State:
+        """Where the arm is; may be set to another state of this arm."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state = state
+        self._placed(state)
+
+    @property
+    def control_vertex_goals(self) -> dict[int, Array]:
+        """Where control vertices are drawn to: nowhere."""
+        return {}
+
+    @control_vertex_goals.setter
+    def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
+        if goals:
+            raise GoalError("this method draws no control vertices; the QP does")
+
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
-        kinematics = self.arm.kinematics
+        kinematics = self.setup.kinematics
         kinematics.evaluate(self.state.nodes)
-        return kinematics.tip_position(self.state.nodes), kinematics.tip_rotation.copy()
+        return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` to `end` in one step; a blocked step has its reason."""
-        dt = self.arm.dt if dt is None else dt
+        dt = self.setup.dt if dt is None else dt
         self._steps += 1
         self._mark = perf_counter()
         try:
@@ -55,16 +87,17 @@ class MethodResolver(ABC):
         except (SolverError, CurveError, np.linalg.LinAlgError) as error:
             reason = f"step {self._steps}: {error}"
             return _step(StepStatus.BLOCKED, 0.0, self.state, reason)
-        kinematics = self.arm.kinematics
+        kinematics = self.setup.kinematics
         kinematics.evaluate(nodes)
-        lengths = frozen(kinematics.lengths)
+        lengths = frozen(kinematics.quantities)
         before = self.state
-        self.state = State(
+        self._state = State(
             time=before.time + dt,
-            nodes=frozen(nodes),
+            q=(q := frozen(nodes)),
+            nodes=q,
             control_vertices=frozen(vertices),
-            lengths=lengths,
-            length_rates=frozen((lengths - before.lengths) / dt),
+            quantities=lengths,
+            rates=frozen((lengths - before.quantities) / dt),
             motion=frozen(nodes - before.nodes),
             duration=dt,
         )
@@ -72,18 +105,48 @@ class MethodResolver(ABC):
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return _step(status, progress, self.state, "")
 
+    def brake(self, path: Path, start: float, end: float) -> Step | None:  # noqa: ARG002
+        """Return None: every state is one of rest."""
+        return None
+
+    def explain(
+        self,
+        path: Path,  # noqa: ARG002
+        start: float,  # noqa: ARG002
+        end: float,  # noqa: ARG002
+        *,
+        dt: float | None = None,  # noqa: ARG002
+        last: Step | None = None,
+        state: State | None = None,  # noqa: ARG002
+    ) -> Stop:
+        """Return what the `last` step said: the method knows no rows that hold the arm."""
+        if last is None:
+            return Stop(StopKind.NONLINEAR)
+        return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
+
+    def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
+        """Return no pairs: none is driven apart."""
+        return {}
+
+    def again(self, problem: Problem) -> Mover | None:  # noqa: ARG002
+        """Return None: there is no other attempt."""
+        return None
+
     def spend(self, phase: str) -> None:
         """Add the time since the last call to `phase`."""
         now = perf_counter()
         self.phases[phase] += now - self._mark
         self._mark = now
 
+    def _placed(self, state: State) -> None:  # noqa: B027
+        """Take over what else there is in a `state` in which the arm was put."""
+
     @abstractmethod
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
         """Return node positions, control vertices and progress after the step, or raise SolverError."""
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
-        truss, lengths = self.arm.truss, self.arm.home_lengths
+        truss, lengths = self.setup.truss, self.setup.arm.home_quantities
         asked = float(np.linalg.norm(path.at(end).position - path.at(start).position))
         limit = self._limit or 0.5 * float(lengths.min()) + 3.0 * asked
         moved = float(np.max(np.abs(nodes - self.state.nodes)))
@@ -96,7 +159,7 @@ class MethodResolver(ABC):
             raise SolverError(f"member {truss.member_names[int(np.argmin(ratio))]} collapsed to a point")
 
 
-def arm_without_curve(problem: Problem) -> Arm:
+def arm_without_curve(problem: Problem) -> Setup:
     """Return the arm of a problem without its curve, for methods that solve no QP of this package.
 
     Raises
@@ -115,4 +178,4 @@ def pose_displacement(start: PathPoint, end: PathPoint) -> tuple[Array, Array]:
 
 
 def _step(status: StepStatus, progress: float, state: State, reason: str) -> Step:
-    return Step(status, progress, state, reason, 0, lambda k, upper: "")  # noqa: ARG005
+    return Step(status, progress, state, reason, 0)

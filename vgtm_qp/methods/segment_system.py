@@ -6,11 +6,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import frame_constants, frame_function, member_function
+from vgtm_qp.arm.frames import frame_constants, frame_function
+from vgtm_qp.arm.truss.arm import truss_of
+from vgtm_qp.arm.truss.kinematics import member_function
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.step.path import turn_between, vector_from_rotation
+from vgtm_qp.rotation import turn_between, vector_from_rotation
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -20,8 +23,8 @@ class Entries:
     """Where the values of one segment's kernel stand in its matrix (rows, own columns then those before)."""
 
     def __init__(self, layout: Layout, segment: Segment) -> None:
-        truss = layout.truss
-        column = layout.node_column[layout.member_nodes[segment.fixed]]
+        truss = truss_of(layout.arm)
+        column = layout.node_column[truss.member_nodes[segment.fixed]]
         row, slot = np.nonzero(column >= 0)
         axis = np.arange(3)
         self.member_source = ((row * column.shape[1] + slot)[:, None] * 3 + axis).ravel()
@@ -62,9 +65,9 @@ class SegmentSystem:
     def __init__(
         self, layout: Layout, segment: Segment, home_lengths: Array, kernels: dict[tuple[int, bool], Kernel]
     ) -> None:
-        truss = layout.truss
+        truss = truss_of(layout.arm)
         self.segment = segment
-        self._nodes = layout.member_nodes[segment.fixed].ravel()
+        self._nodes = truss.member_nodes[segment.fixed].ravel()
         self._home = home_lengths[segment.fixed]
         self._face, self._weights = truss.faces[segment.face], truss.face_weights[segment.face]
         self._entries = Entries(layout, segment)
@@ -76,7 +79,7 @@ class SegmentSystem:
             self._constants.append(truss.joints.offset[segment.fixed].ravel())
         shape = len(segment.fixed), turns
         if shape not in kernels:
-            kernels[shape] = Kernel(_function(layout, *shape))
+            kernels[shape] = Kernel(_function(truss, *shape))
         self._kernel = kernels[shape]
         self._centre = np.zeros(3)
 
@@ -129,19 +132,19 @@ class SegmentSystem:
         return turn if self.segment.tracks == "orientation" else np.asarray(self.frame[:, :2].T @ turn)
 
 
-def _function(layout: Layout, members: int, turns: bool) -> ca.Function:
+def _function(truss: Truss, members: int, turns: bool) -> ca.Function:
     """Return (member nodes (3, Q m), face nodes, constants) -> lengths, gradients and, if it turns, frame and spin."""
-    slots = layout.member_nodes.shape[1]
+    slots = truss.member_nodes.shape[1]
     nodes, face = ca.MX.sym("nodes", 3, slots * members), ca.MX.sym("face", 3, 3)
     inputs, outputs = [nodes, face], []
     frame = [ca.MX.sym("cosines", 3), ca.MX.sym("sines", 3), ca.MX.sym("alignment", 3, 3)] if turns else []
     inputs += frame
     arguments = [nodes]
-    if layout.truss.joints is not None:
+    if truss.joints is not None:
         offsets = ca.MX.sym("offsets", 3, 2 * members)
         inputs.append(offsets)
         arguments.append(offsets)
-    outputs += list(member_function(layout.truss).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
+    outputs += list(member_function(truss).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
     if turns:
         outputs += list(frame_function(3)(face, *frame))
     return ca.Function("segment", inputs, outputs)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import CurveError
 from vgtm_qp.qp.layout import Layout
 
@@ -73,7 +74,7 @@ def make_segments(layout: Layout, turns: str | None) -> tuple[Segment, ...]:
     CurveError
         The truss has no faces, does not end in its end effector, or a segment has more equations than motions.
     """
-    truss = layout.truss
+    truss = truss_of(layout.arm)
     faces = len(truss.faces)
     if faces < 2:
         raise CurveError("a truss without faces cannot track a curve")
@@ -93,15 +94,15 @@ def make_segments(layout: Layout, turns: str | None) -> tuple[Segment, ...]:
 
 
 def _segments(layout: Layout, partition: list[tuple[int, str]]) -> list[Segment]:
-    truss = layout.truss
+    truss = truss_of(layout.arm)
     last_stage = [int(truss.stage[truss.faces[face]].max()) for face, _ in partition]
     last_stage[-1] = int(truss.stage.max())
-    latest = truss.stage[layout.member_nodes].max(axis=1)
+    latest = truss.stage[truss.member_nodes].max(axis=1)
     segments, before = [], -1
     for (face, tracks), last in zip(partition, last_stage, strict=True):
         nodes = truss.free[(truss.stage[truss.free] > before) & (truss.stage[truss.free] <= last)]
-        members = layout.fixed[(latest[layout.fixed] > before) & (latest[layout.fixed] <= last)]
-        touched = np.concatenate([layout.member_nodes[members].ravel(), truss.faces[face]])
+        members = truss.fixed[(latest[truss.fixed] > before) & (latest[truss.fixed] <= last)]
+        touched = np.concatenate([truss.member_nodes[members].ravel(), truss.faces[face]])
         columns = layout.node_column[touched]
         start = int(layout.node_column[nodes].min(initial=layout.node_columns))
         first = int(np.min(columns[columns >= 0], initial=start))

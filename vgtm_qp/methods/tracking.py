@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.condensation import Condensation, CurveNodes, least_norm
@@ -44,7 +44,7 @@ class Tracker:
         parallel: bool,
     ) -> None:
         self.segments = tuple(segments)
-        self._free, self._columns = layout.truss.free, layout.node_columns
+        self._free, self._columns = layout.arm.free, layout.node_columns
         self._kinematics = kinematics
         self._furthest = 2.0 * float(home_lengths.max())
         self._condensation: Condensation | None = None

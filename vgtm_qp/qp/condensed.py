@@ -1,37 +1,21 @@
-"""The step's QP condensed onto the actuators: the fast exact path for short arms.
+"""The step's QP condensed onto the actuators.
 
-The truss is statically determinate, so the node displacements are K d_a + r with the columns of J^-1 that belong to
-actuated members; fixed members hold by construction and stroke and rate limits are bounds on single unknowns. The
-unknowns left are the actuator displacements, the free coordinates of the curve and the progress along the path.
+The node displacements are K d_a + r, so that fixed quantities hold by construction and limits of actuators are bounds
+on single unknowns. The unknowns left are the actuator displacements, the free coordinates of the curve and the progress
+along the path.
 """
 
 from __future__ import annotations
 
-import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgetrf, dgetrs
 
-from vgtm_qp.errors import SolverError
+from vgtm_qp.qp import daqp
+from vgtm_qp.qp.daqp import EQUALITY
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, CurveNumbers, StepNumbers, StepSolution, slack_curvature
 
 Array = NDArray[np.float64]
-
-FEASIBILITY = 1e-10
-_LARGEST_RESIDUAL = 1e-8
-
-
-class InfeasibleStepError(SolverError):
-    """No displacement satisfies every hard row of a step's QP."""
-
-
-class AnswerError(SolverError):
-    """A solver gave no answer that is good enough, which says nothing about the step."""
-
-
-class NoAnswerError(AnswerError, InfeasibleStepError):
-    """A solver found no answer, and does not say whether there is one."""
 
 
 class CondensedSolver:
@@ -40,25 +24,24 @@ class CondensedSolver:
     The curve's base conditions are eliminated: d_p[0] follows the base and d_p[1] - d_p[0] moves along the base normal.
     """
 
+    knows_gain = False
+
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        truss, weights = layout.truss, layout.weights
-        nodes, actuators, vertices = layout.node_columns, len(truss.actuators), layout.vertices
+        arm, weights = layout.arm, layout.weights
+        nodes, actuators, vertices = layout.node_columns, len(arm.actuators), layout.vertices
         curve_nodes = len(layout.tracked)
         self._free_curve = layout.free_curve
         self._size = actuators + self._free_curve + 1
-        self._jacobian = np.zeros((nodes, nodes))
-        self._selection = np.zeros((nodes, actuators + 1))
-        self._selection[truss.actuators, np.arange(actuators)] = 1.0
-
         self._centres = np.zeros((curve_nodes, 3, nodes))
+        stations = arm.stations
         for k, face in enumerate(layout.tracked):
-            for node, weight in zip(truss.faces[face], truss.face_weights[face], strict=True):
+            for node, weight in zip(stations.nodes[face], stations.weights[face], strict=True):
                 column = layout.node_column[node]
                 if column >= 0:
                     self._centres[k, range(3), range(column, column + 3)] = weight
         self._face_columns = (
-            layout.node_column[truss.faces[layout.tracked]] if vertices else np.zeros((0, 3), int)
+            layout.node_column[stations.nodes[layout.tracked]] if vertices else np.zeros((0, 3), int)
         )
         count = nodes + (3 + layout.turns) * curve_nodes + layout.spacings
         self._rows = np.zeros((count, self._size))
@@ -87,17 +70,11 @@ class CondensedSolver:
         InfeasibleStepError
             The hard rows contradict one another.
         SolverError
-            The length Jacobian is singular, or the answer failed the residual check.
+            The arm is in a singular pose, or the answer failed the residual check.
         """
-        layout, truss = self.layout, self.layout.truss
-        count, size, nodes = len(truss.actuators), self._size, layout.node_columns
-        layout.length_jacobian(numbers.gradient, self._jacobian)
-        self._selection[:, -1] = numbers.length_rhs
-        factors, pivots, info = dgetrf(self._jacobian)
-        if info != 0:
-            raise SolverError("the length Jacobian is singular: the truss is in a singular pose")
-        inverse, _ = dgetrs(factors, pivots, self._selection)
-        response, particular = inverse[:, :-1], inverse[:, -1]
+        layout, arm = self.layout, self.layout.arm
+        count, size, nodes = len(arm.actuators), self._size, layout.node_columns
+        response, particular = numbers.motion.response()
 
         rows, rhs = self._rows, self._rhs
         rows[:nodes, :count] = response
@@ -124,16 +101,12 @@ class CondensedSolver:
             hessian, gradient, constraint, lower, upper, sense = _with_slacks(
                 hessian, gradient, constraint, lower, upper, sense, tip, penalty
             )
-        x, _, flag, info = daqp.solve(
-            hessian, gradient, constraint, upper, lower, sense, primal_tol=FEASIBILITY, eps_prox=0.0
-        )
-        if flag == -1:
-            raise InfeasibleStepError("the hard rows of the step contradict one another")
-        multipliers = np.asarray(info["lam"])
-        check_answer(x, multipliers, flag, hessian, gradient, constraint, lower, upper)
+        answer = daqp.ask(hessian, gradient, constraint, lower, upper, sense)
+        daqp.check(answer, hessian, gradient, constraint, lower, upper)
+        x, multipliers = answer.x, answer.multipliers
 
-        displacement = np.zeros((truss.node_count, 3))
-        displacement[truss.free] = (response @ x[:count] + particular).reshape(-1, 3)
+        displacement = np.zeros((len(arm.node_names), 3))
+        displacement[arm.free] = (response @ x[:count] + particular).reshape(-1, 3)
         moved = curve @ x[count : size - 1] + curve_offset
         vertices = moved[: 3 * layout.vertices].reshape(-1, 3)
         clearance = len(numbers.clearance)
@@ -144,10 +117,14 @@ class CondensedSolver:
             progress=float(x[size - 1]),
             actuator_multipliers=multipliers[:count].copy(),
             clearance_multipliers=-multipliers[len(multipliers) - clearance :],
-            iterations=int(info["iterations"]),
+            iterations=answer.iterations,
             torsion=moved[3 * layout.vertices :],
             tip_slack=float(np.max(x[size:], initial=0.0)),
         )
+
+    def gain(self, held: NDArray[np.bool_]) -> Array | None:  # noqa: ARG002
+        """See ``solvers.StepSolver``."""
+        return None
 
     def _curve_basis(self, numbers: StepNumbers) -> tuple[Array, Array]:
         """Return the basis (D, q) of the free displacements of the curve's coordinates, and the offset (D,)."""
@@ -218,7 +195,7 @@ class CondensedSolver:
         lower[:count], upper[:count] = numbers.lower, numbers.upper
         lower[size - 1], upper[size - 1] = numbers.progress_lower, numbers.progress_upper
 
-        columns = layout.node_column[layout.truss.tip]
+        columns = layout.node_column[layout.arm.end_effector.nodes]
         present = columns >= 0
         flat = (columns[present][:, None] + np.arange(3)).reshape(-1)
         jacobian = numbers.tip_jacobian[:, np.repeat(present, 3)]
@@ -239,7 +216,7 @@ class CondensedSolver:
                 "rsc,rsc->r", coefficients, particular[flat]
             )
         sense = np.zeros(size + total, dtype=np.int32)
-        sense[size : size + tip + hard] = 5
+        sense[size : size + tip + hard] = EQUALITY
         return constraint, lower, upper, sense
 
 
@@ -277,42 +254,3 @@ def _with_slacks(
         with_bounds(upper, UNBOUNDED),
         with_bounds(sense.astype(float), 0.0).astype(np.int32),
     )
-
-
-def check_answer(
-    x: Array,
-    y: Array,
-    flag: int,
-    hessian: Array,
-    gradient: Array,
-    constraint: Array,
-    lower: Array,
-    upper: Array,
-) -> None:
-    """Refuse an answer of DAQP whose primal or dual residual is too large, whatever status it came with.
-
-    Raises
-    ------
-    SolverError
-        The norm of a residual is above 1e-8, the dual one relative to the norms of gradient and multipliers.
-    """
-    size = len(x)
-    values = np.concatenate((x, constraint @ x))
-    beyond = values - np.minimum(np.maximum(values, lower), upper)
-    stationarity = hessian @ x
-    stationarity += gradient
-    stationarity += y[:size]
-    stationarity += y[size:] @ constraint
-    refuse_large(_norm(beyond), _norm(stationarity) / (1.0 + _norm(gradient) + _norm(y)), flag)
-
-
-def refuse_large(primal: float, dual: float, flag: int) -> None:
-    """Raise AnswerError where a residual is above 1e-8, or not a number."""
-    if not (primal <= _LARGEST_RESIDUAL and dual <= _LARGEST_RESIDUAL):
-        raise AnswerError(
-            f"daqp (exit flag {flag}) left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
-        )
-
-
-def _norm(vector: Array) -> float:
-    return float(np.sqrt(vector @ vector))

@@ -11,25 +11,18 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from vgtm_qp.arm.arm import Label
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution, slack_curvature
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution, beyond, norm, slack_curvature
+from vgtm_qp.rows.tip import unit
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-
-class Label(NamedTuple):
-    """Name, kind and unit of a row or column."""
-
-    name: str
-    kind: str
-    unit: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,23 +51,16 @@ class StepQP:
     rows: tuple[Label, ...]
 
     def primal_residual(self, z: Array) -> float:
-        """Return the greatest violation of a row or bound at `z`, in that row's unit."""
-        value = self.A @ z
-        return float(
-            max(
-                np.max(self.row_lower - value, initial=0.0),
-                np.max(value - self.row_upper, initial=0.0),
-                np.max(self.column_lower - z, initial=0.0),
-                np.max(z - self.column_upper, initial=0.0),
-            )
-        )
+        """Return the norm of the violations of rows and bounds at `z`, each in its unit."""
+        rows = beyond(self.A @ z, self.row_lower, self.row_upper)
+        return norm(np.concatenate([rows, beyond(z, self.column_lower, self.column_upper)]))
 
     def dual_residual(self, z: Array, row_multipliers: Array, column_multipliers: Array) -> float:
-        """Return max |P z + q + A'y + w|, multipliers positive at upper and negative at lower bounds."""
-        return float(np.max(np.abs(self.P @ z + self.q + self.A.T @ row_multipliers + column_multipliers)))
+        """Return |P z + q + A'y + w|, multipliers positive at upper and negative at lower bounds."""
+        return norm(self.P @ z + self.q + self.A.T @ row_multipliers + column_multipliers)
 
     def complementarity_residual(self, z: Array, row_multipliers: Array, column_multipliers: Array) -> float:
-        """Return the greatest of min(|multiplier|, slack of its bound): what multipliers press on nothing.
+        """Return the norm of |multiplier| times slack of its bound, at most 1: what multipliers press on nothing.
 
         A multiplier of the wrong sign has the slack of the other bound, one of a free row an infinite slack.
         """
@@ -82,11 +68,11 @@ class StepQP:
             (row_multipliers, self.A @ z, self.row_lower, self.row_upper),
             (column_multipliers, z, self.column_lower, self.column_upper),
         )
-        worst = 0.0
+        parts = []
         for multiplier, x, lower, upper in pairs:
             slack = np.where(multiplier > 0.0, upper - x, x - lower)
-            worst = max(worst, float(np.max(np.minimum(np.abs(multiplier), slack), initial=0.0)))
-        return worst
+            parts.append(np.abs(multiplier) * np.clip(slack, 0.0, 1.0))
+        return norm(np.concatenate(parts))
 
     def violated(self, z: Array, tolerance: float = 1e-9) -> list[tuple[str, float]]:
         """Return the names of rows and columns out of their bounds at `z` by more than `tolerance`, worst first."""
@@ -105,10 +91,9 @@ class StepQP:
         rows = Counter((label.kind, label.unit) for label in self.rows)
         lines = [f"QP of one step: {len(self.columns)} columns, {len(self.rows)} rows, {self.A.nnz} nonzeros"]
         lines.append("columns")
-        lines += [f"  {count:6d}  {kind} [{unit}]" for (kind, unit), count in columns.items()]
+        lines += [f"  {count:6d}  {kind} [{of}]" for (kind, of), count in columns.items()]
         lines.append("rows")
-        for (kind, unit), count in rows.items():
-            lines.append(f"  {count:6d}  {kind} [{unit}]")
+        lines += [f"  {count:6d}  {kind} [{of}]" for (kind, of), count in rows.items()]
         value = [label.name for label in self.rows if label.kind == "clearance"]
         if value:
             lines.append("near pairs: " + ", ".join(name.removeprefix("clearance: ") for name in value[:12]))
@@ -120,11 +105,11 @@ class FullBuilder:
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        truss, weights = layout.truss, layout.weights
+        arm, weights = layout.arm, layout.weights
         tracked, vertices = len(layout.tracked), layout.vertices
         sizes = {
             "nodes": layout.node_columns,
-            "actuators": len(truss.actuators),
+            "actuators": len(arm.actuators),
             "vertices": 3 * vertices,
             "torsion": layout.torsion,
             "position": 3 * tracked,
@@ -221,7 +206,7 @@ class FullBuilder:
             column_lower[self.column["tangent"]] = column_upper[self.column["tangent"]] = 0.0
         equal = np.concatenate(
             [
-                numbers.length_rhs,
+                numbers.motion.rhs,
                 numbers.tip_rhs,
                 numbers.base_displacement if layout.vertices else np.zeros(0),
                 numbers.base_rhs if layout.vertices else np.zeros(0),
@@ -246,9 +231,9 @@ class FullBuilder:
         self, z: Array, row_multipliers: Array, column_multipliers: Array, iterations: int
     ) -> StepSolution:
         """Return `z` and the multipliers in the arm's terms."""
-        truss = self.layout.truss
-        nodes = np.zeros((truss.node_count, 3))
-        nodes[truss.free] = z[self.column["nodes"]].reshape(-1, 3)
+        arm = self.layout.arm
+        nodes = np.zeros((len(arm.node_names), 3))
+        nodes[arm.free] = z[self.column["nodes"]].reshape(-1, 3)
         return StepSolution(
             nodes=nodes,
             actuators=z[self.column["actuators"]].copy(),
@@ -262,15 +247,14 @@ class FullBuilder:
         )
 
     def _columns(self) -> tuple[Label, ...]:
-        layout, truss = self.layout, self.layout.truss
-        axes = "xyz"
+        layout, arm = self.layout, self.layout.arm
+        axes, word = "xyz", arm.stations.word
         labels = [
-            Label(f"node {truss.node_names[n]} {a}", "node displacement", "m")
-            for n in truss.free
-            for a in axes
+            Label(f"node {arm.node_names[n]} {a}", "node displacement", "m") for n in arm.free for a in axes
         ]
         labels += [
-            Label(f"stroke: {truss.member_names[m]}", "actuator displacement", "m") for m in truss.actuators
+            Label(f"stroke: {arm.quantity_names[m]}", "actuator displacement", unit)
+            for m, unit in zip(arm.actuators, arm.actuator_units, strict=True)
         ]
         labels += [
             Label(f"control vertex p{i} {a}", "control vertex displacement", "m")
@@ -278,14 +262,14 @@ class FullBuilder:
             for a in axes
         ]
         labels += [Label(f"torsion {j + 1}", "torsion", "rad") for j in range(layout.torsion)]
-        labels += [Label(f"gap: face {k} {a}", "tracking gap", "m") for k in layout.tracked for a in axes]
+        labels += [Label(f"gap: {word} {k} {a}", "tracking gap", "m") for k in layout.tracked for a in axes]
         labels += [
-            Label(f"tilt: face {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in self._turns
+            Label(f"tilt: {word} {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in self._turns
         ]
         labels += [Label(f"stretch: piece {k}", "spacing gap", "m") for k in range(layout.spacings)]
         if layout.elastic_tip:
             labels += [
-                Label(f"tip slack {name.removeprefix('tip ')}{sign}", "tip slack", _unit(name))
+                Label(f"tip slack {name.removeprefix('tip ')}{sign}", "tip slack", unit(name))
                 for sign in "+-"
                 for name in layout.tip_rows
             ]
@@ -293,7 +277,8 @@ class FullBuilder:
 
     def _fixed_pattern(self) -> tuple[Index, Index, tuple[Label, ...]]:
         """Return row and column of every entry above the clearance rows, in the order of `_fixed_values`."""
-        layout, truss, column = self.layout, self.layout.truss, self.column
+        layout, arm, column = self.layout, self.layout.arm, self.column
+        stations, word, tips = arm.stations, arm.stations.word, arm.end_effector.nodes
         rows: list[Index] = []
         cols: list[Index] = []
         labels: list[Label] = []
@@ -302,24 +287,18 @@ class FullBuilder:
             rows.append(np.asarray(i, dtype=np.int64).reshape(-1) + len(labels))
             cols.append(np.asarray(j, dtype=np.int64).reshape(-1))
 
-        member, _, node_column = layout.length_scatter
-        add(member, node_column)
-        add(truss.actuators, column["actuators"].start + np.arange(len(truss.actuators)))
-        labels += [
-            Label(
-                f"{'actuator' if on else 'member'}: {name}", "actuated member" if on else "fixed member", "m"
-            )
-            for name, on in zip(truss.member_names, truss.actuated, strict=True)
-        ]
+        # Columns of the arm's own rows are those of the nodes and actuators, which come first.
+        add(arm.motion_pattern.rows, arm.motion_pattern.columns)
+        labels += arm.motion_pattern.labels
         tip = len(layout.tip_rows)
-        tip_columns = layout.node_column[truss.tip]
+        tip_columns = layout.node_column[tips]
         present = np.repeat(tip_columns >= 0, 3)
         flat = (tip_columns[:, None] + np.arange(3)).reshape(-1)[present]
         add(np.repeat(np.arange(tip), len(flat)), np.tile(flat, tip))
         add(np.arange(tip), np.full(tip, column["progress"].start))
         if layout.elastic_tip:
             add(np.tile(np.arange(tip), 2), np.arange(column["slack"].start, column["slack"].stop))
-        labels += [Label(name, "end effector", _unit(name)) for name in layout.tip_rows]
+        labels += [Label(name, "end effector", unit(name)) for name in layout.tip_rows]
         if not layout.vertices:
             return np.concatenate(rows), np.concatenate(cols), tuple(labels)
 
@@ -330,7 +309,7 @@ class FullBuilder:
         labels += [Label(f"curve base tangent {a}", "curve base", "m") for a in "xy"]
 
         tracked = len(layout.tracked)
-        faces = layout.node_column[truss.faces[layout.tracked]]
+        faces = layout.node_column[stations.nodes[layout.tracked]]
         k, slot = np.nonzero(faces >= 0)
         axis = np.arange(3)
         add(3 * k[:, None] + axis, faces[k, slot][:, None] + axis)
@@ -341,7 +320,7 @@ class FullBuilder:
             curve = np.arange(vertex, column["torsion"].stop)
             add(*(grid.reshape(-1) for grid in np.meshgrid(np.arange(3 * tracked), curve, indexing="ij")))
         add(np.arange(3 * tracked), column["position"].start + np.arange(3 * tracked))
-        labels += [Label(f"track: face {f} {a}", "tracking", "m") for f in layout.tracked for a in "xyz"]
+        labels += [Label(f"track: {word} {f} {a}", "tracking", "m") for f in layout.tracked for a in "xyz"]
 
         turns = layout.turns
         shape = (len(k), turns, 3)
@@ -360,7 +339,7 @@ class FullBuilder:
             add(*(grid.reshape(-1) for grid in np.meshgrid(np.arange(turns * tracked), curve, indexing="ij")))
         add(np.arange(turns * tracked), column["tangent"].start + np.arange(turns * tracked))
         labels += [
-            Label(f"tilt: face {f} {a}", "tangent", "rad") for f in layout.tracked for a in self._turns
+            Label(f"tilt: {word} {f} {a}", "tangent", "rad") for f in layout.tracked for a in self._turns
         ]
         if layout.spacings:
             pieces = np.arange(layout.spacings)
@@ -370,21 +349,19 @@ class FullBuilder:
         return np.concatenate(rows), np.concatenate(cols), tuple(labels)
 
     def _fixed_values(self, numbers: StepNumbers) -> Array:
-        layout, truss = self.layout, self.layout.truss
-        _, flat, _ = layout.length_scatter
-        present = np.repeat(layout.node_column[truss.tip] >= 0, 3)
+        layout, arm = self.layout, self.layout.arm
+        present = np.repeat(layout.node_column[arm.end_effector.nodes] >= 0, 3)
         values = [
-            numbers.gradient.reshape(-1)[flat],
-            np.full(len(truss.actuators), -1.0),
+            numbers.motion.values,
             numbers.tip_jacobian[:, present].reshape(-1),
             -numbers.tip_rate,
         ]
         if layout.elastic_tip:
             values += [np.repeat([1.0, -1.0], len(layout.tip_rows))]
         if layout.vertices:
-            faces = truss.faces[layout.tracked]
+            faces = arm.stations.nodes[layout.tracked]
             k, slot = np.nonzero(layout.node_column[faces] >= 0)
-            weights = truss.face_weights[layout.tracked][k, slot]
+            weights = arm.stations.weights[layout.tracked][k, slot]
             given = numbers.curve
             turned = numbers.tangent_face if given is None else given.turn_face
             tangent = turned.reshape(-1, layout.turns, 3, 3)[k, :, slot]
@@ -409,8 +386,3 @@ class FullBuilder:
             if layout.spacings and given is not None:
                 values += [given.spacing.reshape(-1), np.full(layout.spacings, -1.0)]
         return np.concatenate(values)
-
-
-def _unit(row: str) -> str:
-    """Return the unit of the end effector's row of that name."""
-    return "m" if row[-1] in "xyz" and "rot" not in row else "rad"

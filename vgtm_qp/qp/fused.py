@@ -7,66 +7,44 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.condensed import FEASIBILITY, InfeasibleStepError, check_answer, refuse_large
-from vgtm_qp.qp.fused_parts import Bound
+from vgtm_qp.qp import daqp
+from vgtm_qp.qp.daqp import EQUALITY, DenseAnswer
 from vgtm_qp.qp.fused_rows import row_function
 from vgtm_qp.qp.fused_settle import NEAR, settle_function
-from vgtm_qp.qp.graph import Stage
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepSolution
-from vgtm_qp.qp.shape import CurveRows
+from vgtm_qp.qp.residual import refuse_large
 
 Array = NDArray[np.float64]
 
 _AXES = np.arange(3)
-_EQUALITY = 5
-"""DAQP's mark for a row that is always active."""
-
-
-class TipGoal(NamedTuple):
-    """Where the end effector is to be, position (3,), m, and rotation (3, 3), and its rates per unit of progress."""
-
-    position: Array
-    rotation: Array
-    velocity: Array
-    spin: Array
+_NOWHERE: Array = np.zeros((0, 3))
 
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """A configuration whose members have their lengths.
+    """A configuration whose quantities are what they should be.
 
     Attributes
     ----------
-    X : (N, 3)
-        m.
-    lengths : (M,)
-        m.
+    q : configuration
+    quantities : (M,)
     error : float
-        Greatest deviation of a length from what it should be, m.
+        Greatest deviation of a quantity from what it should be.
     tip_position, tip_rotation : (3,), (3, 3)
     """
 
-    X: Array
-    lengths: Array
+    q: Array
+    quantities: Array
     error: float
     tip_position: Array
     tip_rotation: Array
-
-
-def _bound_kernel(bound: Bound) -> Kernel:
-    kernel = Kernel(bound.function)
-    first = len(kernel.inputs) - len(bound.constants)
-    for k, values in enumerate(bound.constants):
-        kernel.bind_input(first + k, values)
-    return kernel
 
 
 class Taken(NamedTuple):
@@ -75,18 +53,21 @@ class Taken(NamedTuple):
     Attributes
     ----------
     solution : StepSolution
-        Whose ``nodes`` and ``vertices`` are positions, not displacements, m.
+        Whose ``nodes`` and ``vertices`` are left empty: `q` and `vertices` say where they lead.
+    q : configuration
+        By the answer alone.
     closed : Closed
         With the tip at its goal.
     vertices : (V, 3)
         The curve, m.
     progress, moved : float
-        Progress along the path, and the greatest displacement of a coordinate by the answer, m.
+        Progress along the path, and the greatest displacement of a node's coordinate by the answer, m.
     before, after : float
         The tip's errors before and after it was settled, m and rad.
     """
 
     solution: StepSolution
+    q: Array
     closed: Closed
     vertices: Array
     progress: float
@@ -107,16 +88,17 @@ class _Room:
 
 
 class FusedSolver:
-    """Linearises, condenses and solves; for arms with `elimination_stages`."""
+    """Linearises, condenses and solves; for arms whose symbols ``can_eliminate``."""
 
-    def __init__(self, layout: Layout, stages: list[Stage]) -> None:
-        truss = layout.truss
-        self._rows = _bound_kernel(row_function(layout, stages))
-        nodes, actuators = layout.node_columns, len(truss.actuators)
+    def __init__(self, layout: Layout) -> None:
+        arm = layout.arm
+        self._rows = row_function(layout).kernel()
+        nodes, actuators = layout.node_columns, len(arm.actuators)
         self._actuators = actuators
         self._free_curve = layout.free_curve
         self._size = size = actuators + self._free_curve + 1
         self._torsion = size - 1 - layout.torsion
+        self._shape = arm.home_configuration.shape
         self._tip = len(layout.tip_rows)
         self._hard = layout.hard_rows
         out = self._rows.outputs
@@ -129,8 +111,8 @@ class FusedSolver:
         self._constant = np.zeros((size, size))
         self._scale = 1.0 / np.sqrt(layout.weights.node_rate)
         self._width = nodes + 3
-        self._place = 3 * np.where(truss.base, len(truss.free), layout.node_column // 3)
-        self._settled = settled = _bound_kernel(settle_function(layout, stages))
+        self._place = 3 * np.where(arm.base, len(arm.free), layout.node_column // 3)
+        self._settled = settled = settle_function(layout).kernel()
         for argument, shared in enumerate((0, 4, 5, 8, 9, 10, 11, 7)):
             settled.bind_input(argument, self._rows.inputs[shared])
         for argument, result in ((8, 0), (12, 6), (13, 7)):
@@ -162,46 +144,14 @@ class FusedSolver:
         self._constant = np.zeros((self._size, self._size))
         self._constant_normal = b""
 
-    def load(
-        self,
-        X: Array,
-        Y: Array,
-        vertices: Array,
-        lower: Array,
-        upper: Array,
-        goal: TipGoal,
-        progress: float,
-        *,
-        motion: bool,
-        base: Array | None = None,
-        curve: CurveRows | None = None,
-        goals: Array | None = None,
-    ) -> None:
-        """Linearise: residuals at `X` (N, 3), Jacobians at `Y`; see `row_function`.
-
-        `base` (N, 3) are where base nodes go, `curve` the rows of a curve that is more than its tables, `goals` (V, 3)
-        those of the control vertices.
-        """
-        inputs = self._rows.inputs
-        inputs[0][:] = X.reshape(-1)
-        inputs[1][:] = Y.reshape(-1)
-        inputs[2][:] = inputs[0] if base is None else base.reshape(-1)
-        inputs[3][:] = vertices.reshape(-1)
-        inputs[4][:] = lower
-        inputs[5][:] = upper
-        inputs[6][0] = 1.0 if motion else 0.0
-        inputs[7][0] = progress
-        inputs[8][:] = goal.position
-        inputs[9][:] = goal.rotation.T.reshape(-1)
-        inputs[10][:] = goal.velocity
-        inputs[11][:] = goal.spin
-        for k, table in enumerate(curve or (), start=12):
-            inputs[k][:] = table.reshape(-1)
+    def load(self, asked: StepInput) -> None:
+        """Linearise and condense."""
+        asked.load(self._rows)
         self._rows()
         if self.layout.vertex_goals:
             self._goal_pull = self._goal_weight[:, None] * self._offset
-            if motion:
-                self._goal_pull += self.layout.goal_pull(vertices, goals)
+            if asked.motion:
+                self._goal_pull += self.layout.goal_pull(asked.vertices, asked.vertex_goals)
 
     def solve(self, clearance: ClearanceRows) -> StepSolution:
         """Solve the QP at the configuration loaded last.
@@ -211,28 +161,24 @@ class FusedSolver:
         InfeasibleStepError, SolverError
             As ``CondensedSolver.solve``.
         """
-        x, flag, info = self.ask(clearance)
-        multipliers, rows = info["lam"], self._tip + self._hard + len(clearance)
+        answer = self.ask(clearance)
+        x, rows = answer.x, self._tip + self._hard + len(clearance)
         bounds = self._room.lower[: self._size + rows], self._room.upper[: self._size + rows]
-        check_answer(
-            x, multipliers, flag, self._hessian, self._gradient, self._room.constraint[:rows], *bounds
-        )
+        daqp.check(answer, self._hessian, self._gradient, self._room.constraint[:rows], *bounds)
         count = self._actuators
-        nodes = np.zeros((self.layout.truss.node_count, 3))
+        nodes = np.zeros((len(self.layout.arm.node_names), 3))
         moved = np.dot(x[:count], self._response[:count])
         moved += self._response[-1]
         moved *= self._scale
-        nodes[self.layout.truss.free] = moved.reshape(-1, 3)
+        nodes[self.layout.arm.free] = moved.reshape(-1, 3)
         vertices = self._offset.copy()
         if self._free_curve:
             vertices[1] += self._normal * x[count]
             vertices[2:] += x[count + 1 : self._torsion].reshape(-1, 3)
-        return self._solution(x, info, len(clearance), nodes, vertices)
+        return self._solution(answer, len(clearance), nodes, vertices)
 
-    def _solution(
-        self, x: Array, info: dict[str, Any], near: int, nodes: Array, vertices: Array
-    ) -> StepSolution:
-        multipliers, count = info["lam"], self._actuators
+    def _solution(self, answer: DenseAnswer, near: int, nodes: Array, vertices: Array) -> StepSolution:
+        x, multipliers, count = answer.x, answer.multipliers, self._actuators
         return StepSolution(
             nodes=nodes,
             actuators=x[:count],
@@ -240,12 +186,12 @@ class FusedSolver:
             progress=float(x[-1]),
             actuator_multipliers=multipliers[:count],
             clearance_multipliers=-multipliers[len(multipliers) - near :],
-            iterations=info["iterations"],
+            iterations=answer.iterations,
             torsion=x[self._torsion : -1],
         )
 
-    def ask(self, clearance: ClearanceRows) -> tuple[Array, int, dict[str, Any]]:
-        """Return DAQP's answer to the QP at the configuration loaded last, not checked yet, exit flag and details.
+    def ask(self, clearance: ClearanceRows) -> DenseAnswer:
+        """Return DAQP's answer to the QP at the configuration loaded last, not checked yet.
 
         Raises
         ------
@@ -264,29 +210,25 @@ class FusedSolver:
             constraint[self._tip : first, :-1] = block[:-1].T
             upper[size + self._tip : size + first] = lower[size + self._tip : size + first] = -block[-1]
         if near:
-            answer = np.dot(self._spread_rows(clearance), self._response.T)
-            answer *= self._scale
-            constraint[first:, :count] = answer[:, :count]
-            np.subtract(clearance.lower, answer[:, -1], out=lower[size + first : size + rows])
+            moved = np.dot(self._spread_rows(clearance), self._response.T)
+            moved *= self._scale
+            constraint[first:, :count] = moved[:, :count]
+            np.subtract(clearance.lower, moved[:, -1], out=lower[size + first : size + rows])
         self._room.used, before = size + rows, self._room.used
         if before > size + rows:
             lower[size + rows : before] = -UNBOUNDED
-        x, _, flag, info = daqp.solve(
+        answer = daqp.ask(
             hessian,
             gradient,
             constraint,
-            upper[: size + rows],
             lower[: size + rows],
+            upper[: size + rows],
             self._room.sense[: size + rows],
-            primal_tol=FEASIBILITY,
-            eps_prox=0.0,
         )
-        if flag == -1:
-            raise InfeasibleStepError("the hard rows of the step contradict one another")
-        self._answer[:] = x
-        return x, flag, info
+        self._answer[:] = answer.x
+        return answer
 
-    def take(self, answer: tuple[Array, int, dict[str, Any]], near: int) -> Taken:
+    def take(self, answer: DenseAnswer, near: int) -> Taken:
         """Return where an answer of :meth:`ask` leads that had so many clearance rows, at most ``NEAR``.
 
         Raises
@@ -294,29 +236,28 @@ class FusedSolver:
         AnswerError
             The answer's residuals are too large.
         """
-        x, flag, info = answer
-        multipliers, count = info["lam"], len(info["lam"])
+        multipliers, count = answer.multipliers, len(answer.multipliers)
         self._multipliers[:count] = multipliers
         self._multipliers[count:] = 0.0
         self._settle(1.0)
         out = self._settled.outputs
         error, before, after, progress, moved, primal, dual = out[5].tolist()
-        refuse_large(primal, dual, flag)
-        closed = self._closed(error)
+        refuse_large(primal, dual, answer.name)
         vertices = out[4].reshape(-1, 3).copy()
-        solution = self._solution(x, info, near, out[6].reshape(-1, 3).copy(), vertices)
-        return Taken(solution, closed, vertices, progress, moved, before, after)
+        solution = self._solution(answer, near, _NOWHERE, _NOWHERE)
+        q = out[6].reshape(self._shape).copy()
+        return Taken(solution, q, self._closed(error), vertices, progress, moved, before, after)
 
     def settle(
-        self, X: Array, vertices: Array, lower: Array, upper: Array, position: Array, rotation: Array
+        self, q: Array, vertices: Array, lower: Array, upper: Array, position: Array, rotation: Array
     ) -> tuple[Closed, float, float]:
-        """Return `X` (N, 3) with its lengths closed, actuators in their boxes (n_a,), m, and its tip at a pose.
+        """Return configuration `q` with its quantities closed, actuators in their boxes (n_a,), and its tip at a pose.
 
-        `vertices` (V, 3), m, are the curve that faces are held on with hard tracking. Beside the configuration stand
-        the tip's errors before and after settling, m and rad.
+        `vertices` (V, 3), m, are the curve that stations are held on with hard tracking. Beside the configuration
+        stand the tip's errors before and after settling, m and rad.
         """
         inputs = self._settled.inputs
-        inputs[0][:] = X.reshape(-1)
+        inputs[0][:] = q.reshape(-1)
         inputs[1][:] = lower
         inputs[2][:] = upper
         inputs[3][:] = position
@@ -334,9 +275,13 @@ class FusedSolver:
         self._settled()
 
     def _closed(self, error: float) -> Closed:
-        X, lengths, position, rotation = self._settled.outputs[:4]
+        q, quantities, position, rotation = self._settled.outputs[:4]
         return Closed(
-            X.reshape(-1, 3).copy(), lengths.copy(), error, position.copy(), rotation.reshape(3, 3).T.copy()
+            q.reshape(self._shape).copy(),
+            quantities.copy(),
+            error,
+            position.copy(),
+            rotation.reshape(3, 3).T.copy(),
         )
 
     def _reserve(self, rows: int) -> None:
@@ -346,7 +291,7 @@ class FusedSolver:
         self._room.lower, self._room.upper = np.full(rows, -UNBOUNDED), np.full(rows, UNBOUNDED)
         self._room.sense = np.zeros(rows, dtype=np.int32)
         self._room.row_start = self._width * np.arange(rows - size)[:, None, None]
-        self._room.sense[size:equal] = _EQUALITY
+        self._room.sense[size:equal] = EQUALITY
         tip_rows = self._room.constraint[: self._tip].reshape(-1)
         bounds = (values[: size + self._tip] for values in (self._room.lower, self._room.upper))
         for result, array in enumerate((tip_rows, *bounds), start=1):

@@ -1,236 +1,231 @@
-"""The condensed QP of one step as one CasADi graph, from node positions to the rows of its least squares.
-
-The bays are eliminated one after another: with the square diagonal blocks D and the blocks L towards earlier bays of
-the length Jacobian, d_rho = K d_a + r follows from K = D^-1 (E - L K_earlier). What comes out is the matrix whose Gram
-matrix is Hessian and gradient of the objective; everything constant over a maneuver is an argument that is bound once,
-so that the compiled library depends on the topology of the arm alone.
-"""
+"""A step's QP in CasADi's symbols: what the linearised and the condensed form of it have in common."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import frame_constants, frame_function, member_function
+from vgtm_qp.arm.arm import ArmSymbols
+from vgtm_qp.arm.symbols import Bound, Constants, Frames
 from vgtm_qp.qp.layout import Layout
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """One step of the elimination: `nodes` hang by `members` on `earlier` free nodes; all are indices."""
-
-    nodes: Index
-    members: Index
-    earlier: Index
+from vgtm_qp.rows import curve as curve_rows
+from vgtm_qp.rows import tip as tip_rows
+from vgtm_qp.rows import tracking
 
 
-def elimination_stages(layout: Layout) -> list[Stage] | None:
-    """Return the stages of the truss in order, or None where a stage does not have three members for each node."""
-    truss = layout.truss
-    node_stage = np.where(truss.base, -1, truss.stage)
-    member_stage = node_stage[layout.member_nodes].max(axis=1)
-    stages = []
-    for stage in np.unique(truss.stage[truss.free]):
-        nodes = truss.free[node_stage[truss.free] == stage]
-        members = np.flatnonzero(member_stage == stage)
-        if len(members) != 3 * len(nodes):
-            return None
-        used = np.unique(layout.member_nodes[members])
-        earlier = used[(node_stage[used] < stage) & ~truss.base[used]]
-        stages.append(Stage(nodes, members, earlier))
-    return stages
+class StepGraph:
+    """Arguments of a step, and the rows that follow from them.
 
-
-class TrussGraph:
-    """Lengths, gradients and frames of a truss at symbolic positions, and the elimination of its bays."""
-
-    def __init__(self, layout: Layout, stages: list[Stage], constants: Constants) -> None:
-        self.layout = layout
-        self.stages = stages
-        truss = layout.truss
-        self._offsets: list[ca.MX] = []
-        if truss.joints is not None:
-            self._offsets = [constants.add("offsets", truss.joints.offset.reshape(-1, 3))]
-        self._member = member_function(truss)
-        self._shapes: dict[object, ca.Function] = {}
-        self._columns = layout.member_nodes.reshape(-1).tolist()
-        self._blocks = [self._pattern(stage) for stage in stages]
-
-    def lengths(self, X: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Return lengths (M, 1) and all gradients (3 Q M, 1) at positions (3, N)."""
-        function = self._member.map(self.layout.truss.member_count)
-        lengths, gradients = function(X[:, self._columns], *self._offsets)
-        return lengths.T, ca.vec(gradients)
-
-    def _pattern(
-        self, stage: Stage
-    ) -> tuple[list[tuple[Index, ca.Sparsity]], list[tuple[Index, ca.Sparsity]]]:
-        """Return, for D and L, the terms whose sum is the block: gradient positions and the sparsity they fill."""
-        nodes = self.layout.member_nodes[stage.members]
-        terms = []
-        for targets in (stage.nodes, stage.earlier):
-            found: dict[tuple[int, int], list[int]] = {}
-            place = {int(node): 3 * k for k, node in enumerate(targets)}
-            for row, (member, names) in enumerate(zip(stage.members, nodes, strict=True)):
-                for slot, node in enumerate(names):
-                    if int(node) in place:
-                        for axis in range(3):
-                            flat = (int(member) * nodes.shape[1] + slot) * 3 + axis
-                            found.setdefault((row, place[int(node)] + axis), []).append(flat)
-            layers = []
-            for depth in range(max((len(v) for v in found.values()), default=0)):
-                entries = sorted((c, r, v[depth]) for (r, c), v in found.items() if len(v) > depth)
-                sparsity = ca.Sparsity.triplet(
-                    len(stage.members), 3 * len(targets), [e[1] for e in entries], [e[0] for e in entries]
-                )
-                layers.append((np.array([e[2] for e in entries], dtype=np.int64), sparsity))
-            terms.append(layers)
-        return terms[0], terms[1]
-
-    def _block(
-        self, layers: list[tuple[Index, ca.Sparsity]], gradients: ca.MX, shape: tuple[int, int]
-    ) -> ca.MX:
-        block = ca.MX(*shape)
-        for flat, sparsity in layers:
-            block = block + ca.MX(sparsity, gradients[flat.tolist()])
-        return block
-
-    def blocks(self, k: int, gradients: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Return the blocks D and L of stage `k`, sparse."""
-        stage = self.stages[k]
-        rows = len(stage.members)
-        own, earlier = self._blocks[k]
-        columns = 3 * len(stage.earlier)
-        return self._block(own, gradients, (rows, rows)), self._block(earlier, gradients, (rows, columns))
-
-    def _solver(self, D: ca.Sparsity, width: int) -> ca.Function:
-        """Return (D, right-hand sides (rows, width)) -> D^-1 rhs by an unrolled sparse QR factorisation."""
-        key = (D.size1(), tuple(D.row()), tuple(D.colind()), width)
-        if key not in self._shapes:
-            block, rhs = ca.SX.sym("D", D), ca.SX.sym("rhs", D.size1(), width)
-            orthogonal, triangular = ca.qr(block)
-            solved = ca.densify(ca.solve(triangular, orthogonal.T @ rhs))
-            self._shapes[key] = ca.Function(f"bay{len(self._shapes)}", [block, rhs], [solved])
-        return self._shapes[key]
-
-    def response(self, gradients: ca.MX, rhs: ca.MX) -> ca.MX:
-        """Return [K, r] (3 (N - N_c), n_a + 1): node displacements per actuator displacement, and for `rhs` (M, 1)."""
-        truss = self.layout.truss
-        actuators = truss.actuators.tolist()
-        count = len(actuators)
-        place: dict[int, ca.MX] = {}
-        for k, stage in enumerate(self.stages):
-            D, L = self.blocks(k, gradients)
-            own = [(row, actuators.index(int(m))) for row, m in enumerate(stage.members) if truss.actuated[m]]
-            unit = ca.DM(len(stage.members), len(own))
-            for column, (row, _) in enumerate(own):
-                unit[row, column] = 1.0
-            earlier = len(stage.earlier)
-            arguments: list[ca.MX] = [ca.densify(-L)] if earlier else []
-            arguments += [ca.MX(ca.densify(unit))] if own else []
-            width = 3 * earlier + len(own) + 1
-            solved = self._solver(D.sparsity(), width)(D, ca.horzcat(*arguments, rhs[stage.members.tolist()]))
-            particular = solved[:, -1]
-            columns = ca.MX(len(stage.members), count)
-            if earlier:
-                before = ca.vertcat(*(place[int(node)] for node in stage.earlier))
-                product = solved[:, : 3 * earlier] @ before
-                columns, particular = product[:, :count], product[:, count] + particular
-            if own:
-                spread = ca.DM(
-                    ca.Sparsity.triplet(len(own), count, list(range(len(own))), [c for _, c in own]), 1.0
-                )
-                columns = columns + solved[:, 3 * earlier : 3 * earlier + len(own)] @ spread
-            block = ca.horzcat(ca.densify(columns), particular)
-            for j, node in enumerate(stage.nodes):
-                place[int(node)] = block[3 * j : 3 * j + 3, :]
-        return ca.vertcat(*(place[int(node)] for node in truss.free))
-
-    def newton(self, X: ca.MX, wanted: ca.MX, lengths: ca.MX, gradients: ca.MX) -> ca.MX:
-        """Return positions (3, N) after one Newton step of the free nodes to `wanted` lengths (M, 1)."""
-        error = wanted - lengths
-        blocks = [self.blocks(k, gradients) for k in range(len(self.stages))]
-        return X + self._substituted(blocks, [error[stage.members.tolist()] for stage in self.stages])
-
-    def newton_on_faces(
-        self, X: ca.MX, wanted: ca.MX, lengths: ca.MX, gradients: ca.MX, gaps: ca.MX, faces: Index
-    ) -> ca.MX:
-        """Return positions after a Newton step to `wanted` lengths of fixed members and faces moved by `gaps` (3, K).
-
-        `faces` (stages,) are those of :func:`stage_faces`; actuated members take the lengths that follow.
-        """
-        truss, error = self.layout.truss, wanted - lengths
-        tracked = self.layout.tracked.tolist()
-        blocks, rhs = [], []
-        for k, (stage, face) in enumerate(zip(self.stages, faces.tolist(), strict=True)):
-            fixed = np.flatnonzero(~truss.actuated[stage.members]).tolist()
-            D, L = self.blocks(k, gradients)
-            weight = dict(zip(truss.faces[face].tolist(), truss.face_weights[face], strict=True))
-            centre = ca.sparsify(ca.DM(np.kron([weight[int(n)] for n in stage.nodes], np.eye(3))))
-            blocks.append((ca.vertcat(D[fixed, :], centre), ca.vertcat(L[fixed, :], ca.MX(3, L.size2()))))
-            rhs.append(ca.vertcat(error[stage.members[fixed].tolist()], gaps[:, tracked.index(face)]))
-        return X + self._substituted(blocks, rhs)
-
-    def _substituted(self, blocks: list[tuple[ca.MX, ca.MX]], rhs: list[ca.MX]) -> ca.MX:
-        """Return displacements (3, N) of all nodes: each stage's blocks D and L place its nodes after earlier ones."""
-        place: dict[int, ca.MX] = {}
-        for stage, (D, L), right in zip(self.stages, blocks, rhs, strict=True):
-            if len(stage.earlier):
-                right = right - L @ ca.vertcat(*(place[int(node)] for node in stage.earlier))
-            step = self._solver(D.sparsity(), 1)(D, right)
-            for j, node in enumerate(stage.nodes):
-                place[int(node)] = step[3 * j : 3 * j + 3]
-        zero = ca.DM.zeros(3)
-        return ca.horzcat(*(place.get(node, zero) for node in range(self.layout.truss.node_count)))
-
-
-def stage_faces(layout: Layout, stages: list[Stage]) -> Index | None:
-    """Return the tracked face of each stage where its place determines the stage's nodes with the fixed members.
-
-    None where that is not so: a face's three coordinates must stand for three actuated members.
+    Attributes
+    ----------
+    q, at
+        Configurations where residuals and where Jacobians are evaluated.
+    base : (3, N)
+        Where the nodes are when only the base has moved.
+    vertices : (3, V)
+    lower, upper : (n_a,)
+        Boxes of the actuators.
+    motion, progress : scalar
+        1 for the QP that moves the arm and 0 for corrections; progress along the path so far.
+    goal, turned, velocity, spin : (3,), (3, 3), (3,), (3,)
+        Pose of the goal there, and its rates per unit of progress.
+    given : list
+        ``CurveRows`` as arguments, transposed as CasADi reads them, where the curve is more than its tables.
+    X, moved : (3, N)
+        Nodes at `q`, and what the base moves them by.
+    strokes : (n_a,)
+    tip_position, tip_rotation : (3,), (3, 3)
+    tip_error, tip_rate, tip_jacobian : (n_e,), (n_e,), (n_e, 3K)
+        Goal less value, the path's rate, and J_u at `at`.
+    curvature : scalar
+        What the progress along the path is weighted by.
+    rotations, spins : (3, 3F), (3, 9F)
+        Of the stations at `q`, and at `at`.
+    base_axes, normal, offset : (3, 2), (3,), (3, V)
+        What the base makes of the curve.
     """
-    truss = layout.truss
-    nodes_of = {frozenset(truss.faces[face].tolist()): int(face) for face in layout.tracked}
-    faces = [nodes_of.get(frozenset(stage.nodes.tolist()), -1) for stage in stages]
-    three = all(int(truss.actuated[stage.members].sum()) == 3 for stage in stages)
-    return np.array(faces) if three and min(faces) >= 0 and len(faces) == len(layout.tracked) else None
 
+    def __init__(self, layout: Layout, symbols: ArmSymbols, constants: Constants) -> None:
+        arm = layout.arm
+        self.layout, self.symbols, self._constants = layout, symbols, constants
+        count, nodes, vertices = len(arm.actuators), len(arm.node_names), layout.vertices
+        self.q, self.at = ca.MX.sym("q", *symbols.shape), ca.MX.sym("at", *symbols.shape)
+        self.base = ca.MX.sym("base", 3, nodes)
+        self.vertices = ca.MX.sym("p", 3, vertices)
+        self.lower, self.upper = ca.MX.sym("lower", count), ca.MX.sym("upper", count)
+        self.motion, self.progress = ca.MX.sym("motion"), ca.MX.sym("progress")
+        self.goal, self.turned = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
+        self.velocity, self.spin = ca.MX.sym("velocity", 3), ca.MX.sym("spin", 3)
+        self.given = [] if layout.general is None else _given_curve(layout)
+        self.X = symbols.nodes(self.q)
+        self.Y = symbols.nodes(self.at)
+        self.moved = ca.MX.zeros(3, nodes)
+        self.moved[:, symbols.given] = (self.base - self.X)[:, symbols.given]
+        self.strokes = symbols.quantities(self.q)[arm.actuators.tolist()]
+        self._tip()
+        self._curve()
 
-class Constants:
-    """Numbers that are constant over a maneuver: arguments of a graph beside the values to bind to them once."""
-
-    def __init__(self) -> None:
-        self.symbols: list[ca.MX] = []
-        self.values: list[Array] = []
-
-    def add(self, name: str, value: Array) -> ca.MX:
-        """Return the symbol of a constant whose columns are the rows of `value`, a vector or matrix."""
-        self.symbols.append(ca.MX.sym(name, *reversed(np.atleast_2d(value).shape)))
-        self.values.append(np.ascontiguousarray(value, dtype=float).reshape(-1))
-        return self.symbols[-1]
-
-
-class Frames:
-    """Frames of F faces with K nodes each, with their constants."""
-
-    def __init__(self, home: Array, rotations: Array, nodes: Index, constants: Constants, name: str) -> None:
-        values = [frame_constants(points, frame) for points, frame in zip(home, rotations, strict=True)]
-        cosines, sines, alignments = (np.stack(column) for column in zip(*values, strict=True))
-        self._arguments = [
-            constants.add(f"{name}_cosines", cosines),
-            constants.add(f"{name}_sines", sines),
-            constants.add(f"{name}_alignments", alignments.transpose(0, 2, 1).reshape(-1, 3)),
+    @property
+    def inputs(self) -> list[ca.MX]:
+        """Arguments of both functions, the constants last."""
+        return [
+            *(self.q, self.at, self.base, self.vertices, self.lower, self.upper, self.motion, self.progress),
+            *(self.goal, self.turned, self.velocity, self.spin, *self.given, *self._constants.symbols),
         ]
-        self._columns = nodes.reshape(-1).tolist()
-        self._function = frame_function(home.shape[1]).map(len(home))
 
-    def at(self, X: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Return rotations (3, 3F) and spins (3, 3KF) at positions (3, N)."""
-        rotation, spin = self._function(X[:, self._columns], *self._arguments)
-        return rotation, spin
+    def bound(self, name: str, results: list[ca.MX]) -> Bound:
+        """Return the function of these `results`, dense."""
+        function = ca.Function(name, self.inputs, [ca.densify(result) for result in results])
+        return Bound(function, self._constants.values)
+
+    def weights(self, *values: float) -> list[ca.MX]:
+        """Return weights as constants."""
+        return list(ca.vertsplit(self._constants.add("weights", np.array(values))))
+
+    def table(self, name: str, value: np.ndarray) -> ca.MX:
+        """Return a table as a constant; its columns are the rows of `value`."""
+        return self._constants.add(name, value)
+
+    def _tip(self) -> None:
+        rows, tip = self.layout.tip_rows, self.layout.arm.end_effector
+        nodes = tip.nodes.tolist()
+        self.tip_position = self.X[:, nodes] @ ca.DM(tip.weights)
+        self.tip_rotation, spin = ca.MX.eye(3), ca.MX.zeros(3, 3 * len(nodes))
+        if tip.has_frame:
+            frames = tip_frames(self.layout, self._constants)
+            self.tip_rotation, _ = frames.at(self.X)
+            _, spin = frames.at(self.Y)
+        error = tip_rows.error(rows, self.tip_position, self.tip_rotation, self.goal, self.turned)
+        self.tip_error = tip_rows.worth_closing(error, self.motion)
+        position = ca.DM(np.kron(tip.weights, np.eye(3)))
+        self.tip_jacobian = tip_rows.combined(rows, position, spin, self.tip_rotation)
+        self.tip_rate = tip_rows.combined(rows, self.velocity, self.spin, self.tip_rotation)
+        (weight,) = self.weights(self.layout.weights.progress)
+        self.curvature = weight * tip_rows.progress_weight(self.tip_rate)
+
+    def _curve(self) -> None:
+        layout, stations = self.layout, self.layout.arm.stations
+        self.base_axes, self.normal = ca.MX.zeros(3, 2), ca.MX.zeros(3)
+        self.offset = ca.MX.zeros(3, 0)
+        if not layout.vertices:
+            return
+        home = layout.arm.home
+        frames = Frames(home[stations.nodes], stations.frames, stations.nodes, self._constants, "station")
+        self.rotations, _ = frames.at(self.X)
+        _, self.spins = frames.at(self.Y)
+        start = stations.nodes[:1]
+        base = Frames(home[start], stations.frames[:1], start, self._constants, "base")
+        based = self.X + self.moved
+        rotation, _ = base.at(based)
+        centre = based[:, start[0].tolist()] @ ca.DM(stations.weights[0])
+        self.base_axes, self.normal = rotation[:, :2], rotation[:, 2]
+        self.offset = curve_rows.base_offset(centre, rotation, self.vertices)
+        if layout.general is None:
+            self._tables = (
+                self.table("curve_weights", layout.curve_weights),
+                self.table("curve_slopes", layout.curve_slopes),
+            )
+
+    def station(self, k: int) -> list[ca.MX]:
+        """Return the arguments of :class:`StationSymbols` for the k-th tracked station."""
+        layout, stations = self.layout, self.layout.arm.stations
+        face = int(layout.tracked[k])
+        nodes = stations.nodes[face].tolist()
+        arguments = [
+            self.X[:, nodes],
+            self.rotations[:, 3 * face : 3 * face + 3],
+            self.spins[:, 9 * face : 9 * face + 9],
+            ca.MX(ca.DM(stations.weights[face])),
+        ]
+        if layout.general is None:
+            weights, slopes = self._tables
+            return [*arguments, self.vertices, weights[:, k], slopes[:, k]]
+        block = slice(3 * k, 3 * k + 3)
+        position, position_rows, frame, spin_rows = self.given[:4]
+        return [
+            *arguments,
+            position[:, k],
+            position_rows[:, block],
+            frame[:, block],
+            spin_rows[:, block],
+        ]
+
+
+class StationSymbols:
+    """One station and its curve node as symbols: eqs. (32)-(39) where the station is.
+
+    Attributes
+    ----------
+    inputs : list
+        What ``StepGraph.station`` gives.
+    gap, turn : (3,), (R,)
+    face : (R, 9)
+        Rows of the turns over the station's nodes.
+    weights : (3,)
+        Of the nodes in the station's position.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        nodes, self.weights = ca.SX.sym("nodes", 3, 3), ca.SX.sym("face", 3)
+        rotation, spin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("spin", 3, 9)
+        self.inputs = [nodes, rotation, spin, self.weights]
+        self._is_tabled = layout.general is None
+        if self._is_tabled:
+            vertices = ca.SX.sym("p", 3, layout.vertices)
+            self._at, self._slopes = ca.SX.sym("w", layout.vertices), ca.SX.sym("dw", layout.vertices)
+            self.inputs += [vertices, self._at, self._slopes]
+            point = vertices @ self._at
+            self.turn, c, self.slope = tracking.slope_rows(rotation, vertices @ self._slopes)
+        else:
+            size = 3 * layout.vertices + layout.torsion
+            point, position_rows = ca.SX.sym("position", 3), ca.SX.sym("position_rows", size, 3)
+            frame, spin_rows = ca.SX.sym("frame", 3, 3), ca.SX.sym("spin_rows", size, 3)
+            self.inputs += [point, position_rows, frame, spin_rows]
+            # CasADi reads the frame's rows as columns.
+            self.turn, c = tracking.turns(rotation, frame.T, layout.turns)
+            self._position, self._turned = position_rows.T, -c @ spin_rows.T
+        self.gap, self.face = tracking.gap(nodes @ self.weights, point), c @ spin
+
+    def over_curve(self, offset: ca.SX, normal: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Return what the curve's coordinates do to gap and turn, over those the base leaves free.
+
+        Rows (3, q) and (R, q), and the constants (3,) and (R,) of an `offset` of all coordinates ((3, V), or flat where
+        the curve has torsion).
+        """
+        if not self._is_tabled:
+            rows = -self._position, self._turned
+            free = [curve_rows.free_columns(row, normal) for row in rows]
+            return free[0], free[1], rows[0] @ offset, rows[1] @ offset
+        return (
+            -curve_rows.weighted_columns(self._at, normal, ca.SX.eye(3)),
+            curve_rows.weighted_columns(self._slopes, normal, self.slope),
+            -offset @ self._at,
+            self.slope @ (offset @ self._slopes),
+        )
+
+    @property
+    def curve(self) -> Any:
+        """Rows of the turns over the curve: (2, 3) over the slope r', or (R, 3 V + T) over all coordinates."""
+        return self.slope if self._is_tabled else self._turned
+
+
+def tip_frames(layout: Layout, constants: Constants) -> Frames:
+    """Return the end effector's frame."""
+    arm, tip = layout.arm, layout.arm.end_effector
+    return Frames(arm.home[tip.nodes][None], tip.frame[None], tip.nodes[None], constants, "tip")
+
+
+def _given_curve(layout: Layout) -> list[ca.MX]:
+    """Return the arguments that ``CurveRows`` are given as: each array's last axis is the row index."""
+    count, size, pieces = len(layout.tracked), 3 * layout.vertices + layout.torsion, layout.spacings
+    shapes = {
+        "position": (3, count),
+        "position_rows": (size, 3 * count),
+        "frame": (3, 3 * count),
+        "spin_rows": (size, 3 * count),
+        "stretch": (pieces, 1),
+        "stretch_rows": (size, pieces),
+    }
+    return [ca.MX.sym(name, *shape) for name, shape in shapes.items()]

@@ -1,4 +1,4 @@
-"""The layout of a step's QP: which columns and rows there are, built once from the truss, the curve and the task."""
+"""The layout of a step's QP: which columns and rows there are, built once from the arm, the curve and the task."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import member_nodes
-from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arm.arm import Arm
 from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
@@ -28,11 +27,11 @@ class Layout:
 
     Attributes
     ----------
-    truss : Truss
+    arm : Arm
     curve_weights, curve_slopes : (K, V)
         w_i(s_k) and w_i'(s_k) at the curve nodes; V = 0 where there is no curve.
     tracked : (K,) int
-        The faces that track them.
+        The stations that track them.
     tip_rows : tuple of str
         Names of the end effector's coordinates.
     hard_tracking : bool
@@ -41,14 +40,14 @@ class Layout:
         The end effector's rows may give way at an exact penalty.
     weights : Weights
     hard_turns : bool
-        The faces' turns as equalities too, beside their positions.
+        The stations' turns as equalities too, beside their positions.
     shape : CurveShape or None
         How the curve's nodes are placed; None for a curve that is no more than its tables.
     vertex_goals : tuple of int
         Control vertices that are drawn to goals.
     """
 
-    truss: Truss
+    arm: Arm
     curve_weights: Array
     curve_slopes: Array
     tracked: Index
@@ -63,24 +62,19 @@ class Layout:
     @cached_property
     def node_column(self) -> Index:
         """(N,) first column of each free node's displacement; -1 for base nodes."""
-        column = np.full(self.truss.node_count, -1, dtype=np.int64)
-        column[self.truss.free] = 3 * np.arange(len(self.truss.free))
+        column = np.full(len(self.arm.node_names), -1, dtype=np.int64)
+        column[self.arm.free] = 3 * np.arange(len(self.arm.free))
         return column
 
     @property
     def node_columns(self) -> int:
         """Number of node displacement coordinates, 3 (N - N_c)."""
-        return 3 * len(self.truss.free)
+        return 3 * len(self.arm.free)
 
     @property
     def vertices(self) -> int:
         """Number of control vertices V."""
         return int(self.curve_weights.shape[1])
-
-    @cached_property
-    def member_nodes(self) -> Index:
-        """(M, Q) nodes that each member's length depends on."""
-        return member_nodes(self.truss)
 
     @property
     def general(self) -> CurveShape | None:
@@ -104,12 +98,12 @@ class Layout:
 
     @property
     def turns(self) -> int:
-        """Turns R of each face that are tracked."""
+        """Turns R of each station that are tracked."""
         return 2 if self.general is None else self.general.turns
 
     @property
     def hard_rows(self) -> int:
-        """Number of tracking rows that are equalities: the positions of the faces, then their turns."""
+        """Number of tracking rows that are equalities: the positions of the stations, then their turns."""
         tracked = len(self.tracked) if self.hard_tracking else 0
         return (3 + self.turns) * tracked if self.hard_turns else 3 * tracked
 
@@ -120,7 +114,7 @@ class Layout:
 
     @property
     def least_squares(self) -> int:
-        """Number of the objective's rows over displacements: nodes, gaps and turns of the faces, spacings."""
+        """Number of the objective's rows over displacements: nodes, gaps and turns of the stations, spacings."""
         return self.node_columns + (3 + self.turns) * len(self.tracked) + self.spacings
 
     @property
@@ -130,7 +124,7 @@ class Layout:
 
     @cached_property
     def turn_weights(self) -> Array:
-        """(R K,) weights of the faces' turns; ones where they are hard."""
+        """(R K,) weights of the stations' turns; ones where they are hard."""
         weights = [self.weights.tangent, self.weights.tangent, self.weights.roll][: self.turns]
         return (
             np.ones(self.turns * len(self.tracked))
@@ -156,14 +150,9 @@ class Layout:
         if drawn and goals is not None:
             gap = vertices[drawn] - goals[drawn]
             apart = np.linalg.norm(gap, axis=1, keepdims=True)
-            reach = _GOAL_REACH * self.truss.height
+            reach = _GOAL_REACH * self.arm.height
             pull[drawn] = self.weights.vertex_goal * gap * np.minimum(1.0, reach / np.maximum(apart, 1e-300))
         return pull
-
-    @property
-    def has_tip_frame(self) -> bool:
-        """Whether the end effector has an orientation: its tip has three nodes or more."""
-        return len(self.truss.tip) >= 3
 
     @cached_property
     def polygon_bending(self) -> Array:
@@ -172,46 +161,3 @@ class Layout:
             np.diff(np.eye(self.vertices), n=2, axis=0) if self.vertices > 2 else np.zeros((0, self.vertices))
         )
         return np.asarray(second.T @ second)
-
-    @cached_property
-    def fixed(self) -> Index:
-        """(n_l,) indices of the fixed members."""
-        return np.flatnonzero(~self.truss.actuated)
-
-    @cached_property
-    def length_scatter(self) -> tuple[Index, Index, Index]:
-        """Return (member, flat position in the gradient, column) of every entry of the length Jacobian."""
-        columns = self.node_column[self.member_nodes]
-        member, slot = np.nonzero(columns >= 0)
-        axis = np.arange(3)
-        flat = ((member * columns.shape[1] + slot)[:, None] * 3 + axis).ravel()
-        column = (columns[member, slot][:, None] + axis).ravel()
-        return np.repeat(member, 3), flat, column
-
-    def length_jacobian(self, gradient: Array, out: Array | None = None) -> Array:
-        """Return the dense length Jacobian (M, 3 (N - N_c)), eq. (24) and its actuated rows, from member gradients."""
-        member, flat, column = self.length_scatter
-        if out is None:
-            out = np.zeros((self.truss.member_count, self.node_columns))
-        values = gradient.reshape(-1)[flat]
-        if self._has_shared_entries:
-            out[:] = 0.0
-            np.add.at(out, (member, column), values)
-        else:
-            out[member, column] = values
-        return out
-
-    @cached_property
-    def _has_shared_entries(self) -> bool:
-        """Whether a member names one node twice, as offset joints do; its gradients then add up."""
-        member, _, column = self.length_scatter
-        return len(np.unique(member * self.node_columns + column)) < len(member)
-
-    @cached_property
-    def _is_base_entry(self) -> Array:
-        return (self.node_column[self.member_nodes] < 0).astype(float)
-
-    def base_length_rate(self, gradient: Array, displacement: Array) -> Array:
-        """Return (M,) what a displacement (N, 3) of the base nodes alone does to the lengths, eq. (23) negated."""
-        moved = displacement[self.member_nodes] * self._is_base_entry[..., None]
-        return np.asarray(np.einsum("mqc,mqc->m", gradient, moved))

@@ -1,4 +1,4 @@
-"""Newton's step on the member lengths: node displacements for given changes, at linear cost."""
+"""Newton's step on the lengths of members: node displacements for given changes, at linear cost."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from vgtm_qp.arm.arm import Bays
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain import Chain, find_chain
@@ -25,11 +26,12 @@ _SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 class LengthSolver:
     """Solves J d_rho = error with the length Jacobian J: dense, along the chain of bays, or sparse."""
 
-    def __init__(self, layout: Layout) -> None:
-        self._layout = layout
-        chain = find_chain(layout) if layout.node_columns > _DENSE else None
+    def __init__(self, layout: Layout, bays: Bays) -> None:
+        self._bays = bays
+        size = layout.node_columns
+        chain = find_chain(layout) if size > _DENSE else None
         self._chain = None if chain is None else _ChainSubstitution(chain)
-        self._jacobian = np.zeros((layout.node_columns,) * 2 if layout.node_columns <= _DENSE else (0, 0))
+        self._jacobian = np.zeros((size, size) if size <= _DENSE else (0, 0))
 
     def solve(self, gradient: Array, error: Array) -> Array:
         """Return displacements of the free nodes (N - N_c, 3), m, that change the lengths by `error` (M,), m.
@@ -37,58 +39,48 @@ class LengthSolver:
         Parameters
         ----------
         gradient : (M, Q, 3)
-            d length / d (positions of ``layout.member_nodes``).
+            d length / d (positions of ``Bays.member_nodes``).
 
         Raises
         ------
         SolverError
             The truss is in a singular pose.
         """
+        scatter = self._bays.scatter
         if self._chain is not None:
             step = self._chain.solve(gradient, error)
         elif len(self._jacobian):
-            step = self._dense(gradient, error)
+            try:
+                step = np.asarray(
+                    np.linalg.solve(scatter.dense(gradient, self._jacobian), error), dtype=float
+                )
+            except np.linalg.LinAlgError as reason:
+                raise SolverError(_SINGULAR) from reason
         else:
-            step = self._sparse(gradient, error)
-        if not np.all(np.isfinite(step)):
-            raise SolverError(_SINGULAR)
-        return step.reshape(-1, 3)
-
-    def _dense(self, gradient: Array, error: Array) -> Array:
-        try:
-            return np.asarray(np.linalg.solve(self._layout.length_jacobian(gradient, self._jacobian), error))
-        except np.linalg.LinAlgError as reason:
-            raise SolverError(_SINGULAR) from reason
-
-    def _sparse(self, gradient: Array, error: Array) -> Array:
-        member, flat, column = self._layout.length_scatter
-        shape = (self._layout.truss.member_count, self._layout.node_columns)
-        jacobian = sparse.csc_matrix((gradient.reshape(-1)[flat], (member, column)), shape=shape)
-        try:
-            return np.asarray(splu(jacobian).solve(error))
-        except RuntimeError as reason:
-            raise SolverError(_SINGULAR) from reason
+            step = _sparse_solution(scatter.sparse(gradient), error)
+        return _finite(step)
 
 
-class FaceSolver:
-    """Newton's step on the lengths of the fixed members and the places of the faces, where they determine the nodes."""
+class StationSolver:
+    """Newton's step on fixed lengths and places of the stations, where they determine the nodes."""
 
-    def __init__(self, layout: Layout) -> None:
-        self._layout = layout
-        truss = layout.truss
-        member, self._flat, column = layout.length_scatter
-        row = np.full(truss.member_count, -1, dtype=np.int64)
-        row[layout.fixed] = np.arange(len(layout.fixed))
-        self._kept = np.flatnonzero(row[member] >= 0)
-        nodes = truss.faces[layout.tracked]
+    def __init__(self, layout: Layout, bays: Bays) -> None:
+        stations, scatter = layout.arm.stations, bays.scatter
+        self._columns_count = layout.node_columns
+        fixed = np.flatnonzero(~bays.actuated)
+        row = np.full(bays.member_count, -1, dtype=np.int64)
+        row[fixed] = np.arange(len(fixed))
+        kept = np.flatnonzero(row[scatter.member] >= 0)
+        self._flat = scatter.flat[kept]
+        nodes = stations.nodes[layout.tracked]
         face, corner = np.nonzero(layout.node_column[nodes] >= 0)
         axis = np.arange(3)
         first = layout.node_column[nodes[face, corner]]
         self._rows = np.concatenate(
-            [row[member[self._kept]], (len(layout.fixed) + 3 * face[:, None] + axis).ravel()]
+            [row[scatter.member[kept]], (len(fixed) + 3 * face[:, None] + axis).ravel()]
         )
-        self._columns = np.concatenate([column[self._kept], (first[:, None] + axis).ravel()])
-        self._weights = np.repeat(truss.face_weights[layout.tracked[face], corner], 3)
+        self._columns = np.concatenate([scatter.column[kept], (first[:, None] + axis).ravel()])
+        self._weights = np.repeat(stations.weights[layout.tracked[face], corner], 3)
 
     def solve(self, gradient: Array, error: Array, gap: Array) -> Array:
         """Return displacements of the free nodes (N - N_c, 3), m.
@@ -96,27 +88,34 @@ class FaceSolver:
         Parameters
         ----------
         gradient : (M, Q, 3)
-            d length / d (positions of ``layout.member_nodes``).
+            d length / d (positions of ``Bays.member_nodes``).
         error : (n_l,)
             Wanted changes of the fixed members' lengths, m.
         gap : (K, 3)
-            Wanted displacements of the tracked faces' centres, m.
+            Wanted displacements of the tracked stations, m.
 
         Raises
         ------
         SolverError
             The truss is in a pose where these do not determine the nodes.
         """
-        values = np.concatenate([gradient.reshape(-1)[self._flat[self._kept]], self._weights])
-        shape = (len(error) + gap.size, self._layout.node_columns)
+        values = np.concatenate([gradient.reshape(-1)[self._flat], self._weights])
+        shape = (len(error) + gap.size, self._columns_count)
         matrix = sparse.csc_matrix((values, (self._rows, self._columns)), shape=shape)
-        try:
-            step = np.asarray(splu(matrix).solve(np.concatenate([error, gap.reshape(-1)])))
-        except RuntimeError as reason:
-            raise SolverError(_SINGULAR) from reason
-        if not np.all(np.isfinite(step)):
-            raise SolverError(_SINGULAR)
-        return step.reshape(-1, 3)
+        return _finite(_sparse_solution(matrix, np.concatenate([error, gap.reshape(-1)])))
+
+
+def _sparse_solution(matrix: sparse.csc_matrix, rhs: Array) -> Array:
+    try:
+        return np.asarray(splu(matrix).solve(rhs))
+    except RuntimeError as reason:
+        raise SolverError(_SINGULAR) from reason
+
+
+def _finite(step: Array) -> Array:
+    if not np.isfinite(step).all():
+        raise SolverError(_SINGULAR)
+    return step.reshape(-1, 3)
 
 
 class _ChainSubstitution:
@@ -125,9 +124,9 @@ class _ChainSubstitution:
     def __init__(self, chain: Chain) -> None:
         self._chain = chain
         self._sweep = Sweep(_substitution(chain), chain.periods)
-        place = np.empty(chain.layout.truss.node_count, dtype=np.int64)
+        place = np.empty(chain.bays.node_count, dtype=np.int64)
         place[chain.nodes.reshape(-1)] = np.arange(chain.nodes.size)
-        self._order = place[chain.layout.truss.free]
+        self._order = place[chain.bays.free]
 
     def solve(self, gradient: Array, error: Array) -> Array:
         chain, sweep = self._chain, self._sweep

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vgtm_qp.arm.arm import MotionRows
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -85,9 +88,9 @@ class CurveNumbers:
 class StepNumbers:
     """Numbers of one QP at one configuration; displacements d over the step are the unknowns.
 
-    With J the length Jacobian, E the selection of actuated members, W and W' the curve weights::
+    With W and W' the curve weights::
 
-        J d_rho - E d_a                    = length_rhs            m
+        the arm's rows: d_rho = K d_a + r                          m
         lower <= d_a <= upper                                      m
         tip_jacobian d_rho[tip] - tip_rate d_alpha = tip_rhs       m or rad
         progress_lower <= d_alpha <= progress_upper                1
@@ -98,8 +101,8 @@ class StepNumbers:
 
     Attributes
     ----------
-    gradient : (M, Q, 3)
-    length_rhs : (M,)
+    motion : MotionRows
+        How the free nodes move with the actuators.
     lower, upper, actuator_gradient : (n_a,)
         Box on d_a and the objective's gradient there.
     tip_jacobian : (n_e, 3 K_tip)
@@ -118,8 +121,7 @@ class StepNumbers:
         In the place of the curve's tables and the tangent rows, where ``Layout.general`` is given.
     """
 
-    gradient: Array
-    length_rhs: Array
+    motion: MotionRows
     lower: Array
     upper: Array
     actuator_gradient: Array
@@ -191,22 +193,15 @@ def slack_curvature(penalty: float) -> float:
     return _SLACK_CURVATURE * max(penalty, _LEAST_PENALTY)
 
 
-SHORT_WAY = 0.01
-"""A way of the tip, m, below which progress along it counts more, see :func:`progress_scale`."""
-
-CLOSED = 2e-8
-"""A tip error of a state that a motion need not close, m or rad: within what an accepted state may have."""
-
 UNBOUNDED = 1e30
-"""A bound that is none."""
+"""Infinity in DAQP's bounds."""
 
 
-def progress_scale(rate: Array) -> float:
-    """Return what the progress along the path is weighted by, m^2: the square of the tip's way (n_e,) in the step.
+def norm(vector: Array) -> float:
+    """Return the Euclidean norm; NaN where an entry is."""
+    return math.sqrt(vector @ vector)
 
-    A way shorter than 10 mm counts more. The other objectives pull with forces that do not shrink with the way, so
-    that by its square alone the last micrometres would never be covered. Where the path stands still progress costs
-    nothing, and any positive number serves.
-    """
-    way = float(np.sqrt(rate @ rate))
-    return way * max(way, SHORT_WAY) if way > 1e-6 else 1.0
+
+def beyond(values: Array, lower: Array, upper: Array) -> Array:
+    """Return by how much values are out of their bounds, with sign."""
+    return np.asarray(values - np.minimum(np.maximum(values, lower), upper))

@@ -14,24 +14,35 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from vgtm_qp.errors import SolverError, nearest
-from vgtm_qp.qp.condensed import AnswerError, CondensedSolver, InfeasibleStepError, NoAnswerError
+from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import chain_solver, prefers_staged
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, NoAnswerError, refuse_large, relative
 
 Array = NDArray[np.float64]
 
 DEFAULT_SOLVER = "daqp"
-PRIMAL_TOLERANCE = 1e-6
-DUAL_TOLERANCE = 1e-5
 
 
 class StepSolver(Protocol):
-    """Solves the QP of a step."""
+    """Solves the QP of a step.
+
+    Attributes
+    ----------
+    knows_gain : bool
+        Whether :meth:`gain` says how actuators bring the tip to its goal.
+    """
+
+    knows_gain: bool
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Return the solution; raise ``InfeasibleStepError`` or ``SolverError`` instead of a wrong one."""
+        ...
+
+    def gain(self, held: NDArray[np.bool_]) -> Array | None:
+        """Return the least changes (n_a, n_e) of the actuators per unit of tip error, `held` ones (n_a,) resting."""
         ...
 
 
@@ -60,23 +71,25 @@ def make_solver(name: str, layout: Layout) -> StepSolver:
         solver = chain_solver(layout) if prefers_staged(layout) else None
         return solver or CondensedSolver(layout)
     if name == "osqp":
-        return FullSolver(layout, _Osqp())
+        return FullSolver(layout, name, _Osqp())
     if name == "piqp":
-        return FullSolver(layout, _Piqp())
+        return FullSolver(layout, name, _Piqp())
     choices = available_solvers()
     if name not in choices:
         raise SolverError(
             f'no solver "{name}" is installed{nearest(name, choices)}; choices: {", ".join(choices)}'
         )
-    return FullSolver(layout, _QpSolvers(name))
+    return FullSolver(layout, name, _QpSolvers(name))
 
 
 class FullSolver:
     """Builds the full QP, lets a solver answer, and checks the residuals whatever status came with the answer."""
 
-    def __init__(self, layout: Layout, answer: _Answer) -> None:
+    knows_gain = False
+
+    def __init__(self, layout: Layout, name: str, answer: _Answer) -> None:
         self.builder = FullBuilder(layout)
-        self._answer = answer
+        self._name, self._answer = name, answer
         self._structure: object = None
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
@@ -87,25 +100,25 @@ class FullSolver:
         InfeasibleStepError
             The solver found that the hard rows contradict one another.
         AnswerError
-            The solver failed, or its answer has residuals above ``PRIMAL_TOLERANCE`` or ``DUAL_TOLERANCE``.
+            The solver failed, or its answer has residuals that are too large.
         """
         qp = self.builder.build(numbers)
         same, self._structure = self.builder.structure == self._structure, None
         if np.any(qp.row_lower > qp.row_upper) or np.any(qp.column_lower > qp.column_upper):
             raise InfeasibleStepError("a lower bound is above its upper bound")
         z, y, w, iterations = self._answer(qp, same_structure=same)
-        if not all(np.all(np.isfinite(values)) for values in (z, y, w)):
-            raise AnswerError("the answer holds values that are not finite numbers")
-        primal = qp.primal_residual(z)
-        scale = 1.0 + float(np.max(np.abs(qp.q))) + float(np.max(np.abs(y), initial=0.0))
-        dual = max(qp.dual_residual(z, y, w) / scale, qp.complementarity_residual(z, y / scale, w / scale))
-        if not (primal <= PRIMAL_TOLERANCE and dual <= DUAL_TOLERANCE):
-            raise AnswerError(
-                f"the answer has a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
-            )
-        # Only a good answer is a warm start: one that is not a number would stay in the solver for ever.
+        if not all(np.isfinite(part).all() for part in (z, y, w)):
+            refuse_large(np.nan, np.nan, self._name)
+        scale = relative(1.0, qp.q, y)
+        dual = max(scale * qp.dual_residual(z, y, w), qp.complementarity_residual(z, scale * y, scale * w))
+        refuse_large(qp.primal_residual(z), dual, self._name)
+        # Only a good answer is a warm start: NaN would stay in the solver for ever.
         self._structure = self.builder.structure
         return self.builder.solution(z, y, w, iterations)
+
+    def gain(self, held: NDArray[np.bool_]) -> Array | None:  # noqa: ARG002
+        """See :class:`StepSolver`."""
+        return None
 
 
 def _column_multipliers(qp: StepQP, z: Array, y: Array) -> Array:

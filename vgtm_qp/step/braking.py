@@ -14,17 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.fused import Closed
-from vgtm_qp.qp.lengths import LengthSolver
-from vgtm_qp.step.arm import Arm
+from vgtm_qp.step.actuation import Actuation, Box
 from vgtm_qp.step.attempt import Attempt, Outcome
-from vgtm_qp.step.linearise import Target
+from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.path import Path
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
+from vgtm_qp.step.target import Target
 
 Array = NDArray[np.float64]
-Box = tuple[Array, Array]
 
 _MOST_STEPS = 60
 _SPARE_STEPS = 4
@@ -35,8 +33,6 @@ _GENTLER = (0.5, 0.75)
 
 _MOST_RIDING = 500
 """Steps, at most, that an arm is followed on a base that moves on."""
-
-_NEWTON_STEPS = 8
 
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
@@ -74,39 +70,38 @@ class Brakes:
 
     Attributes
     ----------
-    arm : Arm
-    attempt : Attempt
+    setup : Setup
+    attempt, actuation
         Of the same arm.
+    target_of
+        From a state, `dt`, path, start, end and box to the target of a step.
     dt : float
         Duration of a step, s.
-    box
-        Least and greatest lengths of the actuators, m, after a step from a state.
-    target
-        What a step is asked for: from a state along a path, from one of its values to another, within a box.
-    lengths
-        What closes the arm's lengths; it takes its time to be made, and few arms ever need it.
     """
 
-    arm: Arm
+    setup: Setup
     attempt: Attempt
+    actuation: Actuation
+    target_of: Callable[[State, float, Path, float, float, Box], Target]
     dt: float
-    box: Callable[[State], Box]
-    target: Callable[[State, Path, float, float, Box], Target]
-    lengths: Callable[[], LengthSolver]
+
+    def target(self, state: State, path: Path, start: float, end: float, box: Box) -> Target:
+        """Return the target of a step from `state`."""
+        return self.target_of(state, self.dt, path, start, end, box)
 
     def find(self, state: State, path: Path, value: float, piece: float) -> Braking | None:
         """Return the steps that bring the arm from `state` to where it may stay, or None where they were not found.
 
         The tip is at `value` of `path`, and goes on by at most `piece` in each step where it stays on it.
         """
-        if self.arm.tip_mode == "elastic":
+        if self.setup.tip_mode == "elastic":
             found = self._let_go(state) or self._yielding(state)
             return None if found is None else Braking(state, path, [(now, value) for now in found], 0)
         ends = self._until_the_base_rests()
         along = self._along(state, path, value, piece, ends)
         if along is not None:
             return Braking(state, path, along, len(along))
-        if self.arm.base_motion is None:
+        if self.setup.base_motion is None:
             return None
         along = self._along(state, path, value, piece, -np.inf)
         if along is not None:
@@ -123,7 +118,7 @@ class Brakes:
 
     def _until_the_base_rests(self) -> float:
         """Return the time from which the base rests, s."""
-        base = self.arm.base_motion
+        base = self.setup.base_motion
         return -np.inf if base is None else base.end - _INSTANT
 
     def _along(
@@ -159,14 +154,12 @@ class Brakes:
 
     def _yielding(self, state: State) -> list[State] | None:
         """Brake an elastic tip: it is drawn along a way of its own, ever more slowly, and gives way to the limits."""
-        truss = self.arm.truss
-        self.arm.kinematics.evaluate(state.nodes)
-        here, rotation = (
-            self.arm.kinematics.tip_position(state.nodes),
-            self.arm.kinematics.tip_rotation.copy(),
-        )
-        count = max(self._count(state, self.box(state)), 1)
-        there = here + 0.5 * count * (truss.tip_weights @ state.motion[truss.tip])
+        arm, kinematics = self.setup.arm, self.setup.kinematics
+        kinematics.evaluate(state.q)
+        here, rotation = arm.end_effector.position(state.nodes), kinematics.tip_rotation.copy()
+        count = max(self._count(state, self._box(state)), 1)
+        before = arm.end_effector.position(arm.nodes(state.q - state.motion))
+        there = here + 0.5 * count * (here - before)
         way = Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation] * 2))
         taken = 0
 
@@ -180,15 +173,18 @@ class Brakes:
         return self._follow(state, step, self._until_the_base_rests())
 
     def _let_go(self, state: State) -> list[State] | None:
-        """Brake every actuator by itself, whatever becomes of the tip; none where faces must stay on the curve."""
-        if self.arm.layout.hard_tracking:
+        """Brake every actuator by itself, whatever becomes of the tip; None where stations must stay on the curve."""
+        if self.setup.layout.hard_tracking:
             return None
-        solver = self.lengths()
+        closing = Closing(self.setup.layout, self.setup.kinematics)
         return self._follow(
             state,
-            lambda now, limits: self._released(now, limits, solver),
+            lambda now, limits: self._released(now, limits, closing),
             self._until_the_base_rests(),
         )
+
+    def _box(self, state: State) -> Box:
+        return self.actuation.box(state, self.dt)
 
     def _follow(
         self, state: State, step: Callable[[State, Box], Outcome | None], until: float
@@ -197,7 +193,7 @@ class Brakes:
         found: list[State] = []
         most = _MOST_STEPS
         for count in range(_MOST_STEPS + _MOST_RIDING):
-            limits = self.box(state)
+            limits = self._box(state)
             if not self._beyond(state, limits).max() > 0.0 and state.time >= until:
                 return found
             if not count:
@@ -209,67 +205,47 @@ class Brakes:
             outcome = step(state, limits)
             if outcome is None or not outcome.accepted:
                 return None
-            state = outcome.state_after(state)
+            state = outcome.state_after(self.setup.arm, state)
             found.append(state)
         return None
 
     def _beyond(self, state: State, limits: Box) -> Array:
         """Return (n_a,) how far each actuator has to move at least, m."""
-        lengths = state.lengths[self.arm.truss.actuators]
-        return np.asarray(np.maximum(np.maximum(limits[0] - lengths, lengths - limits[1]), 0.0))
+        values = self.actuation.values(state)
+        return np.asarray(np.maximum(np.maximum(limits[0] - values, values - limits[1]), 0.0))
 
     def _count(self, state: State, limits: Box) -> int:
         """Return how many steps the fastest actuator needs by itself.
 
         Each takes as much off it as its box is wide on either side of its middle.
         """
-        lengths = state.lengths[self.arm.truss.actuators]
-        speed = np.abs(0.5 * (limits[0] + limits[1]) - lengths)
+        speed = np.abs(0.5 * (limits[0] + limits[1]) - self.actuation.values(state))
         width = np.maximum(0.5 * (limits[1] - limits[0]), 1e-12)
         return int(np.ceil(min(float((speed / width).max(initial=0.0)), float(_MOST_STEPS))))
 
-    def _released(self, state: State, limits: Box, solver: LengthSolver) -> Outcome | None:
+    def _released(self, state: State, limits: Box, closing: Closing) -> Outcome | None:
         """Return the step in which every actuator moves as little as it may; None where that is not clear."""
-        arm, separation = self.arm, self.attempt.separation
-        actuators, base = arm.truss.actuators, arm.base_motion
-        wanted = arm.home_lengths.copy()
-        wanted[actuators] = np.clip(state.lengths[actuators], *limits)
-        X, vertices, then = state.nodes, state.control_vertices, state.time + self.dt
+        arm, base, separation = self.setup.arm, self.setup.base_motion, self.attempt.separation
+        strokes = np.clip(self.actuation.values(state), *limits)
+        q, vertices, then = state.q, state.control_vertices, state.time + self.dt
         if base is not None:
-            X, vertices = (base.carried(points, state.time, then) for points in (X, vertices))
-        closed = self._closed(np.array(X), wanted, solver)
-        if closed is None:
+            before, after = base.pose(state.time), base.pose(then)
+            q = arm.based(arm.carried(q, before, after), after)
+            vertices = before.carry(vertices, after)
+        tolerance = self.attempt.tolerances.member
+        closed = closing.close(q, strokes, strokes, tolerance, too_far=np.inf)
+        if not closed.error <= tolerance:
             return None
         short = state.shortfall
         if short is None:
-            short = separation.shortfall(state.nodes, state.time)
-        if not separation.deviation(state.nodes, closed.X) < np.inf:
+            short = separation.shortfall(state.q, state.time)
+        if not separation.deviation(state.q, closed.q) < np.inf:
             return None
-        report = separation.between(state.nodes, closed.X, state.time, then, short)
-        after = separation.holds(closed.X, then, short, proven=report.certified)
-        if after is None or not report.certified:
+        report = separation.between(state.q, closed.q, state.time, then, short)
+        found = separation.holds(closed.q, then, short, proven=report.certified)
+        if found is None or not report.certified:
             return None
-        moved, _ = arm.base_at(then)
-        if self.attempt.acceptance.flaw(closed, state.nodes, moved, *limits, None, vertices, state.torsion):
+        moved = None if base is None else base.pose(then)
+        if self.attempt.acceptance.flaw(closed, state.q, moved, *limits, None, vertices, state.torsion):
             return None
-        return Outcome(True, closed, vertices, 1.0, "", shortfall=after, torsion=state.torsion, time=then)
-
-    def _closed(self, X: Array, wanted: Array, solver: LengthSolver) -> Closed | None:
-        """Return the configuration near `X` (N, 3), changed in place, with all lengths as `wanted` (M,), m."""
-        kinematics, tolerance = self.arm.kinematics, self.attempt.tolerances.member
-        for _ in range(_NEWTON_STEPS):
-            kinematics.evaluate_members(X)
-            error = wanted - kinematics.lengths
-            worst = float(np.abs(error).max())
-            if worst <= 1e-3 * tolerance or not worst < np.inf:
-                break
-            try:
-                X[self.arm.truss.free] += solver.solve(kinematics.gradient, error)
-            except SolverError:
-                return None
-        kinematics.evaluate(X)
-        worst = float(np.abs(wanted - kinematics.lengths).max())
-        if not worst <= tolerance:
-            return None
-        lengths = kinematics.lengths.copy()
-        return Closed(X, lengths, worst, kinematics.tip_position(X), kinematics.tip_rotation.copy())
+        return Outcome(True, closed, vertices, 1.0, "", shortfall=found, torsion=state.torsion, time=then)

@@ -1,6 +1,6 @@
 """The engine of long arms: from the positions of the nodes to the step and back by sweeps along the bays.
 
-Its QP is that of the plain engine with the solvers of ``qp.long``; but the numbers of the QP are written where the
+Its QP is that of the general engine with the solvers of ``qp.long``; but the numbers of the QP are written where the
 sweeps read them, and lengths are closed with what the QP has factorised.
 """
 
@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import Kinematics, frame_constants, frame_function
+from vgtm_qp.arm.arm import Kinematics
+from vgtm_qp.arm.frames import frame_constants, frame_function
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.long.closing import MOST_STEPS, TOO_FAR
@@ -21,12 +22,13 @@ from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.long.values import PeriodValues
 from vgtm_qp.qp.long.working_set import RowNumbers
-from vgtm_qp.qp.numbers import StepSolution, progress_scale
+from vgtm_qp.qp.numbers import StepSolution
 from vgtm_qp.qp.settle import held
-from vgtm_qp.step.engine import Accuracy, LengthCloser, enough_length, enough_tip_error, within
-from vgtm_qp.step.linearise import QPInput, Target
+from vgtm_qp.step.closing import Closing, enough_length, within
+from vgtm_qp.step.engine import Accuracy, Engine, enough_tip_error
 from vgtm_qp.step.path import PathPoint
-from vgtm_qp.step.task import TipTask, worth_closing
+from vgtm_qp.step.target import QPInput, Target
+from vgtm_qp.step.task import TipTask
 
 Array = NDArray[np.float64]
 
@@ -50,33 +52,32 @@ class _Frame:
         return rotation.reshape(3, 3).T, spin.reshape(-1, 3).T
 
 
-class ChainEngine:
+class ChainEngine(Engine):
     """See ``engine.Engine``; for arms of `serves`."""
 
-    def __init__(
-        self, solver: StagedSolver | TrackedSolver, kinematics: Kinematics, task: TipTask, home_lengths: Array
-    ) -> None:
-        layout = self._layout = solver.layout
-        truss = layout.truss
+    def __init__(self, solver: StagedSolver | TrackedSolver, kinematics: Kinematics, task: TipTask) -> None:
+        super().__init__(solver.layout)
+        layout, arm = self.layout, self.layout.arm
+        home_lengths, tip = arm.home_quantities, arm.end_effector
         self._solver, self._task, self._data = solver, task, solver.data
         self._values = PeriodValues(solver.chain, solver.data, home_lengths)
         self._home_lengths = home_lengths
-        frames = range(2) if layout.has_tip_frame else ()
-        self._tip_frames = [_Frame(truss.home[truss.tip], truss.tip_frame) for _ in frames]
+        frames = range(2) if tip.has_frame else ()
+        self._tip_frames = [_Frame(arm.home[tip.nodes], tip.frame) for _ in frames]
         if layout.vertices:
-            face = truss.faces[0]
-            self._base_frame = _Frame(truss.home[face], truss.face_frames[0])
+            face = arm.stations.nodes[0]
+            self._base_frame = _Frame(arm.home[face], arm.stations.frames[0])
         self._polygon = layout.weights.smoothness * layout.polygon_bending
         self._closing = solver.closing()
         chain = solver.chain
         self._kinematics = kinematics
         self._members = chain.members.reshape(-1)
         self._members_at = np.argsort(self._members)
-        self._nodes, self._base = chain.nodes.reshape(-1), np.flatnonzero(truss.base)
+        self._nodes, self._base = chain.nodes.reshape(-1), np.flatnonzero(arm.base)
         self._at = np.argsort(np.concatenate([self._nodes, self._base]))
-        self._tip = np.array([np.flatnonzero(self._nodes == node)[0] for node in truss.tip])
+        self._tip = np.array([np.flatnonzero(self._nodes == node)[0] for node in tip.nodes])
         self._aims = home_lengths.copy()
-        self._strokes = home_lengths[truss.actuators]
+        self._strokes = home_lengths[arm.actuators]
         self._answer = (self._strokes, self._strokes, self._strokes)
         self._vertices: Array = np.zeros((layout.vertices, 3))
         self._curve_weights = layout.curve_weights[chain.faces.reshape(-1)]
@@ -88,16 +89,17 @@ class ChainEngine:
         """Whether the arm with that solver is one whose bays are all alike, with a base face that does not bend."""
         if solver.chain.window is None:
             return False
-        layout, truss = solver.layout, solver.layout.truss
-        return not truss.base[truss.tip].any() and (
-            not layout.vertices or bool(truss.base[truss.faces[0]].all())
+        layout, arm = solver.layout, solver.layout.arm
+        return not arm.base[arm.end_effector.nodes].any() and (
+            not layout.vertices or bool(arm.base[arm.stations.nodes[0]].all())
         )
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See ``engine.Engine``."""
-        layout, truss, weights = self._layout, self._layout.truss, self._layout.weights
+        layout, arm, weights = self.layout, self.layout.arm, self.layout.weights
         X, Y, vertices, _, target, goal, progress, rows, motion = asked
-        moved = None if target.base is None else np.where(truss.base[:, None], target.base - X, 0.0)
+        tip, actuators = arm.end_effector, arm.actuators
+        moved = None if target.base is None else arm.based(X, target.base) - X
         if layout.vertices:
             base = X if moved is None else X + moved
             self._hold_base(base, vertices)
@@ -109,23 +111,24 @@ class ChainEngine:
         self._values.fill(X, Y, vertices, moved, motion=motion)
         rotation, spin = np.eye(3), None
         if self._task.turns is not None:
-            rotation, spin = self._tip_frames[0].at(X[truss.tip])[0], self._tip_frames[1].at(Y[truss.tip])[1]
-        error, tip_rate, across = self._task.residual(truss.tip_weights @ X[truss.tip], rotation, goal)
-        length = self._values.lengths[truss.actuators]
-        rate = tip_rate * (target.end - target.start)
-        curvature = weights.progress * progress_scale(rate)
+            rotation, spin = self._tip_frames[0].at(X[tip.nodes])[0], self._tip_frames[1].at(Y[tip.nodes])[1]
+        span = target.end - target.start
+        ahead = PathPoint(goal.position, goal.rotation, goal.velocity * span, goal.spin * span)
+        error, rate, across, weight = self._task.residual(tip.position(X), rotation, ahead, motion=motion)
+        length = self._values.lengths[actuators]
+        curvature = weights.progress * weight
         numbers = RowNumbers(
             lower=target.lower - length,
             upper=target.upper - length,
             tip_jacobian=self._task.jacobian(across, spin),
             tip_rate=rate,
-            tip_rhs=worth_closing(error) if motion else error,
+            tip_rhs=error,
             progress_lower=-progress,
             progress_upper=1.0 - progress,
             progress_gradient=curvature * (progress - 2.0),
             progress_curvature=curvature,
             clearance=rows,
-            actuator_gradient=weights.stroke_centring * (length - self._home_lengths[truss.actuators])
+            actuator_gradient=weights.stroke_centring * (length - self._home_lengths[actuators])
             if motion
             else np.zeros_like(length),
             member_rows=self._values.member_rows,
@@ -138,9 +141,10 @@ class ChainEngine:
 
     def _hold_base(self, base: Array, vertices: Array) -> None:
         """Let the curve begin at the base face of node positions `base` (N, 3), at a right angle."""
-        truss = self._layout.truss
-        axes = self._base_frame.at(base[truss.faces[0]])[0][:, :2].T
-        centre = truss.face_weights[0] @ base[truss.faces[0]]
+        stations = self.layout.arm.stations
+        first = base[stations.nodes[0]]
+        axes = self._base_frame.at(first)[0][:, :2].T
+        centre = stations.weights[0] @ first
         self._data.hold_base(centre - vertices[0], axes, -axes @ (vertices[1] - vertices[0]))
 
     def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
@@ -154,13 +158,13 @@ class ChainEngine:
             return self._by_strokes(X, *bounds, tip_error, self._solver, accuracy)
         closed = self._on_curve(X, *bounds, accuracy.member)
         if not closed.error <= accuracy.member:
-            closed = self._lengths.close(X, *bounds, accuracy.member)
+            closed = self._any_closing.close(X, *bounds, accuracy.member)
         is_there = float(np.abs(tip_error(closed.tip_position, closed.tip_rotation)).max()) <= accuracy.tip
         return closed if is_there and closed.error <= accuracy.member else None
 
     @cached_property
-    def _lengths(self) -> LengthCloser:
-        return LengthCloser(self._layout, self._kinematics, self._home_lengths)
+    def _any_closing(self) -> Closing:
+        return Closing(self.layout, self._kinematics)
 
     def _by_strokes(
         self,
@@ -207,7 +211,7 @@ class ChainEngine:
 
     def _aim(self, aims: Array, strokes: Array) -> None:
         """Let actuated members aim at `strokes` (n_a,), m, and the others at their home lengths."""
-        self._aims[self._layout.truss.actuators] = strokes
+        self._aims[self.layout.arm.actuators] = strokes
         np.take(self._aims, self._members, out=aims.reshape(-1), mode="clip")
 
     def _on_curve(self, X: Array, lower: Array, upper: Array, tolerance: float) -> Closed:
@@ -217,7 +221,7 @@ class ChainEngine:
         np.matmul(self._curve_weights, self._vertices, out=closing.aims[1].reshape(-1, 3))
         own, worst = closing.run(X.take(self._nodes, axis=0), enough)
         closed = self._closed(X, own, worst)
-        actuated = closed.lengths[self._layout.truss.actuators]
+        actuated = closed.quantities[self.layout.arm.actuators]
         return closed if within(actuated, lower, upper, enough) else replace(closed, error=np.inf)
 
     def _closed(self, X: Array, own: Array, worst: float) -> Closed:
@@ -230,4 +234,4 @@ class ChainEngine:
         """Return position (3,) of the tip where the free nodes are at `own`, and its rotation where it `turned`."""
         corners = own[self._tip]
         rotation = self._tip_frames[0].at(corners)[0].copy() if turned and self._tip_frames else np.eye(3)
-        return self._layout.truss.tip_weights @ corners, rotation
+        return self.layout.arm.end_effector.weights @ corners, rotation

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arm.arm import Arm
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
 from vgtm_qp.errors import Mistake, ProblemError
@@ -40,28 +40,28 @@ class HomeCurve:
     vertex_goals: Array | None
 
 
-def home_curve(problem: Problem, truss: Truss, task: TipTask) -> HomeCurve:
-    """Return the QP's layout and the curve at home; both without a curve where no face tracks one.
+def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
+    """Return the QP's layout and the curve at home; both without a curve where no station tracks one.
 
     Raises
     ------
     ProblemError
-        Faces are to keep on the curve exactly what their bays cannot.
+        Stations are to keep on the curve exactly what the arm cannot.
     """
-    method = problem.method
-    if method.tracking == "none" or not len(truss.faces) or problem.curve is None:
+    method, stations = problem.method, arm.stations
+    if method.tracking == "none" or not len(stations) or problem.curve is None:
         empty = np.zeros((0, 0))
-        layout = Layout(truss, empty, empty, np.zeros(0, dtype=np.int64), task.row_names, method.weights)
+        layout = Layout(arm, empty, empty, np.zeros(0, dtype=np.int64), task.row_names, method.weights)
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
-    mistakes = _beyond_the_bays(problem, truss, task)
+    mistakes = _beyond_the_arm(problem, arm, task)
     if mistakes:
         raise ProblemError(str(problem.source or problem.name), mistakes)
     spec = problem.curve
     options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
     family = make_family(spec.family, spec.control_vertices, **options)
-    stride = truss.face_stride if method.hard_tracking else 1
-    tracked = np.arange(len(truss.faces) - 1, stride - 1, -stride)[::-1]
-    centres = np.einsum("fk,fkc->fc", truss.face_weights, truss.home[truss.faces])
+    stride = stations.stride if method.hard_tracking else 1
+    tracked = np.arange(len(stations) - 1, stride - 1, -stride)[::-1]
+    centres = stations.centres(arm.home)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
     fractions = travelled[tracked] / travelled[-1]
     s, vertices = _fitted(family, fractions, centres[0], centres[tracked])
@@ -69,8 +69,8 @@ def home_curve(problem: Problem, truss: Truss, task: TipTask) -> HomeCurve:
     tracks_roll = bool(torsion.size) or (method.hard_tracking and "orientation" in method.hard_coordinates)
     roll = None
     if tracks_roll:
-        frames = Curve(family, vertices, torsion, truss.face_frames[0]).frame(s)
-        turn = np.swapaxes(frames, 1, 2) @ truss.face_frames[tracked]
+        frames = Curve(family, vertices, torsion, stations.frames[0]).frame(s)
+        turn = np.swapaxes(frames, 1, 2) @ stations.frames[tracked]
         roll = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
     by_arc_length = spec.nodes == "arc-length"
     shape = CurveShape(
@@ -88,7 +88,7 @@ def home_curve(problem: Problem, truss: Truss, task: TipTask) -> HomeCurve:
         for goal in spec.control_vertex_goals:
             goals[goal.index] = goal.position
     layout = Layout(
-        truss,
+        arm,
         family.weights(s),
         family.weights(s, 1),
         tracked,
@@ -154,20 +154,21 @@ def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) 
     return fractions, np.vstack([start, np.linalg.lstsq(system, known, rcond=None)[0]])
 
 
-def _beyond_the_bays(problem: Problem, truss: Truss, task: TipTask) -> list[Mistake]:
-    """Return what faces are to keep on the curve although the bays have not the motions for it."""
+def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> list[Mistake]:
+    """Return what stations are to keep on the curve although the arm has not the motions for it."""
     method, curve = problem.method, problem.curve
     if not method.hard_tracking or curve is None:
         return []
     wanted = list(method.hard_coordinates)
     if len(wanted) == 2 and curve.torsion_vertices:
         wanted.append("orientation")
-    which = "every face" if truss.face_stride == 1 else "every second face"
-    can = ", ".join(truss.trackable) or "nothing"
+    stations = arm.stations
+    which = f"every {stations.word}" if stations.stride == 1 else f"every second {stations.word}"
+    can = ", ".join(stations.trackable) or "nothing"
     found = []
-    if not set(wanted) <= set(truss.trackable):
-        missing = ", ".join(name for name in wanted if name not in truss.trackable)
-        text = f"what {which} of this {truss.module} truss can keep, {can}; it cannot keep {missing}"
+    if not set(wanted) <= set(stations.trackable):
+        missing = ", ".join(name for name in wanted if name not in stations.trackable)
+        text = f"what {which} of this {arm.kind} arm can keep, {can}; it cannot keep {missing}"
         found.append(problem.mistake(("method", "hard_coordinates"), text))
     if "orientation" in wanted and task.turns == "orientation" and not curve.torsion_vertices:
         text = "1 or more: the tip is asked for roll, and faces keep the roll of the curve, which has none of its own"

@@ -7,55 +7,12 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vgtm_qp.errors import GoalError
+from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 
 Array = NDArray[np.float64]
-
-
-def rotation_from_vector(vector: ArrayLike) -> Array:
-    """Return the (3, 3) rotation by |vector| about `vector` (3,), rad (Rodrigues)."""
-    v = np.asarray(vector, dtype=float)
-    angle = float(np.linalg.norm(v))
-    if angle < 1e-12:
-        return np.eye(3) + _cross_matrix(v)
-    axis = _cross_matrix(v / angle)
-    return np.asarray(np.eye(3) + np.sin(angle) * axis + (1.0 - np.cos(angle)) * axis @ axis)
-
-
-def vector_from_rotation(rotation: Array) -> Array:
-    """Return the rotation vector (3,), rad, of a (3, 3) rotation; right up to and at half a turn."""
-    twist = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    sine, cosine = float(np.linalg.norm(twist)) / 2, (float(np.trace(rotation)) - 1) / 2
-    angle = float(np.arctan2(sine, cosine))
-    if sine > 1e-7:
-        return np.asarray(twist * (angle / (2 * sine)))
-    if cosine > 0:
-        return np.asarray(twist / 2)
-    outer = (rotation + np.eye(3)) / 2
-    axis = outer[:, int(np.argmax(np.diag(outer)))]
-    return np.asarray(angle * axis / np.linalg.norm(axis))
-
-
-def turn_between(start: Array, end: Array) -> Array:
-    """Return the rotation vector (3,), rad, that takes unit vector `start` to unit vector `end` the short way."""
-    axis = np.cross(start, end)
-    sine = float(np.linalg.norm(axis))
-    angle = float(np.arctan2(sine, float(start @ end)))
-    if sine > 1e-12:
-        return np.asarray(axis * (angle / sine))
-    if angle < 1.0:
-        return np.asarray(axis)
-    across = np.eye(3)[int(np.argmin(np.abs(start)))]
-    axis = np.cross(start, across)
-    return np.asarray(angle * axis / np.linalg.norm(axis))
-
-
-def _cross_matrix(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 @dataclass(frozen=True, eq=False)

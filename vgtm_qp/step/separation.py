@@ -1,4 +1,4 @@
-"""What a step keeps apart: members and obstacles, members and members, and the angles between members that meet.
+"""What a step keeps apart: bodies and obstacles, bodies and bodies, and the angles between bodies that meet.
 
 A pair that is already nearer than it may be does not stop the arm: it may not come nearer, and is driven apart.
 """
@@ -12,15 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.joints import member_ends
-from vgtm_qp.arm.truss.kinematics import EndKinematics
-from vgtm_qp.arm.truss.truss import Truss
-from vgtm_qp.geometry.clearance import BetweenReport, Clearance, NearPairs, Pair
-from vgtm_qp.geometry.pairs import certified
-from vgtm_qp.geometry.watch import Contacts, Watch
+from vgtm_qp.arm.arm import Arm
+from vgtm_qp.geometry.clearance import BetweenReport, Clearance, Contacts, Pair
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.joint_ways import chord_deviation
-from vgtm_qp.step.linearise import clearance_rows
+from vgtm_qp.rows.angles import angle_gradients, angles, corners
+from vgtm_qp.rows.clearance import clearance_rows, slowed
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -29,28 +25,32 @@ Shortfall = Mapping[Pair, float]
 """Pairs that are nearer than they may be, with their distances, m."""
 
 _BINDING = 0.002
-"""Pairs that are nearer than this to their floor, m, are asked of FCL too."""
+"""FCL is asked about pairs that are nearer than this to their floor, m, too."""
 
 _LEAST_APPROACH = 2e-3
 """A pair that slows down may come nearer by so much in one step all the same, m."""
 
 _MOST_PIECES = 16
+"""A motion whose points leave their chords is cut in so many pieces at most."""
 
 _NEAR_ANGLE = 0.3
-"""Members that meet at an angle larger than the least one by this, rad, are far from it."""
+"""Bodies that meet at an angle larger than the least one by this, rad, have no row."""
 
 _BETWEEN = 5e-5
-"""Members with offset joints may come nearer by this between states, m: half of the published tolerance."""
+"""Bodies whose points leave their chords may come nearer by this between states, m.
+
+That is half of the published tolerance.
+"""
 
 
 @dataclass(frozen=True)
 class Distances:
-    """What is kept: surface to surface from obstacles and between members, m, and angles between members, rad.
+    """What is kept: surface to surface from obstacles and between bodies, m, and angles between bodies, rad.
 
     The QP keeps `margin` more, m, for what is not linear in its step; pairs further than `influence`, m, are not
     in it. A pair that is too near at the start of a step is driven apart by up to `recovery`, m, in one step. A pair
-    may use up the part `approach` of its room in one step: where that is 1, members come at full speed and stop dead,
-    which is a jump in the rates of all actuators.
+    may use the share `approach` of its remaining clearance in one step: where that is 1, bodies come at full speed
+    and stop dead, which is a jump in the rates of all actuators.
     """
 
     safe: float
@@ -64,42 +64,49 @@ class Distances:
 
 
 class Separation:
-    """Rows, checks and proofs of clearance for the steps of one arm."""
+    """Rows, checks and proofs of clearance for the steps of one arm.
 
-    def __init__(self, truss: Truss, monitor: Clearance, distances: Distances) -> None:
+    Parameters
+    ----------
+    arm
+        Whose configurations are meant.
+    monitor
+        Of the arm's bodies and the obstacles.
+    distances
+        What is kept.
+    """
+
+    def __init__(self, arm: Arm, monitor: Clearance, distances: Distances) -> None:
+        self._arm = arm
         self.monitor = monitor
         self.distances = distances
-        self.truss = truss
-        self._ends = None if truss.joints is None else EndKinematics(truss)
-        self._watch = Watch(monitor) if Watch.serves(monitor) else None
-        self._corners = (
-            _corners(truss) if distances.minimum_angle > 0.0 else np.zeros((0, 2, 2), dtype=np.int64)
-        )
+        meeting = monitor.bodies.joints if distances.minimum_angle > 0.0 else np.zeros((0, 2), dtype=np.int64)
+        self._corners = corners(meeting)
 
-    def shortfall(self, X: Array, time: float) -> Shortfall:
-        """Return the pairs that are too near at node positions `X` (N, 3); empty as a rule."""
-        kept = self.distances
+    def shortfall(self, q: Array, time: float) -> Shortfall:
+        """Return the pairs that are too near at a configuration; empty as a rule."""
+        kept, points = self.distances, self._arm.points(q)
         floors = kept.safe - kept.rounding, kept.self_safe - kept.rounding
-        if self.monitor.keeps(X, time, *floors):
+        if self.monitor.keeps(points, time, *floors):
             return {}
-        pairs = self.monitor.near(X, time, floors[0], use_fcl=False, self_reach=floors[1])
+        contacts = self.monitor.near(points, time, floors[0], self_reach=floors[1], fcl_reach=0.0)
         found: dict[Pair, float] = {}
-        for k in range(len(pairs)):
-            pair = pairs.pair(k)
-            found[pair] = min(found.get(pair, np.inf), float(pairs.distance[k]))
+        for k in range(len(contacts)):
+            pair = contacts.pair(k)
+            found[pair] = min(found.get(pair, np.inf), float(contacts.distance[k]))
         return found
 
-    def holds(self, X: Array, time: float, before: Shortfall, *, proven: bool = False) -> Shortfall | None:
-        """Return what is too near at `X`, or None where a pair is that was not `before`, or comes nearer.
+    def holds(self, q: Array, time: float, before: Shortfall, *, proven: bool = False) -> Shortfall | None:
+        """Return what is too near at `q`, or None where a pair is that was not `before`, or comes nearer.
 
-        `proven` is whether :meth:`between` was certified for the way there, which then holds for its end too; but not
-        for offset joints, whose members may come a little nearer on the way than at its end.
+        `proven` is whether :meth:`between` was certified for the motion that ends at `q`. Its proof holds at `q` too,
+        but not where points leave their chords: bodies may then come a little nearer on the way than at its end.
         """
-        if not self._angles_hold(X):
+        if not self._angles_hold(q):
             return None
-        if proven and not before and self.truss.joints is None:
+        if proven and not before and not self._arm.leaves_chords:
             return {}
-        after = self.shortfall(X, time)
+        after = self.shortfall(q, time)
         if all(
             distance >= before.get(pair, np.inf) - self.distances.rounding for pair, distance in after.items()
         ):
@@ -115,20 +122,19 @@ class Separation:
             min([least, *(distance for pair, distance in before.items() if pair.is_self == is_self)])
             for least, is_self in ((kept.safe, False), (kept.self_safe, True))
         )
-        if self.truss.joints is None:
+        points = self._arm.points
+        if not self._arm.leaves_chords:
             floors = floor - kept.rounding, max(self_floor - kept.rounding, 0.0)
-            if self._watch is not None and self._watch.follow(start, end, *floors):
-                return certified(min(floors), self.monitor.names)
-            return self.monitor.between(start, end, start_time, end_time, *floors)
-        # Cut in k pieces the ends leave their chords by a k-th of a k-th.
+            return self.monitor.between(points(start), points(end), start_time, end_time, *floors)
         deviation = self.deviation(start, end)
+        # Cut in k pieces, the points leave their chords by 1 / k^2 of that.
         pieces = (
             min(math.ceil(math.sqrt(max(deviation / _BETWEEN, 1.0))), _MOST_PIECES) if deviation < 1.0 else 1
         )
         spare = deviation / pieces**2 - _BETWEEN
         floors, lowest = (floor + spare, max(self_floor + spare, 0.0)), np.inf
         for k in range(pieces):
-            here, there = (start + share * (end - start) for share in (k / pieces, (k + 1) / pieces))
+            here, there = (points(start + share * (end - start)) for share in (k / pieces, (k + 1) / pieces))
             lapse = (end_time - start_time) / pieces
             since = start_time + k * lapse
             report = self.monitor.between(here, there, since, since + lapse, *floors)
@@ -138,23 +144,23 @@ class Separation:
         return replace(report, clearance=lowest, fraction=(k + report.fraction) / pieces)
 
     def deviation(self, start: Array, end: Array) -> float:
-        """Return how far members' ends leave their chords at most, m: offset joints turn on the way."""
-        return 2.0 * chord_deviation(self.truss, start, end)
+        """Return how far two points come nearer to each other than their chords do at most, m."""
+        return self._arm.deviation(start, end) if self._arm.leaves_chords else 0.0
 
     def rows(
-        self, X: Array, time: float, duration: float, reach: float, short: Shortfall, gain: float
+        self, q: Array, time: float, duration: float, reach: float, short: Shortfall, gain: float
     ) -> ClearanceRows:
-        """Return the rows at `X`.
+        """Return the rows at a configuration.
 
         Parameters
         ----------
         duration
-            How long the obstacles move on until the end of the step, s; zero at the end. Where it is not, a zero
-            step is allowed as far as the obstacles rest, but for the margin that the step before may have used up
+            How long the obstacles move on until the end of the step, s; zero at the end. Where it is not zero, a zero
+            step is allowed as far as the obstacles rest, except for the margin that the step before may have used
             and for what is to be recovered; and pairs slow down before they touch.
         reach
             How far a node moves at most, m: a pair further from its floor than that cannot become active. One that
-            was missed because a member moved further is found by the check of the new state, and corrected.
+            was missed because a body moved further is found by the check of the new state, and corrected.
         short, gain
             Pairs that were too near at the start of the step, and how far they are driven apart in it, m.
         """
@@ -162,72 +168,66 @@ class Separation:
         reach += self.monitor.pieces.fastest * duration
         limits = min(kept.influence, kept.safe + reach), min(kept.influence, kept.self_safe + 2.0 * reach)
         fcl_reach = kept.safe + _BINDING if motion else 0.0
-        watched = None if self._watch is None or short else self._watch.near(X, *limits, fcl_reach)
-        if watched is not None:
-            return self._with_angles(self._watched_rows(watched, motion=motion), X, motion=motion)
-        pairs = self.monitor.near(
-            X, time, limits[0], use_fcl=motion, fcl_reach=fcl_reach, self_reach=limits[1]
+        contacts = self.monitor.near(
+            self._arm.points(q), time, limits[0], self_reach=limits[1], fcl_reach=fcl_reach
         )
-        rows = self._clearance_rows(X, pairs)
+        rows = self._clearance_rows(q, contacts)
+        if len(contacts):
+            self._allow(rows, contacts, duration, short, gain)
+        return rows.joined(self._angle_rows(q, motion=motion)) if len(self._corners) else rows
+
+    def _allow(
+        self, rows: ClearanceRows, contacts: Contacts, duration: float, short: Shortfall, gain: float
+    ) -> None:
+        """Let pairs come nearer no faster than they may: overwrites ``rows.lower``; arguments as of :meth:`rows`."""
+        kept, motion = self.distances, duration > 0.0
         if motion:
             np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
-        for k in (
-            np.flatnonzero(pairs.distance < np.where(pairs.is_self, kept.self_safe, kept.safe))
-            if short
-            else ()
-        ):
-            least = kept.self_safe if pairs.is_self[k] else kept.safe
-            before = short.get(pairs.pair(int(k)))
-            if before is not None:
-                rows.lower[k] = min(before + gain, least) - pairs.distance[k]
+        if short:
+            self._recover(rows, contacts, short, gain)
         if motion and self.monitor.pieces.moving:
-            rows.lower += pairs.normal_speed * duration
-        return self._with_angles(rows, X, motion=motion)
-
-    def _with_angles(self, rows: ClearanceRows, X: Array, *, motion: bool) -> ClearanceRows:
-        """Return the rows of near pairs, slowing down where they are to move, and those of angles at `X`."""
+            rows.lower += contacts.normal_speed * duration
         if motion:
-            # Of the room that is left when the obstacles have moved: the arm need not flee from what only comes nearer.
-            slow = np.minimum(self.distances.approach * rows.lower, -_LEAST_APPROACH)
-            np.maximum(rows.lower, slow, out=rows.lower)
-        return rows.joined(self._angle_rows(X, motion=motion)) if len(self._corners) else rows
+            # Slow down by the clearance left when the obstacles have moved: those that only come nearer need no haste.
+            rows.lower = slowed(rows.lower, kept.approach, _LEAST_APPROACH)
 
-    def _watched_rows(self, contacts: Contacts, *, motion: bool) -> ClearanceRows:
-        """Return the rows n . d(witness) >= floor - distance of contacts in a scene at rest."""
-        kept = self.distances
-        if not len(contacts.distance):
-            return ClearanceRows(name=contacts.name)
-        coefficients = contacts.weights[:, :, None] * contacts.normal[:, None, :]
-        lower = kept.safe + kept.margin - contacts.distance
-        lower += (kept.self_safe - kept.safe) * contacts.is_self
-        if motion:
-            np.minimum(lower, 2.0 * kept.margin, out=lower)
-        return ClearanceRows(contacts.nodes, coefficients, lower, contacts.name)
+    def _recover(self, rows: ClearanceRows, contacts: Contacts, short: Shortfall, gain: float) -> None:
+        """Drive pairs that were too near apart by `gain`, m, as far as they are short: overwrites ``rows.lower``."""
+        floor = np.where(contacts.is_self, self.distances.self_safe, self.distances.safe)
+        for k in np.flatnonzero(contacts.distance < floor).tolist():
+            before = short.get(contacts.pair(k))
+            if before is not None:
+                rows.lower[k] = min(before + gain, floor[k]) - contacts.distance[k]
 
     def rows_between(
-        self, start: Array, X: Array, start_time: float, time: float, stations: list[float]
+        self, start: Array, q: Array, start_time: float, time: float, fractions: list[float]
     ) -> list[ClearanceRows]:
-        """Return the rows at the `stations`, 0 to 1, on the way from `start` to `X`: the end state moves them too."""
-        kept = self.distances
+        """Return the rows at `fractions`, 0 to 1, of the way from `start` to `q`: the end state moves them too."""
         found = []
-        for s in stations:
-            at = start + s * (X - start)
-            pairs = self.monitor.near(at, start_time + s * (time - start_time), 1.5 * kept.safe)
-            found.append(self._clearance_rows(at, pairs, s))
+        for s in fractions:
+            at = start + s * (q - start)
+            now = start_time + s * (time - start_time)
+            contacts = self.monitor.near(self._arm.points(at), now, 1.5 * self.distances.safe)
+            found.append(self._clearance_rows(at, contacts, s))
         return found
 
-    def _clearance_rows(self, X: Array, pairs: NearPairs, fraction: float = 1.0) -> ClearanceRows:
-        """Return the rows of pairs found at `X`; those of members in offset joints go over the joints' triangles."""
+    def _clearance_rows(self, q: Array, contacts: Contacts, fraction: float = 1.0) -> ClearanceRows:
+        """Return the rows of contacts found at a configuration, a `fraction` of the way to the end."""
         kept = self.distances
-        floors = kept.safe + kept.margin, kept.self_safe + kept.margin
-        rows = clearance_rows(self.monitor, pairs, *floors, fraction)
-        if self._ends is None or not len(rows):
-            return rows
-        self._ends.evaluate(X)
-        both = np.stack([pairs.member, np.where(pairs.is_self, pairs.other, pairs.member)], axis=1)
-        jacobian = self._ends.jacobian[both].reshape(len(rows), 4, 3, 9)
-        coefficients = np.einsum("rsc,rscn->rsn", rows.coefficients, jacobian).reshape(len(rows), 12, 3)
-        return replace(rows, nodes=self._ends.nodes[both].reshape(len(rows), 12), coefficients=coefficients)
+        if not len(contacts):
+            return ClearanceRows(name=contacts.name)
+        coefficients, lower = clearance_rows(
+            contacts.distance,
+            contacts.normal,
+            contacts.weights,
+            contacts.is_self,
+            kept.safe,
+            kept.self_safe,
+            margin=kept.margin,
+            fraction=fraction,
+        )
+        nodes, coefficients = self._arm.over_nodes(q, contacts.points, coefficients)
+        return ClearanceRows(nodes, coefficients, lower, contacts.name)
 
     def names(self, short: Shortfall) -> tuple[str, ...]:
         """Return what is too near, nearest first."""
@@ -235,51 +235,37 @@ class Separation:
             self.monitor.names.clearance(pair) for pair, _ in sorted(short.items(), key=lambda item: item[1])
         )
 
-    def _angles(self, X: Array) -> tuple[Array, Array, Array]:
-        """Return angles (K,), rad, and the two members' vectors (K, 3) away from the node they share, m."""
-        ends = member_ends(self.truss, X)
-        along = ends[:, 1] - ends[:, 0]
-        first, second = (
-            np.where(self._corners[:, e, 1, None] == 0, 1.0, -1.0) * along[self._corners[:, e, 0]]
-            for e in range(2)
-        )
-        sine = np.linalg.norm(np.cross(first, second), axis=1)
-        return np.arctan2(sine, np.einsum("kc,kc->k", first, second)), first, second
+    def _vectors(self, q: Array) -> tuple[Array, Array]:
+        """Return the vectors (K, 3), m, of both bodies of each corner away from the joint where they meet."""
+        points, (body, end) = self.monitor.bodies.points, np.moveaxis(self._corners, 2, 0)
+        vectors = self._arm.points(q)
+        vectors = vectors[points[body, 1 - end]] - vectors[points[body, end]]
+        return vectors[:, 0], vectors[:, 1]
 
-    def _angles_hold(self, X: Array) -> bool:
+    def _angles_hold(self, q: Array) -> bool:
         if not len(self._corners):
             return True
-        return bool(np.all(self._angles(X)[0] >= self.distances.minimum_angle - self.distances.rounding))
+        least = self.distances.minimum_angle - self.distances.rounding
+        return bool(np.all(angles(*self._vectors(q)) >= least))
 
-    def _angle_rows(self, X: Array, *, motion: bool) -> ClearanceRows:
-        angles, first, second = self._angles(X)
-        chosen = np.flatnonzero(angles < self.distances.minimum_angle + _NEAR_ANGLE)
-        angle, u, v = angles[chosen], first[chosen], second[chosen]
-        lengths = [np.linalg.norm(w, axis=1, keepdims=True) for w in (u, v)]
-        u, v = u / lengths[0], v / lengths[1]
-        sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
-        turn_u = -(v - cosine * u) / (lengths[0] * np.maximum(sine, 1e-6))
-        turn_v = -(u - cosine * v) / (lengths[1] * np.maximum(sine, 1e-6))
-        corners, members = self._corners[chosen], self.truss.members
-        node = members[corners[:, 0, 0], corners[:, 0, 1]]
-        others = [members[corners[:, e, 0], 1 - corners[:, e, 1]] for e in range(2)]
-        nodes = np.stack([node, *others, others[1]], axis=1)
-        coefficients = np.stack([-turn_u - turn_v, turn_u, turn_v, np.zeros_like(turn_u)], axis=1)
-        lower = self.distances.minimum_angle + self.distances.margin - angle
-        names = self.truss.member_names
+    def _angle_rows(self, q: Array, *, motion: bool) -> ClearanceRows:
+        """Return the rows of the angles that are near the least one at a configuration.
+
+        Where points are not the nodes, the nodes of the joints stand for them: the rows are then approximate.
+        """
+        kept, bodies = self.distances, self.monitor.bodies
+        first, second = self._vectors(q)
+        angle = angles(first, second)
+        chosen = np.flatnonzero(angle < kept.minimum_angle + _NEAR_ANGLE)
+        angle = angle[chosen]
+        gradients = angle_gradients(angle, first[chosen], second[chosen])
+        body, end = np.moveaxis(self._corners[chosen], 2, 0)
+        far = bodies.joints[body, 1 - end]
+        nodes = np.concatenate([bodies.joints[body[:, :1], end[:, :1]], far, far[:, 1:]], axis=1)
+        lower = kept.minimum_angle + kept.margin - angle
         return ClearanceRows(
             nodes,
-            coefficients,
-            np.minimum(lower, 2.0 * self.distances.margin) if motion else lower,
-            lambda k: f"angle: {names[corners[k, 0, 0]]} / {names[corners[k, 1, 0]]}",
+            np.pad(gradients, ((0, 0), (0, 1), (0, 0))),
+            np.minimum(lower, 2.0 * kept.margin) if motion else lower,
+            lambda k: f"angle: {bodies.names[body[k, 0]]} / {bodies.names[body[k, 1]]}",
         )
-
-
-def _corners(truss: Truss) -> Index:
-    """Return (K, 2, 2): the two members that meet at a node, and which of their ends does."""
-    at: dict[int, list[tuple[int, int]]] = {}
-    for member, nodes in enumerate(truss.members.tolist()):
-        for end, node in enumerate(nodes):
-            at.setdefault(node, []).append((member, end))
-    found = [(a, b) for meeting in at.values() for k, a in enumerate(meeting) for b in meeting[k + 1 :]]
-    return np.array(found, dtype=np.int64).reshape(-1, 2, 2)

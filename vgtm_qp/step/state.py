@@ -34,18 +34,20 @@ class State:
     ----------
     time : float
         s.
+    q : configuration
+        Of the arm, see ``arm.Arm``; of a truss the positions of its nodes.
     nodes : (N, 3)
-        Node positions, m.
+        Where the nodes are, m.
     control_vertices : (V, 3)
         Reference curve, m; V = 0 without a curve.
     torsion : (T,)
         Torsion coordinates of the curve's frame, rad.
-    lengths : (M,)
-        Member lengths, m.
-    length_rates : (M,)
-        Rate of each length over the step that led here, m/s.
-    motion : (N, 3)
-        Displacement of the nodes over that step, m: the guess for the next one, at whose middle it is linearised.
+    quantities : (M,)
+        Fixed and actuated quantities: member lengths, m, or joint values.
+    rates : (M,)
+        Rate of each over the step that led here, per second.
+    motion : configuration
+        Displacement over that step: the guess for the next one, at whose middle it is linearised.
     duration : float
         Duration of that step, s; 0 at home, where the arm rests.
     shortfall : mapping or None
@@ -53,10 +55,11 @@ class State:
     """
 
     time: float
+    q: Array
     nodes: Array
     control_vertices: Array
-    lengths: Array
-    length_rates: Array
+    quantities: Array
+    rates: Array
     motion: Array
     duration: float = 0.0
     torsion: Array = field(default_factory=lambda: frozen(np.zeros(0)))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
 
+from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.qp.residual import FailedStepError
 from vgtm_qp.step.state import State
 
 
@@ -52,12 +54,13 @@ class Step:
     state: State
     reason: str
     qps: int
-    _limit_name: Callable[[int, bool], str]
-    _solution: StepSolution | None = None
-    _rows: ClearanceRows | None = None
     solver_failed: bool = False
     braked: bool = False
     left_path: bool = False
+    _limit_name: Callable[[int, bool], str] = field(default=lambda k, upper: "")  # noqa: ARG005
+    _solution: StepSolution | None = None
+    _rows: ClearanceRows | None = None
+    _failure: FailedStepError | None = None
 
     def __str__(self) -> str:
         """Return one line: how it ended, how far and when, and what held the arm back where something did."""
@@ -83,6 +86,11 @@ class Step:
         for k in np.flatnonzero(strokes > 1e-9):
             found[self._limit_name(int(k), bool(pull[k] > 0.0))] = float(strokes[k])
         return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    @property
+    def failed_qp(self) -> StepQP | None:
+        """The last QP, where the step was blocked because it had no answer: every row and column with a name."""
+        return None if self._failure is None else self._failure.qp
 
     @property
     def active(self) -> tuple[str, ...]:

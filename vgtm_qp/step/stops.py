@@ -18,15 +18,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.optimize import linprog
-from scipy.sparse.linalg import splu
 
+from vgtm_qp.arm.arm import Arm
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.arm import Arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.separation import Separation
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 
 Array = NDArray[np.float64]
@@ -72,8 +71,8 @@ class Stop:
     ----------
     kind : StopKind
         ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
-        where the tip cannot start in that direction whatever the limits, or the lengths of the members do not
-        determine the nodes; ``out of reach`` where the arm is stretched
+        where the tip cannot start in that direction whatever the limits, or the fixed quantities do not determine the
+        nodes; ``out of reach`` where the arm is stretched
         towards a goal further away; ``nonlinear`` where no row forbids the step to first order, and ``acceleration``
         if it is one after which the arm could not brake; ``solver`` where none does and the QP solver gave no good
         answer.
@@ -131,7 +130,7 @@ class Limits:
 
 
 def explain(
-    arm: Arm,
+    setup: Setup,
     separation: Separation,
     state: State,
     path: Path,
@@ -147,7 +146,7 @@ def explain(
     Where no rows forbid it to first order, what was `pressing` on the last step is told, and the `reason` it gave.
     """
     try:
-        program = _Program(arm, separation, state, path, start, end, limits)
+        program = _Program(setup, separation, state, path, start, end, limits)
     except SolverError:
         return Stop(StopKind.SINGULAR, reason=reason)
     share, costs = program.solve(np.ones(program.count, dtype=bool))
@@ -157,7 +156,7 @@ def explain(
     kept = np.zeros(program.count, dtype=bool)
     kept[np.flatnonzero(costs > _PRESSES)] = True
     if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= bar:
-        kind = StopKind.OUT_OF_REACH if _outward(arm, state, path, start) else StopKind.SINGULAR
+        kind = StopKind.OUT_OF_REACH if _outward(setup.arm, state, path, start) else StopKind.SINGULAR
         if share <= _SINGULAR:
             return Stop(kind, reason=reason)
         kinds = [_kind(name) for name in pressing]
@@ -165,7 +164,7 @@ def explain(
             StopKind.ACCELERATION if reason.startswith((CANNOT_BRAKE, BASE_MOVES_ON)) else StopKind.NONLINEAR
         )
         kind = next((kind for kind in StopKind if kind in kinds), other)
-        return Stop(kind, pressing, _obstacles(arm, pressing), reason)
+        return Stop(kind, pressing, _obstacles(setup, pressing), reason)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
         kept[k] = False
         if program.solve(kept)[0] > bar:
@@ -176,8 +175,8 @@ def explain(
     kind = next(kind for kind in StopKind if kind in kinds)
     if (
         set(kinds) == {StopKind.STROKE}
-        and len(chosen) >= arm.truss.bays
-        and _outward(arm, state, path, start)
+        and len(chosen) >= setup.arm.segments
+        and _outward(setup.arm, state, path, start)
     ):
         kind = StopKind.OUT_OF_REACH
     multipliers: dict[str, float] = {}
@@ -187,12 +186,12 @@ def explain(
         multipliers[name] = max(multipliers.get(name, 0.0), float(costs[k]))
         if program.kind(k) is StopKind.OBSTACLE:
             away += float(costs[k]) * program.normal(k)
-    return Stop(kind, multipliers, _obstacles(arm, multipliers), reason, tuple(away.tolist()))
+    return Stop(kind, multipliers, _obstacles(setup, multipliers), reason, tuple(away.tolist()))
 
 
-def _obstacles(arm: Arm, names: Iterable[str]) -> tuple[str, ...]:
+def _obstacles(setup: Setup, names: Iterable[str]) -> tuple[str, ...]:
     """Return the names of the obstacles in the names of rows."""
-    found = [o.name for o in arm.monitor.obstacles if any(name.endswith(f" / {o.name}") for name in names)]
+    found = [o.name for o in setup.monitor.obstacles if any(name.endswith(f" / {o.name}") for name in names)]
     return tuple(found)
 
 
@@ -204,29 +203,18 @@ def _kind(name: str) -> StopKind:
     return StopKind(first)
 
 
-def _response(jacobian: sparse.csc_matrix, lengths: Array) -> Array:
-    """Return the node displacements (M, n_a) for changes of the lengths (M, n_a); raise `SolverError` without any."""
-    try:
-        response = np.asarray(splu(jacobian).solve(lengths))
-    except RuntimeError as error:
-        raise SolverError("the member lengths do not determine the nodes there") from error
-    if not np.all(np.isfinite(response)):
-        raise SolverError("the member lengths do not determine the nodes there")
-    return response
-
-
 class _Program:
     """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits.
 
     Raises
     ------
     SolverError
-        The pose is singular: the members' lengths do not determine how its nodes move.
+        The pose is singular: the quantities do not determine how the nodes move.
     """
 
     def __init__(
         self,
-        arm: Arm,
+        setup: Setup,
         separation: Separation,
         state: State,
         path: Path,
@@ -234,33 +222,28 @@ class _Program:
         end: float,
         limits: Limits,
     ) -> None:
-        truss, layout, kinematics = arm.truss, arm.layout, arm.kinematics
-        X = state.nodes
-        kinematics.evaluate(X)
-        member, flat, column = layout.length_scatter
-        size = layout.node_columns
-        jacobian = sparse.csc_matrix(
-            (kinematics.gradient.reshape(-1)[flat], (member, column)), shape=(size, size)
-        )
-        selection = np.zeros((size, len(truss.actuators)))
-        selection[truss.actuators, np.arange(len(truss.actuators))] = 1.0
-        response = _response(jacobian, selection)
-        padded = np.zeros((truss.node_count, 3, len(truss.actuators)))
-        padded[truss.free] = response.reshape(-1, 3, len(truss.actuators))
+        arm, kinematics = setup.arm, setup.kinematics
+        kinematics.evaluate(state.q)
+        response, _ = kinematics.motion().response()
+        count = len(arm.actuators)
+        padded = np.zeros((len(arm.node_names), 3, count))
+        padded[arm.free] = response.reshape(-1, 3, count)
 
-        tip = arm.task.rows(X, path.at(start))
+        tip = setup.task.rows(state.nodes, kinematics, path.at(start))
         rate = tip.rate * (end - start)
         length = float(np.linalg.norm(rate))
         # Within the trust the arm covers about so much of the way.
         self._unit = min(1.0, _TRUST / length) if length > 0.0 else 1.0
-        jacobian_tip = np.einsum("rkc,kcn->rn", tip.jacobian.reshape(len(rate), -1, 3), padded[truss.tip])
+        jacobian_tip = np.einsum(
+            "rkc,kcn->rn", tip.jacobian.reshape(len(rate), -1, 3), padded[arm.end_effector.nodes]
+        )
         self._equal = np.column_stack([jacobian_tip, -rate * self._unit])
 
-        self._rows: ClearanceRows = separation.rows(X, state.time, 0.0, 2.0 * _TRUST, {}, 0.0)
+        self._rows: ClearanceRows = separation.rows(state.q, state.time, 0.0, 2.0 * _TRUST, {}, 0.0)
         near = np.einsum("rsc,rscn->rn", self._rows.coefficients, padded[self._rows.nodes])
         self._near = np.column_stack([-near, np.zeros(len(near))])
         self._near_bound = np.maximum(-(self._rows.lower - separation.distances.margin), 0.0)
-        now = state.lengths[truss.actuators]
+        now = state.quantities[arm.actuators]
         self._low = np.minimum(limits.lower - now, 0.0)
         self._high = np.maximum(limits.upper - now, 0.0)
         self._limits = limits
@@ -315,8 +298,7 @@ class _Program:
 
 def _outward(arm: Arm, state: State, path: Path, start: float) -> bool:
     """Return whether the path leads away from the base at `start`, within about 60 degrees."""
-    truss = arm.truss
     point = path.at(start)
-    way = point.position - state.nodes[truss.base].mean(axis=0)
+    way = point.position - state.nodes[arm.base].mean(axis=0)
     speed = float(np.linalg.norm(point.velocity))
     return speed > 0.0 and float(way @ point.velocity) > 0.5 * speed * float(np.linalg.norm(way))

@@ -1,52 +1,64 @@
-"""How far faces that are to stay on the curve exactly are from it: what a linear row leaves, and a step must not."""
+"""How far stations that are to stay on the curve exactly are from it: what a linear row leaves, and a step must not."""
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.arm import Kinematics, Pose
+from vgtm_qp.compiled import Kernel
+from vgtm_qp.qp.graph import StationSymbols
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.shape import turn_rows
-from vgtm_qp.step.linearise import base_frame
+from vgtm_qp.step.target import base_frame
 
 Array = NDArray[np.float64]
 
 
-class HardTracking:
+class TrackingError:
     """Measures the tracking of a layout with hard rows."""
 
     def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
         self._layout, self._kinematics = layout, kinematics
+        count = len(layout.tracked)
+        self._nodes = layout.arm.stations.nodes[layout.tracked].reshape(-1)
+        station = StationSymbols(layout)
+        nodes, rotation, _, weights, *curve = station.inputs
+        if layout.general is not None:
+            curve = [curve[0], curve[2]]
+        function = ca.Function(
+            "station", [nodes, rotation, weights, *curve], [station.gap, ca.densify(station.turn)]
+        )
+        self._kernel = kernel = Kernel(function.map(count), compiled=False)
+        kernel.inputs[2][:] = layout.arm.stations.weights[layout.tracked].reshape(-1)
+        kernel.inputs[1].reshape(count, 9)[:] = np.eye(3).reshape(-1)
+        if layout.general is None:
+            kernel.inputs[4][:] = layout.curve_weights.reshape(-1)
+            kernel.inputs[5][:] = layout.curve_slopes.reshape(-1)
 
-    def error(self, X: Array, vertices: Array, torsion: Array, base_rotation: Array | None) -> float:
-        """Return the greatest gap, m, or turn, rad, that should be none.
+    def greatest(self, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
+        """Return the greatest gap, m, or turn, rad, that should be zero.
 
         Parameters
         ----------
-        X, vertices, torsion
-            Node positions (N, 3), m, and the curve's coordinates (V, 3), m, and (T,), rad.
-        base_rotation
-            (3, 3) rotation of the base, None where it rests.
+        q, vertices, torsion
+            Configuration, and the curve's coordinates (V, 3), m, and (T,), rad.
+        base
+            Where the base is; None where it rests.
         """
-        layout, kinematics = self._layout, self._kinematics
-        faces, shape = layout.tracked, layout.general
+        layout, inputs = self._layout, self._kernel.inputs
+        tracked, arm, shape = layout.tracked, layout.arm, layout.general
+        inputs[0][:] = arm.nodes(q).take(self._nodes, axis=0).reshape(-1)
         if layout.hard_turns:
-            kinematics.evaluate(X)
-        centres = kinematics.face_centres(X)[faces]
+            self._kinematics.evaluate(q)
+            inputs[1][:] = self._kinematics.station_rotation[tracked].transpose(0, 2, 1).reshape(-1)
         if shape is None:
-            worst = float(np.abs(centres - layout.curve_weights @ vertices).max(initial=0.0))
-            if layout.hard_turns:
-                slopes = layout.curve_slopes @ vertices
-                tangents = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
-                along = np.einsum("kca,kc->ka", kinematics.face_rotation[faces][:, :, :2], tangents)
-                worst = max(worst, float(np.abs(along).max(initial=0.0)))
-            return worst
-        rows = shape.rows(vertices, torsion, base_frame(layout.truss, base_rotation))
-        worst = float(np.abs(centres - rows.position).max(initial=0.0))
-        if layout.hard_turns:
-            turns = turn_rows(
-                rows, kinematics.face_rotation[faces], kinematics.face_spin[faces], layout.turns
-            )
-            worst = max(worst, float(np.abs(turns.residual).max(initial=0.0)))
-        return worst
+            inputs[3].reshape(len(tracked), -1)[:] = vertices.reshape(-1)
+        else:
+            rows = shape.rows(vertices, torsion, base_frame(arm, base))
+            inputs[3][:] = rows.position.reshape(-1)
+            inputs[4][:] = rows.frame.reshape(-1)
+        self._kernel()
+        gap, turn = self._kernel.outputs
+        worst = float(np.abs(gap).max())
+        return max(worst, float(np.abs(turn).max())) if layout.hard_turns else worst

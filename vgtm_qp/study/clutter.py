@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.comparison.compare import run_method
 from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.geometry import shapes
@@ -59,6 +60,7 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
     goal = (aside * np.cos(azimuth), aside * np.sin(azimuth), -random.uniform(0.3, 0.7) * aside)
     problem = bending_problem(_BAYS, steps=steps, goal=goal)
     truss = built_truss(problem)
+    bodies = TrussArm(truss).bodies
     target = np.array(problem.maneuver.waypoint[0].position)  # type: ignore[union-attr]
     found: list[dict[str, Any]] = []
     for _ in range(_TRIES):
@@ -70,7 +72,7 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
         if np.linalg.norm(np.maximum(np.abs(target - center) - edge / 2, 0.0)) < 0.6:
             continue
         cube = shapes.box("cube", center, edge)
-        home = Clearance(truss.members, truss.radius, [cube], safe=_SAFE, influence=0.5, self_collision=False)
+        home = Clearance(bodies, [cube], safe=_SAFE, influence=0.5, self_collision=False)
         if home.least(truss.home)[0] < _SAFE + 0.02:
             continue
         name = f"cube {len(found) + 1}"

@@ -58,13 +58,13 @@ def run(module: str, bays: int, steps: int) -> Row:
         if done.reason:
             return {"failed": done.reason}
         value = float(mark)
-    nodes, truss, curve = resolver.state.nodes, resolver.arm.truss, resolver.curve
-    resolver.arm.kinematics.evaluate(nodes)
+    nodes, truss, curve = resolver.state.nodes, resolver.setup.truss, resolver.curve
+    resolver.setup.kinematics.evaluate(nodes)
     points = curve.position(np.linspace(0.0, 1.0, 4001))
-    centres = resolver.arm.kinematics.face_centres(nodes)
+    centres = resolver.setup.arm.stations.centres(nodes)
     middle = np.linspace(0.0, 1.0, 9)[None, :, None]
     axis = (centres[:-1, None] + middle * np.diff(centres, axis=0)[:, None]).reshape(-1, 3)
-    normals = resolver.arm.kinematics.face_rotation[:, :, 2]
+    normals = resolver.setup.kinematics.station_rotation[:, :, 2]
     tangents = curve.tangent(resolver.motion.s)
     sine = np.linalg.norm(np.cross(normals, tangents), axis=1)
     frame = {"nodes": nodes.tolist(), "members": truss.members.tolist(), "actuated": truss.actuated.tolist()}

@@ -71,7 +71,7 @@ def _here(scene: RandomScene) -> Row:
 def _by_ipopt(scene: RandomScene) -> Row:
     resolver = Resolver(scene.problem)
     plan = make_plan(scene.problem, *resolver.tip())
-    _, values = IpoptStepper(resolver.arm).run(plan)
+    _, values = IpoptStepper(resolver.setup).run(plan)
     return {"reached": (values[-1] - plan.path.start) / (plan.path.end - plan.path.start)}
 
 

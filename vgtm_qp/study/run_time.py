@@ -73,8 +73,8 @@ def run(bays: int, method: str, cubes: bool) -> Row:
             value = (
                 float(mark) if step.progress >= 1.0 - 1e-9 else value + step.progress * (float(mark) - value)
             )
-    fixed = resolver.arm.layout.fixed
-    drift = np.abs(resolver.state.lengths - resolver.arm.home_lengths)[fixed].max()
+    fixed = resolver.setup.truss.fixed
+    drift = np.abs(resolver.state.quantities - resolver.setup.arm.home_quantities)[fixed].max()
     return {
         "time": _STEPS * float(np.median(times)),
         "sum": float(np.sum(times)),

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry import shapes
+from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.arm import Arm, build_arm
-from vgtm_qp.step.path import rotation_from_vector
+from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
 
@@ -62,24 +64,24 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
         "maneuver": {"steps": steps, "waypoint": [waypoint]},
         "clearance": {"safe": SAFE, "influence": 0.5},
     }
-    arm = build_arm(Problem.from_dict(problem))
-    home = arm.truss.home
-    shape = random_shape(arm, random)
-    kinematics = arm.kinematics
+    setup = build_arm(Problem.from_dict(problem))
+    home = setup.truss.home
+    shape = random_shape(setup, random)
+    kinematics = setup.kinematics
     if reachable:
         kinematics.evaluate(shape)
-        waypoint["position"] = kinematics.tip_position(shape).tolist()
+        waypoint["position"] = setup.arm.end_effector.position(shape).tolist()
         if directed:
             waypoint["pointing"] = kinematics.tip_rotation[:, 2].tolist()
     else:
         kinematics.evaluate(home)
         aim = random.normal(size=3)
         aim[2] = abs(aim[2])
-        reach = arm.truss.height * random.uniform(0.3, 1.2)
+        reach = setup.truss.height * random.uniform(0.3, 1.2)
         waypoint["position"] = (aim * (reach / np.linalg.norm(aim))).tolist()
         if directed:
             waypoint["pointing"] = (kinematics.tip_rotation[:, 2] + 0.5 * random.normal(size=3)).tolist()
-    problem["obstacle"] = _cubes(arm, random, shape if reachable else None, int(random.integers(1, 9)))
+    problem["obstacle"] = _cubes(setup, random, shape if reachable else None, int(random.integers(1, 9)))
     return RandomScene(number, reachable, Problem.from_dict(problem), shape if reachable else None)
 
 
@@ -96,47 +98,49 @@ def _truss(random: np.random.Generator) -> dict[str, Any]:
     return truss
 
 
-def random_shape(arm: Arm, random: np.random.Generator) -> Array:
+def random_shape(setup: Setup, random: np.random.Generator) -> Array:
     """Return node positions (N, 3) of a bent shape within the strokes whose members keep their clearance, m.
 
     Actuator lengths vary smoothly along and around the arm; they are approached from home by Newton's method, and
     the result is the furthest shape that is neither nearly singular nor in self-collision.
     """
-    truss, kinematics = arm.truss, arm.kinematics
+    truss, kinematics = setup.truss, setup.kinematics
     actuators = truss.actuators
     least, most = 0.15 * truss.height, random.uniform(0.3, 0.9) * truss.height
     furthest = truss.home
     kinematics.evaluate(truss.home)
-    singular = _LEAST_SINGULAR_VALUE * _least_singular_value(arm)
+    singular = _LEAST_SINGULAR_VALUE * _least_singular_value(setup)
     for _ in range(20):
         X = truss.home.copy()
-        wanted = _random_lengths(arm, random)
+        wanted = _random_lengths(setup, random)
         good = X.copy()
         for share in np.arange(1, _SHARES + 1) / _SHARES:
-            goal = arm.home_lengths.copy()
+            goal = setup.arm.home_quantities.copy()
             goal[actuators] += share * (wanted - goal[actuators])
-            if not _newton(arm, X, goal, singular):
+            if not _newton(setup, X, goal, singular):
                 break
-            if arm.monitor.least(X, among="members")[0] < SAFE:
+            if setup.monitor.least(setup.arm.points(X), among="members")[0] < SAFE:
                 break
             good = X.copy()
-            if _tip_motion(arm, good) > most:
+            if _tip_motion(setup, good) > most:
                 break
-        if _tip_motion(arm, good) > _tip_motion(arm, furthest):
+        if _tip_motion(setup, good) > _tip_motion(setup, furthest):
             furthest = good
-        if _tip_motion(arm, furthest) >= least:
+        if _tip_motion(setup, furthest) >= least:
             break
     kinematics.evaluate(furthest)
     return np.asarray(furthest)
 
 
-def _tip_motion(arm: Arm, X: Array) -> float:
-    return float(np.linalg.norm(arm.kinematics.tip_position(X) - arm.kinematics.tip_position(arm.truss.home)))
+def _tip_motion(setup: Setup, X: Array) -> float:
+    return float(
+        np.linalg.norm(setup.arm.end_effector.position(X) - setup.arm.end_effector.position(setup.truss.home))
+    )
 
 
-def _random_lengths(arm: Arm, random: np.random.Generator) -> Array:
+def _random_lengths(setup: Setup, random: np.random.Generator) -> Array:
     """Return (n_a,) lengths that change smoothly along and around the arm, m."""
-    truss = arm.truss
+    truss = setup.truss
     actuators = truss.actuators
     middle = truss.home[truss.members[actuators]].mean(axis=1)
     z = middle[:, 2] / truss.height
@@ -146,39 +150,41 @@ def _random_lengths(arm: Arm, random: np.random.Generator) -> Array:
     for k in range(3):
         wave = wave + random.normal() * np.cos(np.pi * k * z) * np.cos(angle - turn[k])
     wave *= random.uniform(0.3, 0.95) / max(float(np.abs(wave).max()), 1e-9)
-    home = arm.home_lengths[actuators]
+    home = setup.arm.home_quantities[actuators]
     room = np.where(wave > 0.0, truss.stroke[actuators, 1] - home, home - truss.stroke[actuators, 0])
     return np.asarray(home + wave * room)
 
 
-def _least_singular_value(arm: Arm) -> float:
-    jacobian = arm.layout.length_jacobian(arm.kinematics.gradient)
+def _least_singular_value(setup: Setup) -> float:
+    jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
     if not np.all(np.isfinite(jacobian)):
         return 0.0
     return float(np.linalg.svd(jacobian, compute_uv=False)[-1])
 
 
-def _newton(arm: Arm, X: Array, lengths: Array, singular: float) -> bool:
+def _newton(setup: Setup, X: Array, lengths: Array, singular: float) -> bool:
     """Bring all lengths to `lengths` (M,) in place; False where the pose is singular or Newton's method fails."""
-    free = arm.truss.free
+    free = setup.truss.free
     for _ in range(8):
-        arm.kinematics.evaluate(X)
-        error = lengths - arm.kinematics.lengths
+        setup.kinematics.evaluate(X)
+        error = lengths - setup.kinematics.quantities
         if float(np.max(np.abs(error))) < 1e-11:
             return True
-        if _least_singular_value(arm) < singular:
+        if _least_singular_value(setup) < singular:
             return False
-        jacobian = arm.layout.length_jacobian(arm.kinematics.gradient)
+        jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
         X[free] += np.linalg.solve(jacobian, error).reshape(-1, 3)
     return False
 
 
-def _cubes(arm: Arm, random: np.random.Generator, shape: Array | None, count: int) -> list[dict[str, Any]]:
+def _cubes(
+    setup: Setup, random: np.random.Generator, shape: Array | None, count: int
+) -> list[dict[str, Any]]:
     """Return `count` cubes, or as many as find a place, near the arm and clear of its home and goal shapes.
 
     The straight path of the tip to a goal that can be reached is kept free of them, for the tip's face at least.
     """
-    truss = arm.truss
+    truss = setup.truss
     states = [truss.home] if shape is None else [truss.home, shape]
     tips = np.stack([state[truss.tip] for state in states])
     share = np.linspace(0.0, 1.0, 21)[:, None, None]
@@ -194,7 +200,7 @@ def _cubes(arm: Arm, random: np.random.Generator, shape: Array | None, count: in
         center = anchor + offset * (random.uniform(0.1, 1.2) + edge / 2) / np.linalg.norm(offset)
         vector = random.normal(size=3) * (random.random() < 0.5)
         cube = shapes.box("", center.tolist(), edge, rotation_from_vector(vector))
-        if any(_distance(arm, cube, X) < SAFE + _ROOM for X in states):
+        if any(_distance(setup, cube, X) < SAFE + _ROOM for X in states):
             continue
         local = np.abs((passage - center) @ rotation_from_vector(vector)) - edge / 2
         if float(np.linalg.norm(np.maximum(local, 0.0), axis=1).min()) < SAFE + 0.1:
@@ -211,9 +217,8 @@ def _cubes(arm: Arm, random: np.random.Generator, shape: Array | None, count: in
     return cubes
 
 
-def _distance(arm: Arm, obstacle: shapes.Obstacle, X: Array) -> float:
-    truss = arm.truss
-    monitor = Clearance(
-        truss.members, truss.radius, [obstacle], safe=SAFE, influence=0.5, self_collision=False
-    )
+def _distance(setup: Setup, obstacle: shapes.Obstacle, X: Array) -> float:
+    truss = setup.truss
+    between_nodes = capsules(truss.members, truss.radius)
+    monitor = Clearance(between_nodes, [obstacle], safe=SAFE, influence=0.5, self_collision=False)
     return monitor.least(X)[0]

@@ -34,7 +34,7 @@ def run(module: str, steps: int) -> Row:
         bending_problem(8, steps=steps, module=module, stroke=[0.3, 2.0]), "curve-pseudoinverse-corrected"
     )
     resolver = CurveFirstResolver(problem)
-    truss = resolver.arm.truss
+    truss = resolver.setup.truss
     plan = make_plan(problem, *resolver.tip())
     inside = set(truss.faces[_FACES[0] : _FACES[1] + 1].ravel().tolist())
     members = [k for k, (a, b) in enumerate(truss.members.tolist()) if a in inside and b in inside]
@@ -47,13 +47,13 @@ def run(module: str, steps: int) -> Row:
             if done.reason:
                 return {"failed": done.reason}
             value = mark
-        resolver.arm.kinematics.evaluate(resolver.state.nodes)
+        resolver.setup.kinematics.evaluate(resolver.state.nodes)
         segments = resolver.tracker.segments
         faces = np.array([segment.face for segment in segments])
         s = resolver.motion.s[faces]
-        centres = resolver.arm.kinematics.face_centres(resolver.state.nodes)[faces]
+        centres = resolver.setup.arm.stations.centres(resolver.state.nodes)[faces]
         gap = max(gap, float(np.abs(centres - resolver.curve.position(s)).max()))
-        normals = resolver.arm.kinematics.face_rotation[faces][:, :, 2]
+        normals = resolver.setup.kinematics.station_rotation[faces][:, :, 2]
         cosine = np.einsum("kc,kc->k", normals, resolver.curve.tangent(s))
         angle = max(angle, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max()))
         if step in wanted:

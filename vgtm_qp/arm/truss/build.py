@@ -10,7 +10,6 @@ import numpy as np
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.assembly import Limits
 from vgtm_qp.arm.truss.graph import truss_from_graph
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.plate import plate
 from vgtm_qp.arm.truss.truss import Array, Truss
 from vgtm_qp.errors import TrussError, nearest
@@ -73,7 +72,7 @@ def lock_members(truss: Truss, names: Iterable[str], X: Array | None = None) -> 
         return truss
     _check_actuated(truss, names)
     locked = np.array([truss.member(name) for name in names])
-    ends = member_ends(truss, truss.home if X is None else X)[locked]
+    ends = truss.member_ends(truss.home if X is None else X)[locked]
     actuated, stroke = truss.actuated.copy(), truss.stroke.copy()
     rate, acceleration = truss.rate.copy(), truss.acceleration.copy()
     actuated[locked] = False

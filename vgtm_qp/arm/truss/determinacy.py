@@ -66,11 +66,11 @@ def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
         direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         gradient = np.stack([direction, -direction], axis=1)
     else:
-        from vgtm_qp.arm.truss.kinematics import Kinematics
+        from vgtm_qp.arm.truss.kinematics import TrussKinematics
 
-        kinematics = Kinematics(truss, compiled=False)
+        kinematics = TrussKinematics(truss, compiled=False)
         kinematics.evaluate(X)
-        nodes, gradient = kinematics.member_nodes, kinematics.gradient
+        nodes, gradient = truss.member_nodes, kinematics.gradient
     column = np.full(truss.node_count, -1, dtype=np.int64)
     column[truss.free] = np.arange(len(truss.free))
     rows = np.broadcast_to(np.arange(truss.member_count)[:, None, None], gradient.shape)

@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import TrussError
-
-if TYPE_CHECKING:
-    from vgtm_qp.arm.truss.truss import Truss
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -61,13 +57,13 @@ def joint_frames(X: Array, triangle: Index) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
-def member_ends(truss: Truss, X: Array) -> Array:
+def joint_ends(X: Array, members: Index, joints: Joints | None) -> Array:
     """Return (M, 2, 3) where each member's ends r_ik are, eq. (13), for node positions `X` (N, 3), m."""
-    ends = X[truss.members]
-    if truss.joints is None:
+    ends = X[members]
+    if joints is None:
         return np.asarray(ends)
-    frames = joint_frames(X, truss.joints.triangle)
-    return np.asarray(ends + np.einsum("mexy,mey->mex", frames[truss.members], truss.joints.offset))
+    frames = joint_frames(X, joints.triangle)
+    return np.asarray(ends + np.einsum("mexy,mey->mex", frames[members], joints.offset))
 
 
 def joint_triangles(

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, length_jacobian
-from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.truss.kinematics import TrussKinematics
 from vgtm_qp.arm.truss.truss import Array, Index, Truss
 
 RANK_TOLERANCE = 1e-8
@@ -96,19 +96,19 @@ def tip_response(truss: Truss, X: Array | None = None) -> Array:
     in the base frame.
     """
     X = truss.home if X is None else X
-    kinematics = Kinematics(truss, compiled=False)
+    kinematics = TrussKinematics(truss, compiled=False)
     kinematics.evaluate(X)
-    spin = kinematics.tip_spin if kinematics.has_tip_frame else None
+    spin = kinematics.tip_spin if len(truss.tip) >= 3 else None
     return actuator_response(truss, _pose_rows(truss, truss.tip, truss.tip_weights, spin), X)
 
 
 def face_response(truss: Truss, X: Array | None = None) -> Array:
     """Return (F - 1, 6, n_a): twists of the faces beyond the base's for unit rates of the actuators."""
     X = truss.home if X is None else X
-    kinematics = Kinematics(truss, compiled=False)
+    kinematics = TrussKinematics(truss, compiled=False)
     kinematics.evaluate(X)
     rows = [
-        _pose_rows(truss, truss.faces[k], truss.face_weights[k], kinematics.face_spin[k])
+        _pose_rows(truss, truss.faces[k], truss.face_weights[k], kinematics.station_spin[k])
         for k in range(1, len(truss.faces))
     ]
     return actuator_response(truss, np.concatenate(rows), X).reshape(len(rows), 6, -1)

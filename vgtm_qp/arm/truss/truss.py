@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.joints import Joints, member_ends
+from vgtm_qp.arm.scatter import LengthScatter
+from vgtm_qp.arm.truss.joints import Joints, joint_ends
 from vgtm_qp.errors import TrussError, nearest
 
 Array = NDArray[np.float64]
@@ -113,9 +114,30 @@ class Truss:
         return np.flatnonzero(self.actuated)
 
     @cached_property
+    def fixed(self) -> Index:
+        """(n_l,) indices of the fixed members."""
+        return np.flatnonzero(~self.actuated)
+
+    @cached_property
+    def member_nodes(self) -> Index:
+        """(M, Q) nodes that each member's length depends on: two for pin joints, six for offset joints."""
+        if self.joints is None:
+            return self.members
+        return self.joints.triangle[self.members].reshape(self.member_count, 6)
+
+    @cached_property
+    def scatter(self) -> LengthScatter:
+        """Where the gradients of the lengths stand in the length Jacobian."""
+        return LengthScatter(self.member_nodes, self.free, self.node_count)
+
+    def member_ends(self, X: Array) -> Array:
+        """Return (M, 2, 3) where each member's ends r_ik are, eq. (13), for node positions `X` (N, 3), m."""
+        return joint_ends(X, self.members, self.joints)
+
+    @cached_property
     def home_lengths(self) -> Array:
         """(M,) member lengths at home, m, joint offsets included (nominal: between the nodes less the offsets)."""
-        ends = member_ends(self, self.home)
+        ends = self.member_ends(self.home)
         return np.asarray(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
     @cached_property

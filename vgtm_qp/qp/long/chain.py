@@ -1,4 +1,4 @@
-"""A truss as a chain of equal periods, each hung on the one before."""
+"""An arm as a chain of equal periods, each hung on the one before."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from vgtm_qp.arm.arm import Bays
 from vgtm_qp.qp.layout import Layout
 
 Array = NDArray[np.float64]
@@ -26,12 +27,14 @@ _MOST_BASE_NODES = 4
 class Chain:
     """Periods of p stages; its members and tracked faces use nodes of it and of the period before.
 
-    Places within a period: first the w nodes that it uses of the one before, then its own m by stage. Where the truss
+    Places within a period: first the w nodes that it uses of the one before, then its own m by stage. Where the arm
     allows it, the nodes and members of every period are put in the order in which all periods are alike.
 
     Attributes
     ----------
     layout : Layout
+    bays : Bays
+        Of its arm.
     nodes : (n, m) int
         The nodes of each period in stage order.
     members : (n, 3m) int
@@ -60,6 +63,7 @@ class Chain:
     """
 
     layout: Layout
+    bays: Bays
     nodes: Index
     members: Index
     stage_sizes: tuple[int, ...]
@@ -92,14 +96,14 @@ class Chain:
     @cached_property
     def node_period(self) -> Index:
         """(N,) the period of each node; -1 for base nodes."""
-        period = np.full(self.layout.truss.node_count, -1, dtype=np.int64)
+        period = np.full(self.bays.node_count, -1, dtype=np.int64)
         period[self.nodes] = np.arange(self.periods)[:, None]
         return period
 
     @cached_property
     def node_place(self) -> Index:
         """(N,) the place of each node within its period, 0 to m - 1."""
-        place = np.zeros(self.layout.truss.node_count, dtype=np.int64)
+        place = np.zeros(self.bays.node_count, dtype=np.int64)
         place[self.nodes] = np.arange(self.nodes.shape[1])
         return place
 
@@ -111,20 +115,20 @@ class Chain:
     @cached_property
     def gather(self) -> sparse.csr_matrix:
         """The matrix that takes all members' gradients to the Jacobian's nonzeros, period by period."""
-        layout, pattern = self.layout, self.coordinate_pattern
+        bays, pattern = self.bays, self.coordinate_pattern
         number = np.full(pattern.shape, -1, dtype=np.int64)
         number.T[pattern.T] = np.arange(int(pattern.sum()))
-        member, flat, column = layout.length_scatter
-        row = np.empty(layout.truss.member_count, dtype=np.int64)
+        member, flat, column = bays.scatter.member, bays.scatter.flat, bays.scatter.column
+        row = np.empty(bays.member_count, dtype=np.int64)
         period = np.empty_like(row)
         row[self.members] = np.arange(self.members.shape[1])
         period[self.members] = np.arange(self.periods)[:, None]
-        node = layout.truss.free[column // 3]
+        node = bays.free[column // 3]
         place = _places(self.node_period[node], self.node_place[node], period[member], self.carried)
         entry = period[member] * int(pattern.sum()) + number[row[member], 3 * place + column % 3]
         shape = (
             self.periods * int(pattern.sum()),
-            layout.truss.member_count * layout.member_nodes.shape[1] * 3,
+            bays.member_nodes.size * 3,
         )
         return sparse.csr_matrix((np.ones(len(entry)), (entry, flat)), shape=shape)
 
@@ -140,10 +144,15 @@ class Chain:
 
 @lru_cache(maxsize=4)
 def find_chain(layout: Layout) -> Chain | None:
-    """Return the chain of `layout`, with the shortest period; None where the truss is none."""
-    stages = int(layout.truss.stage.max(initial=-1)) + 1
+    """Return the chain of `layout`, with the shortest period; None where the arm is none."""
+    bays = layout.arm.bays
+    if bays is None:
+        return None
+    stages = int(bays.stage.max(initial=-1)) + 1
     lengths = (length for length in range(1, min(stages, _LONGEST_PERIOD) + 1) if stages % length == 0)
-    return next((chain for length in lengths if (chain := _chain(layout, stages, length)) is not None), None)
+    return next(
+        (chain for length in lengths if (chain := _chain(layout, bays, stages, length)) is not None), None
+    )
 
 
 def _places(period: Index, place: Index, here: Index, carried: Index) -> Index:
@@ -158,26 +167,25 @@ def _repeats(counts: Index, length: int) -> bool:
     return bool(counts.min() > 0 and (counts.reshape(-1, length) == counts[:length]).all())
 
 
-def _chain(layout: Layout, stages: int, length: int) -> Chain | None:
-    truss = layout.truss
+def _chain(layout: Layout, bays: Bays, stages: int, length: int) -> Chain | None:
     periods = stages // length
-    node_counts = np.bincount(truss.stage[truss.free], minlength=stages)
-    member_stage = truss.stage[layout.member_nodes].max(axis=1)
+    node_counts = np.bincount(bays.stage[bays.free], minlength=stages)
+    member_stage = bays.stage[bays.member_nodes].max(axis=1)
     if not len(member_stage) or member_stage.min() < 0 or not _repeats(node_counts, length):
         return None
     if (np.bincount(member_stage, minlength=stages) != 3 * node_counts).any():
         return None
-    if len(truss.free) > _MOST_NODES * periods:
+    if len(bays.free) > _MOST_NODES * periods:
         return None
-    nodes = truss.free.reshape(periods, -1)
+    nodes = bays.free.reshape(periods, -1)
     members = np.argsort(member_stage, kind="stable").reshape(periods, -1)
     sizes = tuple(node_counts[:length].tolist())
-    alike = _alike(layout, nodes, members, sizes) if truss.joints is None else None
+    alike = _alike(bays, nodes, members, sizes) if bays.joints is None else None
     if alike is not None:
-        chain = _of_ordered(layout, alike.nodes, alike.members, sizes, alike)
+        chain = _of_ordered(layout, bays, alike.nodes, alike.members, sizes, alike)
         if chain is not None:
             return chain
-    return _of_ordered(layout, nodes, members, sizes, None)
+    return _of_ordered(layout, bays, nodes, members, sizes, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,16 +202,16 @@ class _Alike:
     pairs: list[tuple[int, int]]
 
 
-def _alike(layout: Layout, nodes: Index, members: Index, sizes: tuple[int, ...]) -> _Alike | None:
+def _alike(bays: Bays, nodes: Index, members: Index, sizes: tuple[int, ...]) -> _Alike | None:
     """Return the order in which all periods of a chain of pin-jointed members are alike; None where there is none.
 
     Nodes of a stage are told apart by what they hang on, so that a bay that is the mirror image of the one before
     comes in another order of its nodes.
     """
-    base = np.flatnonzero(layout.truss.base).tolist()
+    base = np.flatnonzero(bays.base).tolist()
     if len(nodes) < 2 or len(base) > min(int(nodes.shape[1]), _MOST_BASE_NODES):
         return None
-    ends = layout.member_nodes.tolist()
+    ends = bays.member_nodes.tolist()
     for order in permutations(base):
         before: list[int] | None = list(order)
         wanted: list[tuple[int, int]] | None = None
@@ -255,18 +263,18 @@ def _ordered_period(
 
 
 def _of_ordered(
-    layout: Layout, nodes: Index, members: Index, sizes: tuple[int, ...], alike: _Alike | None
+    layout: Layout, bays: Bays, nodes: Index, members: Index, sizes: tuple[int, ...], alike: _Alike | None
 ) -> Chain | None:
     """Return the chain of these periods, None where they are none."""
-    truss, periods = layout.truss, len(nodes)
-    period = np.full(truss.node_count, -2, dtype=np.int64)
-    place = np.zeros(truss.node_count, dtype=np.int64)
+    stations, periods = layout.arm.stations, len(nodes)
+    period = np.full(bays.node_count, -2, dtype=np.int64)
+    place = np.zeros(bays.node_count, dtype=np.int64)
     period[nodes], place[nodes] = np.arange(periods)[:, None], np.arange(nodes.shape[1])
     here = np.arange(periods)[:, None, None]
-    used = layout.member_nodes[members]
+    used = bays.member_nodes[members]
     face_used, faces = np.zeros((periods, 0, 3), dtype=np.int64), np.zeros((periods, 0), dtype=np.int64)
     if len(layout.tracked):
-        face_nodes = truss.faces[layout.tracked]
+        face_nodes = stations.nodes[layout.tracked]
         completed = period[face_nodes].max(axis=1)
         order = np.argsort(completed, kind="stable")
         if (
@@ -290,7 +298,7 @@ def _of_ordered(
         )
     )
     face_places = _places(period[face_used], place[face_used], here, carried)
-    weights = np.take_along_axis(truss.face_weights[layout.tracked[faces]], face_order, axis=2)
+    weights = np.take_along_axis(stations.weights[layout.tracked[faces]], face_order, axis=2)
     if (
         (face_places != face_places[:1]).any()
         or (face_places < 0).any()
@@ -301,7 +309,7 @@ def _of_ordered(
     pattern = np.zeros((members.shape[1], len(carried) + nodes.shape[1]), dtype=bool)
     _, row, _ = np.nonzero(places >= 0)
     pattern[row, places[places >= 0]] = True
-    actuated = truss.actuated[members]
+    actuated = bays.actuated[members]
     soft = actuated.mean(axis=0) > 0.5
     locked = members[~actuated & soft]
     if (actuated & ~soft).any() or len(locked) > _MOST_LOCKED:
@@ -316,6 +324,7 @@ def _of_ordered(
         member_places = number[np.array(alike.pairs)]
     return Chain(
         layout=layout,
+        bays=bays,
         nodes=nodes,
         members=members,
         stage_sizes=sizes,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.arm import LengthRowsLike
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.numbers import StepNumbers
 
@@ -51,7 +54,7 @@ class ChainData:
         )
         self._members = chain.members[self.order]
         self._soft = self._members[:, chain.soft]
-        self._actuator = np.zeros(layout.truss.member_count)
+        self._actuator = np.zeros(chain.bays.member_count)
         self.offset, self.normal = np.zeros((layout.vertices, 3)), np.zeros(3)
         self._vertex_gradient = np.zeros((layout.vertices, 3))
         if len(self.faces):
@@ -69,10 +72,11 @@ class ChainData:
     def fill(self, numbers: StepNumbers) -> None:
         """Overwrite everything with the values of `numbers`."""
         chain, part, periods = self.chain, self._part, self.chain.periods
-        jacobian = (chain.gather @ numbers.gradient.reshape(-1)).reshape(periods, -1)
+        rows = cast(LengthRowsLike, numbers.motion)
+        jacobian = (chain.gather @ rows.gradient.reshape(-1)).reshape(periods, -1)
         part["jacobian"][:] = jacobian[self.order]
-        part["rhs"][:] = numbers.length_rhs[self._members]
-        self._actuator[chain.layout.truss.actuators] = numbers.actuator_gradient
+        part["rhs"][:] = rows.rhs[self._members]
+        self._actuator[chain.bays.actuators] = numbers.actuator_gradient
         part["actuator_gradient"][:] = self._actuator[self._soft]
         if not chain.layout.vertices:
             return

@@ -7,7 +7,7 @@ from vgtm_qp.qp.long.chain import Chain, find_chain
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 
-STAGED_ACTUATORS = 45
+STAGED_ACTUATORS = 46
 """From so many actuators on, elimination along the chain is faster than condensing onto the actuators."""
 
 
@@ -23,7 +23,7 @@ def chain_solver(layout: Layout) -> StagedSolver | TrackedSolver | None:
 
 def prefers_staged(layout: Layout) -> bool:
     """Whether `chain_solver` is there for `layout` and faster than the condensed QP."""
-    if len(layout.truss.actuators) < STAGED_ACTUATORS or not layout.is_tabled:
+    if len(layout.arm.actuators) < STAGED_ACTUATORS or not layout.is_tabled:
         return False
     chain = _chain(layout)
     return chain is not None and (not layout.hard_tracking or chain.is_square)

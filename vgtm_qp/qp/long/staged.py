@@ -13,18 +13,18 @@ from scipy.linalg.lapack import dtrtrs
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
-from vgtm_qp.qp.long.closing import Closing
+from vgtm_qp.qp.long.closing import ChainClosing
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import Sweep
 from vgtm_qp.qp.long.working_set import Answer, Point, RowNumbers, RowTable, solve_rows
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution, beyond, norm
+from vgtm_qp.qp.residual import refuse_large, relative
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _BLOCK = 8
 _WORST_CONDITION = 1e8
-RESIDUAL = 1e-8
 SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
 
 
@@ -36,6 +36,8 @@ class StagedSolver:
     chain : Chain
         Of a layout without hard tracking.
     """
+
+    knows_gain = True
 
     def __init__(self, chain: Chain) -> None:
         self.layout, self.chain = chain.layout, chain
@@ -77,12 +79,12 @@ class StagedSolver:
         self._at = np.where(chain.node_period >= 0, chain.node_period * own + chain.node_place, -1)
         self._free, self._progress = np.zeros(self._curve), 0.0
         self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
-        truss = self.layout.truss
-        at = np.empty(truss.member_count, dtype=np.int64)
-        at[chain.members.reshape(-1)] = np.arange(truss.member_count)
-        self._strokes, self._held, self._fixed = at[truss.actuators], at[chain.locked], at[self.layout.fixed]
+        bays = chain.bays
+        at = np.empty(bays.member_count, dtype=np.int64)
+        at[chain.members.reshape(-1)] = np.arange(bays.member_count)
+        self._strokes, self._held, self._fixed = at[bays.actuators], at[chain.locked], at[~bays.actuated]
         soft = chain.members[:, chain.soft].reshape(-1)
-        self._soft = np.argsort(soft)[np.isin(np.sort(soft), truss.actuators)]
+        self._soft = np.argsort(soft)[np.isin(np.sort(soft), bays.actuators)]
         self._reversed_nodes = chain.nodes[::-1].reshape(-1)
         self._reversed_soft = chain.members[::-1][:, chain.soft].reshape(-1)
         self._active: set[tuple[object, ...]] = set()
@@ -99,7 +101,7 @@ class StagedSolver:
             The QP is singular, or the answer failed the residual check.
         """
         self.data.fill(numbers)
-        return self.solve_filled(RowNumbers.of(self.layout, numbers))
+        return self.solve_filled(RowNumbers.of(self.chain.bays, numbers))
 
     def solve_filled(self, numbers: RowNumbers) -> StepSolution:
         """Solve the QP whose other numbers were written to `data`; see :meth:`solve`."""
@@ -154,9 +156,9 @@ class StagedSolver:
         sweep()
         return sweep.outputs[1].reshape(-1, motions.shape[1]).take(self._soft, axis=0)
 
-    def closing(self) -> Closing:
+    def closing(self) -> ChainClosing:
         """Return what brings members to their lengths with the Jacobian of the QP solved last."""
-        return Closing(self.chain, self._elimination.close(), [self._forward_head, self._forward_gains])
+        return ChainClosing(self.chain, self._elimination.close(), [self._forward_head, self._forward_gains])
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
@@ -225,11 +227,11 @@ class StagedSolver:
     def _check(self, table: RowTable, point: Point, multipliers: Array) -> None:
         """Refuse an answer whose primal or dual residual is too large."""
         chain, numbers, weights = self.chain, table.numbers, self.layout.weights
-        truss = self.layout.truss
+        bays = chain.bays
         nodal, force, face = self._balance.inputs[3:]
         gradient = weights.node_rate * point.nodes + table.nodal_forces(multipliers)
-        actuator = np.zeros(truss.member_count)
-        actuator[truss.actuators] = (
+        actuator = np.zeros(bays.member_count)
+        actuator[bays.actuators] = (
             (weights.actuator_rate + weights.stroke_centring) * point.values[table.actuators]
             + numbers.actuator_gradient
             + multipliers[table.actuators]
@@ -237,20 +239,14 @@ class StagedSolver:
         actuator[chain.locked] = multipliers[len(numbers.tip_rhs) : table.equal]
         gradient.take(self._reversed_nodes, axis=0, out=nodal.reshape(-1, 3), mode="clip")
         actuator.take(self._reversed_soft, out=force, mode="clip")
-        residual = 0.0
+        rest = [self._balance.outputs[1]]
         if self._curve:
             parts = self._forward.outputs[3].reshape(chain.periods, -1)[::-1].reshape(-1, 5)
             gap, tilt = self.data.misfit(point.vertices, parts)
             pulled = face.reshape(-1, 5)
             pulled[:, :3], pulled[:, 3:] = weights.tracking * gap, weights.tangent * tilt
-            residual = float(np.max(np.abs(self.data.curve_gradient(point.vertices, gap, tilt))))
+            rest.append(self.data.curve_gradient(point.vertices, gap, tilt))
         self._balance()
-        residual = max(residual, float(np.max(np.abs(self._balance.outputs[1]), initial=0.0)))
-        scale = 1.0 + float(np.max(np.abs(force), initial=0.0)) + float(np.max(np.abs(multipliers)))
-        fixed = self._forward.outputs[2][self._fixed]
-        primal = max(float(np.max(table.violation(point.values))), float(np.max(np.abs(fixed), initial=0.0)))
-        dual = residual / scale
-        if not (primal <= RESIDUAL and dual <= RESIDUAL):
-            raise SolverError(
-                f"the elimination left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
-            )
+        outside = beyond(point.values, table.lower, table.upper)
+        primal = norm(np.concatenate([outside, self._forward.outputs[2][self._fixed]]))
+        refuse_large(primal, relative(norm(np.concatenate(rest)), force, multipliers), "the elimination")

@@ -14,13 +14,14 @@ from scipy.linalg.lapack import dtrtrs
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
-from vgtm_qp.qp.long.closing import Closing
+from vgtm_qp.qp.long.closing import ChainClosing
 from vgtm_qp.qp.long.elimination import Elimination, Positions
 from vgtm_qp.qp.long.sparse_symbols import nonzeros, offsets, small_inverse
-from vgtm_qp.qp.long.staged import RESIDUAL, SINGULAR
+from vgtm_qp.qp.long.staged import SINGULAR
 from vgtm_qp.qp.long.sweep import Sweep
 from vgtm_qp.qp.long.working_set import Point, RowNumbers, RowTable, solve_rows
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution, beyond, norm
+from vgtm_qp.qp.residual import refuse_large, relative
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -125,6 +126,8 @@ class TrackedSolver:
         With hard tracking; ``chain.is_square``.
     """
 
+    knows_gain = False
+
     def __init__(self, chain: Chain) -> None:
         self.layout, self.chain = chain.layout, chain
         elimination = Elimination(chain)
@@ -163,7 +166,7 @@ class TrackedSolver:
             The QP is singular, or the answer failed the residual check.
         """
         self.data.fill(numbers)
-        return self.solve_filled(RowNumbers.of(self.layout, numbers))
+        return self.solve_filled(RowNumbers.of(self.chain.bays, numbers))
 
     def solve_filled(self, numbers: RowNumbers) -> StepSolution:
         """Solve the QP whose other numbers were written to `data`; see :meth:`solve`."""
@@ -174,9 +177,13 @@ class TrackedSolver:
         self._active = answer.active
         return answer.solution()
 
-    def closing(self) -> Closing:
+    def gain(self, held: NDArray[np.bool_]) -> Array | None:  # noqa: ARG002
+        """See ``solvers.StepSolver``."""
+        return None
+
+    def closing(self) -> ChainClosing:
         """Return what brings fixed members to their lengths and keeps the faces on the curve, as the QP solved last."""
-        return Closing(self.chain, self._graphs.hold(), [self.data.head, self._following.outputs[1]])
+        return ChainClosing(self.chain, self._graphs.hold(), [self.data.head, self._following.outputs[1]])
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""
@@ -237,11 +244,15 @@ class TrackedSolver:
         changed = sweep.outputs[1].reshape(chain.periods, -1)
         strokes = changed[:, chain.soft].reshape(-1)
         gap, tilt = self.data.misfit(point.vertices, sweep.outputs[2].reshape(-1, 5))
-        primal = max(
-            float(np.max(np.abs(changed[:, ~chain.soft]), initial=0.0)),
-            float(np.max(np.abs(strokes[self._soft] - point.values[table.actuators]))),
-            float(np.max(np.abs(gap))),
-            float(np.max(table.violation(point.values))),
+        primal = norm(
+            np.concatenate(
+                [
+                    changed[:, ~chain.soft].reshape(-1),
+                    strokes[self._soft] - point.values[table.actuators],
+                    gap.reshape(-1),
+                    beyond(point.values, table.lower, table.upper),
+                ]
+            )
         )
         nodal = weights.node_rate * moved + table.nodal_forces(multipliers).take(self._nodes, axis=0)
         force = (weights.actuator_rate + weights.stroke_centring) * strokes
@@ -251,9 +262,4 @@ class TrackedSolver:
         residual += force @ self._strokes[:, :-1]
         residual += weights.tangent * tilt.reshape(-1) @ self._angles[:, :-1]
         residual += self.data.polygon_gradient(point.vertices)
-        scale = 1.0 + float(np.max(np.abs(force))) + float(np.max(np.abs(multipliers)))
-        dual = float(np.max(np.abs(residual))) / scale
-        if not (primal <= RESIDUAL and dual <= RESIDUAL):
-            raise SolverError(
-                f"the elimination left a primal residual of {primal:.1e} m and a dual residual of {dual:.1e}"
-            )
+        refuse_large(primal, relative(norm(residual), force, multipliers), "the elimination")

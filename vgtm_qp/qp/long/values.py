@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.kinematics import face_frame, frame_constants
+from vgtm_qp.arm.frames import fitted_frame, frame_constants
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
@@ -53,7 +53,7 @@ def period_values(chain: Chain) -> ca.Function:
         angles = frames[7 * k : 7 * k + 7]
         frame = (angles[:3], angles[3:6], angles[6])
         x, moved, slope, slope_moved = ca.vertsplit(curve[12 * k : 12 * k + 12], 3)
-        axes = (face_frame(X[:, places], *frame) @ alignment[:, 3 * k : 3 * k + 3])[:, :2]
+        axes = (fitted_frame(X[:, places], *frame) @ alignment[:, 3 * k : 3 * k + 3])[:, :2]
         slowness = 1.0 / ca.norm_2(slope)
         tangent = slope * slowness
         along = axes.T @ tangent
@@ -77,7 +77,7 @@ def _turning(nodes: ca.SX, frame: tuple[ca.SX, ca.SX, ca.SX], axis: ca.SX) -> ca
 
     Half the sum of r x dr over the frame's axes r, in one sweep backwards through what places them.
     """
-    fitted = face_frame(nodes, *frame)
+    fitted = fitted_frame(nodes, *frame)
     across = ca.horzcat(*[ca.cross(axis, fitted[:, c]) for c in range(3)]) / 2
     return ca.jtimes(ca.vec(fitted), ca.vec(nodes), ca.vec(across), True).T
 
@@ -94,7 +94,7 @@ class PeriodValues:
     def __init__(self, chain: Chain, data: ChainData, home_lengths: Array) -> None:
         if chain.window is None:
             raise ValueError("the periods of this chain are not alike")
-        layout, truss, order = chain.layout, chain.layout.truss, data.order
+        layout, bays, order = chain.layout, chain.bays, data.order
         self._layout, self._data = layout, data
         self._kernel = Kernel(period_values(chain).map(chain.periods))
         for k, array in enumerate((data.head, data.tail, data.lean)):
@@ -104,7 +104,7 @@ class PeriodValues:
         self._curve, self._switches = inputs[6], inputs[7]
         self._window = chain.window[order].reshape(-1)
         members = chain.members[order]
-        inputs[2][:], inputs[3][:] = home_lengths[members], ~truss.actuated[members]
+        inputs[2][:], inputs[3][:] = home_lengths[members], ~bays.actuated[members]
         self._at = np.argsort(members.reshape(-1))
         self._frames(chain, inputs[4], inputs[5])
         weights, slopes = layout.curve_weights[data.faces], layout.curve_slopes[data.faces]
@@ -119,17 +119,17 @@ class PeriodValues:
         self._jacobian = data.head[:, : len(columns)]
         self._rhs = data.head[:, len(columns) : len(columns) + chain.own]
         self._entry = _entries(chain)
-        self._members_at = np.empty(truss.member_count, dtype=np.int64)
-        self._members_at[members.reshape(-1)] = np.arange(truss.member_count)
+        self._members_at = np.empty(bays.member_count, dtype=np.int64)
+        self._members_at[members.reshape(-1)] = np.arange(bays.member_count)
         self._nodes = chain.window[order]
-        self.lengths = np.zeros(truss.member_count)
+        self.lengths = np.zeros(bays.member_count)
 
     def _frames(self, chain: Chain, frames: Array, alignments: Array) -> None:
-        truss, order = chain.layout.truss, chain.face_order[self._data.order].reshape(-1, 3)
+        arm, order = chain.layout.arm, chain.face_order[self._data.order].reshape(-1, 3)
         angles, aligned = [], []
         for face, places in zip(chain.layout.tracked[self._data.faces].tolist(), order, strict=True):
             cosines, sines, alignment = frame_constants(
-                truss.home[truss.faces[face]], truss.face_frames[face]
+                arm.home[arm.stations.nodes[face]], arm.stations.frames[face]
             )
             sense = 1.0 if (np.roll(places, -int(places.argmin())) == np.arange(3)).all() else -1.0
             angles.append(np.concatenate([cosines[places], sines[places], [sense]]))

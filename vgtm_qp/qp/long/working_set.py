@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, cast
 
-import daqp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
+from vgtm_qp.arm.arm import Bays, LengthRowsLike
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.condensed import FEASIBILITY, InfeasibleStepError
+from vgtm_qp.qp import daqp
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.residual import InfeasibleStepError
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -52,8 +53,9 @@ class RowNumbers:
     member_rows: MemberRows
 
     @classmethod
-    def of(cls, layout: Layout, numbers: StepNumbers) -> RowNumbers:
+    def of(cls, bays: Bays, numbers: StepNumbers) -> RowNumbers:
         """Return those of `numbers`."""
+        rows = cast(LengthRowsLike, numbers.motion)
         return cls(
             lower=numbers.lower,
             upper=numbers.upper,
@@ -66,7 +68,7 @@ class RowNumbers:
             progress_curvature=numbers.progress_curvature,
             clearance=numbers.clearance,
             actuator_gradient=numbers.actuator_gradient,
-            member_rows=lambda members: (layout.member_nodes[members], numbers.gradient[members]),
+            member_rows=lambda members: (bays.member_nodes[members], rows.gradient[members]),
         )
 
 
@@ -128,7 +130,7 @@ class RowTable:
         `strokes` (n_a,) and `held` (l,) are the changes of the actuated and of the locked members' lengths.
         """
         numbers, clearance = self.numbers, self.numbers.clearance
-        tip = moved(self.layout.truss.tip).reshape(-1)
+        tip = moved(self.layout.arm.end_effector.nodes).reshape(-1)
         return np.concatenate(
             [
                 numbers.tip_jacobian @ tip - numbers.tip_rate * progress,
@@ -145,20 +147,20 @@ class RowTable:
 
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
         """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
-        numbers, truss = self.numbers, self.layout.truss
+        numbers, tip_nodes = self.numbers, self.layout.arm.end_effector.nodes
         tip = len(numbers.tip_rhs)
         if rows.max() < tip + (not len(self.locked)):
             every = np.vstack([numbers.tip_jacobian, np.zeros_like(numbers.tip_jacobian[:1])])
             on_tip = every[rows].reshape(len(rows), -1, 3)
-            return np.tile(truss.tip, (len(rows), 1)), on_tip, np.append(-numbers.tip_rate, 1.0)[rows]
+            return np.tile(tip_nodes, (len(rows), 1)), on_tip, np.append(-numbers.tip_rate, 1.0)[rows]
         is_stroke = (rows >= self.actuators.start) & (rows < self.clearance.start)
         is_held = (rows >= tip) & (rows < self.equal)
         members = np.empty(len(rows), dtype=np.int64)
-        members[is_stroke] = truss.actuators[rows[is_stroke] - self.actuators.start]
+        members[is_stroke] = self.layout.arm.actuators[rows[is_stroke] - self.actuators.start]
         members[is_held] = self.locked[rows[is_held] - tip]
         along = np.flatnonzero(is_stroke | is_held)
         member_nodes, gradients = numbers.member_rows(members[along])
-        width = max(len(truss.tip), member_nodes.shape[1], numbers.clearance.nodes.shape[1])
+        width = max(len(tip_nodes), member_nodes.shape[1], numbers.clearance.nodes.shape[1])
         nodes, coefficients = np.zeros((len(rows), width), dtype=np.int64), np.zeros((len(rows), width, 3))
         progress = np.zeros(len(rows))
 
@@ -168,7 +170,7 @@ class RowTable:
 
         put(along, member_nodes, gradients)
         where = np.flatnonzero(rows < tip)
-        put(where, truss.tip, numbers.tip_jacobian[rows[where]].reshape(len(where), len(truss.tip), 3))
+        put(where, tip_nodes, numbers.tip_jacobian[rows[where]].reshape(len(where), len(tip_nodes), 3))
         progress[where] = -numbers.tip_rate[rows[where]]
         progress[rows == self.equal] = 1.0
         where = np.flatnonzero(rows >= self.clearance.start)
@@ -178,10 +180,10 @@ class RowTable:
 
     def nodal_forces(self, multipliers: Array) -> Array:
         """Return (N, 3) the tip's and clearance rows' multipliers (total,) times their coefficients."""
-        numbers, truss = self.numbers, self.layout.truss
-        forces = np.zeros((truss.node_count, 3))
+        numbers, arm = self.numbers, self.layout.arm
+        forces = np.zeros((len(arm.node_names), 3))
         tip = multipliers[: len(numbers.tip_rhs)] @ numbers.tip_jacobian
-        np.add.at(forces, truss.tip, tip.reshape(-1, 3))
+        np.add.at(forces, arm.end_effector.nodes, tip.reshape(-1, 3))
         active = np.flatnonzero(multipliers[self.clearance])
         pressing = multipliers[self.clearance][active, None, None] * numbers.clearance.coefficients[active]
         np.add.at(forces, numbers.clearance.nodes[active], pressing)
@@ -257,16 +259,12 @@ def dual_solution(
         value = bound[kept]
         free = np.abs(value) >= UNBOUNDED
         bounds.append(np.where(free, value, (value - values[kept]) * scale))
-    sense = np.where(equal[kept], 5, 0).astype(np.int32)
-    _, _, flag, info = daqp.solve(
-        np.eye(rank), np.zeros(rank), rows, bounds[1], bounds[0], sense, primal_tol=FEASIBILITY, eps_prox=0.0
-    )
-    if flag == -1:
-        raise InfeasibleStepError("the hard rows of the step contradict one another")
-    if flag < 1:
-        raise SolverError(f"daqp ended with exit flag {flag}")
-    multipliers[kept] = np.asarray(info["lam"]) * scale
-    return multipliers, int(info["iterations"])
+    sense = np.where(equal[kept], daqp.EQUALITY, 0).astype(np.int32)
+    answer = daqp.ask(np.eye(rank), np.zeros(rank), rows, bounds[0], bounds[1], sense)
+    if answer.flag < 1:
+        raise SolverError(f"daqp ended with exit flag {answer.flag}")
+    multipliers[kept] = answer.multipliers * scale
+    return multipliers, answer.iterations
 
 
 @dataclass(frozen=True, eq=False)

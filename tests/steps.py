@@ -1,0 +1,138 @@
+"""One step of an arm to ask an engine for, and what two engines' answers have in common."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import qpsolvers
+import scipy.sparse
+from arms import random_pose
+from numpy.typing import NDArray
+
+from vgtm_qp.arm.arm import Kinematics, Pose
+from vgtm_qp.qp.full import StepQP
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.linearise import Linearisation
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.shape import CurveRows
+from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.step.path import Path
+from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.target import QPInput, Target
+
+Array = NDArray[np.float64]
+
+MOVED_BASE = Pose(np.array([0.01, 0.0, 0.02]), rotation_from_vector([0.01, -0.02, 0.015]))
+"""A base that turned and moved a little."""
+
+
+def make_step(
+    layout: Layout, kinematics: Kinematics, rng: np.random.Generator, *, base: bool = False
+) -> tuple[Array, Array, Array, Target, ClearanceRows]:
+    """A pose, the middle of a guessed motion, a curve and a target near them, and clearance rows that are active."""
+    arm, tip = layout.arm, layout.arm.end_effector
+    truss = arm.truss
+    X = random_pose(truss, rng, 0.01)
+    X[arm.base] = arm.home[arm.base]
+    kinematics.evaluate(X)
+    lengths = kinematics.quantities[arm.actuators].copy()
+    here, rotation = tip.position(X), kinematics.tip_rotation.copy()
+    turn = rotation_from_vector([0.02, -0.01, 0.015])
+    path = Path(
+        np.array([0.0, 2.0]),
+        np.stack([here, here + np.array([0.03, 0.02, -0.02])]),
+        np.stack([rotation, turn @ rotation]),
+    )
+    target = Target(path, 0.0, 1.0, lengths - 0.2, lengths + 0.2, 1.0, MOVED_BASE if base else None)
+    vertices = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, arm.height]
+    vertices[2:] += 0.03 * rng.normal(size=vertices[2:].shape)
+    normal = rng.normal(size=(3, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    nodes = truss.members[rng.integers(truss.member_count, size=(3, 2))].reshape(3, 4)
+    share = rng.uniform(size=(3, 4, 1)) * [[1.0], [1.0], [-1.0], [-1.0]]
+    rows = ClearanceRows(nodes, share * normal[:, None, :], np.full(3, -1.0), str)
+    Y = X + 0.005 * rng.normal(size=X.shape)
+    Y[arm.base] = X[arm.base]
+    return X, Y, vertices, target, rows
+
+
+def pressing(rows: ClearanceRows, answer: StepSolution) -> ClearanceRows:
+    """The rows, each asking for a little more than a solution without them gives: some become active."""
+    moved = np.where(np.isfinite(answer.nodes), answer.nodes, 0.0)
+    value = np.einsum("rsc,rsc->r", rows.coefficients, moved[rows.nodes])
+    return ClearanceRows(rows.nodes, rows.coefficients, value + np.array([1e-4, -1e-2, -1e-2]), rows.name)
+
+
+def assert_same_answer(found: Any, wanted: Any, tolerance: float = 1e-10) -> None:
+    """Nodes, actuators, curve and progress are the same."""
+    for which in ("nodes", "actuators", "vertices", "progress"):
+        np.testing.assert_allclose(
+            getattr(found, which), getattr(wanted, which), atol=tolerance, err_msg=which
+        )
+
+
+class TurnRows(NamedTuple):
+    """Turns between faces and curve: (K, R) residuals, rows over the faces' nodes (K, R, 9) and the curve (K, R, D)."""
+
+    residual: Array
+    face: Array
+    curve: Array
+
+
+def turn_rows(rows: CurveRows, rotation: Array, spin: Array, turns: int) -> TurnRows:
+    """Return the turns between faces, `rotation` (K, 3, 3) and `spin` (K, 3, 9), and the curve's frames.
+
+    The first two are cosines between the face's x and y axes and the tangent, the third the sine of the roll. Each is
+    a function of the relative rotation alone: its rate is c . (face's less curve's angular velocity).
+    """
+    frame = rows.frame
+    x, y = rotation[:, :, 0], rotation[:, :, 1]
+    tangent = frame[:, :, 2]
+    residual = [np.einsum("kc,kc->k", axis, tangent) for axis in (x, y)]
+    combined = [np.cross(axis, tangent) for axis in (x, y)]
+    if turns == 3:
+        first, second = frame[:, :, 0], frame[:, :, 1]
+        residual.append(0.5 * np.einsum("kc,kc->k", x, second) - 0.5 * np.einsum("kc,kc->k", y, first))
+        combined.append(0.5 * (np.cross(x, second) - np.cross(y, first)))
+    c = np.stack(combined, axis=1)
+    return TurnRows(np.stack(residual, axis=1), c @ spin, -c @ rows.spin_rows)
+
+
+def numbers_at(
+    setup: Setup,
+    q: Array,
+    vertices: Array,
+    target: Target,
+    progress: float,
+    rows: ClearanceRows,
+    *,
+    motion: bool,
+) -> StepNumbers:
+    """The numbers of the QP of an arm at a configuration, as the general engine has them."""
+    at = QPInput(q, q, vertices, setup.torsion, target, target.goal(progress), progress, rows, motion)
+    return Linearisation(setup.layout, compiled=False).numbers(at.linear(setup.layout), rows)
+
+
+def solved(qp: StepQP) -> tuple[Array, Array]:
+    """Answer and equalities' multipliers, by row, of a whole QP, by PIQP behind qpsolvers; zero for other rows."""
+    equal = qp.row_lower == qp.row_upper
+    sides = qp.A[~equal]
+    G = scipy.sparse.vstack([sides, -sides]).tocsc()
+    h = np.concatenate([qp.row_upper[~equal], -qp.row_lower[~equal]])
+    kept = np.isfinite(h)
+    problem = qpsolvers.Problem(
+        scipy.sparse.csc_matrix(qp.P),
+        qp.q,
+        scipy.sparse.csc_matrix(G.tocsr()[kept]),
+        h[kept],
+        scipy.sparse.csc_matrix(qp.A[equal]),
+        qp.row_lower[equal],
+        qp.column_lower,
+        qp.column_upper,
+    )
+    found = qpsolvers.solve_problem(problem, solver="piqp", eps_abs=1e-10, eps_rel=1e-10)
+    assert found.found
+    multipliers = np.zeros(len(equal))
+    multipliers[equal] = found.y
+    return np.asarray(found.x), multipliers

@@ -1,0 +1,77 @@
+"""Rotations of stations and end effector, fitted to their nodes, and the angular velocity that the nodes give them."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def fitted_frame(nodes: ca.SX, cosines: ca.SX, sines: ca.SX, sense: ca.SX | float = 1.0) -> ca.SX:
+    """Return the rotation (3, 3) that fits the reference polygon with the given polar angles best to (3, K) `nodes`.
+
+    z is the unit area vector; x is the closed solution of the two-dimensional orthogonal Procrustes problem in the
+    plane normal to it. No node is preferred, so a variable triangle gains no false authority over roll.
+    `sense` is -1 where the nodes are named the other way round.
+    """
+    count = nodes.shape[1]
+    centred = nodes - ca.repmat(ca.sum2(nodes) / count, 1, count)
+    area, x = ca.SX.zeros(3), ca.SX.zeros(3)
+    for j in range(count):
+        area += ca.cross(centred[:, j], centred[:, (j + 1) % count])
+    z = area * (sense / ca.norm_2(area))
+    for j in range(count):
+        x += cosines[j] * centred[:, j] + sines[j] * ca.cross(centred[:, j], z)
+    x -= z * ca.dot(z, x)
+    x *= 1.0 / ca.norm_2(x)
+    return ca.horzcat(x, ca.cross(z, x), z)
+
+
+def frame_function(count: int) -> ca.Function:
+    """Return (nodes (3, K), cosines, sines, alignment) -> rotation R (3, 3) and spin S (3, 3K), dR = [S d nodes]x R."""
+    nodes, cosines, sines = (
+        ca.SX.sym("nodes", 3, count),
+        ca.SX.sym("cosines", count),
+        ca.SX.sym("sines", count),
+    )
+    alignment = ca.SX.sym("alignment", 3, 3)
+    fitted = fitted_frame(nodes, cosines, sines)
+    spin = ca.SX.zeros(3, 3 * count)
+    for c in range(3):
+        spin += ca.skew(fitted[:, c]) @ ca.jacobian(fitted[:, c], ca.vec(nodes)) / 2
+    return ca.Function("frame", [nodes, cosines, sines, alignment], [fitted @ alignment, ca.densify(spin)])
+
+
+def frame_constants(home: Array, rotation: Array) -> tuple[Array, Array, Array]:
+    """Return the polar angles' cosines and sines, and the alignment that makes the frame at `home` equal `rotation`."""
+    centred = home - home.mean(axis=0)
+    normal = np.sum(np.cross(centred, np.roll(centred, -1, axis=0)), axis=0)
+    normal /= np.linalg.norm(normal)
+    first = rotation[:, 0] - normal * (normal @ rotation[:, 0])
+    if np.linalg.norm(first) < 1e-6:
+        first = centred[0]
+    first = first / np.linalg.norm(first)
+    second = np.cross(normal, first)
+    angles = np.arctan2(centred @ second, centred @ first)
+    return np.cos(angles), np.sin(angles), np.stack([first, second, normal], axis=0) @ rotation
+
+
+def frames_at(X: ca.MX, home: Array, rotations: Array, nodes: Index) -> list[ca.MX]:
+    """Return rotations (3, 3F) and spins (3, 3KF) of F frames of K nodes each, from all nodes `X` (3, N).
+
+    Parameters
+    ----------
+    home, rotations : (F, K, 3), (F, 3, 3)
+        Nodes and rotations at home, m.
+    nodes : (F, K) int
+    """
+    if not len(home):
+        return [ca.MX(0, 0), ca.MX(0, 0)]
+    constants = [frame_constants(points, rotation) for points, rotation in zip(home, rotations, strict=True)]
+    cosines, sines, alignments = (np.stack(column) for column in zip(*constants, strict=True))
+    function = frame_function(home.shape[1]).map(len(home))
+    arguments = [ca.DM(cosines.T), ca.DM(sines.T), ca.DM(np.concatenate(alignments, axis=1))]
+    return list(function(X[:, nodes.reshape(-1).tolist()], *arguments))

@@ -1,0 +1,75 @@
+"""The bodies of an arm: capsules, each spanned by two points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """B capsules between points of an arm; make them by :func:`capsules`.
+
+    Attributes
+    ----------
+    points : (B, 2) int
+        The two points that span each capsule: rows of the positions (P, 3) that a clearance is asked at.
+    radius : (B,)
+        m.
+    joints : (B, 2) int
+        The joints at the two ends. Two bodies with a joint in common are neighbours, and may touch.
+    names : tuple of str
+    kind : str
+        What such a body is called, as in ``"member L3-2"``.
+    """
+
+    points: Index
+    radius: Array
+    joints: Index
+    names: tuple[str, ...]
+    kind: str
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def called(self, body: int) -> str:
+        """Return kind and name of a body: ``"member L3-2"``."""
+        return f"{self.kind} {self.names[body]}"
+
+
+def capsules(
+    points: ArrayLike,
+    radius: ArrayLike,
+    names: Sequence[str] | None = None,
+    *,
+    joints: ArrayLike | None = None,
+    kind: str = "member",
+) -> Bodies:
+    """Return capsules (B) between `points` (B, 2).
+
+    Parameters
+    ----------
+    points : (B, 2) int
+    radius : float or (B,)
+        m.
+    names
+        By default ``"0"``, ``"1"``...
+    joints : (B, 2) int, optional
+        By default the points: bodies that share a point are neighbours.
+    kind
+        What a body is called in the names of rows.
+    """
+    span = np.asarray(points, dtype=np.int64).reshape(-1, 2)
+    return Bodies(
+        points=span,
+        radius=np.broadcast_to(np.asarray(radius, dtype=float), len(span)).copy(),
+        joints=span if joints is None else np.asarray(joints, dtype=np.int64).reshape(-1, 2),
+        names=tuple(map(str, range(len(span)))) if names is None else tuple(names),
+        kind=kind,
+    )

@@ -1,0 +1,192 @@
+"""From a configuration to the numbers of its QP: every row of a step, linearised there by one compiled function."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.arm.symbols import Bound, Constants
+from vgtm_qp.compiled import Kernel
+from vgtm_qp.qp.graph import StationSymbols, StepGraph
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers
+from vgtm_qp.qp.shape import CurveRows
+
+Array = NDArray[np.float64]
+
+
+class TipGoal(NamedTuple):
+    """Where the end effector is to be, position (3,), m, and rotation (3, 3), and its rates per unit of progress."""
+
+    position: Array
+    rotation: Array
+    velocity: Array
+    spin: Array
+
+
+class StepInput(NamedTuple):
+    """What a step's QP is linearised at.
+
+    Attributes
+    ----------
+    q, at : configurations
+        Where residuals and where Jacobians are evaluated.
+    base : (N, 3)
+        Nodes at `q` when only the base has moved to where it will be, m.
+    vertices : (V, 3)
+        Control vertices, m.
+    lower, upper : (n_a,)
+        Boxes of the actuators at the end of the step.
+    motion : bool
+        Whether the QP moves the arm; a correction returns to the constraints on the shortest way, without the
+        gradients of the null-space objectives.
+    progress : float
+        Progress alpha reached so far; the step may go back to 0 and on to 1.
+    goal : TipGoal
+    curve : CurveRows or None
+        Rows of a curve that is more than its tables.
+    vertex_goals : (V, 3) or None
+    """
+
+    q: Array
+    at: Array
+    base: Array
+    vertices: Array
+    lower: Array
+    upper: Array
+    motion: bool
+    progress: float
+    goal: TipGoal
+    curve: CurveRows | None = None
+    vertex_goals: Array | None = None
+
+    def load(self, kernel: Kernel) -> None:
+        """Write the arguments of a function of ``StepGraph.inputs``."""
+        inputs = kernel.inputs
+        inputs[0][:] = self.q.reshape(-1)
+        inputs[1][:] = self.at.reshape(-1)
+        inputs[2][:] = self.base.reshape(-1)
+        inputs[3][:] = self.vertices.reshape(-1)
+        inputs[4][:] = self.lower
+        inputs[5][:] = self.upper
+        inputs[6][0] = 1.0 if self.motion else 0.0
+        inputs[7][0] = self.progress
+        inputs[8][:] = self.goal.position
+        inputs[9][:] = self.goal.rotation.T.reshape(-1)
+        inputs[10][:] = self.goal.velocity
+        inputs[11][:] = self.goal.spin
+        for k, table in enumerate(self.curve or (), start=12):
+            inputs[k][:] = table.reshape(-1)
+
+
+class Linearisation:
+    """Fills :class:`StepNumbers` at a configuration.
+
+    Attributes
+    ----------
+    quantities : (M,)
+        Of the arm at the configuration linearised last.
+    """
+
+    def __init__(self, layout: Layout, *, compiled: bool = True) -> None:
+        self.layout = layout
+        self._kernel = linear_function(layout).kernel(compiled=compiled)
+        self.quantities = self._kernel.outputs[0]
+
+    def numbers(self, asked: StepInput, clearance: ClearanceRows) -> StepNumbers:
+        """Return the QP's numbers, in arrays of their own."""
+        layout, kernel = self.layout, self._kernel
+        asked.load(kernel)
+        kernel()
+        count, tips, turns = len(layout.tracked), len(layout.tip_rows), layout.turns
+        _, strokes, error, rate, tip, curvature, offset, axes, gap, turn, face, curve, *motion = (
+            output.copy() for output in kernel.outputs
+        )
+        weights, moves = layout.weights, asked.motion
+        home = layout.arm.home_quantities[layout.arm.actuators]
+        vertices = asked.vertices
+        shift, base_axes = np.zeros(3), axes.reshape(2, 3)
+        base_rhs, pull = np.zeros(2), np.zeros_like(vertices)
+        gap, turn = gap.reshape(count, 3), turn.reshape(count, turns)
+        if layout.vertices:
+            shift = offset[:3]
+            base_rhs = -base_axes @ (vertices[1] - vertices[0])
+        if moves:
+            pull = weights.smoothness * (layout.polygon_bending @ vertices)
+            pull += layout.goal_pull(vertices, asked.vertex_goals)
+        if not (moves or layout.hard_tracking):
+            gap = np.zeros_like(gap)
+        if not (moves or layout.hard_turns):
+            turn = np.zeros_like(turn)
+        face = face.reshape(count, 9, turns).transpose(0, 2, 1)
+        curve = curve.reshape(count, curve.size // max(count * turns, 1), turns).transpose(0, 2, 1)
+        general = None
+        if asked.curve is not None:
+            spacing = asked.curve.spacing
+            general = CurveNumbers(
+                position=asked.curve.position_rows,
+                turn_face=face,
+                turn_curve=curve,
+                turn_rhs=turn,
+                spacing=asked.curve.spacing_rows,
+                spacing_rhs=spacing if moves else 0.0 * spacing,
+            )
+        return StepNumbers(
+            motion=layout.arm.motion_rows(*motion),
+            lower=asked.lower - strokes,
+            upper=asked.upper - strokes,
+            actuator_gradient=weights.stroke_centring * (strokes - home) if moves else np.zeros_like(strokes),
+            tip_jacobian=tip.reshape(-1, tips).T,
+            tip_rate=rate,
+            tip_rhs=error,
+            progress_lower=1.0 - asked.progress if layout.elastic_tip else -asked.progress,
+            progress_upper=1.0 - asked.progress,
+            progress_gradient=float(curvature[0]) * (asked.progress - 2.0),
+            progress_curvature=float(curvature[0]),
+            position_rhs=gap,
+            tangent_face=face if general is None else np.zeros((count, 2, 9)),
+            tangent_curve=curve if general is None else np.zeros((count, 2, 3)),
+            tangent_rhs=turn if general is None else np.zeros((count, 2)),
+            vertex_gradient=pull,
+            base_displacement=shift,
+            base_axes=base_axes,
+            base_rhs=base_rhs,
+            clearance=clearance,
+            curve=general,
+        )
+
+
+def linear_function(layout: Layout) -> Bound:
+    """Return the function that linearises a step of `layout`.
+
+    Arguments are ``StepGraph.inputs``. Results: quantities (M,), strokes (n_a,); tip error, rate (n_e,) and J_u
+    (n_e, 3K); curvature of the progress; offsets (3, V) and base axes (3, 2) of the curve; and, one block a tracked
+    station, gaps (3, K), turns (R, K), their rows over the stations' nodes (R, 9 K) and over the curve
+    (``StationSymbols.curve``); last, what the arm's motion rows are made of.
+    """
+    constants = Constants()
+    graph = StepGraph(layout, layout.arm.symbols(constants), constants)
+    symbols, none = graph.symbols, ca.MX(0, 0)
+    blocks: list[list[ca.MX]] = [[none], [none], [none], [none]]
+    if layout.vertices:
+        station = StationSymbols(layout)
+        results = [station.gap, station.turn, station.face, station.curve]
+        function = ca.Function("station", station.inputs, [ca.densify(result) for result in results])
+        found = [function(*graph.station(k)) for k in range(len(layout.tracked))]
+        blocks = [list(column) for column in zip(*found, strict=True)]
+    outputs = [
+        symbols.quantities(graph.q),
+        graph.strokes,
+        graph.tip_error,
+        graph.tip_rate,
+        graph.tip_jacobian,
+        graph.curvature,
+        graph.offset,
+        graph.base_axes,
+        *(ca.horzcat(*block) for block in blocks),
+        *symbols.motion(graph.q, graph.at, graph.moved),
+    ]
+    return graph.bound("linear", outputs)

@@ -1,0 +1,32 @@
+"""Where the reference curve begins, eq. (37)'s counterpart at the base, and what its free coordinates are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+
+def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
+    """Return (3, V) the displacements of the control vertices (3, V) that bring the curve back to its base, m.
+
+    p_0 goes to the `centre` (3,) of the base, p_1 with it and onto the normal of the base's frame, `rotation` (3, 3).
+    """
+    across = rotation[:, :2]
+    offset = ca.MX.zeros(*vertices.shape)
+    offset[:, 0] = centre - vertices[:, 0]
+    offset[:, 1] = offset[:, 0] - across @ (across.T @ (vertices[:, 1] - vertices[:, 0]))
+    return offset
+
+
+def free_columns(rows: Any, normal: Any) -> Any:
+    """Return (R, q) rows over the coordinates that the base leaves free, from rows (R, 3 V + T) over all.
+
+    p_1 moves along the base normal (3,), all later control vertices and the torsion as they like.
+    """
+    return ca.horzcat(rows[:, 3:6] @ normal, rows[:, 6:])
+
+
+def weighted_columns(weights: Any, normal: Any, factor: Any) -> Any:
+    """Return (R, q) the derivative of factor (R, 3) @ sum_i w_i p_i by the free coordinates; weights (V,), (35)."""
+    return ca.horzcat(weights[1] * (factor @ normal), ca.kron(weights[2:].T, factor))

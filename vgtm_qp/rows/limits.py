@@ -1,0 +1,85 @@
+"""Stroke, rate and acceleration of each actuator as one box that never contradicts itself, and what binds it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
+    """Return the greatest speed of a step of `dt` after which steps slowing by `acceleration` stop within `distance`.
+
+    Speeds v, v - a dt, v - 2 a dt, ... cover dt (N v - a dt N (N - 1) / 2) in the N steps before they reach zero;
+    this is the exact inverse, so a speed that was allowed once can always be braked within the limits. m/s.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gap = np.maximum(distance, 0.0)
+        steps = np.maximum(np.ceil((np.sqrt(1.0 + 8.0 * gap / (acceleration * dt * dt)) - 1.0) / 2.0), 1.0)
+        speed = gap / (steps * dt) + acceleration * dt * (steps - 1.0) / 2.0
+    return np.asarray(np.where(np.isfinite(acceleration), speed, np.inf))
+
+
+def actuator_box(
+    value: Array,
+    speed: Array,
+    stroke: Array,
+    rate: Array,
+    acceleration: Array,
+    dt: float,
+    last_dt: float | None = None,
+) -> tuple[Array, Array]:
+    """Return the least and greatest values (n_a,) after a step of `dt` from `value`: lengths, m, or joint values.
+
+    Rate, acceleration and the speed from which the actuator still brakes before the end of its stroke are
+    intersected. Where they contradict one another (a start outside a limit) the acceleration gives way, then the
+    rate; an actuator outside its stroke may only come back.
+
+    Parameters
+    ----------
+    speed : (n_a,)
+        Mean speed over the step before, per second.
+    last_dt
+        Duration of that step, s; `dt` by default. An acceleration is a change of mean speed over the time between
+        the middles of two steps.
+    """
+    low, high = np.minimum(stroke[:, 0], value), np.maximum(stroke[:, 1], value)
+    if np.isinf(acceleration).all():
+        return np.maximum(low, value - rate * dt), np.minimum(high, value + rate * dt)
+    interval = dt if last_dt is None else 0.5 * (dt + last_dt)
+    fastest = np.minimum(rate, braking_speed(high - value, acceleration, dt))
+    slowest = -np.minimum(rate, braking_speed(value - low, acceleration, dt))
+    with np.errstate(invalid="ignore"):
+        least, greatest = speed - acceleration * interval, speed + acceleration * interval
+    lower = np.maximum(low, value + np.clip(least, slowest, fastest) * dt)
+    upper = np.minimum(high, value + np.clip(greatest, slowest, fastest) * dt)
+    # Where both mean the same value, rounding must not set them in the wrong order.
+    return lower, np.maximum(lower, upper)
+
+
+_SAME = 1e-9
+"""Bounds that differ by less are one."""
+
+LOCKED, STROKE, RATE, ACCELERATION = "locked", "stroke", "rate", "acceleration"
+
+
+def binding(
+    bound: Array, end: Array, fastest: Array, acceleration: Array, locked: NDArray[np.bool_]
+) -> list[str]:
+    """Return what sets one side of each actuator's box: ``"locked"``, ``"stroke"``, ``"rate"`` or ``"acceleration"``.
+
+    Parameters
+    ----------
+    bound, end, fastest : (n_a,)
+        The side of the box, the end of the stroke there, and where the greatest rate leads.
+    acceleration : (n_a,)
+        Limits; inf where there is none.
+    locked : (n_a,) bool
+        Actuators that are stuck.
+    """
+    # Actuators without a limited acceleration that stop short slow down before the end of their stroke.
+    other = np.where(np.isinf(acceleration), STROKE, ACCELERATION)
+    kind = np.where(np.abs(bound - fastest) < _SAME, RATE, other)
+    kind = np.where(np.abs(bound - end) < _SAME, STROKE, kind)
+    return [str(name) for name in np.where(locked, LOCKED, kind)]

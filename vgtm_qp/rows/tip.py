@@ -1,0 +1,152 @@
+"""The end effector's coordinates, eqs. (11) and (16): position by axes, attitude by rotation vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+
+from vgtm_qp.errors import GoalError, nearest
+
+_ROWS = {
+    "position": ("tip x", "tip y", "tip z"),
+    "pointing": ("tip direction 1", "tip direction 2"),
+    "orientation": ("tip rotation x", "tip rotation y", "tip rotation z"),
+    "x": ("tip x",),
+    "y": ("tip y",),
+    "z": ("tip z",),
+}
+_AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
+
+TINY = 1e-30
+"""A square that keeps the root of another one smooth at zero."""
+
+SHORT_WAY = 0.01
+"""A way of the tip in a step, m, below which progress along it counts more.
+
+Progress is weighted by the square of the way. The other objectives pull with forces that do not shrink with the way, so
+that by its square alone the last micrometres would never be covered: below this it is way * SHORT_WAY. Where the path
+stands still progress costs nothing, and any positive number serves.
+"""
+
+CLOSED = 2e-8
+"""A tip error of a state that a motion need not close, m or rad: within what an accepted state may have."""
+
+_PARALLEL = 1e-12
+"""Directions whose cross product is shorter are parallel or opposite."""
+
+
+def row_names(track: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the rows of the tracked coordinates.
+
+    Raises
+    ------
+    GoalError
+        A name is unknown, or coordinates are given twice.
+    """
+    for name in track:
+        if name not in _ROWS:
+            raise GoalError(f'cannot track "{name}"{nearest(name, _ROWS)}; choices: {", ".join(_ROWS)}')
+    rows = tuple(row for name in track for row in _ROWS[name])
+    if len(set(rows)) < len(rows) or {"pointing", "orientation"} <= set(track):
+        raise GoalError(f"the end effector's coordinates {list(track)} name one coordinate twice")
+    return rows
+
+
+def axes(rows: Sequence[str]) -> list[int]:
+    """Return the axes, 0 to 2, of the rows that are positions."""
+    return [_AXES[row] for row in rows if row in _AXES]
+
+
+def unit(row: str) -> str:
+    """Return the unit of a row."""
+    return "m" if row in _AXES else "rad"
+
+
+def turned_axes(rows: Sequence[str], rotation: Any) -> Any:
+    """Return (r, 3) the directions about which the tip's turns are tracked: two across its z-axis, three, or none."""
+    if "tip direction 1" in rows:
+        return rotation[:, :2].T
+    if "tip rotation x" in rows:
+        return ca.DM.eye(3)
+    return ca.DM(0, 3)
+
+
+def combined(rows: Sequence[str], position: Any, spin: Any, rotation: Any) -> Any:
+    """Return the rows (n_e, n) made of the tip's velocity and angular velocity (3, n) each: J_u of eq. (16).
+
+    Goals that move are combined in the same way: x_e-dot.
+    """
+    return ca.vertcat(position[axes(rows), :], turned_axes(rows, rotation) @ spin)
+
+
+def error(rows: Sequence[str], position: Any, rotation: Any, goal: Any, turned: Any) -> Any:
+    """Return (n_e, 1) goal minus value, eq. (11), m and rad: the pose `goal` (3,), `turned` (3, 3) less the tip's.
+
+    The turn is the rotation vector of the shortest way to the goal's direction, or to its orientation.
+    """
+    if "tip direction 1" in rows:
+        twist, cosine = ca.cross(rotation[:, 2], turned[:, 2]), ca.dot(rotation[:, 2], turned[:, 2])
+        # Towards the opposite direction every way is as long: about the tip's own x-axis.
+        opposite = ca.logic_and(ca.dot(twist, twist) < _PARALLEL**2, cosine < 0)
+        twist = ca.if_else(opposite, _PARALLEL * rotation[:, 0], twist)
+    elif "tip rotation x" in rows:
+        relative = turned @ rotation.T
+        twist, cosine = ca.inv_skew((relative - relative.T) / 2), (ca.trace(relative) - 1) / 2
+        half = ca.logic_and(ca.dot(twist, twist) < _PARALLEL**2, cosine < 0)
+        twist = ca.if_else(half, _PARALLEL * _half_turn_axis(relative), twist)
+    else:
+        return (goal - position)[axes(rows)]
+    sine = ca.sqrt(ca.dot(twist, twist) + TINY)
+    turn = twist * (ca.atan2(sine, cosine) / sine)
+    return ca.vertcat((goal - position)[axes(rows)], turned_axes(rows, rotation) @ turn)
+
+
+def _half_turn_axis(relative: Any) -> Any:
+    """Return the axis (3, 1) of a rotation by half a turn, whose antisymmetric part says nothing of it."""
+    columns = (relative + ca.DM.eye(3)) / 2
+    first, second, third = (columns[k, k] for k in range(3))
+    axis = ca.if_else(second > first, columns[:, 1], columns[:, 0])
+    axis = ca.if_else(third > ca.fmax(first, second), columns[:, 2], axis)
+    return axis / ca.norm_2(axis)
+
+
+def worth_closing(error: Any, motion: Any) -> Any:
+    """Return an error (n_e, 1), or zeros where a motion (1) finds it within what an accepted state may have.
+
+    An arm that is held on all sides cannot close even that: its QP would have no solution, where staying as it is has
+    one whose multipliers say what holds it.
+    """
+    closed = ca.logic_and(motion > 0, ca.norm_inf(error) <= CLOSED)
+    return ca.if_else(closed, ca.DM.zeros(*error.shape), error)
+
+
+def progress_weight(rate: Any) -> Any:
+    """Return what the progress along the path is weighted by, m^2, from the tip's way (n_e, 1) in the step.
+
+    The square of the way; see :data:`SHORT_WAY`. Where the path stands still any positive number serves.
+    """
+    way = ca.norm_2(rate)
+    return ca.if_else(way > 1e-6, way * ca.fmax(way, SHORT_WAY), 1.0)
+
+
+def tip_function(rows: Sequence[str]) -> ca.Function:
+    """Return the rows of a tip as a function of numbers.
+
+    Arguments: position (3), rotation (3, 3); goal (3), turned (3, 3), velocity and spin (3) of that; motion, 1 or 0,
+    see :func:`worth_closing`. Results: error (n_e), rate (n_e), axes of the turns (r, 3), weight of the progress.
+    """
+    position, rotation = ca.SX.sym("position", 3), ca.SX.sym("rotation", 3, 3)
+    goal, turned = ca.SX.sym("goal", 3), ca.SX.sym("turned", 3, 3)
+    velocity, spin = ca.SX.sym("velocity", 3), ca.SX.sym("spin", 3)
+    motion = ca.SX.sym("motion")
+    rate = combined(rows, velocity, spin, rotation)
+    results = [
+        worth_closing(error(rows, position, rotation, goal, turned), motion),
+        rate,
+        turned_axes(rows, rotation),
+        progress_weight(rate),
+    ]
+    inputs = [position, rotation, goal, turned, velocity, spin, motion]
+    return ca.Function("tip", inputs, [ca.densify(result) for result in results])

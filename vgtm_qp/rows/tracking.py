@@ -1,0 +1,42 @@
+"""Tracking of the reference curve, eqs. (32) and (39): gaps and turns between stations and their curve nodes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+
+def gap(centre: Any, point: Any) -> Any:
+    """Return (3,) the station's position less the curve's, m: eq. (39) for r(s, p) of eq. (32)."""
+    return centre - point
+
+
+def turns(rotation: Any, frame: Any, count: int) -> tuple[Any, Any]:
+    """Return the turns (R,) between a station's and the curve's frame (3, 3), and c (R, 3): eq. (39) for theta(s, p).
+
+    The first two are cosines between the station's x- and y-axes and the tangent, the third the sine of the roll. Each
+    is a function of the relative rotation alone: its rate is c . (angular velocity of the station less that of the
+    curve's frame).
+    """
+    x, y, tangent = rotation[:, 0], rotation[:, 1], frame[:, 2]
+    residual = [ca.dot(x, tangent), ca.dot(y, tangent)]
+    along = [ca.cross(x, tangent), ca.cross(y, tangent)]
+    if count == 3:
+        first, second = frame[:, 0], frame[:, 1]
+        residual.append((ca.dot(x, second) - ca.dot(y, first)) / 2)
+        along.append((ca.cross(x, second) - ca.cross(y, first)) / 2)
+    return ca.vertcat(*residual), ca.horzcat(*along).T
+
+
+def slope_rows(rotation: Any, slope: Any) -> tuple[Any, Any, Any]:
+    """Return the two tilts (2,), c (2, 3) as :func:`turns` does, and the tilts' rows (2, 3) over the slope r' (3,).
+
+    A curve without roll turns with its tangent alone: dt = (1 - t t') dr' / |r'|, and c . (t x dt) = -axis . dt.
+    """
+    slowness = 1.0 / ca.norm_2(slope)
+    tangent = slope * slowness
+    axes = rotation[:, :2].T
+    tilt = axes @ tangent
+    c = ca.horzcat(*(ca.cross(rotation[:, a], tangent) for a in range(2))).T
+    return tilt, c, (axes - tilt @ tangent.T) * slowness

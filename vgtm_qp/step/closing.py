@@ -1,0 +1,130 @@
+"""Newton's iteration that closes a configuration: fixed quantities, actuators in their boxes, stations on the curve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.arm.arm import Kinematics
+from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.lengths import LengthSolver, StationSolver
+
+Array = NDArray[np.float64]
+
+_MOST_STEPS = 8
+
+_TOO_FAR = 1e-2
+"""Quantities that are further off than this after a QP are not worth trying."""
+
+_ROUNDING = float(np.finfo(float).eps)
+
+
+def enough_length(q: Array, tolerance: float) -> float:
+    """Return the error of a quantity that nothing is gained by making smaller.
+
+    Divided by a short step's duration, once or twice, an error of `tolerance` is a rate that counts; but the lengths
+    of an arm that is a kilometre long are not known better than its nodes' places can be told apart.
+    """
+    return max(1e-3 * tolerance, 8.0 * _ROUNDING * float(np.abs(q).max()))
+
+
+def within(values: Array, lower: Array, upper: Array, spare: float) -> bool:
+    """Return whether values (n_a,) are between their bounds, give or take `spare`."""
+    return bool(np.all(values >= lower - spare) and np.all(values <= upper + spare))
+
+
+class Closing:
+    """Closes configurations of one arm.
+
+    Parameters
+    ----------
+    layout : Layout
+    kinematics : Kinematics
+        Overwritten by each call.
+    """
+
+    def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
+        self._layout, self._arm, self._kinematics = layout, layout.arm, kinematics
+        self._actuators, self._fixed = layout.arm.actuators, ~layout.arm.actuated
+
+    @cached_property
+    def _lengths(self) -> LengthSolver:
+        assert self._arm.bays is not None
+        return LengthSolver(self._layout, self._arm.bays)
+
+    @cached_property
+    def _stations(self) -> StationSolver:
+        assert self._arm.bays is not None
+        return StationSolver(self._layout, self._arm.bays)
+
+    def close(
+        self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float = _TOO_FAR
+    ) -> Closed:
+        """Return the configuration near `q` whose actuators keep their values, or go to the nearest one allowed.
+
+        `lower`, `upper` (n_a,) are their bounds. The error is infinite in a singular pose, and errors beyond `too_far`
+        are not worth trying.
+        """
+        kinematics, wanted = self._kinematics, self._arm.home_quantities.copy()
+
+        def missing(_: Array) -> Array:
+            wanted[self._actuators] = np.clip(kinematics.quantities[self._actuators], lower, upper)
+            return np.asarray(wanted - kinematics.quantities)
+
+        def corrected(q: Array, error: Array) -> Array:
+            return self._arm.corrected(q, error, lambda: self._lengths.solve(kinematics.gradient, error))
+
+        return self._newton(q, missing, corrected, tolerance, too_far)
+
+    def close_on_curve(
+        self, q: Array, points: Array, lower: Array, upper: Array, tolerance: float
+    ) -> Closed | None:
+        """Return the configuration near `q` whose tracked stations are at `points` (K, 3), m; actuators follow.
+
+        None where an actuator would leave its bounds (n_a,), or the pose is singular.
+        """
+        arm, kinematics, tracked = self._arm, self._kinematics, self._layout.tracked
+        home, fixed = arm.home_quantities[self._fixed], int(self._fixed.sum())
+
+        def missing(q: Array) -> Array:
+            gap = points - arm.stations.centres(arm.nodes(q))[tracked]
+            return np.concatenate([home - kinematics.quantities[self._fixed], gap.reshape(-1)])
+
+        def corrected(q: Array, error: Array) -> Array:
+            gap = error[fixed:].reshape(-1, 3)
+            return arm.corrected(
+                q, error, lambda: self._stations.solve(kinematics.gradient, error[:fixed], gap)
+            )
+
+        closed = self._newton(q, missing, corrected, tolerance, _TOO_FAR)
+        values = closed.quantities[self._actuators]
+        held = closed.error < np.inf and within(values, lower, upper, enough_length(q, tolerance))
+        return closed if held else None
+
+    def _newton(
+        self,
+        q: Array,
+        missing: Callable[[Array], Array],
+        corrected: Callable[[Array, Array], Array],
+        tolerance: float,
+        too_far: float,
+    ) -> Closed:
+        kinematics, enough, worst = self._kinematics, enough_length(q, tolerance), np.inf
+        for _ in range(_MOST_STEPS):
+            kinematics.evaluate_quantities(q)
+            error = missing(q)
+            worst = float(np.max(np.abs(error)))
+            if worst <= enough or not worst < too_far:
+                break
+            try:
+                q = corrected(q, error)
+            except SolverError:
+                worst = np.inf
+                break
+        position = self._arm.end_effector.position(self._arm.nodes(q))
+        return Closed(q, kinematics.quantities.copy(), worst, position, kinematics.tip_rotation.copy())

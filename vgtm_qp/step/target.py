@@ -1,0 +1,109 @@
+"""What one step is asked for, and what its QP is linearised at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.arm.arm import Arm, Pose
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.linearise import StepInput, TipGoal
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.path import Path, PathPoint
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What one step is asked for: a piece of a path, the time it takes and where the base will be.
+
+    Attributes
+    ----------
+    path : Path
+    start, end : float
+        Values of the path variable between which the step moves; progress alpha runs from 0 to 1 over them.
+    lower, upper : (n_a,)
+        Values of the actuators allowed at the end of the step.
+    time : float
+        Time at the end of the step, s.
+    base : Pose or None
+        Where the base is then; None where it rests.
+    vertex_goals : (V, 3) or None
+        Where control vertices are drawn to, m; the rows in ``Layout.vertex_goals`` count.
+    """
+
+    path: Path
+    start: float
+    end: float
+    lower: Array
+    upper: Array
+    time: float
+    base: Pose | None = None
+    vertex_goals: Array | None = None
+
+    def goal(self, progress: float) -> PathPoint:
+        """Return the tip's goal at a progress of 0 to 1."""
+        return self.path.at(self.start + progress * (self.end - self.start))
+
+
+class QPInput(NamedTuple):
+    """What the QP of a step is linearised at and asked for.
+
+    Attributes
+    ----------
+    q, at : configurations
+        Where residuals and where Jacobians are taken; the same for a correction.
+    vertices, torsion : (V, 3), (T,)
+        The curve, m and rad.
+    target : Target
+    goal : PathPoint
+        The tip's, at `progress`.
+    progress : float
+        How much of the target's piece of path lies behind the tip, 0 to 1.
+    rows : ClearanceRows
+    motion : bool
+        Whether it moves the arm; a correction returns to the constraints on the shortest way.
+    """
+
+    q: Array
+    at: Array
+    vertices: Array
+    torsion: Array
+    target: Target
+    goal: PathPoint
+    progress: float
+    rows: ClearanceRows
+    motion: bool
+
+    def linear(self, layout: Layout) -> StepInput:
+        """Return the same in the terms of a QP of `layout`."""
+        arm, target, shape, curve = layout.arm, self.target, layout.general, None
+        if shape is not None:
+            curve = shape.rows(self.vertices, self.torsion, base_frame(arm, target.base))
+        nodes = arm.nodes(self.q)
+        span = target.end - target.start
+        return StepInput(
+            q=self.q,
+            at=self.at,
+            base=nodes if target.base is None else arm.nodes(arm.based(self.q, target.base)),
+            vertices=self.vertices,
+            lower=target.lower,
+            upper=target.upper,
+            motion=self.motion,
+            progress=self.progress,
+            goal=TipGoal(
+                self.goal.position, self.goal.rotation, self.goal.velocity * span, self.goal.spin * span
+            ),
+            curve=curve,
+            vertex_goals=target.vertex_goals,
+        )
+
+
+def base_frame(arm: Arm, pose: Pose | None) -> Array:
+    """Return (3, 3) the frame of the first station where the base is at `pose`, or at home."""
+    home = arm.stations.frames[0]
+    return home if pose is None else np.asarray(pose.rotation @ home)
