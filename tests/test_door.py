@@ -427,3 +427,40 @@ def test_a_serial_maneuver_is_drawn_and_exported(form, maneuvers, tmp_path):
         maneuvers["serial"], tmp_path / f"snake.{'yaml' if form == 'ros' else form}", to=form
     )
     assert path.stat().st_size > 500
+
+
+def joint(name, axis=(1, 0, 0), position=(0, 0, 0.5), **more):
+    return {"name": name, "axis": list(axis), "position": list(position), "home": 0.1, **more}
+
+
+FINGERS = [joint("a"), joint("b", (0, 1, 0)), joint("c")]
+MISTAKES = {
+    "no length": ([joint("a"), joint("b", position=(0, 0, 0))], {"tip": [0, 0, 0]}, "arm.tip"),
+    "one joint": ([joint("a")], {}, "end_effector.track"),
+    "all locked": (FINGERS, {"locked": ["a", "b", "c"]}, "end_effector.track"),
+    "no end of a slide": ([*FINGERS, joint("s", (0, 0, 1), kind="prismatic", home=0.0)], {}, "limits"),
+    "links in one another": (
+        [
+            joint(name, axis, (0, 0, 0), kind="prismatic", home=0.0, limits=[-1, 1])
+            for name, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0)), ("z", (0, 0, 1)))
+        ],
+        {},
+        "arm.link_radius",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_an_arm_that_cannot_be_moved_is_refused_by_the_key_that_is_to_blame(mistake):
+    joints, more, key = MISTAKES[mistake]
+    with pytest.raises(vq.ProblemError) as raised:
+        vq.solve(
+            serial_problem(
+                {
+                    "joint": [dict(j, axis=[float(x) for x in j["axis"]]) for j in joints],
+                    "tip": [0, 0, 0.5],
+                    **more,
+                }
+            )
+        )
+    assert key in str(raised.value)

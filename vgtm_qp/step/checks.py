@@ -52,8 +52,8 @@ def unreachable_tip(problem: Problem, setup: Setup) -> Iterator[Mistake]:
     jacobian = task.rows(arm.home, kinematics, goal).jacobian
     moved, _ = kinematics.motion().response()
     every = np.zeros((len(arm.node_names), 3, len(arm.actuators)))
-    every[arm.free] = moved.reshape(-1, 3, len(arm.actuators))
-    response = jacobian @ every[arm.end_effector.nodes].reshape(-1, len(arm.actuators))
+    every[arm.free] = moved.reshape(len(arm.free), 3, len(arm.actuators))
+    response = jacobian @ every[arm.end_effector.nodes].reshape(jacobian.shape[1], len(arm.actuators))
     response[len(task.axes) :] *= arm.height
     values = np.linalg.svd(response, compute_uv=False)
     rank = int(np.count_nonzero(values > _RANK_TOLERANCE * values.max(initial=0.0)))
@@ -104,7 +104,8 @@ def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
         distance, body = float(pairs.distance[k]), bodies.called(int(pairs.body[k]))
         place: Place
         if index < 0:
-            place, needed = ("truss", "member_radius"), self_safe
+            place = ("arm", "link_radius") if problem.truss is None else ("truss", "member_radius")
+            needed = self_safe
             other = bodies.names[int(pairs.other[k])]
             what = f"{bodies.kind}s {bodies.names[int(pairs.body[k])]} and {other}, which share no node,"
         else:

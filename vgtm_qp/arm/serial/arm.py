@@ -119,14 +119,15 @@ class ChainSymbols:
         """See ``arm.ArmSymbols``."""
         q = q * 1.0
         q[self._actuators] = ca.fmax(lower, ca.fmin(upper, q[self._actuators]))
-        q[self._fixed] = self.home[self._fixed]
+        for joint in self._fixed:
+            q[joint] = self.home[joint]
         return q
 
     def error(self, quantities: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
         """See ``arm.ArmSymbols``."""
         values = quantities[self._actuators]
         beyond = ca.fmax(ca.fmax(values - upper, lower - values), 0.0)
-        return ca.norm_2(ca.vertcat(beyond, quantities[self._fixed] - self.home[self._fixed]))
+        return ca.norm_2(ca.vertcat(beyond, *(quantities[k] - self.home[k] for k in self._fixed)))
 
     def held(self, tracked: Sequence[int]) -> Callable[[Any, Any], Any] | None:  # noqa: ARG002
         """See ``arm.ArmSymbols``: stations alone do not determine the joints."""
@@ -175,6 +176,8 @@ class SerialArm:
 
     def _trackable(self, nodes: Index) -> tuple[str, ...]:
         """Return whether all stations can keep their positions on the curve at once, by rank at home."""
+        if not len(self.actuators):
+            return ()
         jacobian = self._jacobian_at_home[:, self.actuators]
         rows = jacobian.reshape(-1, 3, len(self.actuators))[nodes[1:, 0]].reshape(-1, len(self.actuators))
         values = np.linalg.svd(rows, compute_uv=False)
