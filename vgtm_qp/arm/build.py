@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from vgtm_qp.arm.arm import Arm
 from vgtm_qp.arm.serial.arm import SerialArm
 from vgtm_qp.arm.serial.build import build_chain
@@ -9,6 +11,7 @@ from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.build import LockError, build_truss
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem import Problem
+from vgtm_qp.problem.arm import ArmTable
 from vgtm_qp.problem.table import shown
 
 
@@ -18,11 +21,14 @@ def make_arm(problem: Problem) -> Arm:
     Raises
     ------
     ProblemError
-        A locked member is no actuated one.
+        A locked member is no actuated one, or joints are not those of an arm that can be moved.
     TrussError
         The truss is not statically determinate.
     """
     if problem.arm is not None:
+        mistakes = list(_beyond_serial(problem, problem.arm))
+        if mistakes:
+            raise ProblemError(str(problem.source or problem.name), mistakes)
         return SerialArm(build_chain(problem.arm))
     assert problem.truss is not None
     try:
@@ -30,3 +36,14 @@ def make_arm(problem: Problem) -> Arm:
     except LockError as error:
         wrong = [Mistake(f"truss.locked[{place}]", shown(name), said) for place, name, said in error.wrong]
         raise ProblemError(str(problem.source or problem.name), wrong) from None
+
+
+def _beyond_serial(problem: Problem, spec: ArmTable) -> Iterator[Mistake]:
+    """Yield what a serial arm of these joints would not know of itself."""
+    if not any(any(joint.position) for joint in spec.joint[1:]) and not any(spec.tip):
+        expected = "a position away from the last joint, since all joints are in one place"
+        yield problem.mistake(("arm", "tip"), expected)
+    for k, joint in enumerate(spec.joint):
+        if joint.kind == "prismatic" and joint.limits is None:
+            expected = "[least, greatest], m: how far a joint slides bounds how far the arm reaches"
+            yield problem.mistake(("arm", "joint", k, "limits"), expected)

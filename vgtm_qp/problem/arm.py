@@ -47,8 +47,6 @@ class Joint(Table):
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.limits is None:
-            if self.kind == "prismatic":
-                yield ("limits",), "[least, greatest], m: a joint that slides needs them"
             return
         if self.limits[0] >= self.limits[1]:
             yield ("limits",), "[least, greatest] with the least value first and below the greatest"
@@ -102,8 +100,6 @@ class ArmTable(Table):
             for key in ("base_link", "tip_link", "home"):
                 if getattr(self, key) is not None:
                     yield (key,), f"no {key} without a urdf file"
-            if self.joint and not any(any(joint.position) for joint in self.joint[1:]) and not any(self.tip):
-                yield ("tip",), "a position away from the last joint, since all joints are in one place"
             yield from unique("joint", "name", [joint.name for joint in self.joint])
             names = {joint.name: joint for joint in self.joint}
             for i, lock in enumerate(self.locked):
