@@ -85,6 +85,7 @@ def verify(maneuver: Result) -> Certificate:
     states = maneuver.configurations
     motion = motion_of(arm, maneuver.time, states)
     lengths, names, unit = arm.quantities(states), arm.quantity_names, arm.unit
+    per = f"({unit})" if " " in unit else unit
 
     bodies, wrong, notes = read_obstacles(
         problem, manifest.get("meshes") or {}, Path(manifest.get("directory") or ".")
@@ -128,7 +129,7 @@ def verify(maneuver: Result) -> Certificate:
         stroke_violation=_worst(_beyond_stroke(arm, lengths), unit, LIMIT_TOLERANCE, names),
         rate_violation=_worst(
             _beyond_rate(arm, maneuver.time, lengths),
-            f"{unit}/s".replace("rad or m", "(rad or m)"),
+            f"{per}/s",
             LIMIT_TOLERANCE,
             names,
         ),
@@ -138,7 +139,7 @@ def verify(maneuver: Result) -> Certificate:
                 0.0,
                 _beyond_acceleration(arm, maneuver.time, lengths),
             ),
-            "m/s^2",
+            f"{per}/s^2",
             LIMIT_TOLERANCE,
             names,
         ),
