@@ -144,7 +144,7 @@ class Watch:
         if not parts:
             return self._none
         found = join(parts, self._none)
-        return found if found.distance.min(initial=np.inf) > 0.0 else None
+        return found if found.distance.min() > 0.0 else None
 
     def follow(self, start: Array, end: Array, floor: float, self_floor: float) -> bool:
         """Return whether no surface distance falls below its floor, m, while points move straight to `end`.

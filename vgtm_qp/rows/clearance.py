@@ -41,7 +41,8 @@ def clearance_rows(
         Where on the straight path to the end of the step the contacts were found: a displacement of the end state
         moves that point by this share of it.
     """
-    coefficients = weights[:, :, None] * (fraction * normal)[:, None, :]
+    pull = normal if fraction == 1.0 else fraction * normal
+    coefficients = weights[:, :, None] * pull[:, None, :]
     lower = safe + margin - distance
     lower += (self_safe - safe) * is_self
     return coefficients, lower
