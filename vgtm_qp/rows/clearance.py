@@ -51,6 +51,6 @@ def clearance_rows(
 def slowed(lower: Array, share: float, least: float) -> Array:
     """Return lower bounds (R,), m, with which a pair uses no more than a `share` of its remaining clearance in a step.
 
-    An approach of `least`, m, is always allowed, where the bounds given allow it.
+    An approach of `least`, m, is allowed as far as `lower` allows it.
     """
     return np.asarray(np.maximum(lower, np.minimum(share * lower, -least)))
