@@ -165,7 +165,9 @@ def test_contacts_are_the_same_whichever_way_they_are_found():
         Y = X.copy()
         for state in walk(X, rng, 12, 0.05):
             Y[:] = state
-            found = [monitor.near(Y, self_reach=0.3, fcl_reach=0.2) for monitor in (watched, listed)]
+            found = [
+                monitor.near(Y, self_reach=0.3, fcl_reach=0.2, tracked=True) for monitor in (watched, listed)
+            ]
             orders = [np.lexsort((c.weights[:, 1], c.other, c.body, c.is_self)) for c in found]
             first, second = (c.select(order) for c, order in zip(found, orders, strict=True))
             assert [first.name(k) for k in range(len(first))] == [second.name(k) for k in range(len(second))]
@@ -182,9 +184,9 @@ def test_a_motion_is_proven_from_where_it_starts_though_its_array_was_overwritte
     assert monitor.between(X, X + 0.1 * FORWARD, 0.0, 0.0, 0.08).certified
     X += 2.0 * FORWARD
     assert not monitor.between(X, X - 2.0 * FORWARD, 0.0, 0.0, 0.08).certified
-    for number in (np.nan, np.inf):
+    for number in (np.nan, np.inf, 1e160):
         with pytest.raises(GeometryError, match="finite"):
-            monitor.near(np.full(X.shape, number))
+            monitor.near(np.full(X.shape, number), tracked=True)
 
 
 def test_a_pair_whose_centres_coincide_at_first_is_watched_like_every_other():

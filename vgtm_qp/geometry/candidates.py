@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.groups import Displacement, Displacements, Group, ShapeKernels
 from vgtm_qp.geometry.parts import Parts
-from vgtm_qp.geometry.shapes import Pieces
+from vgtm_qp.geometry.shapes import ObstaclePieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -61,7 +61,7 @@ class Candidates:
     def __init__(
         self,
         bodies: Bodies,
-        pieces: Pieces,
+        pieces: ObstaclePieces,
         kernels: ShapeKernels,
         X: Array,
         time: float,
@@ -236,7 +236,7 @@ def _moved(states: tuple[Array, ...], reference: Array) -> Array:
 
 
 def _near_pieces(
-    X: Array, bodies: Bodies, parts: Parts, pieces: Pieces, time: float, horizon: float
+    X: Array, bodies: Bodies, parts: Parts, pieces: ObstaclePieces, time: float, horizon: float
 ) -> tuple[Index, Index]:
     """Return the pairs of a body and a piece that the plane between body and bounding sphere does not separate."""
     centers = pieces.center + time * pieces.velocity

@@ -14,7 +14,7 @@ from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.formulas import FURTHEST
 from vgtm_qp.geometry.groups import Displacements, Group, PairDistances, ShapeKernels
 from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, PairNames, join, no_contacts
-from vgtm_qp.geometry.shapes import GeometryError, Obstacle, Pieces
+from vgtm_qp.geometry.shapes import GeometryError, Obstacle, ObstaclePieces
 from vgtm_qp.geometry.solids import Solid
 from vgtm_qp.geometry.sweep import SweepResult, sweep_group
 from vgtm_qp.geometry.watch import Watch
@@ -27,7 +27,7 @@ Index = NDArray[np.int64]
 _AMONG = {"all": (False, True), "obstacles": (False,), "members": (True,)}
 
 _FIRST = 16
-"""The least distance is looked for among so many pairs first: those that were nearest at the reference."""
+"""The least distance is searched for among so many pairs first: those that were nearest at the reference."""
 
 _FEW_PAIRS = 20_000
 """Scenes with no more pairs list them all."""
@@ -40,8 +40,8 @@ class Clearance:
     """Distances of an arm's bodies from obstacles and from each other; one thread at a time.
 
     Positions ``X`` (P, 3) are those of the points that ``Bodies.points`` counts, m. Lists of the pairs that may be
-    near are kept from one call to the next. Small scenes at rest are watched besides, which is faster for states
-    that follow each other.
+    near are kept from one call to the next. Small scenes at rest are watched besides, which is faster for the states
+    of a motion.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Clearance:
         widest = 2.0 * (safe + float(bodies.radius.max(initial=0.0)))
         self.self_influence = min(influence, widest) if self_influence is None else self_influence
         self.fcl_reach = 2.5 * safe if fcl_reach is None else fcl_reach
-        self.pieces = Pieces(self.obstacles)
+        self.pieces = ObstaclePieces(self.obstacles)
         self.names = PairNames(
             bodies, tuple(o.name for o in self.obstacles), tuple(self.pieces.obstacle.tolist())
         )
@@ -117,6 +117,7 @@ class Clearance:
         *,
         self_reach: float | None = None,
         fcl_reach: float | None = None,
+        tracked: bool = False,
     ) -> Contacts:
         """Return all contacts of surfaces nearer than `reach`, exact.
 
@@ -133,12 +134,15 @@ class Clearance:
             m; by default `influence` and the lesser of `reach` and `self_influence`.
         fcl_reach : float or None
             Pairs nearer than this, m, are asked of python-fcl too, and each answer is checked; by default that of
-            this object, and none are where it is zero.
+            this object. Zero asks for none.
+        tracked : bool
+            Whether `X` is a state of a motion, which :meth:`between` is asked to go on from. A watched scene is then
+            evaluated from state to state. Positions that are only tried would make the watch go there and back.
         """
         reach = self.influence if reach is None else reach
         fcl_reach = self.fcl_reach if fcl_reach is None else fcl_reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
-        if self._watch is not None:
+        if tracked and self._watch is not None:
             found = self._watch.near(X, reach, self_reach, fcl_reach)
             if found is not None:
                 return found

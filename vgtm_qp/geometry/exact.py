@@ -1,7 +1,7 @@
 """Exact distances between a segment and a convex piece, as branch-free CasADi SX functions.
 
 Each formula takes the segment as six numbers (both ends) and a piece as a flat parameter vector, and returns
-the signed distance of the member's axis: the capsule's radius is subtracted by the caller. Squared distance
+the signed distance of the body's axis: the capsule's radius is subtracted by the caller. Squared distance
 to a convex set is convex along a segment, so its derivative changes sign once: between two break points of
 that derivative.
 """
@@ -17,7 +17,7 @@ from vgtm_qp.geometry.formulas import FAR, FORMULAS
 from vgtm_qp.geometry.symbolic import Vector, add, at, between, dot, norm, ratio, rotate_back
 
 SHAPES = ("box", "sphere", "cylinder", "triangle", "segment")
-"""Kinds of pieces; a segment is the axis of another member."""
+"""Kinds of pieces; a segment is the axis of another body."""
 
 
 _LEAST_SQUARE = 0.1
@@ -30,10 +30,10 @@ CONTACT = 13
 """Numbers that describe a contact, see :func:`follow_function`."""
 
 KNOWN = WIDTH + 4
-"""Numbers that a pair is known by before, see :func:`follow_function`."""
+"""Numbers that describe a pair before a motion, see :func:`follow_function`."""
 
 SECOND_CONTACT = 0.2
-"""Two contacts of a member with one piece are apart by this fraction of its length, at least."""
+"""Two contacts of a body with one piece are apart by at least this fraction of the body's length."""
 
 
 def parameters_of(shape: str) -> str:
@@ -198,14 +198,14 @@ def _halves(ends: Vector) -> tuple[Vector, Vector]:
 def follow_function(shape: str) -> ca.Function:
     """Return the contacts of a pair after a straight motion, and a lower bound of its distance meanwhile.
 
-    Inputs ``ends (24,)``, before and after it for each end of the member, then of the other member (ignored for an
-    obstacle, which rests); and ``known (19,)``: the piece (15; ignored for two members), what surfaces are nearer than
-    axes, and a unit normal (3), best that of the contact before.
+    Inputs ``ends (24,)``, before and after it for each end of the body, then of the other body (ignored for an
+    obstacle, which rests); and ``known (19,)``: the piece (15; ignored for two bodies), the radius or sum of radii, and
+    a unit normal (3), best that of the contact before.
 
     Output ``contacts (26,)``: ``CONTACT`` numbers for each of two contacts after the motion: surface distance, weights
     (4,) of the four ends in the normal velocity, normal (3,), t, witness point (3,), and the bound over the motion of
-    :func:`_turning_gap`. The second distance is ``FAR`` where there is none worth a row of its own, as is the second
-    bound. Where axis and piece intersect the distance is minus `radius` and the rest of no use.
+    :func:`_turning_gap`. The second distance is ``FAR`` where the second contact needs no row, as is the
+    second bound. Where axis and piece intersect, the distance is minus the radius and the other numbers mean nothing.
     """
     both, known = ca.SX.sym("ends", 24), ca.SX.sym("known", KNOWN)
     points = ca.reshape(both, 3, 8)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.groups import PairDistances
-from vgtm_qp.geometry.shapes import Pieces
+from vgtm_qp.geometry.shapes import ObstaclePieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -42,7 +42,7 @@ class FclQueries:
 
     SHAPES: ClassVar[tuple[str, ...]] = ("box", "sphere", "cylinder")
 
-    def __init__(self, pieces: Pieces) -> None:
+    def __init__(self, pieces: ObstaclePieces) -> None:
         self.asked = self.replaced = 0
         self._pieces = pieces
         self._objects: dict[int, Any] = {}

@@ -28,7 +28,7 @@ from vgtm_qp.geometry.symbolic import (
 )
 
 PARALLEL = 0.02
-"""A second contact is given where a member's distance grows by less than this fraction of its length."""
+"""A second contact is given where a body's distance grows by less than this fraction of its length."""
 
 FAR = 1e30
 
@@ -36,8 +36,8 @@ FURTHEST = 1e60
 """Positions this far away, m, are not finite numbers: their fourth powers overflow, and no bound holds."""
 
 
-class Contact(NamedTuple):
-    """What is known of a segment and a piece; scalars and vectors (3) of SX.
+class SymbolicContact(NamedTuple):
+    """The nearest points of a segment and a piece; scalars and vectors (3) of SX.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ def _box_depth(a: Vector, u: Vector, half: Vector) -> list[Any]:
     return least(candidates)
 
 
-def _segment_box(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:
+def _segment_box(ends: Vector, piece: Vector, *, apart: bool = False) -> SymbolicContact:
     """Return the contact for a box.
 
     The squared distance is piecewise quadratic with at most six break points, where a coordinate crosses a
@@ -154,7 +154,7 @@ def _solid_contact(
     t_outside: Any,
     depth: list[Any] | None,
     breaks: list[Any],
-) -> Contact:
+) -> SymbolicContact:
     """Return the contact of a segment a-b given in the frame of a solid piece.
 
     Parameters
@@ -179,7 +179,7 @@ def _solid_contact(
     others = [(s, norm(excess(s))) for s in breaks]
     t_second = ca.if_else(cut, t, _second(t, outside, norm(between(a, b)), others))
     gap_second = excess(t_second)
-    return Contact(
+    return SymbolicContact(
         distance,
         ca.if_else(cut, distance, norm(gap_second)),
         t,
@@ -189,13 +189,13 @@ def _solid_contact(
     )
 
 
-def _segment_sphere(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:  # noqa: ARG001
+def _segment_sphere(ends: Vector, piece: Vector, *, apart: bool = False) -> SymbolicContact:  # noqa: ARG001
     a, u = ends[0:3], between(ends[0:3], ends[3:6])
     t = clip(ratio(dot(between(a, piece[0:3]), u), dot(u, u)))
     gap = between(piece[0:3], at(ends, t))
     normal = unit(gap, perpendicular(u))
     distance = norm(gap) - piece[3]
-    return Contact(distance, distance, t, t, normal, normal)
+    return SymbolicContact(distance, distance, t, t, normal, normal)
 
 
 def _cylinder_excess(x: Vector, radius: Any, half: Any) -> Vector:
@@ -205,7 +205,7 @@ def _cylinder_excess(x: Vector, radius: Any, half: Any) -> Vector:
     return [scale * x[0], scale * x[1], along]
 
 
-def _segment_cylinder(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:
+def _segment_cylinder(ends: Vector, piece: Vector, *, apart: bool = False) -> SymbolicContact:
     """Return the contact for a solid cylinder with flat ends.
 
     Only over the rim is the derivative not linear or of known sign; there Newton's iteration runs inside the
@@ -284,7 +284,7 @@ def _segment_pair(a: Vector, b: Vector, c: Vector, d: Vector) -> list[list[Any]]
     return [[norm(between(blend(c, d, s), blend(a, b, t))), t, s] for t, s in pairs]
 
 
-def _segment_segment(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:  # noqa: ARG001
+def _segment_segment(ends: Vector, piece: Vector, *, apart: bool = False) -> SymbolicContact:  # noqa: ARG001
     a, b, c, d = ends[0:3], ends[3:6], piece[0:3], piece[3:6]
     u, v = between(a, b), between(c, d)
     candidates = _segment_pair(a, b, c, d)
@@ -293,10 +293,10 @@ def _segment_segment(ends: Vector, piece: Vector, *, apart: bool = False) -> Con
     t_second = _second(t, distance, norm(u), [(k[1], k[0]) for k in candidates[1:]])
     s_second = clip(ratio(dot(between(c, at(ends, t_second)), v), dot(v, v)))
     gap = between(blend(c, d, s_second), at(ends, t_second))
-    return Contact(distance, norm(gap), t, t_second, normal, unit(gap, normal), s, s_second)
+    return SymbolicContact(distance, norm(gap), t, t_second, normal, unit(gap, normal), s, s_second)
 
 
-def _segment_triangle(ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:  # noqa: ARG001
+def _segment_triangle(ends: Vector, piece: Vector, *, apart: bool = False) -> SymbolicContact:  # noqa: ARG001
     """Return the contact for a triangle.
 
     The nearest pair is an end over the face, or a point of an edge, or a piercing point.
@@ -344,7 +344,7 @@ def _segment_triangle(ends: Vector, piece: Vector, *, apart: bool = False) -> Co
     distance_second, *foot = least(nearest)
     normal_second = unit(between(foot, x), normal)
     alone = ca.logic_or(cut, t_second == t)
-    return Contact(
+    return SymbolicContact(
         distance,
         ca.if_else(alone, distance, distance_second),
         t,
@@ -355,9 +355,9 @@ def _segment_triangle(ends: Vector, piece: Vector, *, apart: bool = False) -> Co
 
 
 class Formula(Protocol):
-    """From a segment (6) and a piece to what is known of them; `apart`, nothing of use where the two intersect."""
+    """From a segment (6) and a piece to their contact; where they intersect and `apart` is set, it means nothing."""
 
-    def __call__(self, ends: Vector, piece: Vector, *, apart: bool = False) -> Contact:
+    def __call__(self, ends: Vector, piece: Vector, *, apart: bool = False) -> SymbolicContact:
         """Return the contact."""
         ...
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vgtm_qp.geometry.batch import Batch
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.exact import SECOND_CONTACT, distance_function, follow_function, sweep_function
-from vgtm_qp.geometry.shapes import Pieces
+from vgtm_qp.geometry.shapes import ObstaclePieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -132,7 +132,7 @@ class Group:
         body: Index,
         other: Index,
         bodies: Bodies,
-        pieces: Pieces,
+        pieces: ObstaclePieces,
         kernels: ShapeKernels,
         *,
         is_bending: bool = False,

@@ -115,7 +115,7 @@ def mesh(
 ) -> Obstacle:
     """Return a triangle mesh, convex or not.
 
-    A watertight mesh is solid: a member inside it has a negative clearance. An open one is a sheet.
+    A watertight mesh is solid: a body inside it has a negative clearance. An open one is a sheet.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def _rotation(name: str, rotation: ArrayLike | None) -> Array:
     return turn
 
 
-class Pieces:
+class ObstaclePieces:
     """All pieces of a list of obstacles, side by side.
 
     Attributes

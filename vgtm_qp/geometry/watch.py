@@ -22,7 +22,7 @@ from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.formulas import FAR, FURTHEST
 from vgtm_qp.geometry.groups import FOLLOWED, Group
 from vgtm_qp.geometry.pairs import Contacts, PairNames, join, no_contacts
-from vgtm_qp.geometry.shapes import GeometryError, Pieces
+from vgtm_qp.geometry.shapes import GeometryError, ObstaclePieces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -37,7 +37,7 @@ _NEXT = 2.0
 
 
 class _WatchedGroup:
-    """The pairs of one shape, and what is known of them."""
+    """The pairs of one shape, with bounds and contacts of the last evaluation."""
 
     def __init__(self, group: Group, parameters: Array) -> None:
         count = len(group)
@@ -56,7 +56,7 @@ class _WatchedGroup:
         self.contacts = np.zeros((0, CONTACT))
         """and their contacts, two for each."""
         self.is_close = False
-        """Whether one of them was as near as to matter."""
+        """Whether one of them was nearer than the limit."""
         self.lowest = np.inf
         """Least lower bound of their distances on the way there, m."""
 
@@ -109,7 +109,7 @@ class Watch:
     def __init__(
         self,
         bodies: Bodies,
-        pieces: Pieces,
+        pieces: ObstaclePieces,
         names: PairNames,
         fcl: FclQueries,
         every_pair: Callable[[Array], list[Group]],
@@ -144,7 +144,7 @@ class Watch:
         if not parts:
             return self._none
         found = join(parts, self._none)
-        return found if found.distance.min(initial=np.inf) > 0.0 else None
+        return found if found.distance.min() > 0.0 else None
 
     def follow(self, start: Array, end: Array, floor: float, self_floor: float) -> bool:
         """Return whether no surface distance falls below its floor, m, while points move straight to `end`.
@@ -191,7 +191,7 @@ class Watch:
 
     def _start(self, X: Array) -> Kernel:
         """List all pairs, with their distances at `X`."""
-        if not np.isfinite(X).all():
+        if not np.abs(X).max() < FURTHEST:
             raise GeometryError("node positions must be finite numbers")
         groups = self._every_pair(X)
         self._groups = [_WatchedGroup(group, self._pieces.parameters) for group in groups]

@@ -41,7 +41,8 @@ def clearance_rows(
         Where on the straight path to the end of the step the contacts were found: a displacement of the end state
         moves that point by this share of it.
     """
-    coefficients = weights[:, :, None] * (fraction * normal)[:, None, :]
+    pull = normal if fraction == 1.0 else fraction * normal
+    coefficients = weights[:, :, None] * pull[:, None, :]
     lower = safe + margin - distance
     lower += (self_safe - safe) * is_self
     return coefficients, lower
@@ -50,6 +51,6 @@ def clearance_rows(
 def slowed(lower: Array, share: float, least: float) -> Array:
     """Return lower bounds (R,), m, with which a pair uses no more than a `share` of its remaining clearance in a step.
 
-    An approach of `least`, m, is always allowed, where the bounds given allow it.
+    An approach of `least`, m, is allowed as far as `lower` allows it.
     """
     return np.asarray(np.maximum(lower, np.minimum(share * lower, -least)))

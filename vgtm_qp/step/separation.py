@@ -169,7 +169,7 @@ class Separation:
         limits = min(kept.influence, kept.safe + reach), min(kept.influence, kept.self_safe + 2.0 * reach)
         fcl_reach = kept.safe + _BINDING if motion else 0.0
         contacts = self.monitor.near(
-            self._arm.points(q), time, limits[0], self_reach=limits[1], fcl_reach=fcl_reach
+            self._arm.points(q), time, limits[0], self_reach=limits[1], fcl_reach=fcl_reach, tracked=not short
         )
         rows = self._clearance_rows(q, contacts)
         if len(contacts):
