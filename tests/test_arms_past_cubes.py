@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.build import build_arm
 
 import vgtm_qp as vq
 

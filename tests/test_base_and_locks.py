@@ -133,15 +133,15 @@ def test_lock_at_run_time_holds_and_is_named():
         resolver.lock(name)
     assert resolver.locked == {"B1-1", "B2-2"}
     assert resolver.state is kept
-    other = Resolver(resolver.arm)
+    other = Resolver(resolver.setup)
     assert other.locked == frozenset()
-    index = [resolver.arm.truss.member(name) for name in ("B1-1", "B2-2")]
+    index = [resolver.setup.truss.member(name) for name in ("B1-1", "B2-2")]
     active = set()
     for k in range(2, 8):
         step = resolver.step(position=start + STRIDE * k)
         assert step.status is StepStatus.REACHED
         active.update(step.active)
-        np.testing.assert_allclose(step.state.lengths[index], kept.lengths[index], atol=1e-10)
+        np.testing.assert_allclose(step.state.quantities[index], kept.quantities[index], atol=1e-10)
     assert {"locked: B1-1", "locked: B2-2"} <= active
     with pytest.raises(GoalError, match=r"L1-1.*fixed length"):
         resolver.lock("L1-1")
@@ -156,7 +156,7 @@ def test_an_arm_with_every_actuator_locked_stays_and_says_so():
         resolver.lock(name)
     step = resolver.step(position=resolver.tip()[0] + [0.1, 0.0, 0.0])
     assert step.progress < 1e-6
-    np.testing.assert_allclose(resolver.state.nodes, resolver.arm.truss.home, atol=1e-9)
+    np.testing.assert_allclose(resolver.state.nodes, resolver.setup.truss.home, atol=1e-9)
 
 
 @pytest.mark.parametrize("build", [Resolver, vq.solve])

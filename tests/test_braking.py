@@ -32,7 +32,7 @@ def problem(acceleration=0.1, **changes):
 
 def may_rest(truss, before, last, slack=1e-9):
     """Return whether no actuator moved faster in the last step than it can stop within one."""
-    rate = (last.lengths - before.lengths)[truss.actuators] / last.duration
+    rate = (last.quantities - before.quantities)[truss.actuators] / last.duration
     return bool(np.all(np.abs(rate) <= truss.acceleration[truss.actuators] * last.duration + slack))
 
 
@@ -58,7 +58,7 @@ def test_a_maneuver_that_is_blocked_ends_where_the_arm_may_rest():
 @pytest.mark.parametrize("obstacles", [[], [CRATE]])
 def test_random_goals_in_a_control_loop_never_trap_a_moving_arm(seed, obstacles):
     resolver = vq.Resolver(problem(0.1, obstacle=obstacles))
-    truss, random = resolver.arm.truss, np.random.default_rng(seed)
+    truss, random = resolver.setup.truss, np.random.default_rng(seed)
     steps, goal = [], np.zeros(3)
     for k in range(40):
         if k % 8 == 0:
@@ -69,36 +69,36 @@ def test_random_goals_in_a_control_loop_never_trap_a_moving_arm(seed, obstacles)
             assert may_rest(truss, steps[-1], before)
             continue
         steps.append(before)
-        change = np.abs(step.state.length_rates - before.length_rates)[truss.actuators]
+        change = np.abs(step.state.rates - before.rates)[truss.actuators]
         interval = 0.5 * (step.state.duration + (before.duration or step.state.duration))
         assert np.all(change <= (truss.acceleration[truss.actuators] + 1e-9) * interval)
         if obstacles:
-            assert resolver.arm.monitor.least(step.state.nodes, among="obstacles")[0] >= 0.05 - 1e-9
+            assert resolver.setup.monitor.least(step.state.nodes, among="obstacles")[0] >= 0.05 - 1e-9
     assert len(steps) >= 30
-    assert max(np.abs(state.length_rates).max() for state in steps) > 0.03
+    assert max(np.abs(state.rates).max() for state in steps) > 0.03
 
 
 def keeps_accelerations(truss, before, after, slack=1e-9):
     """Return whether no actuator changed its speed in a step by more than it may."""
-    change = np.abs(after.length_rates - before.length_rates)[truss.actuators]
+    change = np.abs(after.rates - before.rates)[truss.actuators]
     interval = 0.5 * (after.duration + (before.duration or after.duration))
     return bool(np.all(change <= (truss.acceleration[truss.actuators] + slack) * interval))
 
 
 def drive(resolver, goals, dt=0.2):
     """Send an arm to one goal after another; return its steps, none of which may break a limit or trap it."""
-    truss, steps, before = resolver.arm.truss, [], None
+    truss, steps, before = resolver.setup.truss, [], None
     for goal in goals:
         here = resolver.state
         step = resolver.step(position=goal(resolver), dt=dt)
         steps.append(step)
         if step.status is vq.StepStatus.BLOCKED:
             assert before is None or may_rest(truss, before, here)
-            assert here.time >= (resolver.arm.base_motion.end if resolver.arm.base_motion else 0.0) - 1e-9
+            assert here.time >= (resolver.setup.base_motion.end if resolver.setup.base_motion else 0.0) - 1e-9
             continue
         assert keeps_accelerations(truss, here, step.state)
         assert (
-            resolver.arm.monitor.least(step.state.nodes, step.state.time, among="obstacles")[0] >= 0.05 - 1e-9
+            resolver.setup.monitor.least(step.state.nodes, step.state.time, among="obstacles")[0] >= 0.05 - 1e-9
         )
         before = here
     return steps
@@ -124,7 +124,7 @@ def random_goals(seed, count=40, base=None):
 def test_an_elastic_tip_leaves_its_goal_to_brake_and_never_traps_a_moving_arm(seed, obstacles):
     resolver = vq.Resolver(problem(0.1, obstacle=obstacles, **{"end_effector.mode": "elastic"}))
     steps = drive(resolver, random_goals(seed))
-    assert max(np.abs(step.state.length_rates).max() for step in steps) > 0.1
+    assert max(np.abs(step.state.rates).max() for step in steps) > 0.1
     assert any(step.braked and step.left_path for step in steps)
 
 
@@ -140,7 +140,7 @@ def test_a_hard_tip_that_is_turned_round_brakes_along_its_path(seed):
             speed = -speed
         steps += drive(resolver, [lambda resolver, speed=speed: resolver.tip()[0] + 0.2 * speed])
         if steps[-1].braked or steps[-1].status is vq.StepStatus.BLOCKED:
-            speed = resolver.arm.truss.tip_weights @ resolver.state.motion[resolver.arm.truss.tip] / 0.2
+            speed = resolver.setup.truss.tip_weights @ resolver.state.motion[resolver.setup.truss.tip] / 0.2
     braked = [step for step in steps if step.braked]
     assert braked
     assert not any(step.left_path for step in braked)
@@ -159,7 +159,7 @@ def test_a_moving_base_never_traps_a_moving_arm(mode, base, obstacles):
     steps = drive(vq.Resolver(problem(0.1, obstacle=obstacles, **changes)), random_goals(1, 60, base))
     assert sum(step.braked for step in steps) > 3
     assert mode == "elastic" or not any(step.left_path for step in steps)
-    assert max(np.abs(step.state.length_rates).max() for step in steps) > 0.1
+    assert max(np.abs(step.state.rates).max() for step in steps) > 0.1
 
 
 @pytest.mark.parametrize("mode", ["scaled", "elastic"])
@@ -248,10 +248,10 @@ def test_a_control_loop_may_bring_its_arm_to_rest_at_any_time(mode):
     before, count = resolver.state, 0
     while (step := resolver.brake()) is not None:
         assert step.braked
-        assert keeps_accelerations(resolver.arm.truss, before, step.state)
+        assert keeps_accelerations(resolver.setup.truss, before, step.state)
         last, before, count = before, step.state, count + 1
     assert count >= 1
-    assert may_rest(resolver.arm.truss, last, resolver.state)
+    assert may_rest(resolver.setup.truss, last, resolver.state)
 
 
 def test_an_arm_that_is_sent_back_brakes_first_and_says_so():

@@ -7,23 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import make_layout
-from test_engines import assert_same_answer, make_step, pressing
-from vgtm_qp.step.linearise import Linearisation, QPInput
+from steps import assert_same_answer, make_step, pressing
 
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.build import lock_members
-from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.bench.scenes import make_scenes
 from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.chain_data import ChainData
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.select import chain_solver
 from vgtm_qp.qp.long.values import PeriodValues
-from vgtm_qp.step import arm as arm_module
 from vgtm_qp.step.chain_engine import ChainEngine
-from vgtm_qp.step.engine import Accuracy, PlainEngine
+from vgtm_qp.step.engine import Accuracy, GeneralEngine
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.target import QPInput
 
 MODULES = {
     "octahedral": lambda: modules.octahedral(5),
@@ -45,18 +43,14 @@ def _without_a_compiler(monkeypatch):
 
 def engines(name, *, vertices=5, hard=False, track=None):
     truss = MODULES[name]()
-    kinematics = Kinematics(truss)
     layout, task = make_layout(
-        truss,
-        kinematics,
-        track or TRACKS.get(name, ("position",)),
-        vertices=vertices,
-        hard_tracking=hard,
+        truss, track or TRACKS.get(name, ("position",)), vertices=vertices, hard_tracking=hard
     )
+    kinematics = layout.arm.kinematics()
     solvers = [chain_solver(layout) for _ in range(2)]
     assert ChainEngine.serves(solvers[0])
-    plain = PlainEngine(Linearisation(layout, kinematics, task, truss.home_lengths), solvers[0])
-    return layout, kinematics, plain, ChainEngine(solvers[1], kinematics, task, truss.home_lengths)
+    plain = GeneralEngine(layout, kinematics, task, solvers[0])
+    return layout, kinematics, plain, ChainEngine(solvers[1], kinematics, task)
 
 
 @pytest.mark.parametrize("base", [False, True])
@@ -70,9 +64,6 @@ def test_both_engines_give_one_answer(name, vertices, hard, base):
     rng = np.random.default_rng(5)
     X, Y, points, target, rows = make_step(layout, kinematics, rng, base=base)
     target = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0) if hard else target
-    if vertices:
-        rotation = kinematics.face_rotation[0]
-        target = replace(target, base_rotation=None if not base else rotation)
     for motion, progress in ((True, 0.0), (False, 0.7), (True, 0.0)):
         goal = target.path.at(progress)
         at = Y if motion else X
@@ -98,14 +89,14 @@ def test_both_engines_give_one_answer(name, vertices, hard, base):
 def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
     """From the end of a motion; `tight` actuators end at a bound, or beyond it, and are brought back."""
     layout, kinematics, plain, chain = engines(name, vertices=vertices, hard=hard)
-    truss = layout.truss
+    truss = layout.arm.truss
     points = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, truss.height]
     _, _, _, target, rows = make_step(layout, kinematics, np.random.default_rng(5))
     kinematics.evaluate(truss.home)
-    home = kinematics.lengths[truss.actuators]
+    home = kinematics.quantities[truss.actuators]
     reach = 0.004 if tight else 0.5
     target = replace(target, lower=home - reach, upper=home + reach)
-    here = kinematics.tip_position(truss.home)
+    here = layout.arm.end_effector.position(truss.home)
     path = Path(
         np.array([0.0, 1.0]),
         np.stack([here, here + np.array([0.02, 0.01, -0.005])]),
@@ -124,19 +115,19 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
         assert ends[1] is None
         return
     assert ends[1] is not None
-    np.testing.assert_allclose(ends[1].X, ends[0].X, atol=1e-10)
-    np.testing.assert_allclose(ends[1].lengths, ends[0].lengths, atol=1e-10)
+    np.testing.assert_allclose(ends[1].q, ends[0].q, atol=1e-10)
+    np.testing.assert_allclose(ends[1].quantities, ends[0].quantities, atol=1e-10)
     np.testing.assert_allclose(ends[1].tip_rotation, ends[0].tip_rotation, atol=1e-10)
     assert ends[1].error <= ACCURACY.member
-    kinematics.evaluate(ends[1].X)
-    np.testing.assert_allclose(kinematics.lengths, ends[1].lengths, atol=1e-14)
-    np.testing.assert_allclose(kinematics.lengths[layout.fixed], truss.home_lengths[layout.fixed], atol=1e-10)
-    strokes = kinematics.lengths[truss.actuators]
+    kinematics.evaluate(ends[1].q)
+    np.testing.assert_allclose(kinematics.quantities, ends[1].quantities, atol=1e-14)
+    np.testing.assert_allclose(kinematics.quantities[~truss.actuated], truss.home_lengths[~truss.actuated], atol=1e-10)
+    strokes = kinematics.quantities[truss.actuators]
     assert (strokes >= target.lower - 1e-12).all()
     assert (strokes <= target.upper + 1e-12).all()
     if hard:
         curve = layout.curve_weights @ (points + answer.vertices)
-        np.testing.assert_allclose(kinematics.face_centres(ends[1].X)[layout.tracked], curve, atol=1e-10)
+        np.testing.assert_allclose(layout.arm.stations.centres(ends[1].q)[layout.tracked], curve, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["octahedral", "hexapod", "tetrahedral-23"])
@@ -144,7 +135,7 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
 def test_the_rows_of_a_period_are_derivatives(name, reverse):
     """Lengths, gaps and angles against central differences of themselves, the Jacobians being taken at X too."""
     layout, kinematics, *_ = engines(name)
-    chain, truss = find_chain(layout), layout.truss
+    chain, truss = find_chain(layout), layout.arm.truss
     elimination = Elimination(chain)
     data = ChainData(chain, elimination.inputs.sizes, reverse=reverse)
     values = PeriodValues(chain, data, truss.home_lengths)
@@ -163,7 +154,7 @@ def test_the_rows_of_a_period_are_derivatives(name, reverse):
     change = [(a - b) / (2 * h) for a, b in zip(ahead, behind, strict=True)]
     at(0.0)
     kinematics.evaluate(X)
-    np.testing.assert_allclose(values.lengths, kinematics.lengths, atol=1e-14)
+    np.testing.assert_allclose(values.lengths, kinematics.quantities, atol=1e-14)
     members = np.arange(truss.member_count)
     nodes, rows = values.member_rows(members)
     np.testing.assert_allclose(np.einsum("rqc,rqc->r", rows, moved[nodes]), change[0], atol=1e-8)
@@ -180,9 +171,9 @@ def test_whole_maneuvers_are_the_same(tracking, monkeypatch):
     ends = []
     for plain in (False, True):
         if plain:
-            monkeypatch.setattr(arm_module.ChainEngine, "serves", staticmethod(lambda _: False))
+            monkeypatch.setattr(ChainEngine, "serves", staticmethod(lambda _: False))
         resolver = Resolver(scene.problem)
-        assert isinstance(resolver.arm.engine, PlainEngine if plain else ChainEngine)
+        assert isinstance(resolver.setup.engine, GeneralEngine if plain else ChainEngine)
         tip = resolver.tip()[0]
         for k in range(1, 6):
             step = resolver.step(position=tip + k * np.array([0.03, 0.0, -0.001]))

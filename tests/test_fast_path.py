@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.build import build_arm
 
 import vgtm_qp as vq
 from vgtm_qp.maneuver.plan import make_plan
@@ -22,11 +22,11 @@ SCENES = [
 def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, changes):
     problem = vq.load_problem(name).replace(changes)
     fast, plain = vq.Resolver(problem), vq.Resolver(build_arm(problem, compiled=False))
-    assert isinstance(fast.arm.engine, FusedEngine)
-    assert isinstance(plain.arm.engine, PlainEngine)
-    watched = fast.arm.monitor._watch is not None
-    assert watched == (fast.arm.monitor.self_collision or bool(problem.obstacle))
-    plain.arm.monitor._watch = None
+    assert isinstance(fast.setup.engine, FusedEngine)
+    assert isinstance(plain.setup.engine, PlainEngine)
+    watched = fast.setup.monitor._watch is not None
+    assert watched == (fast.setup.monitor.self_collision or bool(problem.obstacle))
+    plain.setup.monitor._watch = None
     plan = make_plan(problem, *fast.tip())
     value, compared, furthest = plan.path.start, 0, 0.0
     for mark in plan.marks.tolist():

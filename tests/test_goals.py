@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.linearise import Linearisation, Target
 
 import vgtm_qp as vq

@@ -7,7 +7,6 @@ import pytest
 from arms import TRUSSES, central_differences, make_layout, random_pose
 from scipy.spatial.transform import Rotation
 
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import Kinematics
 
 OFFSETS = (0.0, 0.12)
@@ -53,8 +52,8 @@ def scattered(rows, nodes, count):
 
 def test_at_home_everything_is_as_the_truss_says(truss, kinematics):
     kinematics.evaluate(truss.home)
-    np.testing.assert_allclose(kinematics.lengths, truss.home_lengths, atol=1e-14)
-    np.testing.assert_allclose(kinematics.face_rotation, truss.face_frames, atol=1e-14)
+    np.testing.assert_allclose(kinematics.quantities, truss.home_lengths, atol=1e-14)
+    np.testing.assert_allclose(kinematics.station_rotation, truss.face_frames, atol=1e-14)
     np.testing.assert_allclose(kinematics.tip_rotation, truss.tip_frame, atol=1e-14)
     np.testing.assert_allclose(kinematics.tip_position(truss.home), truss.tip_weights @ truss.home[truss.tip])
 
@@ -62,7 +61,7 @@ def test_at_home_everything_is_as_the_truss_says(truss, kinematics):
 def test_lengths_are_those_between_member_ends_and_gradients_their_derivatives(truss, kinematics):
     X = random_pose(truss, np.random.default_rng(1))
     kinematics.evaluate(X)
-    np.testing.assert_allclose(kinematics.lengths, lengths_of(truss, X), atol=1e-14)
+    np.testing.assert_allclose(kinematics.quantities, lengths_of(truss, X), atol=1e-14)
     gradient = np.zeros((truss.member_count, truss.node_count, 3))
     for slot in range(kinematics.member_nodes.shape[1]):
         np.add.at(
@@ -106,17 +105,17 @@ def test_face_spins_are_the_angular_velocity_rows_of_the_face_frames(truss, kine
 
     def rotations(Y):
         kinematics.evaluate(Y)
-        return kinematics.face_rotation.copy()
+        return kinematics.station_rotation.copy()
 
     wanted = spin_by_differences(rotations, X)
     kinematics.evaluate(X)
     np.testing.assert_allclose(
-        kinematics.face_rotation @ kinematics.face_rotation.transpose(0, 2, 1),
-        np.broadcast_to(np.eye(3), kinematics.face_rotation.shape),
+        kinematics.station_rotation @ kinematics.station_rotation.transpose(0, 2, 1),
+        np.broadcast_to(np.eye(3), kinematics.station_rotation.shape),
         atol=1e-14,
     )
     for face, nodes in enumerate(truss.faces):
-        rows = scattered(kinematics.face_spin[face], nodes, truss.node_count)
+        rows = scattered(kinematics.station_spin[face], nodes, truss.node_count)
         np.testing.assert_allclose(rows, wanted[face], atol=5e-9)
 
 
@@ -139,15 +138,15 @@ def test_a_rigid_motion_keeps_lengths_and_turns_frames_with_it(truss, kinematics
     turn, shift = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3)
     kinematics.evaluate(X)
     lengths, faces, tip = (
-        kinematics.lengths.copy(),
-        kinematics.face_rotation.copy(),
+        kinematics.quantities.copy(),
+        kinematics.station_rotation.copy(),
         kinematics.tip_rotation.copy(),
     )
     gradient, position = kinematics.gradient.copy(), kinematics.tip_position(X)
     moved = X @ turn.T + shift
     kinematics.evaluate(moved)
-    np.testing.assert_allclose(kinematics.lengths, lengths, atol=1e-13)
-    np.testing.assert_allclose(kinematics.face_rotation, turn @ faces, atol=1e-12)
+    np.testing.assert_allclose(kinematics.quantities, lengths, atol=1e-13)
+    np.testing.assert_allclose(kinematics.station_rotation, turn @ faces, atol=1e-12)
     np.testing.assert_allclose(kinematics.gradient, gradient @ turn.T, atol=1e-12)
     np.testing.assert_allclose(kinematics.tip_position(moved), turn @ position + shift, atol=1e-13)
     if kinematics.has_tip_frame:
@@ -164,7 +163,7 @@ def test_a_face_frame_prefers_no_node():
         faces = np.roll(truss.faces, shift, axis=1)
         kinematics = Kinematics(type(truss)(**{**vars_of(truss), "faces": faces}), compiled=False)
         kinematics.evaluate(X)
-        frames.append(kinematics.face_rotation.copy())
+        frames.append(kinematics.station_rotation.copy())
     np.testing.assert_allclose(frames[1], frames[0], atol=1e-12)
     np.testing.assert_allclose(frames[2], frames[0], atol=1e-12)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from vgtm_qp.step.limits import braking_speed, length_box
+from vgtm_qp.rows.limits import actuator_box, braking_speed
 
 positive = st.floats(0.01, 10.0)
 limit = st.one_of(st.just(np.inf), positive)
@@ -50,7 +50,7 @@ def test_lengths_that_stay_in_their_boxes_keep_every_limit(
     stroke = np.array([[least, least + travel]])
     length, speed, rates, accelerations = one(least + start * travel, 0.0, rate, acceleration)
     for choice in choices:
-        lower, upper = length_box(length, speed, stroke, rates, accelerations, dt)
+        lower, upper = actuator_box(length, speed, stroke, rates, accelerations, dt)
         assert lower[0] <= upper[0]
         after = lower + choice * (upper - lower)
         change = (after - length) / dt
@@ -75,7 +75,7 @@ def test_a_start_outside_any_limit_has_a_box_that_leads_back(
 ):
     stroke = np.array([[least, least + travel]])
     lengths, speeds, rates, accelerations = one(length, speed, rate, acceleration)
-    lower, upper = length_box(lengths, speeds, stroke, rates, accelerations, dt)
+    lower, upper = actuator_box(lengths, speeds, stroke, rates, accelerations, dt)
     assert lower[0] <= upper[0]
     assert np.isfinite([lower[0], upper[0]]).all()
     assert lower[0] >= min(least, length) - 1e-12
@@ -90,7 +90,7 @@ def test_an_actuator_outside_its_stroke_comes_back_by_its_own_limits():
     rate, acceleration, dt = np.array([0.5]), np.array([0.4]), 0.1
     for _ in range(100):
         before, speed_before = length, speed
-        length, upper = length_box(length, speed, stroke, rate, acceleration, dt)
+        length, upper = actuator_box(length, speed, stroke, rate, acceleration, dt)
         assert upper[0] <= max(before[0], 1.5) + 1e-15
         speed = (length - before) / dt
         assert abs(speed[0]) <= 0.5 + 1e-12
@@ -105,8 +105,8 @@ def test_each_actuator_has_its_own_box():
     length = stroke[:, 0] + rng.uniform(size=count) * np.diff(stroke, axis=1)[:, 0]
     speed, rate = rng.uniform(-0.2, 0.2, count), rng.uniform(0.2, 1.0, count)
     acceleration = np.where(rng.uniform(size=count) < 0.3, np.inf, rng.uniform(0.1, 1.0, count))
-    together = length_box(length, speed, stroke, rate, acceleration, 0.2)
+    together = actuator_box(length, speed, stroke, rate, acceleration, 0.2)
     for k in range(count):
         row = slice(k, k + 1)
-        alone = length_box(length[row], speed[row], stroke[row], rate[row], acceleration[row], 0.2)
+        alone = actuator_box(length[row], speed[row], stroke[row], rate[row], acceleration[row], 0.2)
         assert (together[0][k], together[1][k]) == (alone[0][0], alone[1][0])

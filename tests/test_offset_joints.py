@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from arms import TRUSSES, arm_problem, central_differences, random_pose
-from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.build import build_arm
 
 import vgtm_qp as vq
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.errors import TrussError
 from vgtm_qp.qp.numbers import ClearanceRows

@@ -107,7 +107,7 @@ def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
 
 def contradiction(layout, numbers):
     """Numbers whose clearance row asks for a jump that the strokes do not allow."""
-    truss = layout.truss
+    truss = layout.arm.truss
     node = truss.free[-1]
     rows = ClearanceRows(
         np.full((1, 4), node), np.zeros((1, 4, 3)), np.array([5.0]), lambda k: "clearance: far"
@@ -118,7 +118,7 @@ def contradiction(layout, numbers):
 
 def full_point(builder, numbers, solution):
     """The full QP's unknowns at a solution: its displacements, and the gaps that follow from them."""
-    layout, truss = builder.layout, builder.layout.truss
+    layout, truss = builder.layout, builder.layout.arm.truss
     parts = [solution.nodes[truss.free].reshape(-1), solution.actuators, solution.vertices.reshape(-1)]
     if layout.vertices:
         faces = truss.faces[layout.tracked]

@@ -8,12 +8,10 @@ import json
 import numpy as np
 import pytest
 from arms import mast
-from vgtm_qp.step.joint_ways import chord_deviation
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.chords import chord_deviation
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver
 
@@ -45,7 +43,7 @@ def beside(gap):
 
 def test_an_arm_too_near_at_the_start_recovers_monotonically_and_says_so():
     resolver = Resolver(problem(obstacle=[beside(0.03)]))
-    arm = resolver.arm
+    arm = resolver.setup
     before = resolver._separation.shortfall(resolver.state.nodes, 0.0)
     assert before
     assert any("crate" in name for name in resolver._separation.names(before))
@@ -254,5 +252,5 @@ def test_an_arm_at_rest_need_not_flee_from_an_obstacle_that_only_comes_nearer():
     resting = Resolver(problem(obstacle=[{**crate, "velocity": [0.0, 0.0, 0.0]}]))
     still = resting._separation.rows(resting.state.nodes, 0.0, 1.0, 2.0, {}, 0.0)
     least = max(still.lower[k] for k in range(len(still)) if "crate" in still.name(k))
-    room = resting.arm.monitor.least(resting.state.nodes, 0.0, among="obstacles")[0] - resting.arm.safe
+    room = resting.setup.monitor.least(resting.state.nodes, 0.0, among="obstacles")[0] - resting.setup.safe
     assert least == pytest.approx(-0.4 * room, abs=1e-3)

@@ -86,7 +86,7 @@ def lie(monkeypatch, change):
 
 
 def moved(closed, nodes, way):
-    X = closed.X.copy()
+    X = closed.q.copy()
     X[nodes] += way
     return replace(closed, X=X)
 
@@ -95,7 +95,7 @@ LIES = {
     "the base": lambda closed: moved(closed, 0, (1e-8, 0.0, 0.0)),
     "all of it": lambda closed: moved(closed, slice(None), (0.03, 0.0, 0.0)),
     "a member": lambda closed: moved(closed, 7, (0.0, 1e-6, 0.0)),
-    "a length": lambda closed: replace(closed, lengths=closed.lengths + 1e-6),
+    "a length": lambda closed: replace(closed, lengths=closed.quantities + 1e-6),
     "nothing finite": lambda closed: moved(closed, 9, (np.nan, 0.0, 0.0)),
 }
 

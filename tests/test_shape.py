@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from arms import arm_problem
 from scipy.spatial.transform import Rotation
-from vgtm_qp.step.arm import build_arm
+from vgtm_qp.step.build import build_arm
 
 import vgtm_qp as vq
 from vgtm_qp.curve.curve import Curve
@@ -42,12 +42,12 @@ def walk(resolver, count=6, stride=STRIDE, **goal):
 
 def gaps(resolver):
     """Positions and turns between the tracked faces and the curve, by the curve's own class."""
-    layout, state = resolver.arm.layout, resolver.state
-    kinematics, faces = resolver.arm.kinematics, layout.tracked
-    rows = layout.shape.rows(state.control_vertices, state.torsion, layout.truss.face_frames[0])
+    layout, state = resolver.setup.layout, resolver.state
+    kinematics, faces = resolver.setup.kinematics, layout.tracked
+    rows = layout.shape.rows(state.control_vertices, state.torsion, layout.arm.truss.face_frames[0])
     kinematics.evaluate(state.nodes)
-    turns = turn_rows(rows, kinematics.face_rotation[faces], kinematics.face_spin[faces], layout.turns)
-    return kinematics.face_centres(state.nodes)[faces] - rows.position, turns.residual
+    turns = turn_rows(rows, kinematics.station_rotation[faces], kinematics.station_spin[faces], layout.turns)
+    return kinematics.centres(state.nodes)[faces] - rows.position, turns.residual
 
 
 CURVES = [
@@ -66,7 +66,7 @@ def test_every_family_starts_on_the_faces_and_goes_with_them(curve, nodes):
     assert np.abs(gaps(resolver)[0]).max() < 1e-9
     walk(resolver)
     assert np.abs(gaps(resolver)[0]).max() < 0.1
-    state, shape = resolver.state, resolver.arm.layout.shape
+    state, shape = resolver.state, resolver.setup.layout.shape
     if nodes == "arc-length":
         now = Curve(shape.family, state.control_vertices)
         s = now.arc_parameter(shape.nodes)
@@ -94,10 +94,10 @@ def test_hard_tracking_holds_at_every_state(module, bays, coordinates, curve):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         resolver = Resolver(problem)
-    layout = resolver.arm.layout
-    stride = layout.truss.face_stride
+    layout = resolver.setup.layout
+    stride = layout.arm.truss.face_stride
     assert list(np.diff(layout.tracked)) == [stride] * (len(layout.tracked) - 1)
-    assert layout.tracked[-1] == len(layout.truss.faces) - 1
+    assert layout.tracked[-1] == len(layout.arm.truss.faces) - 1
     for _ in range(4):
         walk(resolver, 1)
         gap, turn = gaps(resolver)
@@ -149,11 +149,11 @@ def test_torsion_takes_up_the_roll_of_the_tip(module, bays):
     for _ in range(20):
         resolver.step(position=here)
     assert 0.15 < resolver.state.torsion[0] < 0.45
-    kinematics = resolver.arm.kinematics
+    kinematics = resolver.setup.kinematics
     kinematics.evaluate(resolver.state.nodes)
     roll = [
         Rotation.from_matrix(frame @ home.T).as_rotvec()[2]
-        for frame, home in zip(kinematics.face_rotation, resolver.arm.truss.face_frames, strict=True)
+        for frame, home in zip(kinematics.station_rotation, resolver.setup.truss.face_frames, strict=True)
     ]
     assert roll[-1] == pytest.approx(0.3, abs=1e-6)
     assert 0.05 < roll[len(roll) // 2] < 0.25
@@ -164,10 +164,10 @@ def test_spacing_keeps_the_curve_nodes_apart_as_at_home():
     for weight in (0.0, 20.0):
         resolver = Resolver(shaped_problem(method={"weights": {"spacing": weight}}))
         walk(resolver, 9, np.array([0.02, 0.0, -0.08]))
-        family = resolver.arm.layout.family
+        family = resolver.setup.layout.family
         points = Curve(family, resolver.state.control_vertices).position(np.linspace(0, 1, 5))
         spread.append(
-            np.abs(np.linalg.norm(np.diff(points, axis=0), axis=1) - resolver.arm.truss.height / 4).max()
+            np.abs(np.linalg.norm(np.diff(points, axis=0), axis=1) - resolver.setup.truss.height / 4).max()
         )
     assert spread[1] < 0.8 * spread[0]
 
@@ -187,7 +187,7 @@ def test_a_vertex_goes_to_its_goal_and_the_arm_follows_while_the_tip_stays(solve
         before.control_vertices[3] - goal
     )
     np.testing.assert_allclose(resolver.tip()[0], tip, atol=1e-6)
-    faces = resolver.arm.truss.faces
+    faces = resolver.setup.truss.faces
     middle = [state.nodes[faces[3]].mean(axis=0) for state in (before, after)]
     assert middle[1][0] - middle[0][0] > 0.05
     resolver.set_control_vertex_goal(3, None)
@@ -210,9 +210,9 @@ def test_goals_set_as_a_whole_and_wrong_ones_refused():
     resolver = Resolver(shaped_problem())
     resolver.control_vertex_goals = {2: [0.1, 0.0, 1.5], 3: [0.2, 0.0, 2.0]}
     assert sorted(resolver.control_vertex_goals) == [2, 3]
-    arm = resolver.arm
+    arm = resolver.setup
     resolver.control_vertex_goals = {2: [0.3, 0.0, 1.5], 3: [0.2, 0.0, 2.0]}
-    assert resolver.arm is arm
+    assert resolver.setup is arm
     np.testing.assert_array_equal(resolver.control_vertex_goals[2], [0.3, 0.0, 1.5])
     for index in (5, -1, "2"):
         with pytest.raises(GoalError, match="0 to 4"):
@@ -240,9 +240,9 @@ def test_more_control_vertices_leave_the_curve_where_it_is(family, torsion):
     s = np.linspace(0, 1, 40)
 
     def points():
-        return Curve(resolver.arm.layout.family, resolver.state.control_vertices).position(s)
+        return Curve(resolver.setup.layout.family, resolver.state.control_vertices).position(s)
 
-    first_arm, before = resolver.arm, points()
+    first_arm, before = resolver.setup, points()
     assert resolver.set_control_vertices(7) < 1e-12
     assert resolver.state.control_vertices.shape == (7, 3)
     np.testing.assert_allclose(points(), before, atol=1e-12)
@@ -252,10 +252,10 @@ def test_more_control_vertices_leave_the_curve_where_it_is(family, torsion):
     before = points()
     change = resolver.set_control_vertices(5)
     assert change == pytest.approx(np.linalg.norm(points() - before, axis=1).max(), rel=0.2)
-    assert resolver.arm.layout.vertices == 5
+    assert resolver.setup.layout.vertices == 5
     walk(resolver, 2)
     if family == "bezier":
-        assert resolver.arm is first_arm
+        assert resolver.setup is first_arm
     with pytest.raises(CurveError, match="control vertices"):
         resolver.set_control_vertices(2)
     assert resolver.state.control_vertices.shape == (5, 3)

@@ -72,11 +72,11 @@ def random_numbers(
     motion=True,
 ):
     """One QP at a random pose: members off their lengths, narrow strokes, clearance rows on two members each."""
-    truss = layout.truss
+    truss = layout.arm.truss
     X = random_pose(truss, rng, off)
     X[truss.base] = truss.home[truss.base]
     kinematics.evaluate(X)
-    home = kinematics.lengths + 1e-4 * rng.normal(size=truss.member_count)
+    home = kinematics.quantities + 1e-4 * rng.normal(size=truss.member_count)
     here, rotation = kinematics.tip_position(X), kinematics.tip_rotation.copy()
     turn = rotation_from_vector(0.2 * push * rng.normal(size=3))
     path = Path(
@@ -84,7 +84,7 @@ def random_numbers(
         np.stack([here, here + push * rng.normal(size=3)]),
         np.stack([rotation, turn @ rotation]),
     )
-    now = kinematics.lengths[truss.actuators]
+    now = kinematics.quantities[truss.actuators]
     room = box * rng.uniform(0.2, 1.0, size=(2, len(now)))
     moved = truss.home @ rotation_from_vector([0.01, -0.02, 0.015]).T + [0.01, 0.0, 0.02] if base else None
     target = Target(path, 0.0, 1.0, now - room[0], now + room[1], 0.0, moved)
@@ -257,7 +257,7 @@ def test_rows_that_contradict_one_another_are_infeasible(shared):
     )
     with pytest.raises(InfeasibleStepError):
         solver.solve(replace(numbers, clearance=opposed))
-    base = np.flatnonzero(layout.truss.base)[:1]
+    base = np.flatnonzero(layout.arm.truss.base)[:1]
     unmovable = ClearanceRows(np.full((1, 4), base), rows.coefficients, np.array([1e-3]))
     with pytest.raises(InfeasibleStepError):
         solver.solve(replace(numbers, clearance=unmovable))
@@ -317,7 +317,7 @@ def test_a_wrong_answer_is_refused(hard, monkeypatch):
 def test_the_periods_hold_the_whole_length_jacobian(name, joint_offset):
     layout, kinematics, _ = make(MODULES[name](joint_offset=joint_offset))
     chain = find_chain(layout)
-    kinematics.evaluate(random_pose(layout.truss, np.random.default_rng(0)))
+    kinematics.evaluate(random_pose(layout.arm.truss, np.random.default_rng(0)))
     values = (chain.gather @ kinematics.gradient.reshape(-1)).reshape(chain.periods, -1)
     pattern, rebuilt = chain.coordinate_pattern, np.zeros((layout.node_columns, layout.node_columns))
     for period in range(chain.periods):
@@ -406,7 +406,7 @@ def test_lengths_by_every_path(name, path, joint_offset, monkeypatch):
 
 def test_the_gain_is_the_least_motion_of_the_tip():
     layout, kinematics, task = make(MODULES["octahedral"](), vertices=0)
-    truss, weights = layout.truss, layout.weights
+    truss, weights = layout.arm.truss, layout.weights
     solver, rng = StagedSolver(find_chain(layout)), np.random.default_rng(3)
     assert solver.gain(np.zeros(len(truss.actuators), dtype=bool)) is None
     stopped = 0

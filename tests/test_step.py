@@ -12,7 +12,6 @@ from vgtm_qp.step.linearise import Linearisation, Target, clearance_rows
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.bodies import member_bodies
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.errors import GoalError, ProblemError, VgtmError
 from vgtm_qp.geometry import shapes
@@ -56,8 +55,8 @@ class Scene:
             self.path,
             0.0,
             2.0,
-            self.kinematics.lengths[actuators] - 0.1,
-            self.kinematics.lengths[actuators] + 0.2,
+            self.kinematics.quantities[actuators] - 0.1,
+            self.kinematics.quantities[actuators] + 0.2,
             time=1.0,
             base=self.X + 0.01 * rng.normal(size=self.X.shape) if base else None,
         )
@@ -74,7 +73,7 @@ class Scene:
         ends = member_ends(truss, X)
         lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
         self.kinematics.evaluate(X)
-        faces, tip = self.kinematics.face_rotation.copy(), self.kinematics.tip_rotation.copy()
+        faces, tip = self.kinematics.station_rotation.copy(), self.kinematics.tip_rotation.copy()
         goal = self.path.at(2.0 * progress)
         error = (truss.tip_weights @ X[truss.tip] - goal.position)[self.task.axes]
         if self.task.turns == "pointing":
@@ -118,7 +117,7 @@ def test_rows_of_the_full_qp_linearise_what_they_say(name, track, joint_offset):
         )
 
     scene.kinematics.evaluate(scene.X)
-    axes0 = scene.kinematics.face_rotation[0][:, :2].T.copy()
+    axes0 = scene.kinematics.station_rotation[0][:, :2].T.copy()
     across0 = scene.kinematics.tip_rotation[:, :2].T.copy()
     h = 1e-6
     change = [(a - b) / (2 * h) for a, b in zip(moved(h), moved(-h), strict=True)]
@@ -141,7 +140,7 @@ def test_right_hand_sides_are_the_residuals(name):
     scene = Scene(name, ("position", "pointing"))
     numbers = scene.numbers()
     scene.kinematics.evaluate(scene.X)
-    axes0 = scene.kinematics.face_rotation[0][:, :2].T.copy()
+    axes0 = scene.kinematics.station_rotation[0][:, :2].T.copy()
     across0 = scene.kinematics.tip_rotation[:, :2].T.copy()
     lengths, error, start, slope, gap, tilt = scene.residual(scene.X, scene.vertices, 0.4, axes0, across0)
     truss = scene.truss
@@ -194,7 +193,7 @@ def test_a_moving_base_takes_its_members_and_the_curve_with_it():
         for s in (1.0, -1.0)
     )
     rate = (ahead - behind) / (2 * h)
-    error = np.where(truss.actuated, 0.0, truss.home_lengths - scene.kinematics.lengths)
+    error = np.where(truss.actuated, 0.0, truss.home_lengths - scene.kinematics.quantities)
     np.testing.assert_allclose(numbers.length_rhs, error - rate, atol=1e-8)
     centre = truss.face_weights[0] @ base[truss.faces[0]]
     np.testing.assert_allclose(scene.vertices[0] + numbers.base_displacement, centre, atol=1e-13)
@@ -365,7 +364,7 @@ def test_a_direction_that_is_none_is_refused(goal):
 def test_states_cannot_be_changed(crate_problem):
     resolver = Resolver(crate_problem)
     step = resolver.step(position=[0.1, 0.0, 1.6])
-    for state in (resolver.state, step.state, Resolver(resolver.arm).state):
+    for state in (resolver.state, step.state, Resolver(resolver.setup).state):
         for field in dataclasses.fields(state):
             with pytest.raises(dataclasses.FrozenInstanceError):
                 setattr(state, field.name, None)
@@ -400,7 +399,7 @@ def walk(resolver, targets, dt=None):
 
 def check_step(resolver, before, target, step, dt):
     """Recompute from the nodes alone everything that an accepted step has to keep."""
-    truss, state = resolver.arm.truss, step.state
+    truss, state = resolver.setup.truss, step.state
     if step.status is StepStatus.BLOCKED:
         assert step.state is before
         assert resolver.state is before
@@ -412,25 +411,25 @@ def check_step(resolver, before, target, step, dt):
         dt = state.duration
     assert resolver.state is state
     lengths, lengths_before = lengths_at(truss, state.nodes), lengths_at(truss, before.nodes)
-    np.testing.assert_allclose(state.lengths, lengths, atol=1e-13)
+    np.testing.assert_allclose(state.quantities, lengths, atol=1e-13)
     np.testing.assert_array_equal(state.nodes[truss.base], truss.home[truss.base])
     fixed = ~truss.actuated
     assert np.max(np.abs(lengths - truss.home_lengths)[fixed], initial=0.0) <= 1e-9
     stroke = np.maximum(truss.stroke[:, 0] - lengths, lengths - truss.stroke[:, 1])[truss.actuated]
     assert np.max(stroke) <= 1e-9
     rate = (lengths - lengths_before) / dt
-    np.testing.assert_allclose(state.length_rates, rate, atol=1e-12 / dt)
+    np.testing.assert_allclose(state.rates, rate, atol=1e-12 / dt)
     assert np.max((np.abs(rate) - truss.rate)[truss.actuated]) <= 1e-9
     if before.time > 0.0:
         interval = 0.5 * (dt + before.duration)
-        acceleration = np.abs(rate - before.length_rates) / interval
+        acceleration = np.abs(rate - before.rates) / interval
         assert np.max((acceleration - truss.acceleration)[truss.actuated]) <= 1e-9
     assert state.time == pytest.approx(before.time + dt)
     start = truss.tip_weights @ before.nodes[truss.tip]
     tip = truss.tip_weights @ state.nodes[truss.tip]
     wanted = start + step.progress * (np.asarray(target) - start)
     if not step.braked:
-        np.testing.assert_allclose(tip[resolver.arm.task.axes], wanted[resolver.arm.task.axes], atol=1e-6)
+        np.testing.assert_allclose(tip[resolver.setup.task.axes], wanted[resolver.setup.task.axes], atol=1e-6)
     assert (step.status is StepStatus.REACHED) == (step.progress >= 1.0 - 1e-9)
     assert 0.0 <= step.progress <= 1.0
 
@@ -445,7 +444,7 @@ def test_accepted_steps_keep_every_limit_by_recomputation(crate_problem, dt):
     resolver = Resolver(crate_problem)
     start, goal = resolver.tip()[0], np.array([1.05, 0.0, 1.25])
     statuses = set()
-    fresh = Resolver(crate_problem).arm.monitor
+    fresh = Resolver(crate_problem).setup.monitor
     for before, target, step in walk(resolver, targets_to(goal, start, 14 if dt > 0.1 else 60), dt):
         check_step(resolver, before, target, step, dt)
         statuses.add(step.status)
@@ -488,7 +487,7 @@ def test_every_module_moves_by_the_resolver(name):
     problem = arm_problem((0.2, 0.1, 1.0), truss={"module": name, "stroke": None, "joint_offset": 0.05})
     resolver = Resolver(problem)
     start = resolver.tip()[0]
-    goal = start + np.array([0.12, 0.05, -0.05]) * resolver.arm.truss.height
+    goal = start + np.array([0.12, 0.05, -0.05]) * resolver.setup.truss.height
     for before, target, step in walk(resolver, targets_to(goal, start, 4), 1.0):
         check_step(resolver, before, target, step, 1.0)
         assert step.status is StepStatus.REACHED
@@ -558,7 +557,7 @@ def test_blocked_says_why_and_leaves_the_state(crate_problem):
 def test_active_rows_are_named_with_their_multipliers(crate_problem):
     resolver = Resolver(crate_problem)
     start, goal = resolver.tip()[0], np.array([1.05, 0.0, 1.25])
-    members = set(resolver.arm.truss.member_names)
+    members = set(resolver.setup.truss.member_names)
     seen = set()
     for _, _, step in walk(resolver, targets_to(goal, start, 14), 0.5):
         assert set(step.active) == set(step.multipliers)
@@ -606,8 +605,8 @@ def test_calls_are_deterministic(crate_problem):
 
 def test_two_resolvers_on_one_arm_do_not_disturb_each_other(crate_problem):
     alone = Resolver(crate_problem)
-    first = Resolver(alone.arm)
-    second = Resolver(alone.arm)
+    first = Resolver(alone.setup)
+    second = Resolver(alone.setup)
     fresh = Resolver(crate_problem)
     start = fresh.tip()[0]
     for k in range(1, 6):

@@ -7,7 +7,6 @@ import pytest
 
 from vgtm_qp.arm.truss.build import build_truss, lock_members
 from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.arm.truss.kinematics import Kinematics
 from vgtm_qp.arm.truss.mobility import describe, tip_response, trackable_coordinates
 from vgtm_qp.arm.truss.modules import double_octahedral, hexapod, longeron, octahedral, tetrahedral
@@ -88,7 +87,7 @@ def test_names_are_unique_and_faces_grow_along_z(module):
     np.testing.assert_array_equal(truss.face_frames, np.tile(np.eye(3), (5, 1, 1)))
     kinematics = Kinematics(truss, compiled=False)
     kinematics.evaluate(truss.home)
-    np.testing.assert_allclose(kinematics.face_rotation, truss.face_frames, atol=1e-12)
+    np.testing.assert_allclose(kinematics.station_rotation, truss.face_frames, atol=1e-12)
     np.testing.assert_allclose(kinematics.tip_rotation, truss.tip_frame, atol=1e-12)
 
 
