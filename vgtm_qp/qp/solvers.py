@@ -108,10 +108,11 @@ class FullSolver:
             raise InfeasibleStepError("a lower bound is above its upper bound")
         z, y, w, iterations = self._answer(qp, same_structure=same)
         scale = relative(1.0, qp.q, y)
-        dual = max(
-            scale * qp.dual_residual(z, y, w), qp.complementarity_residual(z, scale * y, scale * w)
-        )
-        refuse_large(qp.primal_residual(z), dual, self._name)
+        # Of an answer that is not finite a residual is NaN, and refused.
+        with np.errstate(invalid="ignore"):
+            primal, dual = qp.primal_residual(z), scale * qp.dual_residual(z, y, w)
+            pressing = qp.complementarity_residual(z, scale * y, scale * w)
+        refuse_large(primal, max(dual, pressing), self._name)
         # Only a good answer is a warm start: NaN would stay in the solver for ever.
         self._structure = self.builder.structure
         return self.builder.solution(z, y, w, iterations)
