@@ -137,17 +137,22 @@ def test_the_rows_of_a_period_are_derivatives(name, reverse):
     layout, kinematics, *_ = engines(name)
     chain, truss = find_chain(layout), layout.arm.truss
     elimination = Elimination(chain)
-    data = ChainData(chain, elimination.inputs.sizes, reverse=reverse)
+    sizes = elimination.inputs.sizes
+    data = ChainData(chain, sizes, reverse=reverse)
     values = PeriodValues(chain, data, truss.home_lengths)
     rng = np.random.default_rng(3)
     X, _, points, _, _ = make_step(layout, kinematics, rng)
     moved = rng.normal(size=X.shape)
     moved[truss.base] = 0.0
 
+    def part(vector, name):
+        names = list(sizes[vector])
+        first = sum(sizes[vector][before] for before in names[: names.index(name)])
+        return getattr(data, vector)[:, first : first + sizes[vector][name]].copy()
+
     def at(step):
         values.fill(X + step * moved, X + step * moved, points, None, motion=True)
-        tail = {name: data._part[name].copy() for name in ("gap", "tilt")}
-        return values.lengths.copy(), tail["gap"], tail["tilt"]
+        return values.lengths.copy(), part("tail", "gap"), part("tail", "tilt")
 
     h = 1e-5
     ahead, behind = at(h), at(-h)
@@ -161,7 +166,7 @@ def test_the_rows_of_a_period_are_derivatives(name, reverse):
     faces = moved[chain.window[data.order]][:, chain.face_places].reshape(len(data.faces), 9)
     centres = np.einsum("f,kfc->kc", chain.face_weights[0], faces.reshape(-1, 3, 3))
     np.testing.assert_allclose(change[1].reshape(-1, 3), centres, atol=1e-8)
-    turns = data._part["tangent_face"].reshape(-1, 2, 9)
+    turns = part("head", "tangent_face").reshape(-1, 2, 9)
     np.testing.assert_allclose(np.einsum("kaf,kf->ka", turns, faces), change[2].reshape(-1, 2), atol=1e-8)
 
 

@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import TRUSSES, make_layout, random_pose
+from steps import answer_of
 
 import vgtm_qp as vq
-from vgtm_qp.arm.truss.kinematics import Kinematics
+from vgtm_qp.arm.truss.lengths import LengthRows
 from vgtm_qp.errors import SolverError, VgtmError
-from vgtm_qp.qp.condensed import InfeasibleStepError
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
-from vgtm_qp.qp.solvers import _TIGHT, FullSolver, available_solvers, make_solver
+from vgtm_qp.qp.residual import InfeasibleStepError
+from vgtm_qp.qp.solvers import FullSolver, available_solvers, make_solver
 
 FULL_SOLVERS = ["osqp", "piqp", "clarabel"]
 SOLVERS = ["daqp", *FULL_SOLVERS]
@@ -30,13 +31,13 @@ def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
     """A layout and random numbers of its QP: feasible, with bounds and clearance rows near active."""
     rng = np.random.default_rng(seed)
     truss = TRUSSES[name](joint_offset=joint_offset)
-    kinematics = Kinematics(truss, compiled=False)
     track = ("position",)
     if curve == "hard":
         track = ("z",)
     layout, task = make_layout(
-        truss, kinematics, track, vertices=0 if curve == "none" else 6, hard_tracking=curve == "hard"
+        truss, track, vertices=0 if curve == "none" else 6, hard_tracking=curve == "hard"
     )
+    kinematics = layout.arm.kinematics(compiled=False)
     X = random_pose(truss, rng, 0.03)
     kinematics.evaluate(X)
     count, vertices, tracked = len(truss.actuators), layout.vertices, len(layout.tracked)
@@ -48,7 +49,7 @@ def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
     change = length_rhs.copy()
     change[truss.actuators] += actuators
     nodes = np.zeros_like(X)
-    nodes[truss.free] = np.linalg.solve(layout.length_jacobian(kinematics.gradient), change).reshape(-1, 3)
+    nodes[truss.free] = np.linalg.solve(truss.scatter.dense(kinematics.gradient), change).reshape(-1, 3)
 
     shift, base_rhs = 0.01 * rng.normal(size=3), 0.01 * rng.normal(size=2)
     curve_step = 0.02 * rng.normal(size=(vertices, 3))
@@ -75,8 +76,7 @@ def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
     coefficients = scale[..., None] * normal[:, None, :]
     value = np.einsum("rsc,rsc->r", coefficients, nodes[clearance_nodes])
     numbers = StepNumbers(
-        gradient=kinematics.gradient.copy(),
-        length_rhs=length_rhs,
+        motion=LengthRows(truss, kinematics.gradient.copy(), length_rhs),
         lower=actuators - rng.uniform(0.0, 0.03, count),
         upper=actuators + rng.uniform(0.0, 0.03, count),
         actuator_gradient=rng.normal(size=count),
@@ -211,8 +211,6 @@ def test_a_solver_gives_the_same_answers_whatever_it_solved_before(solver):
     cases = [first] + [
         make_case("octahedral", seed=s, rows=r)[1] for s, r in ((22, 5), (23, 0), (24, 2), (25, 5))
     ]
-    for case in cases[1:]:
-        case.gradient = case.gradient.copy()
     reused = make_solver(solver, layout)
     for numbers in (*cases, first):
         with pytest.raises(InfeasibleStepError):
@@ -233,12 +231,15 @@ def test_an_answer_does_not_change_when_the_solver_goes_on(solver):
     reused = make_solver(solver, layout)
     answer = reused.solve(numbers)
     kept = {name: np.copy(getattr(answer, name)) for name in StepSolution.__dataclass_fields__}
-    before = {name: np.copy(getattr(numbers, name)) for name in ("gradient", "lower", "upper", "tip_rhs")}
+    before = {name: np.copy(getattr(numbers, name)) for name in ("lower", "upper", "tip_rhs")}
+    gradient, rhs = numbers.motion.gradient.copy(), numbers.motion.rhs.copy()
     reused.solve(make_case("octahedral", seed=32)[1])
     for name, value in kept.items():
         np.testing.assert_array_equal(getattr(answer, name), value)
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(numbers, name), value)
+    np.testing.assert_array_equal(numbers.motion.gradient, gradient)
+    np.testing.assert_array_equal(numbers.motion.rhs, rhs)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -280,10 +281,11 @@ def test_a_row_that_is_not_a_number_is_refused(solver):
 
 def test_a_singular_truss_is_named():
     layout, numbers = make_case("octahedral", seed=45)
-    gradient = numbers.gradient.copy()
+    gradient = numbers.motion.gradient.copy()
     gradient[-1] = 0.0
+    motion = LengthRows(layout.arm.truss, gradient, numbers.motion.rhs)
     with pytest.raises(SolverError, match="singular"):
-        make_solver("daqp", layout).solve(replace(numbers, gradient=gradient))
+        make_solver("daqp", layout).solve(replace(numbers, motion=motion))
 
 
 def test_unknown_solvers_are_named_with_the_choices():
@@ -306,7 +308,7 @@ def test_every_solver_on_the_list_solves():
         np.testing.assert_allclose(found.nodes, wanted.nodes, atol=1e-5, err_msg=name)
 
 
-@pytest.mark.parametrize("name", sorted(_TIGHT))
+@pytest.mark.parametrize("name", ["clarabel", "proxqp", "scs"])
 def test_a_maneuver_takes_no_more_steps_for_its_solver(name):
     """Answers that fail the residual check would halve the steps, and end the maneuver."""
     if name not in available_solvers():
@@ -318,18 +320,10 @@ def test_a_maneuver_takes_no_more_steps_for_its_solver(name):
 
 
 def good_answer(layout, numbers):
-    """The answer with all its multipliers, caught on its way into the residual check."""
-    kept = {}
-    from vgtm_qp.qp.solvers import _Piqp
-
-    piqp = _Piqp()
-
-    def answer(qp, *, same_structure):
-        kept["answer"] = piqp(qp, same_structure=same_structure)
-        return kept["answer"]
-
-    FullSolver(layout, answer).solve(numbers)
-    return kept["answer"]
+    """The answer with all its multipliers, which the residual check lets pass."""
+    answer = answer_of(FullBuilder(layout).build(numbers))
+    FullSolver(layout, "good", lambda qp, *, same_structure: (*answer, 1)).solve(numbers)
+    return answer
 
 
 GARBAGE = {
@@ -349,9 +343,9 @@ GARBAGE = {
 @pytest.mark.parametrize("kind", GARBAGE)
 def test_garbage_with_a_good_status_is_refused(kind):
     layout, numbers = make_case("octahedral", seed=51)
-    answer = GARBAGE[kind](*good_answer(layout, numbers)[:3])
+    answer = GARBAGE[kind](*good_answer(layout, numbers))
     with pytest.raises(SolverError):
-        FullSolver(layout, lambda qp, *, same_structure: (*answer, 1)).solve(numbers)
+        FullSolver(layout, "garbage", lambda qp, *, same_structure: (*answer, 1)).solve(numbers)
 
 
 def test_a_feasible_answer_that_is_not_optimal_is_refused():
@@ -366,7 +360,7 @@ def test_a_feasible_answer_that_is_not_optimal_is_refused():
     w = -(qp.P @ z + qp.q)
     assert qp.dual_residual(z, y, w) < 1e-12
     with pytest.raises(SolverError):
-        FullSolver(layout, lambda qp, *, same_structure: (z, y, w, 1)).solve(numbers)
+        FullSolver(layout, "garbage", lambda qp, *, same_structure: (z, y, w, 1)).solve(numbers)
 
 
 def test_garbage_from_a_library_is_refused(monkeypatch):
@@ -398,7 +392,7 @@ def test_the_full_qp_names_and_measures_every_row_and_column():
     assert {"member: L1-1", "actuator: B2-3", "tip x", "clearance: row 4"} <= set(names)
     z = np.zeros(len(qp.q))
     violated = dict(qp.violated(z, 1e-12))
-    assert max(violated.values()) == pytest.approx(qp.primal_residual(z))
+    assert np.linalg.norm(list(violated.values())) == pytest.approx(qp.primal_residual(z))
     assert list(violated.values()) == sorted(violated.values(), reverse=True)
     text = str(qp)
     assert f"{len(qp.columns)} columns, {len(qp.rows)} rows" in text
