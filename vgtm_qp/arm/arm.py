@@ -4,8 +4,8 @@ An arm is a configuration q that places points in space, its *nodes* X = p(q) of
 which are its configuration themselves, or the joints of a serial arm. *Bodies* are spanned by points of the arm,
 *stations* are poses made of nodes: they track the reference curve, and the last of all is the end effector.
 
-What moves an arm are its *quantities* [c; a]: those that are fixed, c(q) = const, and the actuated ones a(q), which have
-boxes. They are as many as the coordinates of q, so that to first order the nodes move by K d_a + r.
+What moves an arm are its *quantities* [c; a]: those that are fixed, c(q) = const, and the actuated ones a(q), which
+have boxes. They are as many as the coordinates of q, so that to first order the nodes move by K d_a + r.
 
 Nothing outside the folder ``arm`` asks which arm it has.
 """
@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -208,7 +207,7 @@ class ArmSymbols(Protocol):
         ...
 
     def coordinates(self, nodes: Any, strokes: Any) -> Any:
-        """Return which of both moves the configuration: displacements (3 (N - N_c), c) of nodes, or (n_a, c) strokes."""
+        """Return which of both moves the configuration: those of the nodes (3 (N - N_c), c), or strokes (n_a, c)."""
         ...
 
     def along(self, q: Any, coordinates: Any) -> Any:
@@ -216,7 +215,7 @@ class ArmSymbols(Protocol):
         ...
 
     def closed(self, q: Any, lower: Any, upper: Any) -> Any:
-        """Return the configuration after one Newton step to the fixed quantities, with actuators in their boxes (n_a,)."""
+        """Return the configuration after one Newton step to the fixed quantities, actuators in their boxes (n_a,)."""
         ...
 
     def error(self, quantities: Any, lower: Any, upper: Any) -> Any:
@@ -255,8 +254,8 @@ class Bays(Protocol):
     scatter : LengthScatter
     """
 
-    joints: Any
-
+    @property
+    def joints(self) -> object: ...
     @property
     def node_count(self) -> int: ...
     @property

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from vgtm_qp.arm.arm import Arm
+from vgtm_qp.arm.serial.arm import SerialArm
+from vgtm_qp.arm.serial.build import build_chain
 from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.build import LockError, build_truss
 from vgtm_qp.errors import Mistake, ProblemError
@@ -20,6 +22,8 @@ def make_arm(problem: Problem) -> Arm:
     TrussError
         The truss is not statically determinate.
     """
+    if problem.arm is not None:
+        return SerialArm(build_chain(problem.arm))
     assert problem.truss is not None
     try:
         return TrussArm(build_truss(problem.truss))

@@ -18,9 +18,9 @@ def check(
     """Check a problem file: its keys and values, its truss, its obstacles and goals at the home pose."""
     from dataclasses import asdict
 
+    from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.errors import ProblemError
     from vgtm_qp.problem import load_problem
-    from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.step.build import build_arm
     from vgtm_qp.step.checks import check_problem, find_warnings
 

@@ -157,7 +157,7 @@ class Clearance:
     def _distances(
         self, group: Group, X: Array, time: float, rows: Index, fcl_reach: float
     ) -> tuple[PairDistances, NDArray[np.bool_]]:
-        """Return the distances of `rows`, and which have a second contact (K,): by the closed form, whatever FCL says."""
+        """Return distances of `rows`, and which have a second contact (K,): by the closed form, whatever FCL says."""
         segments, others = group.segments(X, rows), group.others(X, time, rows)
         answer = group.distances_of(segments, others, rows)
         two = answer.two()

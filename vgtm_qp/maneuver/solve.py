@@ -268,6 +268,8 @@ def _too_near(setup: Setup, q: Array) -> dict[str, float]:
     kept = Separation(setup.arm, setup.monitor, Distances(setup.safe, setup.self_safe, setup.influence))
     found: dict[str, float] = {}
     for pair, distance in kept.shortfall(q, 0.0).items():
-        name = setup.monitor.names.clearance(pair).removeprefix("clearance: member ").replace("/ member ", "/ ")
+        name = (
+            setup.monitor.names.clearance(pair).removeprefix("clearance: member ").replace("/ member ", "/ ")
+        )
         found[name] = min(found.get(name, np.inf), distance)
     return found

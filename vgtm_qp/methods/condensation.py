@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.arm import Kinematics
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.segment_system import Entries
 from vgtm_qp.methods.segments import Segment

@@ -52,7 +52,11 @@ class CurveFirstResolver(MethodResolver):
         self.curve: Curve = self.motion.home
         segments = make_segments(setup.layout, setup.task.turns)
         self.tracker = Tracker(
-            setup.layout, setup.kinematics, segments, setup.arm.home_quantities, parallel=method.tracking == "parallel"
+            setup.layout,
+            setup.kinematics,
+            segments,
+            setup.arm.home_quantities,
+            parallel=method.tracking == "parallel",
         )
         self._faces = np.array([segment.face for segment in segments])
         self._frames = any(segment.tracks != "position" for segment in segments)

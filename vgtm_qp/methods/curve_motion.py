@@ -63,7 +63,9 @@ class CurveMotion:
         centres = np.einsum("fk,fkc->fc", truss.face_weights, truss.home[truss.faces])
         steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
         self.s = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
-        self.home = Curve(family, setup.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0])
+        self.home = Curve(
+            family, setup.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0]
+        )
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         gains = method.gains
         self._terms = {name: float(getattr(gains, name)) for name in names}

@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.frames import frame_constants, frame_function
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
@@ -143,7 +143,9 @@ def _function(layout: Layout, members: int, turns: bool) -> ca.Function:
         offsets = ca.MX.sym("offsets", 3, 2 * members)
         inputs.append(offsets)
         arguments.append(offsets)
-    outputs += list(member_function(truss_of(layout.arm)).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
+    outputs += (
+        list(member_function(truss_of(layout.arm)).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
+    )
     if turns:
         outputs += list(frame_function(3)(face, *frame))
     return ca.Function("segment", inputs, outputs)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.arm import Kinematics
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.condensation import Condensation, CurveNodes, least_norm

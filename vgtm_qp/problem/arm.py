@@ -7,7 +7,18 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from vgtm_qp.problem.fields import Choice, Direction, Distance, File, Limit, Name, Number, Vector, exactly
+from vgtm_qp.problem.fields import (
+    Choice,
+    Count,
+    Direction,
+    Distance,
+    File,
+    Limit,
+    Name,
+    Number,
+    Vector,
+    exactly,
+)
 from vgtm_qp.problem.table import Place, Table
 from vgtm_qp.problem.truss import BasePose, Lock, increasing, known_names, unique
 
@@ -66,6 +77,10 @@ class ArmTable(Table):
     )
     link_radius: Distance = Field(
         default=0.03, description="radius of the capsules between successive joints, m"
+    )
+    every: Annotated[int, Count(1, 1000)] | None = Field(
+        default=None,
+        description="which joints' frames track the curve: every so many; where absent, as few as keep to it exactly",
     )
     locked: tuple[Lock, ...] = Field(
         default=(), description="joints that are stuck: names, or tables of member and time"

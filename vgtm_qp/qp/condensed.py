@@ -1,7 +1,7 @@
 """The step's QP condensed onto the actuators.
 
-The node displacements are K d_a + r, so that fixed quantities hold by construction and limits of actuators are bounds on
-single unknowns. The unknowns left are the actuator displacements, the free coordinates of the curve and the progress
+The node displacements are K d_a + r, so that fixed quantities hold by construction and limits of actuators are bounds
+on single unknowns. The unknowns left are the actuator displacements, the free coordinates of the curve and the progress
 along the path.
 """
 

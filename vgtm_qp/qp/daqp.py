@@ -8,7 +8,8 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.qp.residual import InfeasibleStepError, beyond, norm, refuse_large, relative
+from vgtm_qp.qp.numbers import beyond, norm
+from vgtm_qp.qp.residual import InfeasibleStepError, refuse_large, relative
 
 Array = NDArray[np.float64]
 

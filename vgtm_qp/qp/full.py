@@ -18,8 +18,7 @@ from scipy import sparse
 
 from vgtm_qp.arm.arm import Label
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution, slack_curvature
-from vgtm_qp.qp.residual import beyond, norm
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution, beyond, norm, slack_curvature
 from vgtm_qp.rows.tip import unit
 
 Array = NDArray[np.float64]
@@ -92,10 +91,9 @@ class StepQP:
         rows = Counter((label.kind, label.unit) for label in self.rows)
         lines = [f"QP of one step: {len(self.columns)} columns, {len(self.rows)} rows, {self.A.nnz} nonzeros"]
         lines.append("columns")
-        lines += [f"  {count:6d}  {kind} [{unit}]" for (kind, unit), count in columns.items()]
+        lines += [f"  {count:6d}  {kind} [{of}]" for (kind, of), count in columns.items()]
         lines.append("rows")
-        for (kind, unit), count in rows.items():
-            lines.append(f"  {count:6d}  {kind} [{unit}]")
+        lines += [f"  {count:6d}  {kind} [{of}]" for (kind, of), count in rows.items()]
         value = [label.name for label in self.rows if label.kind == "clearance"]
         if value:
             lines.append("near pairs: " + ", ".join(name.removeprefix("clearance: ") for name in value[:12]))

@@ -19,17 +19,17 @@ _HELD_STEPS = 4
 
 
 def settle_function(layout: Layout) -> Bound:
-    """Return the function that takes the answer of a QP to a configuration with closed quantities and the tip at its goal.
+    """Return the function from the answer of a QP to a configuration with closed quantities and the tip at its goal.
 
     Arguments: q; lower, upper (n_a); goal position (3), rotation (3, 3), velocity and spin (3) per unit of progress;
     progress so far; results 0 to 3, 6 and 7 of `row_function`, with the tip rows and bounds followed by those of hard
-    tracking and of ``NEAR`` clearances; p (3, V); Hessian and gradient; the QP's answer and multipliers; (n_a, n_a) Gram
-    matrix of the weighted node displacements in R; and 1 where the answer is to be taken, 0 where q is what is to be
+    tracking and of ``NEAR`` clearances; p (3, V); Hessian and gradient; the QP's answer and multipliers; Gram matrix
+    (n_a, n_a) of the weighted node displacements in R; and 1 where the answer is to be taken, 0 where q is to be
     settled at the goal given. With hard tracking the stations are held on the curve instead, where they and the fixed
     quantities determine the configuration: the tip then is where the curve ends.
 
     Results: q, whose fixed quantities are those at home and whose actuators are in their boxes; quantities there; tip
-    position; tip rotation; p; and (7) error of the quantities and of the tip before the gain of :mod:`vgtm_qp.qp.settle`
+    position; tip rotation; p; and (7) error of the quantities and of the tip before the gain of ``qp.settle``
     was first used and at the end (norms, so that NaN shows), progress, greatest displacement of a node by the answer,
     and the answer's primal and dual residuals, see :mod:`vgtm_qp.qp.residual`; q before it was settled.
     """
@@ -93,7 +93,11 @@ def settle_function(layout: Layout) -> Bound:
         free = ca.logic_and(chosen > low[:count] + AT_BOUND, chosen < high[:count] - AT_BOUND)
         gain = _gain(gram, stiffness, constraint[:count, :tip_rows], free)
         settling = symbols.coordinates(scale * (response @ gain), gain)
-        at, off, by = ca.MX.sym("at", *symbols.shape), ca.MX.sym("off", tip_rows), ca.MX.sym("by", *settling.shape)
+        at, off, by = (
+            ca.MX.sym("at", *symbols.shape),
+            ca.MX.sym("off", tip_rows),
+            ca.MX.sym("by", *settling.shape),
+        )
         nearer = symbols.closed(symbols.along(at, by @ off), lower, upper)
         rest = [lower, upper, by, goal, turned, *constants.symbols]
         again = ca.Function(

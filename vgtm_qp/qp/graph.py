@@ -123,8 +123,9 @@ class StepGraph:
         self.base_axes, self.normal = rotation[:, :2], rotation[:, 2]
         self.offset = curve_rows.base_offset(centre, rotation, self.vertices)
         if layout.general is None:
-            self._tables = self.table("curve_weights", layout.curve_weights), self.table(
-                "curve_slopes", layout.curve_slopes
+            self._tables = (
+                self.table("curve_weights", layout.curve_weights),
+                self.table("curve_slopes", layout.curve_slopes),
             )
 
     def station(self, k: int) -> list[ca.MX]:

@@ -51,7 +51,9 @@ class LengthSolver:
             step = self._chain.solve(gradient, error)
         elif len(self._jacobian):
             try:
-                step = np.asarray(np.linalg.solve(scatter.dense(gradient, self._jacobian), error), dtype=float)
+                step = np.asarray(
+                    np.linalg.solve(scatter.dense(gradient, self._jacobian), error), dtype=float
+                )
             except np.linalg.LinAlgError as reason:
                 raise SolverError(_SINGULAR) from reason
         else:

@@ -194,3 +194,13 @@ def slack_curvature(penalty: float) -> float:
 
 UNBOUNDED = 1e30
 """Infinity in DAQP's bounds."""
+
+
+def norm(vector: Array) -> float:
+    """Return the Euclidean norm; NaN where an entry is."""
+    return float(np.sqrt(vector @ vector))
+
+
+def beyond(values: Array, lower: Array, upper: Array) -> Array:
+    """Return by how much values are out of their bounds, with sign."""
+    return np.asarray(values - np.minimum(np.maximum(values, lower), upper))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.numbers import norm
 
 if TYPE_CHECKING:
     from vgtm_qp.qp.full import StepQP
@@ -18,8 +19,8 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-6
 """Greatest residual of an answer: m or rad, and for the dual one relative to the objective's forces.
 
-DAQP and the eliminations stay below 1e-12. This is what OSQP can keep, too: what it leaves is closed afterwards, and the
-state that comes of it is checked by itself, to 1e-10 m.
+DAQP and the eliminations stay below 1e-12. This is what OSQP can keep, too: what it leaves is closed afterwards, and
+the state that comes of it is checked by itself, to 1e-10 m.
 """
 
 
@@ -52,16 +53,6 @@ class NoAnswerError(AnswerError, InfeasibleStepError):
     """A solver found no answer, and does not say whether there is one."""
 
 
-def norm(vector: Array) -> float:
-    """Return the Euclidean norm; NaN where an entry is."""
-    return float(np.sqrt(vector @ vector))
-
-
-def beyond(values: Array, lower: Array, upper: Array) -> Array:
-    """Return by how much values are out of their bounds, with sign."""
-    return np.asarray(values - np.minimum(np.maximum(values, lower), upper))
-
-
 def relative(stationarity: float, *forces: Array) -> float:
     """Return the norm of what is left of stationarity, relative to those of the objective's forces and multipliers."""
     return stationarity / (1.0 + sum(norm(force) for force in forces))
@@ -73,7 +64,7 @@ def refuse_large(primal: float, dual: float, solver: str) -> None:
     Parameters
     ----------
     primal, dual
-        See :func:`beyond` and :func:`relative`.
+        See :func:`vgtm_qp.qp.numbers.beyond` and :func:`relative`.
     solver
         What gave the answer, and how it ended.
     """

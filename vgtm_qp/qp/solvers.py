@@ -112,7 +112,7 @@ class FullSolver:
         with np.errstate(invalid="ignore"):
             primal, dual = qp.primal_residual(z), scale * qp.dual_residual(z, y, w)
             pressing = qp.complementarity_residual(z, scale * y, scale * w)
-        refuse_large(primal, max(dual, pressing), self._name)
+        refuse_large(primal, float(np.maximum(dual, pressing)), self._name)
         # Only a good answer is a warm start: NaN would stay in the solver for ever.
         self._structure = self.builder.structure
         return self.builder.solution(z, y, w, iterations)

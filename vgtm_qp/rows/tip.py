@@ -1,4 +1,4 @@
-"""The end effector's coordinates, eqs. (11) and (16): position by axes, direction or orientation by rotation vectors."""
+"""The end effector's coordinates, eqs. (11) and (16): position by axes, attitude by rotation vectors."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def unit(row: str) -> str:
 
 
 def turned_axes(rows: Sequence[str], rotation: Any) -> Any:
-    """Return (r, 3) the directions along which the tip's turns are tracked: two across its z-axis, all three, or none."""
+    """Return (r, 3) the directions about which the tip's turns are tracked: two across its z-axis, three, or none."""
     if "tip direction 1" in rows:
         return rotation[:, :2].T
     if "tip rotation x" in rows:
@@ -144,7 +144,7 @@ def progress_weight(rate: Any) -> Any:
 def tip_function(rows: Sequence[str]) -> ca.Function:
     """Return the rows of a tip as a function of numbers.
 
-    Arguments: position (3), rotation (3, 3); goal (3), turned (3, 3), velocity and spin (3) of the goal; motion, 1 or 0,
+    Arguments: position (3), rotation (3, 3); goal (3), turned (3, 3), velocity and spin (3) of that; motion, 1 or 0,
     see :func:`worth_closing`. Results: error (n_e), rate (n_e), axes of the turns (r, 3), weight of the progress.
     """
     position, rotation = ca.SX.sym("position", 3), ca.SX.sym("rotation", 3, 3)

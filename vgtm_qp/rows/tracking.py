@@ -1,4 +1,4 @@
-"""Tracking of the reference curve, eqs. (32) and (39): gaps and turns between a station of the arm and its curve node."""
+"""Tracking of the reference curve, eqs. (32) and (39): gaps and turns between stations and their curve nodes."""
 
 from __future__ import annotations
 

@@ -104,7 +104,10 @@ class Actuation:
         value = self.values(state)
         down, up = (
             np.maximum(_APPROACH * room, np.minimum(room, _LEAST_APPROACH))
-            for room in (np.maximum(value - self.stroke[:, 0], 0.0), np.maximum(self.stroke[:, 1] - value, 0.0))
+            for room in (
+                np.maximum(value - self.stroke[:, 0], 0.0),
+                np.maximum(self.stroke[:, 1] - value, 0.0),
+            )
         )
         return np.maximum(box[0], np.minimum(value - down, box[1])), np.minimum(
             box[1], np.maximum(value + up, box[0])

@@ -34,7 +34,7 @@ ANY_RANK = 2
 
 
 class Piece(NamedTuple):
-    """A piece of path, from its value `start` to `end`, in `dt` seconds; no smaller share of it than `smallest` is tried."""
+    """A piece of path, from its value `start` to `end`, in `dt` seconds; no share below `smallest` is tried."""
 
     path: Path
     start: float

@@ -31,7 +31,7 @@ _TOO_FAR = 1e3
 """No answer of a QP that moves a node by so many times the arm's length means anything: the pose is singular."""
 
 _DEVIATION = 0.1
-"""An offset joint that may take a member's end further from its chord turns too far in one step, m."""
+"""An arm whose points may leave their chords by more than this turns too far in one step, m."""
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ class Attempt:
             if after is None:
                 continue
             if not separation.deviation(state.q, q) < _DEVIATION:
-                return outcome("an offset joint turns too far in one step", count)
+                return outcome("the arm turns too far in one step", count)
             if report.certified:
                 return outcome("", count)
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)

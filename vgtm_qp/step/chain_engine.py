@@ -55,9 +55,7 @@ class _Frame:
 class ChainEngine(Engine):
     """See ``engine.Engine``; for arms of `serves`."""
 
-    def __init__(
-        self, solver: StagedSolver | TrackedSolver, kinematics: Kinematics, task: TipTask
-    ) -> None:
+    def __init__(self, solver: StagedSolver | TrackedSolver, kinematics: Kinematics, task: TipTask) -> None:
         super().__init__(solver.layout)
         layout, arm = self.layout, self.layout.arm
         home_lengths, tip = arm.home_quantities, arm.end_effector

@@ -92,7 +92,9 @@ def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
     rules = problem.clearance
     safe = rules.safe
     self_safe = safe if rules.self_safe is None else rules.self_safe
-    pairs = setup.monitor.near(setup.arm.points(setup.arm.home_configuration), 0.0, reach=safe, self_reach=self_safe)
+    pairs = setup.monitor.near(
+        setup.arm.points(setup.arm.home_configuration), 0.0, reach=safe, self_reach=self_safe
+    )
     bodies = setup.arm.bodies
     owner = np.where(pairs.is_self, -1, 0)
     owner[~pairs.is_self] = setup.monitor.pieces.obstacle[pairs.other[~pairs.is_self]]
@@ -137,7 +139,9 @@ def _out_of_reach(problem: Problem, setup: Setup) -> Iterator[Mistake]:
         k = int(np.argmax(distance - reach))
         if distance[k] > reach[k] + _POINT:
             node = f'base node "{arm.node_names[base[k]]}"'
-            where = f"a position at most {reach[k]:.3f} m from {node}, all {arm.bodies.kind}s at their longest"
+            where = (
+                f"a position at most {reach[k]:.3f} m from {node}, all {arm.bodies.kind}s at their longest"
+            )
             yield Mistake(key, value, f"{where}; this one is {distance[k]:.3f} m from it, out of any reach")
 
 

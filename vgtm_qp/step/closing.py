@@ -72,7 +72,7 @@ class Closing:
         """
         kinematics, wanted = self._kinematics, self._arm.home_quantities.copy()
 
-        def missing(q: Array) -> Array:
+        def missing(_: Array) -> Array:
             wanted[self._actuators] = np.clip(kinematics.quantities[self._actuators], lower, upper)
             return np.asarray(wanted - kinematics.quantities)
 

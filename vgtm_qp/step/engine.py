@@ -154,10 +154,10 @@ class Engine(ABC):
 
     @abstractmethod
     def settle(self, q: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
-        """Return the configuration near `q` with its quantities closed and the tip at `goal`; None where a QP is due."""
+        """Return the configuration near `q`, its quantities closed and the tip at `goal`; None where a QP is due."""
 
-    def drawn(self, layout: Layout) -> Engine | None:
-        """Return the engine for a layout that differs in the control vertices with goals alone; None if it is made anew."""
+    def drawn(self, layout: Layout) -> Engine | None:  # noqa: ARG002
+        """Return the engine for a layout that differs in its vertex goals alone; None if it is made anew."""
         return None
 
 
@@ -280,7 +280,7 @@ class GeneralEngine(Engine):
         accuracy: Accuracy,
         free: NDArray[np.bool_],
     ) -> Closed | None:
-        """Return the configuration that the least motion of the nodes brings to the goal, `free` (n_a,) actuators moving."""
+        """Return the configuration that the least motion brings to the goal, `free` (n_a,) actuators moving."""
         gain = self._gain(free)
         for step in range(SETTLING_STEPS + 1):
             closed = self._closing.close(q, *bounds, accuracy.member)
@@ -295,7 +295,7 @@ class GeneralEngine(Engine):
         return closed if off <= accuracy.tip else None
 
     def _gain(self, free: NDArray[np.bool_]) -> tuple[Array, Array] | None:
-        """Return what settles the tip after the last QP, (N, 3, n_e) and (n_a, n_e); None where only another QP does."""
+        """Return what settles the tip after the last QP, (N, 3, n_e) and (n_a, n_e); None where another QP has to."""
         layout, arm, weights = self.layout, self.layout.arm, self.layout.weights
         if layout.hard_tracking or self._last is None:
             return None
@@ -361,9 +361,7 @@ class FusedEngine(Engine):
         )
         torsion = asked.torsion + taken.solution.torsion if len(asked.torsion) else asked.torsion
         closed = taken.closed if is_settled else None
-        return Move(
-            taken.solution, taken.q, taken.vertices, torsion, taken.progress, taken.moved, closed
-        )
+        return Move(taken.solution, taken.q, taken.vertices, torsion, taken.progress, taken.moved, closed)
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""

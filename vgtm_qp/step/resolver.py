@@ -84,9 +84,7 @@ class Resolver:
             tracking=_tracking_error(setup),
             tolerances=kept,
         )
-        self._advancer = Advancer(
-            self._attempt, self._actuation, self._brakes, self._target, setup.tip_mode
-        )
+        self._advancer = Advancer(self._attempt, self._actuation, self._brakes, self._target, setup.tip_mode)
         self._state = setup.home_state()
         self._braking: Braking | None = None
 

@@ -134,9 +134,7 @@ class Separation:
         spare = deviation / pieces**2 - _BETWEEN
         floors, lowest = (floor + spare, max(self_floor + spare, 0.0)), np.inf
         for k in range(pieces):
-            here, there = (
-                points(start + share * (end - start)) for share in (k / pieces, (k + 1) / pieces)
-            )
+            here, there = (points(start + share * (end - start)) for share in (k / pieces, (k + 1) / pieces))
             lapse = (end_time - start_time) / pieces
             since = start_time + k * lapse
             report = self.monitor.between(here, there, since, since + lapse, *floors)

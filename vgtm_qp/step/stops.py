@@ -234,7 +234,9 @@ class _Program:
         length = float(np.linalg.norm(rate))
         # Within the trust the arm covers about so much of the way.
         self._unit = min(1.0, _TRUST / length) if length > 0.0 else 1.0
-        jacobian_tip = np.einsum("rkc,kcn->rn", tip.jacobian.reshape(len(rate), -1, 3), padded[arm.end_effector.nodes])
+        jacobian_tip = np.einsum(
+            "rkc,kcn->rn", tip.jacobian.reshape(len(rate), -1, 3), padded[arm.end_effector.nodes]
+        )
         self._equal = np.column_stack([jacobian_tip, -rate * self._unit])
 
         self._rows: ClearanceRows = separation.rows(state.q, state.time, 0.0, 2.0 * _TRUST, {}, 0.0)

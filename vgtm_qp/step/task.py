@@ -40,7 +40,9 @@ class TipTask:
         self.turns = "pointing" if "pointing" in track else "orientation" if "orientation" in track else None
         self._tip = tip = arm.end_effector
         if self.turns and not tip.has_frame:
-            raise GoalError(f'"{self.turns}" needs a tip of three or more nodes; this one has {len(tip.nodes)}')
+            raise GoalError(
+                f'"{self.turns}" needs a tip of three or more nodes; this one has {len(tip.nodes)}'
+            )
         self.axes = np.array(axes(self.row_names), dtype=np.int64)
         self._rows = Kernel(tip_function(self.row_names), compiled=False)
         self._position_jacobian = np.kron(tip.weights, np.eye(3))[self.axes]
@@ -48,7 +50,7 @@ class TipTask:
     def residual(
         self, position: Array, rotation: Array, goal: PathPoint, *, motion: bool = False
     ) -> tuple[Array, Array, Array, float]:
-        """Return error (n_e,) goal minus value, rate (n_e,) along the path, turned axes (r, 3) and the progress's weight.
+        """Return error (n_e,) goal minus value, rate (n_e,) along the path, turned axes (r, 3) and weight of progress.
 
         The rows of the axes times the tip's angular velocity are the tracked turns. `motion` is whether errors that
         are not worth closing count as zero.

@@ -8,12 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import load_problem
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.study.drawing import MARKS, label, panels
 from vgtm_qp.study.workers import Row, Task

@@ -133,7 +133,9 @@ def random_shape(setup: Setup, random: np.random.Generator) -> Array:
 
 
 def _tip_motion(setup: Setup, X: Array) -> float:
-    return float(np.linalg.norm(setup.arm.end_effector.position(X) - setup.arm.end_effector.position(setup.truss.home)))
+    return float(
+        np.linalg.norm(setup.arm.end_effector.position(X) - setup.arm.end_effector.position(setup.truss.home))
+    )
 
 
 def _random_lengths(setup: Setup, random: np.random.Generator) -> Array:
@@ -175,7 +177,9 @@ def _newton(setup: Setup, X: Array, lengths: Array, singular: float) -> bool:
     return False
 
 
-def _cubes(setup: Setup, random: np.random.Generator, shape: Array | None, count: int) -> list[dict[str, Any]]:
+def _cubes(
+    setup: Setup, random: np.random.Generator, shape: Array | None, count: int
+) -> list[dict[str, Any]]:
     """Return `count` cubes, or as many as find a place, near the arm and clear of its home and goal shapes.
 
     The straight path of the tip to a goal that can be reached is kept free of them, for the tip's face at least.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -135,6 +136,7 @@ class SerialArm:
 
     kind = "serial"
     bays = None
+    leaves_chords = True
 
     def __init__(self, chain: Chain) -> None:
         self.chain = chain
@@ -164,7 +166,7 @@ class SerialArm:
         nodes = self.chain.station_nodes
         centres = self.home[nodes[:, 0]]
         frames = [np.eye(3)]
-        for before, after in zip(centres[:-1], centres[1:], strict=True):
+        for before, after in pairwise(centres):
             frames.append(_leaning(frames[-1], after - before))
         weights = np.tile([1.0, 0.0, 0.0], (len(nodes), 1))
         return Stations(nodes, weights, np.stack(frames), self._trackable(nodes), word="joint")
@@ -197,14 +199,7 @@ class SerialArm:
         points = np.stack([first, first + 1], axis=1)[kept]
         names = [chain.names[j] for j in kept]
         joints = np.stack([place[:-1], place[1:]], axis=1)[kept]
-        return capsules(points, self._radius, names, joints=joints, kind="link")
-
-    _radius = 0.03
-
-    def with_radius(self, radius: float) -> SerialArm:
-        """Return the same arm, its links of that radius, m."""
-        self._radius = radius
-        return self
+        return capsules(points, chain.radius, names, joints=joints, kind="link")
 
     @cached_property
     def motion_pattern(self) -> MotionPattern:
@@ -212,7 +207,9 @@ class SerialArm:
         rows, count = 3 * len(self.free), len(self.actuators)
         grid = np.indices((rows, count)).reshape(2, -1)
         labels = tuple(
-            Label(f"node: {self.node_names[n]} {axis}", "kinematics", "m") for n in self.free for axis in "xyz"
+            Label(f"node: {self.node_names[n]} {axis}", "kinematics", "m")
+            for n in self.free
+            for axis in "xyz"
         )
         every = np.arange(rows)
         return MotionPattern(
@@ -226,6 +223,10 @@ class SerialArm:
         return self._nodes.outputs[0].reshape(-1, 3).copy()
 
     points = nodes
+
+    def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:  # noqa: ARG002
+        """See ``arm.Arm``: the points are the nodes."""
+        return points, coefficients
 
     def measured(self, q: Array) -> Array:
         """See ``arm.Arm``."""

@@ -27,7 +27,7 @@ def build_chain(spec: ArmTable) -> Chain:
         ),
         home=np.array([joint.home for joint in joints], dtype=float),
         tip=np.array(spec.tip, dtype=float),
-        every=spec.every or 3,
+        every=spec.every or -(-len(joints) // max(1, (len(joints) - len(stuck)) // 3)),
         locked=np.array([joint.name in stuck for joint in joints]),
         radius=spec.link_radius,
     )

@@ -37,6 +37,8 @@ class Chain:
         Which joints are stations: every so many.
     locked : (J,) bool
         Joints that are stuck at home.
+    radius : float
+        Of the links, m.
     """
 
     names: tuple[str, ...]
@@ -51,6 +53,7 @@ class Chain:
     tip: Array
     every: int
     locked: Mask
+    radius: float
 
     def __len__(self) -> int:
         return len(self.names)
@@ -92,7 +95,12 @@ class Chain:
 
     def geometry(self) -> list[Array]:
         """Return what :func:`chain_function` takes beside the configuration, each flattened column by column."""
-        return [self.axis.reshape(-1), self.position.reshape(-1), self.rotation.transpose(0, 2, 1).reshape(-1), self.tip]
+        return [
+            self.axis.reshape(-1),
+            self.position.reshape(-1),
+            self.rotation.transpose(0, 2, 1).reshape(-1),
+            self.tip,
+        ]
 
 
 def turned(vector: ca.SX) -> ca.SX:

@@ -15,7 +15,7 @@ import numpy as np
 
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.kinematics import member_function
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Index, Truss
 
 _Layers = list[tuple[Index, ca.Sparsity]]
 """Terms whose sum is a block: places in the gradients, and the sparsity that they fill."""
@@ -153,9 +153,7 @@ class TrussSymbols:
                 D, L = self._stage_blocks(k, gradients)
                 weight = dict(zip(truss.faces[face].tolist(), truss.face_weights[face], strict=True))
                 centre = ca.sparsify(ca.DM(np.kron([weight[int(n)] for n in stage.nodes], np.eye(3))))
-                blocks.append(
-                    (ca.vertcat(D[fixed, :], centre), ca.vertcat(L[fixed, :], ca.MX(3, L.size2())))
-                )
+                blocks.append((ca.vertcat(D[fixed, :], centre), ca.vertcat(L[fixed, :], ca.MX(3, L.size2()))))
                 rhs.append(ca.vertcat(error[stage.members[fixed].tolist()], gaps[:, order.index(face)]))
             return X + self._substituted(blocks, rhs)
 

@@ -150,7 +150,9 @@ def find_chain(layout: Layout) -> Chain | None:
         return None
     stages = int(bays.stage.max(initial=-1)) + 1
     lengths = (length for length in range(1, min(stages, _LONGEST_PERIOD) + 1) if stages % length == 0)
-    return next((chain for length in lengths if (chain := _chain(layout, bays, stages, length)) is not None), None)
+    return next(
+        (chain for length in lengths if (chain := _chain(layout, bays, stages, length)) is not None), None
+    )
 
 
 def _places(period: Index, place: Index, here: Index, carried: Index) -> Index:

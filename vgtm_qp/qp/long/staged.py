@@ -17,8 +17,8 @@ from vgtm_qp.qp.long.closing import Closing
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import Sweep
 from vgtm_qp.qp.long.working_set import Answer, Point, RowNumbers, RowTable, solve_rows
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution
-from vgtm_qp.qp.residual import beyond, norm, refuse_large, relative
+from vgtm_qp.qp.numbers import StepNumbers, StepSolution, beyond, norm
+from vgtm_qp.qp.residual import refuse_large, relative
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
