@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vgtm_qp.step.build import build_arm
 
 import vgtm_qp as vq
+from vgtm_qp.step.build import build_arm
 
 SAFE = 0.08
 PAST = [

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from vgtm_qp.step.build import build_arm
 
 import vgtm_qp as vq
-from vgtm_qp.step.checks import check_problem, find_warnings, longest_ways
+from vgtm_qp.arm.truss.reach import longest_ways
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.checks import check_problem, find_warnings
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from vgtm_qp.rows.limits import actuator_box, braking_speed
 
 positive = st.floats(0.01, 10.0)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from arms import TRUSSES, arm_problem, central_differences, random_pose
-from vgtm_qp.step.build import build_arm
+from arms import TRUSSES, arm_problem, central_differences, member_ends, random_pose
+from steps import separation_of
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.errors import TrussError
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.study.scenes import random_scene
 
 
@@ -45,26 +45,20 @@ def beside_a_cube(joint_offset=0.1, **more):
     )
 
 
-def separation_of(arm):
-    return Separation(
-        arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence, margin=0.0), arm.body_points
-    )
-
-
 def test_clearance_rows_are_the_derivatives_of_the_distances():
     """Distances by their definition at moved nodes, against the rows: the joints' rotation is part of both."""
     rng = np.random.default_rng(2)
-    arm = build_arm(beside_a_cube())
-    truss, monitor = arm.truss, arm.monitor
+    setup = build_arm(beside_a_cube())
+    truss, monitor = setup.truss, setup.monitor
     X = truss.home + 0.02 * rng.normal(size=truss.home.shape)
-    rows = separation_of(arm).rows(X, 0.0, 0.0, 1.0, {}, 0.0)
+    rows = separation_of(setup, margin=0.0).rows(X, 0.0, 0.0, 1.0, {}, 0.0)
     assert rows.nodes.shape[1] == 12
     step = rng.normal(size=X.shape)
     h, names = 1e-6, [rows.name(k) for k in range(len(rows))]
     change = np.einsum("rsc,rsc->r", rows.coefficients, step[rows.nodes])
 
     def distances(Y):
-        pairs = monitor.near(arm.points(Y), 0.0, 0.6, fcl_reach=0.0)
+        pairs = monitor.near(setup.arm.points(Y), 0.0, 0.6, fcl_reach=0.0)
         found = {}
         for k in range(len(pairs)):
             found[pairs.name(k)] = min(found.get(pairs.name(k), np.inf), float(pairs.distance[k]))
@@ -92,22 +86,22 @@ def test_rows_of_different_widths_join():
 
 def test_a_proof_of_the_way_holds_at_every_instant_of_it():
     rng = np.random.default_rng(4)
-    arm = build_arm(beside_a_cube())
-    separation, truss, monitor = separation_of(arm), arm.truss, arm.monitor
+    setup = build_arm(beside_a_cube())
+    separation, truss, monitor = separation_of(setup, margin=0.0), setup.truss, setup.monitor
     certified = 0
     for _ in range(12):
         start, end = (truss.home + 0.05 * rng.normal(size=truss.home.shape) for _ in range(2))
         end = start + 0.5 * (end - start)
         least = min(
-            arm.least_clearance(start + s * (end - start), 0.0, among="obstacles")
+            setup.least_clearance(start + s * (end - start), 0.0, among="obstacles")
             for s in np.linspace(0, 1, 41)
         )
         report = separation.between(start, end, 0.0, 0.0, {})
         if report.certified:
             certified += 1
-            assert least >= arm.safe - 5e-5 - 1e-9
+            assert least >= setup.safe - 5e-5 - 1e-9
         else:
-            assert least < arm.safe + 1e-3 or not monitor.keeps(arm.points(end), 0.0, 0.0, arm.self_safe)
+            assert least < setup.safe + 1e-3 or not monitor.keeps(setup.arm.points(end), 0.0, 0.0, setup.self_safe)
             assert np.all((report.fraction >= 0.0) & (report.fraction <= 1.0))
     assert certified > 0
 
