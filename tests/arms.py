@@ -12,7 +12,6 @@ from vgtm_qp.arm.arm import Arm
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.graph import graph_truss
-from vgtm_qp.arm.truss.joints import joint_ends
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.curve.families import bezier
 from vgtm_qp.problem import Problem
@@ -58,17 +57,6 @@ TRUSSES: dict[str, Callable[..., Truss]] = {
     "tetrahedral-123": lambda **kw: modules.tetrahedral(2, actuated=(1, 2, 3), longeron=1.1, **kw),
     "graph": mast,
 }
-
-
-def member_ends(truss: Truss, X: Array) -> Array:
-    """(M, 2, 3) where each member's ends are for node positions `X` (N, 3), eq. (13)."""
-    return joint_ends(X, truss.members, truss.joints)
-
-
-def lengths_of(truss: Truss, X: Array) -> Array:
-    """(M,) distances of the members' ends."""
-    ends = member_ends(truss, X)
-    return np.asarray(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
 
 def random_pose(truss: Truss, rng: np.random.Generator, size: float = 0.05) -> Array:

@@ -1,354 +1,362 @@
-"""A step's QP by plain NumPy formulas, written apart from the package: what its symbolic one is tested against.
+"""The rows of a truss's step by their equations: plain NumPy, one function an equation, Jacobians by complex steps.
 
-Of the package stand in here the arm's kinematics, which have tests by differences of their own, and constant tables.
+It shares nothing with the arms, frames and rows of the library but the data of a truss and of a layout. A derivative by
+a complex step, Im f(x + ih) / h, is exact to rounding and no formula of anybody.
 """
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from vgtm_qp.arm.arm import Kinematics
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput, TipGoal
-from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers
-from vgtm_qp.qp.shape import CurveRows
+from vgtm_qp.qp.numbers import StepNumbers
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
+Index = NDArray[np.int64]
 
-ENOUGH = 2e-8
-"""A tip error of a state that a motion need not close, m or rad."""
-
-SHORT_WAY = 0.01
-"""A way of the tip, m, below which progress along it counts more."""
-
-GOAL_REACH = 0.01
-"""Greatest part of the arm's length that a control vertex is drawn towards its goal in one step."""
+_STEP = 1e-30
 
 
-def turn_between(start: Array, end: Array, across: Array) -> Array:
-    """Return the rotation vector from a unit vector to another; half a turn is about the unit vector `across`."""
+def derivative(function: Callable[[Array], Array], x: Array) -> Array:
+    """Return the derivative of an analytic function of `x`: shape of its value, then shape of `x`."""
+    columns = []
+    for place in np.ndindex(*np.shape(x)):
+        ahead = np.array(x, dtype=complex)
+        ahead[place] += 1j * _STEP
+        columns.append(np.imag(function(ahead)) / _STEP)
+    return np.stack(columns, axis=-1).reshape(*np.shape(columns[0]), *np.shape(x))
+
+
+def norm(vectors: Array) -> Array:
+    """Return |v| over the last axis, by an analytic function."""
+    return np.asarray(np.sqrt(np.sum(vectors * vectors, axis=-1)))
+
+
+def unit(vectors: Array) -> Array:
+    """Return v / |v| over the last axis."""
+    return vectors / norm(vectors)[..., None]
+
+
+def turned(rotation: Array, angles: Array) -> Array:
+    """Return a rotation after a small turn by a rotation vector (3,), to first order."""
+    return np.asarray(rotation + np.cross(angles, rotation, axisb=0, axisc=0))
+
+
+# Lengths, eqs. (12)-(17) and (22)-(24).
+
+
+def member_ends(truss: Truss, X: Array) -> Array:
+    """Return (M, 2, 3) the ends of all members, eq. (13): constant in the frames of the joints at their nodes."""
+    ends = X[truss.members]
+    if truss.joints is None:
+        return ends
+    node, first, second = (X[truss.joints.triangle[:, k]] for k in range(3))
+    normal = unit(np.cross(first - node, second - node))
+    outward = -unit(unit(first - node) + unit(second - node))
+    axes = np.stack([outward, np.cross(normal, outward), normal], axis=1)
+    return np.asarray(ends + np.einsum("mea,meac->mec", truss.joints.offset, axes[truss.members]))
+
+
+def lengths(truss: Truss, X: Array) -> Array:
+    """Return (M,) the member lengths, eq. (12)."""
+    ends = member_ends(truss, X)
+    return norm(ends[:, 0] - ends[:, 1])
+
+
+def length_jacobian(truss: Truss, X: Array) -> Array:
+    """Return (M, N, 3) d length / d node, eq. (17)."""
+    return derivative(lambda Y: lengths(truss, Y), X)
+
+
+def motion(truss: Truss, X: Array, at: Array, base: Array) -> tuple[Array, Array]:
+    """Return [J, -E] (M, 3 (N - N_c) + n_a) and right-hand sides (M,): eqs. (22)-(24) beside the actuated members'."""
+    jacobian = length_jacobian(truss, at)
+    moved = np.where(truss.base[:, None], base - X, 0.0)
+    missing = np.where(truss.actuated, 0.0, lengths(truss, truss.home) - lengths(truss, X))
+    actuated = np.eye(truss.member_count)[:, truss.actuators]
+    rows = np.hstack([jacobian[:, truss.free].reshape(truss.member_count, -1), -actuated])
+    return rows, missing - np.einsum("mnc,nc->m", jacobian, moved)
+
+
+# Frames of faces and tip.
+
+
+def polygon_frame(points: Array, angles: Array) -> Array:
+    """Return the frame (3, 3) of a polygon (K, 3) whose corners are at polar `angles` (K,) as nearly as they can.
+
+    z is the normal of the area; about z the corners fit best: of sum_j |c_j| cos(theta_j - phi_j - turn) the greatest.
+    """
+    corners = points - points.mean(axis=0)
+    z = unit(np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0))
+    first = unit(corners[0] - z * (corners[0] @ z))
+    second = np.cross(z, first)
+    u, v = corners @ first, corners @ second
+    cosine = np.sum(u * np.cos(angles) + v * np.sin(angles))
+    sine = np.sum(v * np.cos(angles) - u * np.sin(angles))
+    x = unit(cosine * first + sine * second)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def frame(points: Array, home: Array, rotation: Array) -> Array:
+    """Return the rotation (3, 3) of a body of `points` (K, 3) that has `rotation` where they are at `home`."""
+    corners = home - home.mean(axis=0)
+    z = unit(np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0))
+    first = unit(corners[0] - z * (corners[0] @ z))
+    angles = np.arctan2(corners @ np.cross(z, first), corners @ first)
+    return polygon_frame(points, angles) @ polygon_frame(home, angles).T @ rotation
+
+
+def spin(points: Array, home: Array, rotation: Array) -> Array:
+    """Return (3, 3K) the angular velocity of a frame by its points: the axial vector of dR R'."""
+    change = derivative(lambda moved: frame(moved, home, rotation), points).reshape(3, 3, -1)
+    W = np.einsum("abk,cb->ack", change, frame(points, home, rotation))
+    return np.stack([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]]) / 2
+
+
+def face_rotations(truss: Truss, X: Array) -> Array:
+    """Return (F, 3, 3) the rotations of the faces."""
+    pairs = zip(truss.faces, truss.face_frames, strict=True)
+    return np.array([frame(X[nodes], truss.home[nodes], home) for nodes, home in pairs]).reshape(-1, 3, 3)
+
+
+def face_spins(truss: Truss, X: Array) -> Array:
+    """Return (F, 3, 9) the angular velocities of the faces by their nodes."""
+    pairs = zip(truss.faces, truss.face_frames, strict=True)
+    return np.array([spin(X[nodes], truss.home[nodes], home) for nodes, home in pairs]).reshape(-1, 3, 9)
+
+
+def face_centres(truss: Truss, X: Array) -> Array:
+    """Return (F, 3) where the axis passes through the faces."""
+    return np.array([w @ X[nodes] for w, nodes in zip(truss.face_weights, truss.faces, strict=True)])
+
+
+def tip_rotation(truss: Truss, X: Array) -> Array:
+    """Return (3, 3) the rotation of the end effector; identity for a tip of fewer than three nodes."""
+    nodes = truss.tip
+    return frame(X[nodes], truss.home[nodes], truss.tip_frame) if len(nodes) >= 3 else np.eye(3)
+
+
+def tip_spin(truss: Truss, X: Array) -> Array:
+    """Return (3, 3K) its angular velocity by its nodes."""
+    nodes = truss.tip
+    if len(nodes) < 3:
+        return np.zeros((3, 3 * len(nodes)))
+    return spin(X[nodes], truss.home[nodes], truss.tip_frame)
+
+
+# End effector, eqs. (11) and (16).
+
+_AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
+
+
+def shortest_turn(start: Array, end: Array) -> Array:
+    """Return the rotation vector (3,) that turns one direction to another about what both are normal to."""
     axis = np.cross(start, end)
-    sine = np.linalg.norm(axis)
-    if sine > 1e-12:
-        return axis * (np.arctan2(sine, start @ end) / sine)
-    return np.zeros(3) if start @ end > 0.0 else np.pi * across
+    return np.asarray(axis / norm(axis) * np.arctan2(norm(axis), start @ end))
 
 
-def rotation_vector(rotation: Array) -> Array:
-    """Return the rotation vector of a rotation, up to half a turn."""
-    twist = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    sine, cosine = np.linalg.norm(twist) / 2, (np.trace(rotation) - 1) / 2
-    angle = np.arctan2(sine, cosine)
-    if sine > 1e-7:
-        return twist * (angle / (2 * sine))
-    if cosine > 0:
-        return twist / 2
-    outer = (rotation + np.eye(3)) / 2
-    axis = outer[:, int(np.argmax(np.diag(outer)))]
-    return angle * axis / np.linalg.norm(axis)
-
-
-class TipRows(NamedTuple):
-    """Goal less value (n_e,), the path's rate (n_e,), and which turns are tracked, (r, 3)."""
-
-    error: Array
-    rate: Array
-    across: Array
-
-
-def tip_rows(rows: tuple[str, ...], position: Array, rotation: Array, goal: TipGoal) -> TipRows:
-    """Return the rows of a tip, eqs. (11) and (16)."""
-    axes = ["xyz".index(row[-1]) for row in rows if row in ("tip x", "tip y", "tip z")]
-    error, rate = (goal.position - position)[axes], goal.velocity[axes]
+def tip_turn(rows: Sequence[str], rotation: Array, goal: Array) -> Array:
+    """Return the rotation vector (3,) from the tip's direction, or its orientation, to the goal's."""
     if "tip direction 1" in rows:
-        across = rotation[:, :2].T
-        turn = turn_between(rotation[:, 2], goal.rotation[:, 2], rotation[:, 0])
-    elif "tip rotation x" in rows:
-        across = np.eye(3)
-        turn = rotation_vector(goal.rotation @ rotation.T)
-    else:
-        return TipRows(error, rate, np.zeros((0, 3)))
-    return TipRows(
-        np.concatenate([error, across @ turn]), np.concatenate([rate, across @ goal.spin]), across
-    )
+        return shortest_turn(rotation[:, 2], goal[:, 2])
+    return np.asarray(Rotation.from_matrix(goal @ rotation.T).as_rotvec())
+
+
+def tip_axes(rows: Sequence[str], rotation: Array) -> Array:
+    """Return (r, 3) the axes of the turns that are rows."""
+    if "tip direction 1" in rows:
+        return rotation[:, :2].T
+    return np.eye(3) if "tip rotation x" in rows else np.zeros((0, 3))
+
+
+def tip_error(rows: Sequence[str], position: Array, rotation: Array, goal: TipGoal) -> Array:
+    """Return (n_e,) goal less value, eq. (11)."""
+    missing = [(goal.position - position)[_AXES[row]] for row in rows if row in _AXES]
+    return np.array([*missing, *(tip_axes(rows, rotation) @ tip_turn(rows, rotation, goal.rotation))])
+
+
+def tip_rate(rows: Sequence[str], rotation: Array, goal: TipGoal) -> Array:
+    """Return (n_e,) how the goal moves in a step."""
+    speed = [goal.velocity[_AXES[row]] for row in rows if row in _AXES]
+    return np.array([*speed, *(tip_axes(rows, rotation) @ goal.spin)])
+
+
+def tip_jacobian(rows: Sequence[str], truss: Truss, X: Array, at: Array) -> Array:
+    """Return (n_e, 3K) J_u of eq. (16), taken `at`, with the axes at `X`."""
+    position = derivative(lambda tips: truss.tip_weights @ tips, at[truss.tip]).reshape(3, -1)
+    kept = position[[_AXES[row] for row in rows if row in _AXES]]
+    return np.vstack([kept, tip_axes(rows, tip_rotation(truss, X)) @ tip_spin(truss, at)])
 
 
 def progress_weight(rate: Array) -> float:
-    """Return the square of the way, or more where it is short."""
-    way = float(np.linalg.norm(rate))
-    return way * max(way, SHORT_WAY) if way > 1e-6 else 1.0
+    """Return what progress is weighted by: the square of the tip's way, of which 10 mm count at least once."""
+    way = float(norm(rate))
+    return way * max(way, 0.01) if way > 1e-6 else 1.0
 
 
-class TurnRows(NamedTuple):
-    """Turns between faces and curve: (K, R) residuals, rows over the faces' nodes (K, R, 9) and the curve (K, R, D)."""
-
-    residual: Array
-    face: Array
-    curve: Array
+# Reference curve, eqs. (32)-(39).
 
 
-def turn_rows(rows: CurveRows, rotation: Array, spin: Array, turns: int) -> TurnRows:
-    """Return the turns between stations, `rotation` (K, 3, 3) and `spin` (K, 3, 9), and the curve's frames, eq. (39)."""
-    frame = rows.frame
-    x, y = rotation[:, :, 0], rotation[:, :, 1]
-    tangent = frame[:, :, 2]
-    residual = [np.einsum("kc,kc->k", axis, tangent) for axis in (x, y)]
-    combined = [np.cross(axis, tangent) for axis in (x, y)]
-    if turns == 3:
-        first, second = frame[:, :, 0], frame[:, :, 1]
-        residual.append(0.5 * np.einsum("kc,kc->k", x, second) - 0.5 * np.einsum("kc,kc->k", y, first))
-        combined.append(0.5 * (np.cross(x, second) - np.cross(y, first)))
-    c = np.stack(combined, axis=1)
-    return TurnRows(np.stack(residual, axis=1), c @ spin, -c @ rows.spin_rows)
+def gaps(truss: Truss, X: Array, tracked: Index, points: Array) -> Array:
+    """Return (K, 3) the faces' places less the curve's, eq. (39)."""
+    return face_centres(truss, X)[tracked] - points
 
 
-def length_jacobian(truss: Truss, gradient: Array) -> Array:
-    """Return the dense Jacobian (M, 3 N) of lengths by all nodes, from gradients (M, Q, 3)."""
-    full = np.zeros((truss.member_count, truss.node_count, 3))
-    for slot in range(gradient.shape[1]):
-        np.add.at(full, (np.arange(truss.member_count), truss.member_nodes[:, slot]), gradient[:, slot])
-    return full.reshape(truss.member_count, -1)
+def turns(rotation: Array, frame: Array, count: int) -> Array:
+    """Return (R,) the turns between a face and the curve: two tilts and the roll of the relative rotation R'F."""
+    relative = rotation.T @ frame
+    tilts = [relative[0, 2], relative[1, 2]]
+    return np.array([*tilts, (relative[0, 1] - relative[1, 0]) / 2] if count == 3 else tilts)
 
 
-def goal_pull(layout: Layout, vertices: Array, goals: Array | None) -> Array:
-    """Return (V, 3) the gradient of the control vertices' goals."""
+def turn_rows(rotation: Array, frame: Array, count: int) -> tuple[Array, Array]:
+    """Return (R, 3) twice: the turns' derivatives by turnings of the face, and of the curve."""
+    still = np.zeros(3)
+    face = derivative(lambda angles: turns(turned(rotation, angles), frame, count), still)
+    return face, derivative(lambda angles: turns(rotation, turned(frame, angles), count), still)
+
+
+def tilts(rotation: Array, slope: Array) -> Array:
+    """Return (2,) the cosines between a face's x- and y-axes and the curve's tangent r' / |r'|."""
+    return rotation[:, :2].T @ unit(slope)
+
+
+def tilt_rows(rotation: Array, slope: Array) -> tuple[Array, Array]:
+    """Return (2, 3) twice: the tilts' derivatives by turnings of the face, and by the slope r'."""
+    face = derivative(lambda angles: tilts(turned(rotation, angles), slope), np.zeros(3))
+    return face, derivative(lambda moved: tilts(rotation, moved), slope)
+
+
+def base_conditions(truss: Truss, base: Array, vertices: Array) -> tuple[Array, Array, Array]:
+    """Return d_p[0] (3,), two axes (2, 3) and what d_p[1] - d_p[0] is along them (2,).
+
+    The curve begins in the centre of the base face and leaves it along its normal.
+    """
+    axes = face_rotations(truss, base)[0][:, :2].T
+    return face_centres(truss, base)[0] - vertices[0], axes, -axes @ (vertices[1] - vertices[0])
+
+
+def bending_gradient(vertices: Array, weight: float) -> Array:
+    """Return (V, 3) the gradient of weight / 2 times the squares of the second differences."""
+    return derivative(lambda p: np.asarray(weight / 2 * np.sum(np.diff(p, n=2, axis=0) ** 2)), vertices)
+
+
+def goal_gradient(layout: Layout, vertices: Array, goals: Array | None) -> Array:
+    """Return (V, 3) the pull of vertices to their goals, by no more than a hundredth of the arm's length."""
     pull = np.zeros_like(vertices)
-    for i in layout.vertex_goals if goals is not None else ():
+    if goals is None:
+        return pull
+    for i in layout.vertex_goals:
         gap = vertices[i] - goals[i]
-        apart = float(np.linalg.norm(gap))
-        if apart > 0.0:
-            share = min(1.0, GOAL_REACH * layout.arm.height / apart)
-            pull[i] = layout.weights.vertex_goal * share * gap
+        share = min(1.0, 0.01 * truss_of(layout.arm).height / float(norm(gap)))
+        pull[i] = layout.weights.vertex_goal * share * gap
     return pull
 
 
-def numbers(
-    layout: Layout, kinematics: Kinematics, asked: StepInput, clearance: ClearanceRows
-) -> StepNumbers:
-    """Return the QP's numbers of a truss; ``motion`` has its gradient and right-hand sides alone."""
-    arm: Any = layout.arm
-    truss, stations, tip, weights = arm.truss, arm.stations, arm.end_effector, layout.weights
-    tracked, actuators, moves = layout.tracked, truss.actuators, asked.motion
-    kinematics.evaluate(asked.at)
-    gradient, spin = kinematics.gradient.copy(), kinematics.station_spin.copy()
-    tip_spin = kinematics.tip_spin.copy()
-    X = asked.q
-    moved = np.where(truss.base[:, None], asked.base - X, 0.0)
-    base_rotation = np.eye(3)
-    if layout.vertices:
-        kinematics.evaluate(X + moved)
-        base_rotation = kinematics.station_rotation[0].copy()
-    kinematics.evaluate(X)
-    lengths, rotations = kinematics.quantities.copy(), kinematics.station_rotation[tracked].copy()
-    missing = np.where(truss.actuated, 0.0, truss.home_lengths - lengths)
-    missing -= length_jacobian(truss, gradient) @ moved.reshape(-1)
-
-    rows = tip_rows(layout.tip_rows, tip.weights @ X[tip.nodes], kinematics.tip_rotation, asked.goal)
-    error = rows.error
-    if moves and np.abs(error).max(initial=0.0) <= ENOUGH:
-        error = np.zeros_like(error)
-    axes = ["xyz".index(row[-1]) for row in layout.tip_rows if row in ("tip x", "tip y", "tip z")]
-    jacobian = np.kron(tip.weights, np.eye(3))[axes]
-    if len(rows.across):
-        jacobian = np.concatenate([jacobian, rows.across @ tip_spin])
-    curvature = weights.progress * progress_weight(rows.rate)
-
-    count = len(tracked)
-    gap, shift = np.zeros((count, 3)), np.zeros(3)
-    face, slope, tilt = np.zeros((count, 2, 9)), np.zeros((count, 2, 3)), np.zeros((count, 2))
-    base_axes, base_rhs, pull = np.zeros((2, 3)), np.zeros(2), np.zeros_like(asked.vertices)
-    curve = None
-    if layout.vertices:
-        p, given = asked.vertices, asked.curve
-        centres = np.einsum("fk,fkc->fc", stations.weights, X[stations.nodes])
-        points = layout.curve_weights @ p if given is None else given.position
-        if moves or layout.hard_tracking:
-            gap = centres[tracked] - points
-        if given is None:
-            slopes = layout.curve_slopes @ p
-            speed = np.linalg.norm(slopes, axis=1, keepdims=True)
-            tangents = slopes / speed
-            across = rotations[:, :, :2].transpose(0, 2, 1)
-            along = np.einsum("kac,kc->ka", across, tangents)
-            face = np.einsum("kac,kcf->kaf", np.cross(across, tangents[:, None, :]), spin[tracked])
-            slope = (across - along[..., None] * tangents[:, None, :]) / speed[:, None]
-            if moves or layout.hard_turns:
-                tilt = along
-        else:
-            turns = turn_rows(given, rotations, spin[tracked], layout.turns)
-            curve = CurveNumbers(
-                position=given.position_rows,
-                turn_face=turns.face,
-                turn_curve=turns.curve,
-                turn_rhs=turns.residual if moves or layout.hard_turns else 0.0 * turns.residual,
-                spacing=given.spacing_rows,
-                spacing_rhs=given.spacing if moves else 0.0 * given.spacing,
-            )
-        if moves:
-            bending = np.diff(np.eye(layout.vertices), n=2, axis=0)
-            pull = weights.smoothness * (bending.T @ bending @ p)
-            pull += goal_pull(layout, p, asked.vertex_goals)
-        base_axes = base_rotation[:, :2].T
-        first = stations.nodes[0]
-        shift = stations.weights[0] @ (X + moved)[first] - p[0]
-        base_rhs = -base_axes @ (p[1] - p[0])
-    strokes = lengths[actuators]
-    pulled = weights.stroke_centring * (strokes - truss.home_lengths[actuators])
-    motion: Any = SimpleNamespace(gradient=gradient, rhs=missing)
-    return StepNumbers(
-        motion=motion,
-        lower=asked.lower - strokes,
-        upper=asked.upper - strokes,
-        actuator_gradient=pulled if moves else np.zeros(len(actuators)),
-        tip_jacobian=jacobian,
-        tip_rate=rows.rate,
-        tip_rhs=error,
-        progress_lower=1.0 - asked.progress if layout.elastic_tip else -asked.progress,
-        progress_upper=1.0 - asked.progress,
-        progress_gradient=curvature * (asked.progress - 2.0),
-        progress_curvature=curvature,
-        position_rhs=gap,
-        tangent_face=face,
-        tangent_curve=slope,
-        tangent_rhs=tilt,
-        vertex_gradient=pull,
-        base_displacement=shift,
-        base_axes=base_axes,
-        base_rhs=base_rhs,
-        clearance=clearance,
-        curve=curve,
-    )
+# The whole step.
 
 
-class Condensed(NamedTuple):
-    """The QP over what actuators, base and path leave free: d_a, the curve's q coordinates, and the progress.
-
-    Attributes
-    ----------
-    rows : (L, n_a + q + 1)
-        Rows whose squares are the objective's, the last column their constants.
-    tip : (n_e, n_a + q + 1)
-    lower, upper : (n_a + q + 1 + n_e,)
-    gradient : (n_a + q + 1,)
-        What else there is of it.
-    offset, normal : (V, 3), (3,)
-    """
-
-    rows: Array
-    tip: Array
-    lower: Array
-    upper: Array
-    gradient: Array
-    offset: Array
-    normal: Array
-
-
-def condensed(layout: Layout, asked: StepInput, given: StepNumbers) -> Condensed:
-    """Return a truss's QP condensed, from its :func:`numbers`."""
-    arm: Any = layout.arm
-    truss, stations, weights, V = arm.truss, arm.stations, layout.weights, layout.vertices
-    count, torsion, tracked = len(truss.actuators), layout.torsion, layout.tracked
-    moved = np.where(truss.base[:, None], asked.base - asked.q, 0.0)
-    whole = length_jacobian(truss, given.motion.gradient).reshape(truss.member_count, -1, 3)
-    known = np.zeros((truss.member_count, count + 1))
-    known[truss.actuators, np.arange(count)] = 1.0
-    known[:, -1] = given.motion.rhs
-    free = np.linalg.solve(whole[:, truss.free].reshape(truss.member_count, -1), known)
-    nodes = np.zeros((truss.node_count, 3, count + 1))
-    nodes[:, :, -1] = moved
-    nodes[truss.free] = free.reshape(-1, 3, count + 1)
-
-    size = 3 * V + torsion
-    offset, normal = np.zeros((V, 3)), np.zeros(3)
-    basis = np.zeros((size, layout.free_curve))
-    if V:
-        axes = given.base_axes
-        normal = np.cross(axes[0], axes[1])
-        offset[0] = given.base_displacement
-        offset[1] = given.base_displacement + given.base_rhs @ axes
-        basis[3:6, 0] = normal
-        basis[6:, 1:] = np.eye(size - 6)
-    start = np.concatenate([offset.reshape(-1), np.zeros(torsion)])
-
-    def stacked(over_nodes: Array, over_curve: Array, constant: Array) -> Array:
-        """Rows (R, n_a + q + 1) of rows over the nodes' displacements, (R, n_a + 1) as above, and over the curve's."""
-        last = constant + over_nodes[:, -1] + over_curve @ start
-        return np.column_stack([over_nodes[:, :-1], over_curve @ basis, last])
-
-    hard, turned = layout.hard_tracking, layout.hard_turns
-    parts = [np.sqrt(weights.node_rate) * stacked(free, np.zeros((len(free), size)), np.zeros(len(free)))]
-    if V:
-        K, R = len(tracked), layout.turns
-        if given.curve is None:
-            position = np.einsum("kv,cd->kcvd", layout.curve_weights, np.eye(3)).reshape(K, 3, size)
-            turning = np.einsum("kac,kv->kavc", given.tangent_curve, layout.curve_slopes).reshape(K, 2, size)
-            face, residual = given.tangent_face, given.tangent_rhs
-        else:
-            position, turning = given.curve.position, given.curve.turn_curve
-            face, residual = given.curve.turn_face, given.curve.turn_rhs
-        corners = nodes[stations.nodes[tracked]]
-        centres = np.einsum("kf,kfcn->kcn", stations.weights[tracked], corners)
-        gaps = stacked(
-            centres.reshape(3 * K, -1), -position.reshape(3 * K, -1), given.position_rhs.reshape(-1)
-        )
-        turns = stacked(
-            np.einsum("krf,kfn->krn", face, corners.reshape(K, 9, -1)).reshape(R * K, -1),
-            turning.reshape(R * K, -1),
-            residual.reshape(-1),
-        )
-        scale = np.sqrt([weights.tangent, weights.tangent, weights.roll][:R])
-        parts += [
-            gaps * (1.0 if hard else np.sqrt(weights.tracking)),
-            turns * (1.0 if turned else np.tile(scale, K)[:, None]),
-        ]
-        if given.curve is not None and layout.spacings:
-            still = np.zeros((layout.spacings, count + 1))
-            parts.append(
-                np.sqrt(weights.spacing) * stacked(still, given.curve.spacing, given.curve.spacing_rhs)
-            )
-    tips = nodes[arm.end_effector.nodes].reshape(-1, count + 1)
-    tip = given.tip_jacobian @ tips
-    tip_value = given.tip_rhs - tip[:, -1]
-    unbounded = np.full(layout.free_curve, 1e30)
-    own = np.zeros(0)
-    if V:
-        bending = np.diff(np.eye(V), n=2, axis=0)
-        pull = weights.curve_rate * offset + weights.smoothness * (bending.T @ bending @ offset)
-        # The goals of control vertices are no part of these rows.
-        pull += given.vertex_gradient - (goal_pull(layout, asked.vertices, asked.vertex_goals) * asked.motion)
-        own = np.concatenate([pull.reshape(-1), np.zeros(torsion)]) @ basis
-    return Condensed(
-        rows=np.concatenate(parts),
-        tip=np.column_stack([tip[:, :-1], np.zeros((len(tip), layout.free_curve)), -given.tip_rate]),
-        lower=np.concatenate([given.lower, -unbounded, [-asked.progress], tip_value]),
-        upper=np.concatenate([given.upper, unbounded, [1.0 - asked.progress], tip_value]),
-        gradient=np.concatenate([given.actuator_gradient, own, [given.progress_gradient]]),
-        offset=offset,
-        normal=normal,
-    )
+def numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
+    """Return the numbers of a step's QP by the names of ``StepNumbers``; rows of the motion and the curve as arrays."""
+    truss, weights, rows = truss_of(layout.arm), layout.weights, layout.tip_rows
+    X, at = asked.q, asked.at
+    strokes, rest = (lengths(truss, Y)[truss.actuators] for Y in (X, truss.home))
+    matrix, rhs = motion(truss, X, at, asked.base)
+    rotation = tip_rotation(truss, X)
+    error = tip_error(rows, truss.tip_weights @ X[truss.tip], rotation, asked.goal)
+    rate = tip_rate(rows, rotation, asked.goal)
+    curvature = weights.progress * progress_weight(rate)
+    found = {
+        "motion": matrix,
+        "motion_rhs": rhs,
+        "lower": asked.lower - strokes,
+        "upper": asked.upper - strokes,
+        "actuator_gradient": asked.motion * weights.stroke_centring * (strokes - rest),
+        "tip_jacobian": tip_jacobian(rows, truss, X, at),
+        "tip_rate": rate,
+        "tip_rhs": 0.0 * error if asked.motion and np.abs(error).max() <= 2e-8 else error,
+        "progress_lower": 1.0 - asked.progress if layout.elastic_tip else -asked.progress,
+        "progress_upper": 1.0 - asked.progress,
+        "progress_gradient": curvature * (asked.progress - 2.0),
+        "progress_curvature": curvature,
+    }
+    return {key: np.asarray(value) for key, value in (found | curve_numbers(layout, asked)).items()}
 
 
-def tracking_error(
-    layout: Layout, kinematics: Kinematics, q: Array, vertices: Array, given: CurveRows | None
-) -> float:
-    """Return the greatest gap, m, or turn, rad, of stations that are to stay on the curve exactly."""
-    stations, tracked = layout.arm.stations, layout.tracked
-    kinematics.evaluate(q)
-    centres = np.einsum("fk,fkc->fc", stations.weights, layout.arm.nodes(q)[stations.nodes])[tracked]
-    rotations = kinematics.station_rotation[tracked]
-    if given is not None:
-        gaps = centres - given.position
-        turns = turn_rows(given, rotations, kinematics.station_spin[tracked], layout.turns).residual
-    else:
+def curve_numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
+    """Return those of the curve; corrections close only what is to hold exactly."""
+    truss, tracked, vertices, given = truss_of(layout.arm), layout.tracked, asked.vertices, asked.curve
+    if not layout.vertices:
+        return {}
+    closes_gaps, closes_turns = asked.motion or layout.hard_tracking, asked.motion or layout.hard_turns
+    shift, axes, base_rhs = base_conditions(truss, asked.base, vertices)
+    pull = bending_gradient(vertices, layout.weights.smoothness)
+    pull += goal_gradient(layout, vertices, asked.vertex_goals)
+    rotations, spins = face_rotations(truss, asked.q)[tracked], face_spins(truss, asked.at)[tracked]
+    points = layout.curve_weights @ vertices if given is None else given.position
+    found = {
+        "base_displacement": shift,
+        "base_axes": axes,
+        "base_rhs": base_rhs,
+        "vertex_gradient": asked.motion * pull,
+        "position_rhs": closes_gaps * gaps(truss, asked.q, tracked, points),
+    }
+    if given is None:
         slopes = layout.curve_slopes @ vertices
-        tangents = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
-        gaps = centres - layout.curve_weights @ vertices
-        turns = np.einsum("kca,kc->ka", rotations[:, :, :2], tangents)
-    return max(float(np.abs(gaps).max()), float(np.abs(turns).max()) if layout.hard_turns else 0.0)
+        pairs = list(zip(rotations, slopes, strict=True))
+        residuals = [tilts(*pair) for pair in pairs]
+        derivatives = [tilt_rows(*pair) for pair in pairs]
+        curve = [by_slope for _, by_slope in derivatives]
+        names = "tangent_rhs", "tangent_face", "tangent_curve"
+    else:
+        frames = list(zip(rotations, given.frame, strict=True))
+        residuals = [turns(*pair, layout.turns) for pair in frames]
+        derivatives = [turn_rows(*pair, layout.turns) for pair in frames]
+        curve = [by_curve @ row for (_, by_curve), row in zip(derivatives, given.spin_rows, strict=True)]
+        names = "curve.turn_rhs", "curve.turn_face", "curve.turn_curve"
+        found["curve.position"] = given.position_rows
+        found["curve.spacing"] = given.spacing_rows
+        found["curve.spacing_rhs"] = asked.motion * given.spacing
+    face = [by_face @ row for (by_face, _), row in zip(derivatives, spins, strict=True)]
+    for name, value in zip(names, (closes_turns * np.array(residuals), face, curve), strict=True):
+        found[name] = np.array(value)
+    return found
+
+
+def tracking_error(layout: Layout, X: Array, vertices: Array, frames: Array | None, points: Array) -> float:
+    """Return the greatest gap, m, and turn, rad, of faces that are to be on the curve exactly.
+
+    `points` (K, 3) and `frames` (K, 3, 3) of the curve; the latter None where it has slopes alone.
+    """
+    truss, tracked = truss_of(layout.arm), layout.tracked
+    found = [gaps(truss, X, tracked, points).reshape(-1)]
+    if layout.hard_turns:
+        rotations = face_rotations(truss, X)[tracked]
+        slopes = layout.curve_slopes @ vertices
+        if frames is None:
+            found += [tilts(*pair) for pair in zip(rotations, slopes, strict=True)]
+        else:
+            found += [turns(*pair, layout.turns) for pair in zip(rotations, frames, strict=True)]
+    return float(np.abs(np.concatenate(found)).max())
+
+
+def check_numbers(
+    found: StepNumbers, wanted: dict[str, Array], layout: Layout, tolerance: float = 1e-12
+) -> None:
+    """Assert that a linearisation found the numbers of the equations."""
+    pattern, count = layout.arm.motion_pattern, layout.node_columns + len(layout.arm.actuators)
+    matrix = np.zeros((len(found.motion.rhs), count))
+    np.add.at(matrix, (pattern.rows, pattern.columns), found.motion.values)
+    own = {"motion": matrix, "motion_rhs": found.motion.rhs}
+    for name, value in wanted.items():
+        group, _, key = name.rpartition(".")
+        got = own[name] if name in own else getattr(getattr(found, group) if group else found, key)
+        np.testing.assert_allclose(got, value, rtol=1e-11, atol=tolerance, err_msg=name)

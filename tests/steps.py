@@ -1,87 +1,45 @@
-"""Steps of small arms at random poses, for the tests of what linearises and solves them."""
+"""One step of an arm to ask an engine for, and what two engines' answers have in common."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import piqp
 from arms import random_pose
 from numpy.typing import NDArray
-from scipy import sparse
 
 from vgtm_qp.arm.arm import Kinematics, Pose
-from vgtm_qp.curve.families import make_family
-from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
-from vgtm_qp.qp.shape import CurveShape
+from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.separation import Distances, Separation
-from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.target import QPInput, Target
+from vgtm_qp.step.target import Target
 
 Array = NDArray[np.float64]
 
-SHAPES: dict[str, dict[str, Any]] = {
-    "arc-length": {"by_arc_length": True},
-    "torsion": {"torsion": 2, "tracks_roll": True},
-    "spacing": {"spacing": True},
-    "everything": {"by_arc_length": True, "torsion": 1, "tracks_roll": True, "spacing": True},
-}
-
-BASE_POSE = Pose(np.array([0.01, 0.0, 0.02]), rotation_from_vector([0.01, -0.02, 0.015]))
-
-
-def shaped(
-    layout: Layout,
-    shape: str | None = None,
-    *,
-    family: str = "bezier",
-    goals: tuple[int, ...] = (),
-    hard: bool = False,
-    **weights: float,
-) -> Layout:
-    """The layout with a curve that is more than its tables."""
-    curve = make_family(family, layout.vertices)
-    nodes = layout.tracked / layout.tracked[-1]
-    options = dict(SHAPES[shape]) if shape else {}
-    if options.pop("spacing", False):
-        options["spacing"] = np.full(len(nodes), 0.7)
-    options["roll"] = np.linspace(0.1, -0.2, len(nodes))
-    return replace(
-        layout,
-        curve_weights=curve.weights(nodes),
-        curve_slopes=curve.weights(nodes, 1),
-        shape=CurveShape(curve, nodes, **options),
-        vertex_goals=goals,
-        hard_tracking=hard,
-        hard_turns=hard,
-        weights=layout.weights.model_copy(update={"spacing": 0.3, **weights}),
-    )
+MOVED_BASE = Pose(np.array([0.01, 0.0, 0.02]), rotation_from_vector([0.01, -0.02, 0.015]))
+"""A base that turned and moved a little."""
 
 
 def make_step(
     layout: Layout, kinematics: Kinematics, rng: np.random.Generator, *, base: bool = False
 ) -> tuple[Array, Array, Array, Target, ClearanceRows]:
     """A pose, the middle of a guessed motion, a curve and a target near them, and clearance rows that are active."""
-    arm: Any = layout.arm
+    arm, tip = layout.arm, layout.arm.end_effector
     truss = arm.truss
     X = random_pose(truss, rng, 0.01)
-    X[truss.base] = truss.home[truss.base]
+    X[arm.base] = arm.home[arm.base]
     kinematics.evaluate(X)
-    lengths = kinematics.quantities[truss.actuators].copy()
-    here, rotation = arm.end_effector.position(X), kinematics.tip_rotation.copy()
+    lengths = kinematics.quantities[arm.actuators].copy()
+    here, rotation = tip.position(X), kinematics.tip_rotation.copy()
     turn = rotation_from_vector([0.02, -0.01, 0.015])
     path = Path(
         np.array([0.0, 2.0]),
         np.stack([here, here + np.array([0.03, 0.02, -0.02])]),
         np.stack([rotation, turn @ rotation]),
     )
-    pose = BASE_POSE if base else None
-    target = Target(path, 0.0, 1.0, lengths - 0.2, lengths + 0.2, 1.0, pose)
+    target = Target(path, 0.0, 1.0, lengths - 0.2, lengths + 0.2, 1.0, MOVED_BASE if base else None)
     vertices = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, arm.height]
     vertices[2:] += 0.03 * rng.normal(size=vertices[2:].shape)
     normal = rng.normal(size=(3, 3))
@@ -90,33 +48,8 @@ def make_step(
     share = rng.uniform(size=(3, 4, 1)) * [[1.0], [1.0], [-1.0], [-1.0]]
     rows = ClearanceRows(nodes, share * normal[:, None, :], np.full(3, -1.0), str)
     Y = X + 0.005 * rng.normal(size=X.shape)
-    Y[truss.base] = X[truss.base]
+    Y[arm.base] = X[arm.base]
     return X, Y, vertices, target, rows
-
-
-def asked_at(
-    q: Array,
-    vertices: Array,
-    target: Target,
-    progress: float,
-    rows: ClearanceRows | None = None,
-    *,
-    at: Array | None = None,
-    torsion: Array | None = None,
-    motion: bool = True,
-) -> QPInput:
-    """What a QP is asked for at a configuration; Jacobians are taken there too, by default."""
-    return QPInput(
-        q,
-        q if at is None else at,
-        vertices,
-        np.zeros(0) if torsion is None else torsion,
-        target,
-        target.goal(progress),
-        progress,
-        ClearanceRows() if rows is None else rows,
-        motion,
-    )
 
 
 def pressing(rows: ClearanceRows, answer: StepSolution) -> ClearanceRows:
@@ -126,42 +59,36 @@ def pressing(rows: ClearanceRows, answer: StepSolution) -> ClearanceRows:
     return ClearanceRows(rows.nodes, rows.coefficients, value + np.array([1e-4, -1e-2, -1e-2]), rows.name)
 
 
-def assert_same_answer(found: StepSolution, wanted: StepSolution, tolerance: float = 1e-10) -> None:
-    """Compare the displacements of two answers."""
+def assert_same_answer(found: Any, wanted: Any, tolerance: float = 1e-10) -> None:
+    """Nodes, actuators, curve and progress are the same."""
     for which in ("nodes", "actuators", "vertices", "progress"):
         np.testing.assert_allclose(
             getattr(found, which), getattr(wanted, which), atol=tolerance, err_msg=which
         )
 
 
-def answer_of(qp: StepQP) -> tuple[Array, Array, Array]:
-    """The whole QP's unknowns by PIQP, tightly, and the multipliers of rows and columns."""
-    equal = qp.row_lower == qp.row_upper
-    solver = piqp.SparseSolver()
-    solver.settings.eps_abs = 1e-10
-    solver.settings.eps_rel = 1e-12
-    solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = 1e-13
-    solver.setup(
-        qp.P,
-        qp.q,
-        sparse.csc_matrix(qp.A[equal]),
-        qp.row_lower[equal],
-        sparse.csc_matrix(qp.A[~equal]),
-        qp.row_lower[~equal],
-        qp.row_upper[~equal],
-        qp.column_lower,
-        qp.column_upper,
-    )
-    solver.solve()
-    y, z = np.zeros(len(qp.row_lower)), np.array(solver.result.x)
-    y[equal] = solver.result.y
-    y[~equal] = solver.result.z_u - solver.result.z_l
-    return z, y, -(qp.P @ z + qp.q + qp.A.T @ y)
+class TurnRows(NamedTuple):
+    """Turns between faces and curve: (K, R) residuals, rows over the faces' nodes (K, R, 9) and the curve (K, R, D)."""
+
+    residual: Array
+    face: Array
+    curve: Array
 
 
-def separation_of(setup: Setup, **distances: float) -> Separation:
-    """What keeps an arm apart from what is around it; with the margin of its problem, or that in `distances`."""
-    kept = {"margin": setup.margin, **distances}
-    return Separation(
-        setup.arm, setup.monitor, Distances(setup.safe, setup.self_safe, setup.influence, **kept)
-    )
+def turn_rows(rows: CurveRows, rotation: Array, spin: Array, turns: int) -> TurnRows:
+    """Return the turns between faces, `rotation` (K, 3, 3) and `spin` (K, 3, 9), and the curve's frames.
+
+    The first two are cosines between the face's x and y axes and the tangent, the third the sine of the roll. Each is
+    a function of the relative rotation alone: its rate is c . (face's less curve's angular velocity).
+    """
+    frame = rows.frame
+    x, y = rotation[:, :, 0], rotation[:, :, 1]
+    tangent = frame[:, :, 2]
+    residual = [np.einsum("kc,kc->k", axis, tangent) for axis in (x, y)]
+    combined = [np.cross(axis, tangent) for axis in (x, y)]
+    if turns == 3:
+        first, second = frame[:, :, 0], frame[:, :, 1]
+        residual.append(0.5 * np.einsum("kc,kc->k", x, second) - 0.5 * np.einsum("kc,kc->k", y, first))
+        combined.append(0.5 * (np.cross(x, second) - np.cross(y, first)))
+    c = np.stack(combined, axis=1)
+    return TurnRows(np.stack(residual, axis=1), c @ spin, -c @ rows.spin_rows)

@@ -8,6 +8,7 @@ from arms import arm_problem, central_differences
 from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
+from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.errors import GoalError, ProblemError
 from vgtm_qp.problem.truss import BasePose
@@ -20,6 +21,7 @@ POSES = (
     {"time": 5.0, "position": [0.5, -0.1, 0.1], "rotation_vector": [0.0, 0.0, 0.4]},
 )
 
+HOME = Pose(np.zeros(3), np.eye(3))
 STRIDE = np.array([0.05, 0.0, -0.02])
 WAY = np.array([0.25, 0.1, -0.2])
 
@@ -32,20 +34,22 @@ def _without_a_compiler(monkeypatch):
 
 def test_a_base_passes_its_poses_and_is_rigid_between():
     truss = modules.octahedral(2)
-    motion = BaseMotion([BasePose(**pose) for pose in POSES], truss)
-    np.testing.assert_array_equal(motion.nodes(0.0), truss.home)
+    motion = BaseMotion([BasePose(**pose) for pose in POSES])
+
+    def nodes(time):
+        return HOME.carry(truss.home, motion.pose(time))
+
+    np.testing.assert_array_equal(nodes(0.0), truss.home)
     for pose in POSES:
         turn = Rotation.from_rotvec(pose["rotation_vector"]).as_matrix()
-        np.testing.assert_allclose(
-            motion.nodes(pose["time"]), truss.home @ turn.T + pose["position"], atol=1e-14
-        )
-        np.testing.assert_allclose(motion.rotation(pose["time"]), turn, atol=1e-14)
-    np.testing.assert_array_equal(motion.nodes(9.0), motion.nodes(5.0))
-    lengths = [np.linalg.norm(np.diff(motion.nodes(t), axis=0), axis=1) for t in (0.0, 0.7, 3.1)]
+        np.testing.assert_allclose(nodes(pose["time"]), truss.home @ turn.T + pose["position"], atol=1e-14)
+        np.testing.assert_allclose(motion.pose(pose["time"]).rotation, turn, atol=1e-14)
+    np.testing.assert_array_equal(nodes(9.0), nodes(5.0))
+    lengths = [np.linalg.norm(np.diff(nodes(t), axis=0), axis=1) for t in (0.0, 0.7, 3.1)]
     np.testing.assert_allclose(lengths[1:], [lengths[0]] * 2, atol=1e-14)
     halfway = 0.5 * np.array(POSES[0]["position"])
-    np.testing.assert_allclose(motion.nodes(1.0)[:3].mean(axis=0), halfway, atol=1e-14)
-    rate = central_differences(lambda t: motion.nodes(float(t[0])), np.array([1.3]))
+    np.testing.assert_allclose(nodes(1.0)[:3].mean(axis=0), halfway, atol=1e-14)
+    rate = central_differences(lambda t: nodes(float(t[0])), np.array([1.3]))
     assert np.abs(rate).max() > 0.1
 
 
@@ -77,13 +81,13 @@ def test_a_maneuver_on_a_moving_base_is_certified(solver, joint_offset):
     maneuver = vq.solve(problem)
     assert maneuver.status == "solved", maneuver.manifest["blocked_by"]
     assert maneuver.certificate.ok, maneuver.certificate.failures()
-    base = BaseMotion(problem.truss.base_motion, modules.octahedral(4))
+    base, home = BaseMotion(problem.truss.base_motion), modules.octahedral(4).home[:3]
     for time, nodes, vertices in zip(maneuver.time, maneuver.nodes, maneuver.control_vertices, strict=True):
-        wanted = base.nodes(time)[:3]
+        wanted = HOME.carry(home, base.pose(time))
         np.testing.assert_allclose(nodes[:3], wanted, atol=1e-12)
         np.testing.assert_allclose(vertices[0], wanted.mean(axis=0), atol=1e-9)
         along = vertices[1] - vertices[0]
-        assert np.linalg.norm(np.cross(along, base.rotation(time)[:, 2])) < 1e-6
+        assert np.linalg.norm(np.cross(along, base.pose(time).rotation[:, 2])) < 1e-6
     np.testing.assert_allclose(maneuver.tip_position[-1], [1.0, 0.2, 2.2], atol=1e-6)
     altered = maneuver.nodes.copy()
     altered[7, :3] += 1e-6
@@ -177,7 +181,7 @@ def test_two_octahedral_bays_have_three_coordinates_at_home():
     problem = arm_problem(bays=2, waypoint=point, end_effector={"track": ["position", "pointing"]})
     with pytest.raises(ProblemError, match="rank 3 of 5"):
         Resolver(problem)
-    assert Resolver(arm_problem(bays=2)).arm.task.row_names == ("tip x", "tip y", "tip z")
+    assert Resolver(arm_problem(bays=2)).setup.task.row_names == ("tip x", "tip y", "tip z")
 
 
 @pytest.mark.parametrize(

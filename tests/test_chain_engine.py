@@ -1,4 +1,4 @@
-"""The engine of long arms against the plain one: one QP and one settled configuration, two ways to them."""
+"""The engine of long arms against the general one: one QP and one settled configuration, two ways to them."""
 
 from __future__ import annotations
 
@@ -42,9 +42,8 @@ def _without_a_compiler(monkeypatch):
 
 
 def engines(name, *, vertices=5, hard=False, track=None):
-    truss = MODULES[name]()
     layout, task = make_layout(
-        truss, track or TRACKS.get(name, ("position",)), vertices=vertices, hard_tracking=hard
+        MODULES[name](), track or TRACKS.get(name, ("position",)), vertices=vertices, hard_tracking=hard
     )
     kinematics = layout.arm.kinematics()
     solvers = [chain_solver(layout) for _ in range(2)]
@@ -89,14 +88,14 @@ def test_both_engines_give_one_answer(name, vertices, hard, base):
 def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
     """From the end of a motion; `tight` actuators end at a bound, or beyond it, and are brought back."""
     layout, kinematics, plain, chain = engines(name, vertices=vertices, hard=hard)
-    truss = layout.arm.truss
-    points = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, truss.height]
+    arm, tip = layout.arm, layout.arm.end_effector
+    points = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, arm.height]
     _, _, _, target, rows = make_step(layout, kinematics, np.random.default_rng(5))
-    kinematics.evaluate(truss.home)
-    home = kinematics.quantities[truss.actuators]
+    kinematics.evaluate(arm.home)
+    home = kinematics.quantities[arm.actuators]
     reach = 0.004 if tight else 0.5
     target = replace(target, lower=home - reach, upper=home + reach)
-    here = layout.arm.end_effector.position(truss.home)
+    here = tip.position(arm.home)
     path = Path(
         np.array([0.0, 1.0]),
         np.stack([here, here + np.array([0.02, 0.01, -0.005])]),
@@ -105,11 +104,11 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
     target = replace(target, path=path)
     ends = []
     for engine in (plain, chain):
-        home = truss.home
+        home = arm.home
         asked = QPInput(home, home, points, np.zeros(0), target, path.at(0.0), 0.0, rows, True)
         answer = engine.solve(asked)
         goal = path.at(max(answer.progress, 0.0))
-        ends.append(engine.settle(truss.home + answer.nodes, target, goal, ACCURACY))
+        ends.append(engine.settle(home + answer.nodes, target, goal, ACCURACY))
     if ends[0] is None:
         assert tight or hard
         assert ends[1] is None
@@ -121,13 +120,14 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
     assert ends[1].error <= ACCURACY.member
     kinematics.evaluate(ends[1].q)
     np.testing.assert_allclose(kinematics.quantities, ends[1].quantities, atol=1e-14)
-    np.testing.assert_allclose(kinematics.quantities[~truss.actuated], truss.home_lengths[~truss.actuated], atol=1e-10)
-    strokes = kinematics.quantities[truss.actuators]
+    fixed = ~arm.actuated
+    np.testing.assert_allclose(kinematics.quantities[fixed], arm.home_quantities[fixed], atol=1e-10)
+    strokes = kinematics.quantities[arm.actuators]
     assert (strokes >= target.lower - 1e-12).all()
     assert (strokes <= target.upper + 1e-12).all()
     if hard:
         curve = layout.curve_weights @ (points + answer.vertices)
-        np.testing.assert_allclose(layout.arm.stations.centres(ends[1].q)[layout.tracked], curve, atol=1e-10)
+        np.testing.assert_allclose(arm.stations.centres(ends[1].q)[layout.tracked], curve, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["octahedral", "hexapod", "tetrahedral-23"])
@@ -135,24 +135,24 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
 def test_the_rows_of_a_period_are_derivatives(name, reverse):
     """Lengths, gaps and angles against central differences of themselves, the Jacobians being taken at X too."""
     layout, kinematics, *_ = engines(name)
-    chain, truss = find_chain(layout), layout.arm.truss
+    chain, arm = find_chain(layout), layout.arm
     elimination = Elimination(chain)
-    sizes = elimination.inputs.sizes
-    data = ChainData(chain, sizes, reverse=reverse)
-    values = PeriodValues(chain, data, truss.home_lengths)
+    data = ChainData(chain, elimination.inputs.sizes, reverse=reverse)
+    values = PeriodValues(chain, data, arm.home_quantities)
     rng = np.random.default_rng(3)
     X, _, points, _, _ = make_step(layout, kinematics, rng)
     moved = rng.normal(size=X.shape)
-    moved[truss.base] = 0.0
+    moved[arm.base] = 0.0
 
-    def part(vector, name):
-        names = list(sizes[vector])
-        first = sum(sizes[vector][before] for before in names[: names.index(name)])
-        return getattr(data, vector)[:, first : first + sizes[vector][name]].copy()
+    def part(array, which, name):
+        sizes = elimination.inputs.sizes[which]
+        names = list(sizes)
+        start = sum(sizes[before] for before in names[: names.index(name)])
+        return array[:, start : start + sizes[name]].copy()
 
     def at(step):
         values.fill(X + step * moved, X + step * moved, points, None, motion=True)
-        return values.lengths.copy(), part("tail", "gap"), part("tail", "tilt")
+        return values.lengths.copy(), part(data.tail, "tail", "gap"), part(data.tail, "tail", "tilt")
 
     h = 1e-5
     ahead, behind = at(h), at(-h)
@@ -160,13 +160,13 @@ def test_the_rows_of_a_period_are_derivatives(name, reverse):
     at(0.0)
     kinematics.evaluate(X)
     np.testing.assert_allclose(values.lengths, kinematics.quantities, atol=1e-14)
-    members = np.arange(truss.member_count)
+    members = np.arange(len(arm.quantity_names))
     nodes, rows = values.member_rows(members)
     np.testing.assert_allclose(np.einsum("rqc,rqc->r", rows, moved[nodes]), change[0], atol=1e-8)
     faces = moved[chain.window[data.order]][:, chain.face_places].reshape(len(data.faces), 9)
     centres = np.einsum("f,kfc->kc", chain.face_weights[0], faces.reshape(-1, 3, 3))
     np.testing.assert_allclose(change[1].reshape(-1, 3), centres, atol=1e-8)
-    turns = part("head", "tangent_face").reshape(-1, 2, 9)
+    turns = part(data.head, "head", "tangent_face").reshape(-1, 2, 9)
     np.testing.assert_allclose(np.einsum("kaf,kf->ka", turns, faces), change[2].reshape(-1, 2), atol=1e-8)
 
 

@@ -1,17 +1,16 @@
-"""The fused engine against the plain one: one QP, two ways to its numbers, one answer."""
+"""The fused engine against the general one: one QP, two ways to its numbers, one answer."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-import oracle
 import pytest
-from arms import TRUSSES, central_differences, make_layout, random_pose
-from steps import BASE_POSE, SHAPES, asked_at, assert_same_answer, make_step, pressing, shaped
+from arms import TRUSSES, make_layout, random_pose
+from steps import assert_same_answer, make_step, pressing, turn_rows
 
+from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.curve.families import make_family
-from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.shape import CurveShape
@@ -20,7 +19,6 @@ from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.engine import Accuracy, FusedEngine, GeneralEngine
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.target import QPInput, Target
-from vgtm_qp.step.task import TipTask
 
 ELIMINABLE = [name for name in TRUSSES if name != "graph"]
 TRACKS = {"hexapod": ("position", "orientation"), "longeron": ("x", "pointing")}
@@ -32,13 +30,42 @@ def _without_a_compiler(monkeypatch):
     monkeypatch.setenv("VGTM_CC", "none")
 
 
+SHAPES = {
+    "arc-length": {"by_arc_length": True},
+    "torsion": {"torsion": 2, "tracks_roll": True},
+    "spacing": {"spacing": True},
+    "everything": {"by_arc_length": True, "torsion": 1, "tracks_roll": True, "spacing": True},
+}
+
+
+def shaped(layout, shape=None, *, family="bezier", goals=(), hard=False, **weights):
+    """The layout with a curve that is more than its tables."""
+    family = make_family(family, layout.vertices)
+    nodes = layout.tracked / layout.tracked[-1]
+    options = dict(SHAPES[shape]) if shape else {}
+    if options.pop("spacing", False):
+        options["spacing"] = np.full(len(nodes), 0.7)
+    options["roll"] = np.linspace(0.1, -0.2, len(nodes))
+    return replace(
+        layout,
+        curve_weights=family.weights(nodes),
+        curve_slopes=family.weights(nodes, 1),
+        shape=CurveShape(family, nodes, **options),
+        vertex_goals=goals,
+        hard_tracking=hard,
+        hard_turns=hard,
+        weights=layout.weights.model_copy(update={"spacing": 0.3, **weights}),
+    )
+
+
 def engines(name, *, joint_offset=0.0, track=None, vertices=5, **options):
     truss = TRUSSES[name](joint_offset=joint_offset)
     layout, task = make_layout(truss, track or TRACKS.get(name, ("position",)), vertices=vertices)
     if options:
         layout = shaped(layout, **options)
+    assert layout.arm.symbols(Constants()).can_eliminate
     kinematics = layout.arm.kinematics()
-    return layout, kinematics, general(layout, kinematics, task), FusedEngine(layout)
+    return layout, kinematics, task, general(layout, kinematics, task), FusedEngine(layout)
 
 
 def general(layout, kinematics, task, solver="daqp"):
@@ -49,8 +76,8 @@ def general(layout, kinematics, task, solver="daqp"):
 @pytest.mark.parametrize("joint_offset", [0.0, 0.1])
 @pytest.mark.parametrize("name", ELIMINABLE)
 def test_both_engines_give_one_answer(name, joint_offset, base):
-    layout, kinematics, plain, fused = engines(name, joint_offset=joint_offset)
-    truss = layout.arm.truss
+    layout, kinematics, _, plain, fused = engines(name, joint_offset=joint_offset)
+    arm = layout.arm
     rng = np.random.default_rng(5)
     X, Y, vertices, target, rows = make_step(layout, kinematics, rng, base=base)
     for motion, progress in ((True, 0.0), (False, 0.7)):
@@ -65,11 +92,11 @@ def test_both_engines_give_one_answer(name, joint_offset, base):
             answers[0].clearance_multipliers, answers[1].clearance_multipliers, atol=1e-8
         )
         assert answers[0].clearance_multipliers.max() > 0.0
-    near = truss.home + 1e-3 * rng.normal(size=X.shape)
-    near[truss.base] = truss.home[truss.base]
-    for pose in (truss.home, near):
+    near = arm.home + 1e-3 * rng.normal(size=X.shape)
+    near[arm.base] = arm.home[arm.base]
+    for pose in (arm.home, near):
         kinematics.evaluate(pose)
-        goal = replace(target.path.at(0.0), position=layout.arm.end_effector.position(pose) + 1e-6)
+        goal = replace(target.path.at(0.0), position=arm.end_effector.position(pose) + 1e-6)
         box = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0)
         closed = [engine.settle(pose, box, goal, Accuracy(1e-12, 1e-7, np.inf)) for engine in (fused, plain)]
         if name == "tetrahedral-2" and None in closed:
@@ -88,14 +115,13 @@ def test_both_engines_give_one_answer(name, joint_offset, base):
 )
 def test_both_engines_give_one_answer_on_every_curve(name, shape, family):
     """Arc-length nodes, torsion, spacing and goals of control vertices, on a moving base."""
-    layout, kinematics, plain, fused = engines(name, shape=shape, family=family, goals=(2, 4))
+    layout, kinematics, task, plain, fused = engines(name, shape=shape, family=family, goals=(2, 4))
     rng = np.random.default_rng(7)
     X, Y, vertices, target, rows = make_step(layout, kinematics, rng, base=True)
     goals = np.full(vertices.shape, np.nan)
     goals[2], goals[4] = vertices[2] + [0.3, 0.0, 0.0], vertices[4] + [0.0, 0.002, 0.0]
     torsion = 0.1 * rng.normal(size=layout.torsion)
     target = replace(target, vertex_goals=goals)
-    task = TipTask(TRACKS.get(name, ("position",)), layout.arm)
     full = general(layout, kinematics, task, "piqp")
     for motion, progress in ((True, 0.0), (False, 0.7)):
         goal = target.path.at(progress)
@@ -111,37 +137,35 @@ def test_both_engines_give_one_answer_on_every_curve(name, shape, family):
 
 @pytest.mark.parametrize("name", ["octahedral", "longeron"])
 def test_both_engines_hold_faces_on_the_curve_where_these_determine_the_nodes(name):
-    truss = TRUSSES[name]()
-    layout, task = make_layout(truss, ("position",), vertices=5, hard_tracking=True)
-    kinematics = layout.arm.kinematics()
+    layout, task = make_layout(TRUSSES[name](), vertices=5, hard_tracking=True)
+    arm, kinematics = layout.arm, layout.arm.kinematics()
     plain, fused = general(layout, kinematics, task), FusedEngine(layout)
-    X = truss.home
+    X = arm.home
     kinematics.evaluate(X)
-    lengths, here = kinematics.quantities[truss.actuators].copy(), layout.arm.end_effector.position(X)
+    lengths, here = kinematics.quantities[arm.actuators].copy(), arm.end_effector.position(X)
     rotation = np.stack([kinematics.tip_rotation] * 2)
     path = Path(np.array([0.0, 1.0]), here + np.outer([0.0, 1.0], [0.02, 0.01, -0.015]), rotation)
     target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
-    centres = layout.arm.stations.centres(X)[[0, *layout.tracked]]
+    centres = arm.stations.centres(X)[[0, *layout.tracked]]
     vertices = np.linspace(0, 1, layout.vertices)[:, None] * (centres[-1] - centres[0]) + centres[0]
     asked = QPInput(X, X, vertices, np.zeros(0), target, path.at(0.0), 0.0, ClearanceRows(), True)
-    closed = []
+    accuracy, closed = Accuracy(1e-10, 1e-8, 1e-2), []
     for engine in (fused, plain):
         answer = engine.solve(asked)
         goal = path.at(answer.progress)
-        closed.append(engine.settle(X + answer.nodes, target, goal, Accuracy(1e-10, 1e-8, 1e-2)))
-        kinematics.evaluate(closed[-1].q)
-        gap = layout.arm.stations.centres(closed[-1].q)[layout.tracked]
+        closed.append(engine.settle(X + answer.nodes, target, goal, accuracy))
+        gap = arm.stations.centres(closed[-1].q)[layout.tracked]
         gap -= layout.curve_weights @ (vertices + answer.vertices)
         assert np.abs(gap).max() < 1e-12
         assert np.abs(answer.nodes).max() > 0.01
     np.testing.assert_allclose(closed[0].q, closed[1].q, atol=1e-10)
-    move = fused.move(asked, Accuracy(1e-10, 1e-8, 1e-2), lambda _: None)
+    move = fused.move(asked, accuracy, lambda _: None)
     np.testing.assert_allclose(move.closed.q, closed[0].q, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["hexapod", "tetrahedral-123", "tetrahedral-23"])
 def test_both_engines_keep_the_whole_pose_of_faces_on_the_curve(name):
-    layout, kinematics, plain, fused = engines(name, vertices=6, track=("z",), shape="torsion", hard=True)
+    layout, kinematics, _, plain, fused = engines(name, vertices=6, track=("z",), shape="torsion", hard=True)
     X, Y, vertices, target, rows = make_step(layout, kinematics, np.random.default_rng(11))
     target = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0)
     torsion = np.array([0.05, -0.02])
@@ -150,19 +174,18 @@ def test_both_engines_keep_the_whole_pose_of_faces_on_the_curve(name):
         asked = QPInput(X, at, vertices, torsion, target, goal, 0.0, rows, motion)
         answers = [engine.solve(asked) for engine in (fused, plain)]
         assert_same_answer(*answers, 1e-9)
-    truss = layout.arm.truss
+    stations = layout.arm.stations
     moved = X + answers[0].nodes
     kinematics.evaluate(moved)
     curve = layout.shape.rows(
-        vertices + answers[0].vertices, torsion + answers[0].torsion, truss.face_frames[0]
+        vertices + answers[0].vertices, torsion + answers[0].torsion, stations.frames[0]
     )
-    gap = layout.arm.stations.centres(moved)[layout.tracked] - curve.position
-    turns = oracle.turn_rows(
+    gap = stations.centres(moved)[layout.tracked] - curve.position
+    turns = turn_rows(
         curve, kinematics.station_rotation[layout.tracked], kinematics.station_spin[layout.tracked], 3
     )
-    kinematics.evaluate(X)
-    before = layout.shape.rows(vertices, torsion, truss.face_frames[0])
-    first = layout.arm.stations.centres(X)[layout.tracked] - before.position
+    before = layout.shape.rows(vertices, torsion, stations.frames[0])
+    first = stations.centres(X)[layout.tracked] - before.position
     assert np.abs(gap).max() < 0.1 * np.abs(first).max() + 1e-3
     assert np.abs(turns.residual).max() < 1e-2
 
@@ -177,8 +200,7 @@ def moved_curve(shape, vertices, torsion, frame, step):
 def test_rows_of_a_curve_are_its_derivatives(shape, family):
     """By central differences over all coordinates: nodes that slide by arc length slide in the differences too."""
     rng = np.random.default_rng(3)
-    truss = TRUSSES["hexapod"]()
-    layout, _ = make_layout(truss, vertices=6)
+    layout, _ = make_layout(TRUSSES["hexapod"](), vertices=6)
     curve = shaped(layout, shape, family=family).shape
     curve = replace(curve, nodes=np.array([0.4, 1.0]))
     vertices = np.linspace(0.0, 1.0, 6)[:, None] * [0.1, 0.0, 2.0] + 0.1 * rng.normal(size=(6, 3))
@@ -220,7 +242,7 @@ def test_turn_rows_are_the_derivatives_of_their_residuals():
     def turns(step):
         kinematics.evaluate(X + step[: X.size].reshape(X.shape))
         moved = moved_curve(curve, vertices, torsion, np.eye(3), step[X.size :])
-        return oracle.turn_rows(moved, kinematics.station_rotation[faces], kinematics.station_spin[faces], 3)
+        return turn_rows(moved, kinematics.station_rotation[faces], kinematics.station_spin[faces], 3)
 
     step = rng.normal(size=X.size + vertices.size + 2)
     h = 1e-6
@@ -232,6 +254,43 @@ def test_turn_rows_are_the_derivatives_of_their_residuals():
     assert np.abs(here.residual).min() > 1e-4
 
 
+@pytest.mark.parametrize("base", [False, True])
+@pytest.mark.parametrize("name", ["hexapod", "longeron"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_both_engines_linearise_a_curve_as_arrays_do(shape, name, base):
+    """Both take their rows from one graph: that is held against NumPy, residuals at q and Jacobians at another pose."""
+    layout, kinematics, *_ = engines(name, shape=shape, goals=(3,))
+    X, Y, vertices, target, rows = make_step(layout, kinematics, np.random.default_rng(2), base=base)
+    goals = np.full(vertices.shape, np.nan)
+    goals[3] = vertices[3] + [0.0, 0.002, 0.0]
+    target, torsion = replace(target, vertex_goals=goals), np.linspace(0.1, -0.2, layout.torsion)
+    asked = QPInput(X, Y, vertices, torsion, target, target.path.at(0.0), 0.0, rows, motion=True)
+    numbers = Linearisation(layout, compiled=False).numbers(asked.linear(layout), rows)
+    stations, faces = layout.arm.stations, layout.tracked
+    frame = target.base.rotation @ stations.frames[0] if base else stations.frames[0]
+    curve = layout.shape.rows(vertices, torsion, frame)
+    kinematics.evaluate(Y)
+    spin = kinematics.station_spin[faces]
+    kinematics.evaluate(X)
+    turns = turn_rows(curve, kinematics.station_rotation[faces], spin, layout.turns)
+    wanted = {
+        "position": curve.position_rows,
+        "turn_face": turns.face,
+        "turn_curve": turns.curve,
+        "turn_rhs": turns.residual,
+        "spacing": curve.spacing_rows,
+        "spacing_rhs": curve.spacing,
+    }
+    for which, value in wanted.items():
+        np.testing.assert_allclose(getattr(numbers.curve, which), value, atol=1e-12, err_msg=which)
+    gap = stations.centres(X)[faces] - curve.position
+    np.testing.assert_allclose(numbers.position_rhs, gap, atol=1e-13)
+    weights = layout.weights
+    pull = weights.smoothness * layout.polygon_bending @ vertices
+    pull[3] -= weights.vertex_goal * np.array([0.0, 0.002, 0.0])
+    np.testing.assert_allclose(numbers.vertex_gradient, pull, atol=1e-12)
+
+
 def test_spacing_is_measured_from_the_base():
     curve = CurveShape(make_family("bezier", 4), np.array([0.5, 1.0]), spacing=np.array([0.4, 0.4]))
     vertices = np.linspace(0.0, 1.0, 4)[:, None] * [0.0, 0.0, 1.0]
@@ -239,11 +298,12 @@ def test_spacing_is_measured_from_the_base():
 
 
 def test_names_of_general_rows_are_unique_and_measured():
-    layout, kinematics, *_ = engines("hexapod", shape="everything", goals=(3,))
-    X, _, vertices, target, rows = make_step(layout, kinematics, np.random.default_rng(0))
-    asked = asked_at(X, vertices, target, 0.0, rows, torsion=np.array([0.1]))
-    numbers = Linearisation(layout, compiled=False).numbers(asked.linear(layout), rows)
-    qp = FullBuilder(layout).build(replace(numbers, clearance=ClearanceRows()))
+    layout, kinematics, _, plain, fused = engines("hexapod", shape="everything", goals=(3,))
+    X, _, vertices, target, _ = make_step(layout, kinematics, np.random.default_rng(0))
+    asked = QPInput(
+        X, X, vertices, np.array([0.1]), target, target.path.at(0.0), 0.0, ClearanceRows(), motion=True
+    )
+    qp = plain.qp(asked)
     names = [label.name for label in qp.rows]
     assert len(set(names)) == len(names) == qp.A.shape[0]
     assert {"tilt: face 1 z", "spacing: piece 0"} <= set(names)
@@ -251,3 +311,6 @@ def test_names_of_general_rows_are_unique_and_measured():
     assert len(set(columns)) == len(columns) == qp.A.shape[1]
     assert "torsion 1" in columns
     assert np.all(np.linalg.eigvalsh(qp.P.toarray()) > -1e-12)
+    same = fused.qp(asked)
+    assert (same.rows, same.columns) == (qp.rows, qp.columns)
+    np.testing.assert_allclose(same.A.toarray(), qp.A.toarray(), atol=1e-14)

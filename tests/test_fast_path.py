@@ -1,12 +1,15 @@
-"""The compiled step with its watch on near pairs, beside the plain one with neither: one step, to 1e-10."""
+"""The compiled step with its watch on near pairs, beside the general one with neither: one step, to 1e-10."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from vgtm_qp.step.build import build_arm
 
 import vgtm_qp as vq
+from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.step.engine import FusedEngine, PlainEngine
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.engine import FusedEngine, GeneralEngine
 
 SCENES = [
     ("five_bay_two_cubes", {}),
@@ -21,12 +24,15 @@ SCENES = [
 @pytest.mark.parametrize(("name", "changes"), SCENES)
 def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, changes):
     problem = vq.load_problem(name).replace(changes)
-    fast, plain = vq.Resolver(problem), vq.Resolver(build_arm(problem, compiled=False))
+    slow = build_arm(problem, compiled=False)
+    monitor = slow.monitor
+    options = {key: getattr(monitor, key) for key in ("safe", "influence", "self_collision")}
+    listed = Clearance(monitor.bodies, monitor.obstacles, watch=False, **options)
+    fast, plain = vq.Resolver(problem), vq.Resolver(replace(slow, monitor=listed))
     assert isinstance(fast.setup.engine, FusedEngine)
-    assert isinstance(plain.setup.engine, PlainEngine)
-    watched = fast.setup.monitor._watch is not None
-    assert watched == (fast.setup.monitor.self_collision or bool(problem.obstacle))
-    plain.setup.monitor._watch = None
+    assert isinstance(plain.setup.engine, GeneralEngine)
+    assert fast.setup.monitor.is_watched == (fast.setup.monitor.self_collision or bool(problem.obstacle))
+    assert not plain.setup.monitor.is_watched
     plan = make_plan(problem, *fast.tip())
     value, compared, furthest = plan.path.start, 0, 0.0
     for mark in plan.marks.tolist():

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import oracle
 import pytest
-from arms import TRUSSES, central_differences, lengths_of, random_pose
+from arms import TRUSSES, central_differences, make_layout, random_pose
 from scipy.spatial.transform import Rotation
 
-from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.arm import TrussArm
-from vgtm_qp.arm.truss.kinematics import TrussKinematics
-from vgtm_qp.arm.truss.lengths import LengthRows
-from vgtm_qp.errors import SolverError
 
 OFFSETS = (0.0, 0.12)
 
@@ -27,6 +26,11 @@ def truss(request):
 @pytest.fixture
 def kinematics(truss):
     return TrussArm(truss).kinematics(compiled=False)
+
+
+def lengths_of(truss, X):
+    ends = truss.member_ends(X)
+    return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
 
 
 def spin_by_differences(rotation_at, X, h=1e-6):
@@ -55,19 +59,18 @@ def test_at_home_everything_is_as_the_truss_says(truss, kinematics):
     np.testing.assert_allclose(kinematics.station_rotation, truss.face_frames, atol=1e-14)
     np.testing.assert_allclose(kinematics.tip_rotation, truss.tip_frame, atol=1e-14)
     arm = TrussArm(truss)
-    np.testing.assert_array_equal(arm.nodes(arm.home_configuration), truss.home)
-    np.testing.assert_allclose(arm.measured(arm.home_configuration), truss.home_lengths, atol=1e-14)
     np.testing.assert_allclose(
         arm.end_effector.position(truss.home), truss.tip_weights @ truss.home[truss.tip]
     )
+    np.testing.assert_allclose(arm.measured(truss.home), truss.home_lengths, atol=1e-14)
 
 
 def test_lengths_are_those_between_member_ends_and_gradients_their_derivatives(truss, kinematics):
     X = random_pose(truss, np.random.default_rng(1))
     kinematics.evaluate(X)
     np.testing.assert_allclose(kinematics.quantities, lengths_of(truss, X), atol=1e-14)
-    gradient = np.zeros((truss.member_count, truss.node_count, 3))
     np.testing.assert_allclose(TrussArm(truss).measured(X), lengths_of(truss, X), atol=1e-14)
+    gradient = np.zeros((truss.member_count, truss.node_count, 3))
     for slot in range(truss.member_nodes.shape[1]):
         np.add.at(
             gradient,
@@ -80,23 +83,23 @@ def test_lengths_are_those_between_member_ends_and_gradients_their_derivatives(t
 def test_length_jacobian_has_the_free_nodes_columns_and_the_base_the_rest(truss, kinematics):
     rng = np.random.default_rng(2)
     X = random_pose(truss, rng)
+    layout, _ = make_layout(truss)
     kinematics.evaluate(X)
-    scatter = truss.scatter
     wanted = central_differences(lambda Y: lengths_of(truss, Y), X)
     free = wanted[:, truss.free].reshape(truss.member_count, -1)
-    reused = np.zeros((truss.member_count, 3 * len(truss.free)))
+    reused = np.zeros((truss.member_count, layout.node_columns))
     for _ in range(2):
-        np.testing.assert_allclose(scatter.dense(kinematics.gradient, reused), free, atol=2e-9)
-    np.testing.assert_allclose(scatter.dense(kinematics.gradient), free, atol=2e-9)
-    np.testing.assert_allclose(scatter.sparse(kinematics.gradient).toarray(), free, atol=2e-9)
+        np.testing.assert_allclose(truss.scatter.dense(kinematics.gradient, reused), free, atol=2e-9)
+    np.testing.assert_allclose(truss.scatter.dense(kinematics.gradient), free, atol=2e-9)
+    np.testing.assert_allclose(truss.scatter.sparse(kinematics.gradient).toarray(), free, atol=2e-9)
     moved = np.where(truss.base[:, None], rng.normal(size=X.shape), 0.0)
-    rate = scatter.base_rate(kinematics.gradient, moved)
+    rate = truss.scatter.base_rate(kinematics.gradient, moved)
     np.testing.assert_allclose(rate, np.einsum("mnc,nc->m", wanted, moved), atol=2e-8)
     everywhere = rng.normal(size=X.shape)
     only_base = np.where(truss.base[:, None], everywhere, 0.0)
     np.testing.assert_allclose(
-        scatter.base_rate(kinematics.gradient, everywhere),
-        scatter.base_rate(kinematics.gradient, only_base),
+        truss.scatter.base_rate(kinematics.gradient, everywhere),
+        truss.scatter.base_rate(kinematics.gradient, only_base),
         atol=1e-12,
     )
 
@@ -138,26 +141,63 @@ def test_tip_spin_is_the_angular_velocity_rows_of_the_tip_frame(truss, kinematic
     np.testing.assert_allclose(scattered(kinematics.tip_spin, truss.tip, truss.node_count), wanted, atol=5e-9)
 
 
+def test_everything_is_as_the_equations_say_to_rounding(truss, kinematics):
+    """Differences are good to 1e-9; complex steps of the plain equations to the last digits."""
+    X = random_pose(truss, np.random.default_rng(8))
+    kinematics.evaluate(X)
+    np.testing.assert_allclose(kinematics.quantities, oracle.lengths(truss, X), atol=1e-14)
+    rows = np.stack(
+        [
+            scattered(row.reshape(-1), nodes, truss.node_count)
+            for row, nodes in zip(kinematics.gradient, truss.member_nodes, strict=True)
+        ]
+    )
+    wanted = oracle.length_jacobian(truss, X).reshape(truss.member_count, -1)
+    np.testing.assert_allclose(rows, wanted, atol=1e-13)
+    np.testing.assert_allclose(kinematics.station_rotation, oracle.face_rotations(truss, X), atol=1e-13)
+    np.testing.assert_allclose(kinematics.station_spin, oracle.face_spins(truss, X), atol=1e-13)
+    np.testing.assert_allclose(kinematics.tip_rotation, oracle.tip_rotation(truss, X), atol=1e-13)
+    np.testing.assert_allclose(kinematics.tip_spin, oracle.tip_spin(truss, X), atol=1e-13)
+    stations = TrussArm(truss).stations
+    np.testing.assert_allclose(stations.centres(X), oracle.face_centres(truss, X), atol=1e-14)
+
+
+def test_the_rows_of_the_motion_are_the_length_jacobian_beside_the_actuators(truss, kinematics):
+    arm, X = TrussArm(truss), random_pose(truss, np.random.default_rng(9), 0.02)
+    kinematics.evaluate(X)
+    rows, pattern = kinematics.motion(), arm.motion_pattern
+    found = np.zeros((truss.member_count, 3 * len(arm.free) + len(arm.actuators)))
+    np.add.at(found, (pattern.rows, pattern.columns), rows.values)
+    wanted, _ = oracle.motion(truss, X, X, X)
+    np.testing.assert_allclose(found, wanted, atol=1e-13)
+    assert [label.kind == "actuated member" for label in pattern.labels] == arm.actuated.tolist()
+    rhs = np.random.default_rng(10).normal(size=truss.member_count)
+    response, rest = arm.motion_rows(kinematics.gradient.copy(), rhs).response()
+    moved = np.vstack([response, np.eye(len(arm.actuators))])
+    np.testing.assert_allclose(wanted @ moved, 0.0, atol=1e-11)
+    np.testing.assert_allclose(wanted[:, : len(rest)] @ rest, rhs, atol=1e-10)
+
+
 def test_a_rigid_motion_keeps_lengths_and_turns_frames_with_it(truss, kinematics):
     rng = np.random.default_rng(5)
     X = random_pose(truss, rng)
     turn, shift = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3)
     kinematics.evaluate(X)
-    lengths, faces, tip = (
+    tip = TrussArm(truss).end_effector
+    lengths, faces, tip_rotation = (
         kinematics.quantities.copy(),
         kinematics.station_rotation.copy(),
         kinematics.tip_rotation.copy(),
     )
-    position_of, has_frame = (end := TrussArm(truss).end_effector).position, end.has_frame
-    gradient, position = kinematics.gradient.copy(), position_of(X)
+    gradient, position = kinematics.gradient.copy(), tip.position(X)
     moved = X @ turn.T + shift
     kinematics.evaluate(moved)
     np.testing.assert_allclose(kinematics.quantities, lengths, atol=1e-13)
     np.testing.assert_allclose(kinematics.station_rotation, turn @ faces, atol=1e-12)
     np.testing.assert_allclose(kinematics.gradient, gradient @ turn.T, atol=1e-12)
-    np.testing.assert_allclose(position_of(moved), turn @ position + shift, atol=1e-13)
-    if has_frame:
-        np.testing.assert_allclose(kinematics.tip_rotation, turn @ tip, atol=1e-12)
+    np.testing.assert_allclose(tip.position(moved), turn @ position + shift, atol=1e-13)
+    if tip.has_frame:
+        np.testing.assert_allclose(kinematics.tip_rotation, turn @ tip_rotation, atol=1e-12)
 
 
 def test_a_face_frame_prefers_no_node():
@@ -168,66 +208,20 @@ def test_a_face_frame_prefers_no_node():
     frames = []
     for shift in range(3):
         faces = np.roll(truss.faces, shift, axis=1)
-        kinematics = TrussKinematics(type(truss)(**{**vars_of(truss), "faces": faces}), compiled=False)
+        kinematics = TrussArm(replace(truss, faces=faces)).kinematics(compiled=False)
         kinematics.evaluate(X)
         frames.append(kinematics.station_rotation.copy())
     np.testing.assert_allclose(frames[1], frames[0], atol=1e-12)
     np.testing.assert_allclose(frames[2], frames[0], atol=1e-12)
 
 
-def vars_of(truss):
-    return {name: getattr(truss, name) for name in truss.__dataclass_fields__}
-
-
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_the_compiled_kernel_is_the_interpreted_one(offset):
     truss = TRUSSES["octahedral"](joint_offset=offset)
-    compiled, interpreted = TrussKinematics(truss), TrussKinematics(truss, compiled=False)
+    arm = TrussArm(truss)
+    compiled, interpreted = arm.kinematics(), arm.kinematics(compiled=False)
     X = random_pose(truss, np.random.default_rng(7))
     for kinematics in (compiled, interpreted):
         kinematics.evaluate(X)
     for name in ("quantities", "gradient", "station_rotation", "station_spin", "tip_rotation", "tip_spin"):
         np.testing.assert_allclose(getattr(compiled, name), getattr(interpreted, name), atol=1e-13)
-
-
-@pytest.mark.parametrize("long", [False, True])
-def test_quantities_alone_are_those_of_the_whole(long):
-    """Where there are many faces another function leaves them out; it writes to the same arrays."""
-    truss = modules.octahedral(24) if long else TRUSSES["octahedral"]()
-    rng = np.random.default_rng(8)
-    whole, part = (TrussKinematics(truss, compiled=False) for _ in range(2))
-    for _ in range(2):
-        X = random_pose(truss, rng)
-        whole.evaluate(X)
-        part.evaluate_quantities(X)
-        for name in ("quantities", "gradient", "tip_rotation", "tip_spin"):
-            np.testing.assert_array_equal(getattr(part, name), getattr(whole, name))
-
-
-def test_the_response_of_the_nodes_is_how_they_move_with_the_actuators(truss, kinematics):
-    """Eqs. (16)-(24), by Newton's iteration on the lengths a little ahead and behind."""
-    rng = np.random.default_rng(9)
-    X = random_pose(truss, rng, 0.03)
-    kinematics.evaluate(X)
-    rows = kinematics.motion()
-    response, rest = rows.response()
-    np.testing.assert_array_equal(rest, 0.0)
-    jacobian = central_differences(lambda Y: lengths_of(truss, Y), X)[:, truss.free]
-    unit = np.zeros((truss.member_count, len(truss.actuators)))
-    unit[truss.actuators, np.arange(len(truss.actuators))] = 1.0
-    np.testing.assert_allclose(jacobian.reshape(truss.member_count, -1) @ response, unit, atol=1e-6)
-    pattern = TrussArm(truss).motion_pattern
-    matrix = np.zeros((truss.member_count, 3 * len(truss.free) + len(truss.actuators)))
-    np.add.at(matrix, (pattern.rows, pattern.columns), rows.values)
-    both = np.concatenate([response, np.eye(len(truss.actuators))])
-    np.testing.assert_allclose(matrix @ both, 0.0, atol=1e-9)
-    assert len(pattern.labels) == truss.member_count
-
-
-def test_quantities_that_do_not_determine_the_nodes_have_no_response():
-    """Both where the Jacobian is dense and where it is sparse."""
-    for bays in (2, 24):
-        truss = modules.octahedral(bays)
-        gradient = np.zeros((truss.member_count, 2, 3))
-        with pytest.raises(SolverError, match="singular"):
-            LengthRows(truss, gradient, np.zeros(truss.member_count)).response()

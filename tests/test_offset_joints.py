@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from arms import TRUSSES, arm_problem, central_differences, member_ends, random_pose
-from steps import separation_of
+from arms import TRUSSES, arm_problem, central_differences, random_pose
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.errors import TrussError
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.separation import Distances, Separation
 from vgtm_qp.study.scenes import random_scene
 
 
@@ -21,8 +21,8 @@ def test_ends_and_their_jacobians_are_those_of_the_formulas(name):
     X = random_pose(truss, np.random.default_rng(1))
     kinematics = EndKinematics(truss, compiled=False)
     kinematics.evaluate(X)
-    np.testing.assert_allclose(kinematics.ends, member_ends(truss, X), atol=1e-14)
-    wanted = central_differences(lambda Y: member_ends(truss, Y), X)
+    np.testing.assert_allclose(kinematics.ends, truss.member_ends(X), atol=1e-14)
+    wanted = central_differences(truss.member_ends, X)
     found = np.zeros_like(wanted)
     for member, end, corner in np.ndindex(*kinematics.nodes.shape):
         node = kinematics.nodes[member, end, corner]
@@ -45,13 +45,18 @@ def beside_a_cube(joint_offset=0.1, **more):
     )
 
 
+def separation_of(setup):
+    distances = Distances(setup.safe, setup.self_safe, setup.influence, margin=0.0)
+    return Separation(setup.arm, setup.monitor, distances)
+
+
 def test_clearance_rows_are_the_derivatives_of_the_distances():
     """Distances by their definition at moved nodes, against the rows: the joints' rotation is part of both."""
     rng = np.random.default_rng(2)
     setup = build_arm(beside_a_cube())
     truss, monitor = setup.truss, setup.monitor
     X = truss.home + 0.02 * rng.normal(size=truss.home.shape)
-    rows = separation_of(setup, margin=0.0).rows(X, 0.0, 0.0, 1.0, {}, 0.0)
+    rows = separation_of(setup).rows(X, 0.0, 0.0, 1.0, {}, 0.0)
     assert rows.nodes.shape[1] == 12
     step = rng.normal(size=X.shape)
     h, names = 1e-6, [rows.name(k) for k in range(len(rows))]
@@ -87,7 +92,7 @@ def test_rows_of_different_widths_join():
 def test_a_proof_of_the_way_holds_at_every_instant_of_it():
     rng = np.random.default_rng(4)
     setup = build_arm(beside_a_cube())
-    separation, truss, monitor = separation_of(setup, margin=0.0), setup.truss, setup.monitor
+    separation, truss, monitor = separation_of(setup), setup.truss, setup.monitor
     certified = 0
     for _ in range(12):
         start, end = (truss.home + 0.05 * rng.normal(size=truss.home.shape) for _ in range(2))
@@ -101,7 +106,9 @@ def test_a_proof_of_the_way_holds_at_every_instant_of_it():
             certified += 1
             assert least >= setup.safe - 5e-5 - 1e-9
         else:
-            assert least < setup.safe + 1e-3 or not monitor.keeps(setup.arm.points(end), 0.0, 0.0, setup.self_safe)
+            assert least < setup.safe + 1e-3 or not monitor.keeps(
+                setup.arm.points(end), 0.0, 0.0, setup.self_safe
+            )
             assert np.all((report.fraction >= 0.0) & (report.fraction <= 1.0))
     assert certified > 0
 

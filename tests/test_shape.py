@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
+import oracle
 import pytest
-from arms import arm_problem
+from arms import arm_problem, central_differences
 from scipy.spatial.transform import Rotation
-from vgtm_qp.step.build import build_arm
 
 import vgtm_qp as vq
+from vgtm_qp.arm.arm import Pose
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.errors import CurveError, GoalError, ProblemError
-from vgtm_qp.qp.shape import turn_rows
+from vgtm_qp.qp.linearise import Linearisation
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import find_warnings
+from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.target import QPInput, Target
+from vgtm_qp.step.tracking import TrackingError
 
 STRIDE = np.array([0.05, 0.02, -0.02])
 POSE = ["position", "pointing", "orientation"]
@@ -41,13 +48,13 @@ def walk(resolver, count=6, stride=STRIDE, **goal):
 
 
 def gaps(resolver):
-    """Positions and turns between the tracked faces and the curve, by the curve's own class."""
-    layout, state = resolver.setup.layout, resolver.state
-    kinematics, faces = resolver.setup.kinematics, layout.tracked
-    rows = layout.shape.rows(state.control_vertices, state.torsion, layout.arm.truss.face_frames[0])
-    kinematics.evaluate(state.nodes)
-    turns = turn_rows(rows, kinematics.station_rotation[faces], kinematics.station_spin[faces], layout.turns)
-    return kinematics.centres(state.nodes)[faces] - rows.position, turns.residual
+    """Positions and turns between the tracked faces and the curve, by the curve's own class and the oracle."""
+    setup, state = resolver.setup, resolver.state
+    layout, truss = setup.layout, setup.truss
+    rows = layout.shape.rows(state.control_vertices, state.torsion, truss.face_frames[0])
+    rotations = oracle.face_rotations(truss, state.nodes)[layout.tracked]
+    turns = [oracle.turns(R, F, layout.turns) for R, F in zip(rotations, rows.frame, strict=True)]
+    return oracle.gaps(truss, state.nodes, layout.tracked, rows.position), np.array(turns)
 
 
 CURVES = [
@@ -73,6 +80,106 @@ def test_every_family_starts_on_the_faces_and_goes_with_them(curve, nodes):
         np.testing.assert_allclose(now.length(s) / now.length(1.0), [0.25, 0.5, 0.75, 1.0], atol=1e-9)
 
 
+GENERAL = [
+    ("octahedral", 4, {"nodes": "arc-length"}, {}),
+    ("hexapod", 3, {"torsion_vertices": 2}, {"weights": {"spacing": 0.4, "roll": 0.2}}),
+    ("longeron", 4, {"nodes": "arc-length", "torsion_vertices": 1}, {"weights": {"spacing": 1.0}}),
+    ("hexapod", 3, {"family": "b-spline"}, {"hard_tracking": True, "hard_coordinates": POSE}),
+    (
+        "hexapod",
+        3,
+        {"nodes": "arc-length"},
+        {"hard_tracking": True, "hard_coordinates": ["position", "pointing"]},
+    ),
+    ("octahedral", 4, {"control_vertex_goals": [{"index": 3, "position": [0.4, 0.1, 1.8]}]}, {}),
+]
+
+
+def built(module, bays, curve, method):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return build_arm(shaped_problem(module, bays, curve, method=method), compiled=False)
+
+
+def near_home(setup, rng):
+    """A curve and poses that are nearly those at home."""
+    vertices = setup.control_vertices + 0.05 * rng.normal(size=setup.control_vertices.shape)
+    poses = (setup.arm.home + 0.03 * rng.normal(size=setup.arm.home.shape) for _ in range(2))
+    return (*poses, vertices, setup.torsion + 0.1 * rng.normal(size=setup.torsion.shape))
+
+
+@pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL, ids=str)
+def test_the_rows_of_a_general_curve_are_those_of_the_equations(module, bays, curve, method):
+    rng = np.random.default_rng(0)
+    setup = built(module, bays, curve, method)
+    layout, count = setup.layout, len(setup.arm.actuators)
+    linearisation = Linearisation(layout, compiled=False)
+    rotations = np.stack([np.eye(3), Rotation.from_rotvec([0.4, -0.3, 0.8]).as_matrix()])
+    path = Path(np.array([0.0, 2.0]), rng.normal(size=(2, 3)), rotations)
+    for motion in (True, False):
+        q, at, vertices, torsion = near_home(setup, rng)
+        lower = rng.uniform(0.5, 1.0, count)
+        pose = Pose(0.05 * rng.normal(size=3), Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix())
+        target = Target(path, 0.5, 1.75, lower, lower + 0.1, 1.0, pose, setup.vertex_goals)
+        goal, none = target.goal(0.4), ClearanceRows()
+        asked = QPInput(q, at, vertices, torsion, target, goal, 0.4, none, motion).linear(layout)
+        np.testing.assert_allclose(asked.goal.velocity, 1.25 * np.diff(path.positions, axis=0)[0] / 2.0)
+        np.testing.assert_allclose(asked.goal.spin, 1.25 * np.array([0.4, -0.3, 0.8]) / 2.0, atol=1e-14)
+        np.testing.assert_allclose(asked.goal.position, path.at(1.0).position)
+        based = np.where(setup.arm.base[:, None], setup.arm.home @ pose.rotation.T + pose.position, q)
+        np.testing.assert_allclose(asked.base, based, atol=1e-15)
+        if layout.general is not None:
+            begins = oracle.face_rotations(setup.truss, based)[0]
+            for table, known in zip(asked.curve, layout.shape.rows(vertices, torsion, begins), strict=True):
+                np.testing.assert_allclose(table, known, atol=1e-10)
+        found = linearisation.numbers(asked, none)
+        oracle.check_numbers(found, oracle.numbers(layout, asked), layout)
+        assert (found.curve is None) == (layout.general is None)
+
+
+@pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL[:5], ids=str)
+def test_the_rows_of_a_curve_are_the_derivatives_of_its_nodes_frames_and_spacings(
+    module, bays, curve, method
+):
+    setup = built(module, bays, curve, method)
+    shape, arm = setup.layout.shape, setup.arm
+    _, _, vertices, torsion = near_home(setup, np.random.default_rng(1))
+    base = arm.stations.frames[0]
+    # The frame is carried along from the base face: it stays where the curve leaves that along its normal.
+    vertices[1] = vertices[0] + [0.0, 0.0, 0.4]
+    coordinates = np.concatenate([vertices.reshape(-1), torsion])
+
+    def at(z):
+        return shape.rows(z[: vertices.size].reshape(-1, 3), z[vertices.size :], base)
+
+    rows = at(coordinates)
+    for value, row in (("position", rows.position_rows), ("spacing", rows.spacing_rows)):
+        wanted = central_differences(lambda z, name=value: getattr(at(z), name), coordinates)
+        np.testing.assert_allclose(row, wanted, atol=1e-7)
+    change = central_differences(lambda z: at(z).frame, coordinates)
+    turning = np.cross(np.swapaxes(rows.spin_rows, 1, 2)[:, None], rows.frame.transpose(0, 2, 1)[:, :, None])
+    if not shape.tracks_roll:
+        change, turning = change[:, :, 2:], turning[:, 2:]
+    free = np.r_[5 : len(coordinates)]
+    np.testing.assert_allclose(turning.transpose(0, 3, 1, 2)[..., free], change[..., free], atol=1e-7)
+
+
+@pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL[3:5], ids=str)
+def test_tracking_errors_are_the_greatest_gap_or_turn(module, bays, curve, method):
+    setup = built(module, bays, curve, method)
+    layout, rng = setup.layout, np.random.default_rng(2)
+    X, _, vertices, torsion = near_home(setup, rng)
+    rows = layout.shape.rows(vertices, torsion, setup.arm.stations.frames[0])
+    for each in (layout, replace(layout, hard_turns=False), replace(layout, hard_tracking=True, shape=None)):
+        frames, points = rows.frame, rows.position
+        if each.general is None:
+            frames, points = None, each.curve_weights @ vertices
+        wanted = oracle.tracking_error(each, X, vertices, frames, points)
+        found = TrackingError(each, setup.kinematics).greatest(X, vertices, torsion, None)
+        assert found == pytest.approx(wanted, abs=1e-13)
+        assert found > 0.01
+
+
 HARD = [
     ("octahedral", 4, ["position"], {}),
     ("double-octahedral", 3, ["position"], {}),
@@ -95,9 +202,9 @@ def test_hard_tracking_holds_at_every_state(module, bays, coordinates, curve):
         warnings.simplefilter("ignore")
         resolver = Resolver(problem)
     layout = resolver.setup.layout
-    stride = layout.arm.truss.face_stride
-    assert list(np.diff(layout.tracked)) == [stride] * (len(layout.tracked) - 1)
-    assert layout.tracked[-1] == len(layout.arm.truss.faces) - 1
+    stations = resolver.setup.arm.stations
+    assert list(np.diff(layout.tracked)) == [stations.stride] * (len(layout.tracked) - 1)
+    assert layout.tracked[-1] == len(stations) - 1
     for _ in range(4):
         walk(resolver, 1)
         gap, turn = gaps(resolver)
@@ -149,11 +256,12 @@ def test_torsion_takes_up_the_roll_of_the_tip(module, bays):
     for _ in range(20):
         resolver.step(position=here)
     assert 0.15 < resolver.state.torsion[0] < 0.45
-    kinematics = resolver.setup.kinematics
-    kinematics.evaluate(resolver.state.nodes)
+    truss = resolver.setup.truss
     roll = [
         Rotation.from_matrix(frame @ home.T).as_rotvec()[2]
-        for frame, home in zip(kinematics.station_rotation, resolver.setup.truss.face_frames, strict=True)
+        for frame, home in zip(
+            oracle.face_rotations(truss, resolver.state.nodes), truss.face_frames, strict=True
+        )
     ]
     assert roll[-1] == pytest.approx(0.3, abs=1e-6)
     assert 0.05 < roll[len(roll) // 2] < 0.25
@@ -210,9 +318,9 @@ def test_goals_set_as_a_whole_and_wrong_ones_refused():
     resolver = Resolver(shaped_problem())
     resolver.control_vertex_goals = {2: [0.1, 0.0, 1.5], 3: [0.2, 0.0, 2.0]}
     assert sorted(resolver.control_vertex_goals) == [2, 3]
-    arm = resolver.setup
+    setup = resolver.setup
     resolver.control_vertex_goals = {2: [0.3, 0.0, 1.5], 3: [0.2, 0.0, 2.0]}
-    assert resolver.setup is arm
+    assert resolver.setup is setup
     np.testing.assert_array_equal(resolver.control_vertex_goals[2], [0.3, 0.0, 1.5])
     for index in (5, -1, "2"):
         with pytest.raises(GoalError, match="0 to 4"):
@@ -242,7 +350,7 @@ def test_more_control_vertices_leave_the_curve_where_it_is(family, torsion):
     def points():
         return Curve(resolver.setup.layout.family, resolver.state.control_vertices).position(s)
 
-    first_arm, before = resolver.setup, points()
+    first_setup, before = resolver.setup, points()
     assert resolver.set_control_vertices(7) < 1e-12
     assert resolver.state.control_vertices.shape == (7, 3)
     np.testing.assert_allclose(points(), before, atol=1e-12)
@@ -255,7 +363,7 @@ def test_more_control_vertices_leave_the_curve_where_it_is(family, torsion):
     assert resolver.setup.layout.vertices == 5
     walk(resolver, 2)
     if family == "bezier":
-        assert resolver.setup is first_arm
+        assert resolver.setup is first_setup
     with pytest.raises(CurveError, match="control vertices"):
         resolver.set_control_vertices(2)
     assert resolver.state.control_vertices.shape == (5, 3)

@@ -16,7 +16,7 @@ MEMBERS = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def scene(rng, *, round_numbers=False):
+def scene(rng, *, round_numbers=False, watch=True):
     """Nodes, and a monitor of their members among a box, a ball and a post at rest."""
 
     def vector(bound):
@@ -34,7 +34,7 @@ def scene(rng, *, round_numbers=False):
         cylinder("post", vector(2.0), 0.25, 1.0, turn()),
     ]
     nodes = np.array([vector(1.5) for _ in range(6)])
-    return nodes, Clearance(capsules(MEMBERS, 0.03), obstacles, safe=0.08, influence=0.5)
+    return nodes, Clearance(capsules(MEMBERS, 0.03), obstacles, safe=0.08, influence=0.5, watch=watch)
 
 
 def watch_of(monitor):
@@ -141,7 +141,7 @@ def test_a_way_from_a_state_that_was_left_is_bound_from_there():
 def test_scenes_that_are_watched():
     def watched(*obstacles, members=MEMBERS, **options):
         monitor = Clearance(capsules(members, 0.03), obstacles, safe=0.08, influence=0.5, **options)
-        return monitor._watch is not None
+        return monitor.is_watched
 
     ball = sphere("ball", [5.0, 0.0, 0.0], 0.2)
     wedge = mesh(
@@ -161,8 +161,7 @@ def test_contacts_are_the_same_whichever_way_they_are_found():
     for seed in range(6):
         rng = np.random.default_rng(seed)
         X, watched = scene(rng)
-        _, listed = scene(np.random.default_rng(seed))
-        listed._watch = None
+        _, listed = scene(np.random.default_rng(seed), watch=False)
         Y = X.copy()
         for state in walk(X, rng, 12, 0.05):
             Y[:] = state

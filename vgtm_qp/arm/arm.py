@@ -100,7 +100,7 @@ class Tip:
 
     def position(self, X: Array) -> Array:
         """Return (3,) the position of the end effector where the nodes are at `X` (N, 3), m."""
-        return np.asarray(self.weights @ X[self.nodes])
+        return np.asarray(self.weights @ X.take(self.nodes, axis=0))
 
 
 class MotionPattern(NamedTuple):

@@ -58,6 +58,8 @@ class Clearance:
         together.
     fcl_reach : float or None
         Pairs nearer than this are asked of FCL too; by default 2.5 `safe`.
+    watch : bool
+        Whether small scenes at rest are watched; the answers are the same.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Clearance:
         self_collision: bool = True,
         self_influence: float | None = None,
         fcl_reach: float | None = None,
+        watch: bool = True,
     ) -> None:
         self.bodies, self.obstacles = bodies, tuple(obstacles)
         self.safe, self.influence, self.self_collision = safe, influence, self_collision
@@ -84,7 +87,7 @@ class Clearance:
         self._none = no_contacts(self.names)
         self._kernels = ShapeKernels()
         shapes = {*self.pieces.shape.tolist()} | ({"segment"} if self_collision else set())
-        watched = self._can_be_watched()
+        watched = watch and self._can_be_watched()
         self._kernels.prepare(sorted(shapes), rests=watched)
         self._watch = Watch(bodies, self.pieces, self.names, self.fcl, self.every_pair) if watched else None
         self._candidates: Candidates | None = None
@@ -93,6 +96,11 @@ class Clearance:
             for k, o in enumerate(self.obstacles)
             if o.shape == "triangle" and o.solid
         }
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether pairs are followed from state to state."""
+        return self._watch is not None
 
     def _can_be_watched(self) -> bool:
         """Return whether nothing moves but the arm, there are no meshes, and there are not too many pairs."""

@@ -141,6 +141,8 @@ class Watch:
                 rows = (pairs.contacts[:, 0] < (self_limit if pairs.is_self else limit)).nonzero()[0]
                 if len(rows):
                     parts.append(self._contacts(pairs, rows, fcl_reach))
+        if not parts:
+            return self._none
         found = join(parts, self._none)
         return found if found.distance.min(initial=np.inf) > 0.0 else None
 

@@ -70,6 +70,10 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
         The problem cannot be set up, or is not a Problem; no step was made.
     """
     check_is_problem(problem)
+    if problem.arm is not None:
+        expected = "[truss]: a Resolver steps serial arms, but result files and certificates take trusses alone in this version"
+        mistake = problem.mistake(("arm",), expected)
+        raise ProblemError(str(problem.source or problem.name), [mistake])
     started = perf_counter()
     resolver = make_resolver(problem)
     mistakes = check_problem(problem, resolver.setup)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -198,7 +199,7 @@ UNBOUNDED = 1e30
 
 def norm(vector: Array) -> float:
     """Return the Euclidean norm; NaN where an entry is."""
-    return float(np.sqrt(vector @ vector))
+    return math.sqrt(vector @ vector)
 
 
 def beyond(values: Array, lower: Array, upper: Array) -> Array:

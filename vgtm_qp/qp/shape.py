@@ -132,30 +132,3 @@ class CurveShape:
             spacing = distance - self.spacing
             spacing_rows = np.einsum("kc,kcd->kd", steps / distance[:, None], change)
         return CurveRows(position, position_rows, frame, spin_rows, spacing, spacing_rows)
-
-
-class TurnRows(NamedTuple):
-    """Turns between faces and curve: (K, R) residuals, rows over the faces' nodes (K, R, 9) and the curve (K, R, D)."""
-
-    residual: Array
-    face: Array
-    curve: Array
-
-
-def turn_rows(rows: CurveRows, rotation: Array, spin: Array, turns: int) -> TurnRows:
-    """Return the turns between faces, `rotation` (K, 3, 3) and `spin` (K, 3, 9), and the curve's frames.
-
-    The first two are cosines between the face's x and y axes and the tangent, the third the sine of the roll. Each is
-    a function of the relative rotation alone: its rate is c . (face's less curve's angular velocity).
-    """
-    frame = rows.frame
-    x, y = rotation[:, :, 0], rotation[:, :, 1]
-    tangent = frame[:, :, 2]
-    residual = [np.einsum("kc,kc->k", axis, tangent) for axis in (x, y)]
-    combined = [np.cross(axis, tangent) for axis in (x, y)]
-    if turns == 3:
-        first, second = frame[:, :, 0], frame[:, :, 1]
-        residual.append(0.5 * np.einsum("kc,kc->k", x, second) - 0.5 * np.einsum("kc,kc->k", y, first))
-        combined.append(0.5 * (np.cross(x, second) - np.cross(y, first)))
-    c = np.stack(combined, axis=1)
-    return TurnRows(np.stack(residual, axis=1), c @ spin, -c @ rows.spin_rows)

@@ -6,13 +6,12 @@ configuration is the only thing taken from it here, and quantities and tip are f
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm, Kinematics, Pose
 from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.numbers import beyond, norm
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.task import TipTask
 
@@ -25,7 +24,7 @@ Rounding never decides then, and what is published of a state still holds.
 """
 
 _ROUNDING = 64.0 * float(np.finfo(float).eps)
-"""Of the furthest coordinate: quantities found in two ways differ by no more."""
+"""Of the configuration's norm: quantities found in two ways differ by no more."""
 
 
 class Acceptance:
@@ -72,24 +71,24 @@ class Acceptance:
         curve
             Whatever else has to be finite.
         """
-        arm, q, quantities = self._arm, closed.q, closed.quantities
-        # NaN passes no comparison with `<=`, and is in every sum.
-        size = _greatest(q)
-        if not size < np.inf or not all(math.isfinite(part.sum()) for part in curve):
+        arm, q = self._arm, closed.q
+        # NaN passes no comparison with `<=`, and is in every norm.
+        size = norm(q.reshape(-1))
+        if not size < np.inf or not all(norm(part.reshape(-1)) < np.inf for part in curve):
             return "the new state is not finite"
         rounding = _ROUNDING * size
         X, at = arm.nodes(q), arm.nodes(before if base is None else arm.based(q, base))
         # A base that rests is left alone by everything, so that it cannot drift either.
         spare = 0.0 if base is None else self._member + rounding
-        off = _greatest(X.take(self._base, axis=0) - at.take(self._base, axis=0))
+        off = norm((X.take(self._base, axis=0) - at.take(self._base, axis=0)).reshape(-1))
         if not off <= spare:
             return f"the new state has its base {off:.3g} m from where it is"
         values, enough = arm.measured(q), self._member + rounding
         self._least[self._actuators], self._greatest[self._actuators] = lower, upper
-        off = max(float((self._least - values).max()), float((values - self._greatest).max()))
+        off = norm(beyond(values, self._least, self._greatest))
         if not off <= enough:
             return f"the new state has a member {off:.3g} m from the lengths it may have"
-        off = _greatest(values - quantities)
+        off = norm(values - closed.quantities)
         if not off <= enough:
             return f"the new state has a member {off:.3g} m from the length that it is said to have"
         if goal is not None:
@@ -102,11 +101,6 @@ class Acceptance:
         """Return the greatest error of the tip, m or rad."""
         position, task = self._arm.end_effector.position(X), self._task
         if task.turns is None:
-            return _greatest((goal.position - position)[task.axes])
+            return norm((goal.position - position)[task.axes])
         self._kinematics.evaluate_quantities(q)
         return task.error(position, self._kinematics.tip_rotation, goal)
-
-
-def _greatest(values: Array) -> float:
-    """Return the greatest absolute value; NaN where there is one."""
-    return float(np.abs(values).max(initial=0.0))

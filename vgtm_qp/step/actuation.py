@@ -102,16 +102,10 @@ class Actuation:
         if not self._slows_down or not self.starts_at_once:
             return box
         value = self.values(state)
-        down, up = (
-            np.maximum(_APPROACH * room, np.minimum(room, _LEAST_APPROACH))
-            for room in (
-                np.maximum(value - self.stroke[:, 0], 0.0),
-                np.maximum(self.stroke[:, 1] - value, 0.0),
-            )
-        )
-        return np.maximum(box[0], np.minimum(value - down, box[1])), np.minimum(
-            box[1], np.maximum(value + up, box[0])
-        )
+        lower, upper = box
+        down, up = _approach(value - self.stroke[:, 0]), _approach(self.stroke[:, 1] - value)
+        slow_lower, slow_upper = np.minimum(value - down, upper), np.maximum(value + up, lower)
+        return np.maximum(lower, slow_lower), np.minimum(upper, slow_upper)
 
     def creeping(self, state: State, box: Box, dt: float) -> Box | None:
         """Return the part of a box after which every actuator may rest; None where there is none."""
@@ -138,3 +132,9 @@ class Actuation:
         low = binding(box[0], self.stroke[:, 0], value - way, *rest)
         high = binding(box[1], self.stroke[:, 1], value + way, *rest)
         return Limits(*box, self.names, [StopKind(kind) for kind in low], [StopKind(kind) for kind in high])
+
+
+def _approach(room: Array) -> Array:
+    """Return how far actuators that slow down move in one step with so much room (n_a,) before them."""
+    room = np.maximum(room, 0.0)
+    return np.asarray(np.maximum(_APPROACH * room, np.minimum(room, _LEAST_APPROACH)))

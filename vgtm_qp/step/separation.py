@@ -172,6 +172,15 @@ class Separation:
             self._arm.points(q), time, limits[0], self_reach=limits[1], fcl_reach=fcl_reach
         )
         rows = self._clearance_rows(q, contacts)
+        if len(contacts):
+            self._allow(rows, contacts, duration, short, gain)
+        return rows.joined(self._angle_rows(q, motion=motion)) if len(self._corners) else rows
+
+    def _allow(
+        self, rows: ClearanceRows, contacts: Contacts, duration: float, short: Shortfall, gain: float
+    ) -> None:
+        """Let pairs come nearer no faster than they may: overwrites ``rows.lower``; arguments as of :meth:`rows`."""
+        kept, motion = self.distances, duration > 0.0
         if motion:
             np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
         if short:
@@ -181,7 +190,6 @@ class Separation:
         if motion:
             # Slow down by the clearance left when the obstacles have moved: those that only come nearer need no haste.
             rows.lower = slowed(rows.lower, kept.approach, _LEAST_APPROACH)
-        return rows.joined(self._angle_rows(q, motion=motion)) if len(self._corners) else rows
 
     def _recover(self, rows: ClearanceRows, contacts: Contacts, short: Shortfall, gain: float) -> None:
         """Drive pairs that were too near apart by `gain`, m, as far as they are short: overwrites ``rows.lower``."""

@@ -21,6 +21,7 @@ class TrackingError:
     def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
         self._layout, self._kinematics = layout, kinematics
         count = len(layout.tracked)
+        self._nodes = layout.arm.stations.nodes[layout.tracked].reshape(-1)
         station = StationSymbols(layout)
         nodes, rotation, _, weights, *curve = station.inputs
         if layout.general is not None:
@@ -47,7 +48,7 @@ class TrackingError:
         """
         layout, inputs = self._layout, self._kernel.inputs
         tracked, arm, shape = layout.tracked, layout.arm, layout.general
-        inputs[0][:] = arm.nodes(q)[arm.stations.nodes[tracked]].reshape(-1)
+        inputs[0][:] = arm.nodes(q).take(self._nodes, axis=0).reshape(-1)
         if layout.hard_turns:
             self._kinematics.evaluate(q)
             inputs[1][:] = self._kinematics.station_rotation[tracked].transpose(0, 2, 1).reshape(-1)
@@ -59,5 +60,5 @@ class TrackingError:
             inputs[4][:] = rows.frame.reshape(-1)
         self._kernel()
         gap, turn = self._kernel.outputs
-        worst = float(np.abs(gap).max(initial=0.0))
-        return max(worst, float(np.abs(turn).max(initial=0.0))) if layout.hard_turns else worst
+        worst = float(np.abs(gap).max())
+        return max(worst, float(np.abs(turn).max())) if layout.hard_turns else worst

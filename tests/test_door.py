@@ -1,0 +1,332 @@
+"""Both kinds of arm behind the one door: what a step asks of an arm holds for trusses and for serial arms alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arms import arm_problem, make_layout
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import vgtm_qp as vq
+from vgtm_qp.arm.build import make_arm
+from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.geometry.shapes import sphere
+from vgtm_qp.problem import Problem
+from vgtm_qp.qp.linearise import Linearisation, StepInput, TipGoal
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.rows.clearance import clearance_rows
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.engine import FusedEngine, GeneralEngine
+
+H = 1e-6
+
+
+def chain(links=5, *, prismatic=False, **arm):
+    """Universal joints along a gentle arc, and a joint that slides at the end if asked for."""
+    joints = []
+    for k in range(links):
+        common = {"limits": [-1.2, 1.2], "rate": 0.5}
+        joints.append(
+            {
+                "name": f"p{k + 1}",
+                "axis": [1, 0, 0],
+                "position": [0, 0, 0.4 if k else 0.1],
+                "home": 0.16,
+                **common,
+            }
+        )
+        joints.append({"name": f"y{k + 1}", "axis": [0, 2, 0], "home": 0.1, **common})
+    if prismatic:
+        slide = {"name": "slide", "kind": "prismatic", "axis": [0, 0, 1], "position": [0, 0, 0.3]}
+        joints.append({**slide, "rotation_vector": [0.1, 0.2, 0.0], "limits": [-0.1, 0.3], "rate": 0.2})
+    return {"joint": joints, "tip": [0.0, 0.0, 0.4], "link_radius": 0.03, **arm}
+
+
+def problem_of(name, **more):
+    """A problem of an arm of that name that tracks a curve."""
+    common = {"curve": {"control_vertices": 4}, **more}
+    if name in SERIAL:
+        return serial_problem(SERIAL[name], **common)
+    truss = {"stroke": None, "bays": 3, **TRUSSES[name]}
+    return arm_problem((0.1, 0.1, 2.2), truss=truss, bays=3, **common)
+
+
+def serial_problem(arm, **more):
+    maneuver = {"steps": 10, "waypoint": [{"time": 10.0, "position": [0.1, -0.2, 1.8]}]}
+    return Problem.from_dict({"schema_version": 1, "arm": arm, "maneuver": maneuver, **more})
+
+
+TRUSSES = {
+    "octahedral": {"module": "octahedral"},
+    "hexapod": {"module": "hexapod"},
+    "offset joints": {"module": "octahedral", "joint_offset": 0.1},
+}
+SERIAL = {
+    "serial": chain(),
+    "serial with a slide": chain(4, prismatic=True),
+    "serial, locked": chain(5, locked=["p2", "y4"]),
+}
+
+
+@pytest.fixture(autouse=True)
+def _without_a_compiler(monkeypatch):
+    monkeypatch.setenv("VGTM_CC", "none")
+
+
+@pytest.fixture(params=[*TRUSSES, *SERIAL])
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def arm(name):
+    return make_arm(problem_of(name))
+
+
+def evaluated(arm, q):
+    kinematics = arm.kinematics(compiled=False)
+    kinematics.evaluate(q)
+    return kinematics
+
+
+def bent(arm, seed=0, size=0.05):
+    """A configuration off home to which the actuators have led."""
+    rng, q = np.random.default_rng(seed), arm.home_configuration
+    for _ in range(3):
+        strokes = size * rng.normal(size=len(arm.actuators)) / 3
+        q = arm.advanced(q, moved_by(arm, q, strokes), strokes)
+    return q
+
+
+def moved_by(arm, q, strokes):
+    """Displacements (N, 3) of the nodes that belong to strokes, to first order."""
+    response, _ = evaluated(arm, q).motion().response()
+    nodes = np.zeros_like(arm.home)
+    nodes[arm.free] = (response @ strokes).reshape(-1, 3)
+    return nodes
+
+
+def derivative(arm, q, strokes, function):
+    """The derivative of a function of the configuration along strokes, and the nodes' displacements per unit."""
+    nodes = moved_by(arm, q, strokes)
+    ahead, behind = (function(arm.advanced(q, s * H * nodes, s * H * strokes)) for s in (1.0, -1.0))
+    return (np.asarray(ahead) - np.asarray(behind)) / (2.0 * H), nodes
+
+
+@settings(deadline=None, max_examples=5)
+@given(seed=st.integers(0, 1000))
+def check_motion(arm, seed):
+    q, rng = bent(arm, seed), np.random.default_rng(seed)
+    strokes = rng.normal(size=len(arm.actuators))
+    change, nodes = derivative(arm, q, strokes, arm.nodes)
+    np.testing.assert_allclose(change, nodes, atol=1e-7)
+    change, _ = derivative(arm, q, strokes, arm.measured)
+    wanted = np.zeros(len(arm.quantity_names))
+    wanted[arm.actuators] = strokes
+    np.testing.assert_allclose(change, wanted, atol=1e-7)
+    np.testing.assert_allclose(evaluated(arm, q).quantities, arm.measured(q), atol=1e-12)
+
+
+def test_nodes_and_quantities_move_with_the_actuators(arm):
+    check_motion(arm)
+
+
+TRACKS = [("position",), ("position", "orientation"), ("x", "z", "pointing")]
+
+
+@pytest.mark.parametrize("track", TRACKS, ids="+".join)
+def test_rows_of_tip_and_stations_are_the_derivatives_of_their_residuals(arm, track):
+    layout, _ = make_layout(arm, track, vertices=5)
+    linearisation = Linearisation(layout, compiled=False)
+    q, rng = bent(arm, 3), np.random.default_rng(5)
+    kinematics, tip, count = evaluated(arm, q), arm.end_effector, len(arm.actuators)
+    goal = TipGoal(
+        tip.position(arm.nodes(q)), kinematics.tip_rotation.copy(), rng.normal(size=3), np.zeros(3)
+    )
+    vertices = np.linspace(0.0, 1.0, 5)[:, None] * goal.position + 0.05 * rng.normal(size=(5, 3))
+
+    def numbers(at):
+        box = arm.measured(at)[arm.actuators]
+        asked = StepInput(at, at, arm.nodes(at), vertices, box - 0.1, box + 0.1, True, 0.0, goal)
+        return linearisation.numbers(asked, ClearanceRows())
+
+    here = numbers(q)
+    response, rest = here.motion.response()
+    np.testing.assert_allclose(response, kinematics.motion().response()[0], atol=1e-10)
+    assert np.abs(rest).max() < 0.05
+    strokes = rng.normal(size=count)
+    gap, nodes = derivative(arm, q, strokes, lambda at: numbers(at).position_rhs)
+    centres = np.einsum("fk,fkc->fc", arm.stations.weights, nodes[arm.stations.nodes])[layout.tracked]
+    np.testing.assert_allclose(gap, centres, atol=1e-6)
+    turn, _ = derivative(arm, q, strokes, lambda at: numbers(at).tangent_rhs)
+    over_faces = nodes[arm.stations.nodes[layout.tracked]].reshape(len(layout.tracked), 9)
+    np.testing.assert_allclose(turn, np.einsum("ktn,kn->kt", here.tangent_face, over_faces), atol=1e-6)
+    error, _ = derivative(arm, q, strokes, lambda at: numbers(at).tip_rhs)
+    np.testing.assert_allclose(-error, here.tip_jacobian @ nodes[tip.nodes].reshape(-1), atol=1e-6)
+    if "position" in track:
+        np.testing.assert_allclose(here.tip_rate[:3], goal.velocity, atol=1e-12)
+
+
+def test_rows_of_clearances_are_the_derivatives_of_the_distances(arm):
+    q, rng = bent(arm, 7), np.random.default_rng(2)
+    points = arm.points(q)
+    beside = points[arm.bodies.points[len(arm.bodies) // 2]].mean(axis=0) + [0.31, 0.17, 0.05]
+    monitor = Clearance(arm.bodies, [sphere("ball", beside, 0.1)], safe=0.05, influence=1.0)
+    strokes = rng.normal(size=len(arm.actuators))
+
+    def contacts(at):
+        return monitor.near(arm.points(at), self_reach=0.6)
+
+    def ordered(found):
+        """Distances by pair, those of pairs with one row."""
+        pairs = [found.pair(k) for k in range(len(found))]
+        return {
+            pair: float(d) for pair, d in zip(pairs, found.distance, strict=True) if pairs.count(pair) == 1
+        }
+
+    here = contacts(q)
+    coefficients, _ = clearance_rows(here.distance, here.normal, here.weights, here.is_self, 0.05, 0.05)
+    over, coefficients = arm.over_nodes(q, here.points, coefficients)
+    nodes = moved_by(arm, q, strokes)
+    ahead, behind = (ordered(contacts(arm.advanced(q, s * H * nodes, s * H * strokes))) for s in (1.0, -1.0))
+    compared = 0
+    for k in range(len(here)):
+        pair = here.pair(k)
+        if pair in ahead and pair in behind and pair in ordered(here):
+            row = float(np.sum(coefficients[k] * nodes[over[k]]))
+            assert row == pytest.approx((ahead[pair] - behind[pair]) / (2.0 * H), abs=2e-5)
+            compared += 1
+    assert compared >= 3
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10_000), size=st.floats(0.001, 0.5))
+def check_deviation(arm, seed, size):
+    rng = np.random.default_rng(seed)
+    start = bent(arm, seed, 0.2)
+    end = start + size * rng.normal(size=start.shape) / len(start)
+    bound = arm.deviation(start, end)
+    first, last = arm.points(start), arm.points(end)
+    for s in np.linspace(0.0, 1.0, 9)[1:-1]:
+        off = arm.points(start + s * (end - start)) - (first + s * (last - first))
+        # Two points that both leave their chords come nearer by twice as much.
+        assert 2.0 * np.linalg.norm(off, axis=1).max() <= bound + 1e-12
+    assert np.abs(arm.nodes(end) - arm.nodes(start)).max() <= arm.travel(end - start) + 1e-12
+
+
+def test_points_leave_their_chords_by_no_more_than_is_said(arm):
+    if not arm.leaves_chords:
+        pytest.skip("its points move on straight lines")
+    check_deviation(arm)
+
+
+CLUTTER = {
+    "obstacle": [{"name": "ball", "shape": "sphere", "center": [0.8, 0.3, 1.2], "radius": 0.2}],
+    "clearance": {"safe": 0.05, "influence": 0.5},
+}
+
+
+def stride_of(arm):
+    return 0.004 * arm.height * np.array([1.0, 0.6, -0.5])
+
+
+@pytest.mark.parametrize("solver", ["daqp", "osqp"])
+def test_steps_reach_their_goals_keep_their_limits_and_stay_clear(name, solver):
+    problem = problem_of(name, method={"solver": solver}, **CLUTTER)
+    resolver = vq.Resolver(problem)
+    arm = resolver.setup.arm
+    moved = 0
+    for _ in range(8):
+        before = resolver.state
+        goal = resolver.tip()[0] + stride_of(arm)
+        step = resolver.step(position=goal)
+        if step.status is vq.StepStatus.BLOCKED:
+            assert step.reason or step.blocked_by
+            break
+        moved += 1
+        state = resolver.state
+        if step.progress == 1.0:
+            np.testing.assert_allclose(resolver.tip()[0], goal, atol=1e-6)
+        values = arm.measured(state.q)
+        np.testing.assert_allclose(values, state.quantities, atol=1e-9)
+        fixed = ~arm.actuated
+        np.testing.assert_allclose(values[fixed], arm.home_quantities[fixed], atol=1e-9)
+        stroke = arm.stroke[arm.actuators]
+        assert (values[arm.actuators] >= stroke[:, 0] - 1e-9).all()
+        assert (values[arm.actuators] <= stroke[:, 1] + 1e-9).all()
+        rates = np.abs(values - arm.measured(before.q))[arm.actuators] / (state.time - before.time)
+        assert (rates <= arm.rate[arm.actuators] + 1e-9).all()
+        for s in np.linspace(0.0, 1.0, 21):
+            least = resolver.setup.least_clearance(
+                before.q + s * (state.q - before.q), state.time, "obstacles"
+            )
+            assert least >= 0.05 - 1e-4
+    assert moved >= 3
+
+
+@pytest.mark.parametrize("hard", [False, True])
+def test_both_engines_take_the_same_steps(name, hard):
+    method = {"hard_tracking": hard}
+    if hard and "position" not in make_arm(problem_of(name)).stations.trackable:
+        pytest.skip("its stations cannot keep to a curve")
+    problem = problem_of(name, method=method, **CLUTTER)
+    fast, plain = vq.Resolver(build_arm(problem)), vq.Resolver(build_arm(problem, compiled=False))
+    assert isinstance(fast.setup.engine, FusedEngine)
+    assert isinstance(plain.setup.engine, GeneralEngine)
+    for _ in range(4):
+        plain.state = fast.state
+        goal = fast.tip()[0] + stride_of(fast.setup.arm)
+        first, second = fast.step(position=goal), plain.step(position=goal)
+        assert first.status is second.status
+        if first.status is vq.StepStatus.BLOCKED:
+            break
+        np.testing.assert_allclose(fast.state.q, plain.state.q, atol=1e-6 if hard else 1e-8)
+
+
+def test_a_moving_base_carries_every_arm(name):
+    where = {"time": 5.0, "position": [0.1, 0.0, 0.05], "rotation_vector": [0.0, 0.0, 0.1]}
+    table = {"base_motion": [where]}
+    if name in SERIAL:
+        problem = serial_problem({**SERIAL[name], **table}, curve={"control_vertices": 4})
+    else:
+        truss = {"stroke": None, "bays": 3, **TRUSSES[name], **table}
+        problem = arm_problem((0.1, 0.1, 2.2), truss=truss, bays=3, curve={"control_vertices": 4})
+    resolver = vq.Resolver(problem)
+    arm = resolver.setup.arm
+    for _ in range(3):
+        goal = resolver.tip()[0] + stride_of(arm)
+        step = resolver.step(position=goal, dt=1.0)
+        assert step.status is vq.StepStatus.REACHED, step.reason
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.1 * 3 / 5]).as_matrix()
+    wanted = arm.home[arm.base] @ turn.T + 0.6 * np.array([0.1, 0.0, 0.05])
+    np.testing.assert_allclose(resolver.state.nodes[arm.base], wanted, atol=1e-9)
+    np.testing.assert_allclose(resolver.tip()[0], goal, atol=1e-6)
+
+
+@pytest.mark.parametrize("serial", list(SERIAL))
+def test_a_chain_is_where_the_product_of_its_joints_says(serial):
+    arm, rng = make_arm(problem_of(serial)), np.random.default_rng(1)
+    joints = SERIAL[serial]["joint"]
+    for _ in range(5):
+        q = np.concatenate([rng.uniform(-1.0, 1.0, len(joints)), rng.normal(size=6)])
+        at, frame = q[-6:-3], Rotation.from_rotvec(q[-3:])
+        origins = [at]
+        for joint, value in zip(joints, q, strict=False):
+            axis = np.array(joint["axis"]) / np.linalg.norm(joint["axis"])
+            at = at + frame.apply(joint.get("position", [0.0, 0.0, 0.0]))
+            frame = frame * Rotation.from_rotvec(joint.get("rotation_vector", [0.0, 0.0, 0.0]))
+            origins.append(at)
+            if joint.get("kind") == "prismatic":
+                at = at + value * frame.apply(axis)
+            else:
+                frame = frame * Rotation.from_rotvec(value * axis)
+        origins.append(at + frame.apply([0.0, 0.0, 0.4]))
+        np.testing.assert_allclose(arm.nodes(q)[: len(origins)], origins, atol=1e-12)
+        np.testing.assert_allclose(arm.end_effector.position(arm.nodes(q)), origins[-1], atol=1e-12)
+
+
+def test_a_serial_arm_has_no_result_file_and_solve_says_so():
+    with pytest.raises(vq.VgtmError, match=r"arm: .*\[truss\]"):
+        vq.solve(problem_of("serial"))
