@@ -108,6 +108,9 @@ def _bundled() -> Iterator[Case]:
         "tetrahedral_truss_circle": {},
     }
     for path in sorted(PROBLEMS.glob("*.toml")):
+        if "[truss]" not in path.read_text(encoding="utf-8"):
+            # Other arms came after the change that this is the record of.
+            continue
         yield Case(f"bundled {path.stem}", steps.get(path.stem, {}), file=path.stem)
 
 

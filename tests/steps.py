@@ -5,16 +5,21 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import qpsolvers
+import scipy.sparse
 from arms import random_pose
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics, Pose
+from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.qp.linearise import Linearisation
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.target import Target
+from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.target import QPInput, Target
 
 Array = NDArray[np.float64]
 
@@ -92,3 +97,42 @@ def turn_rows(rows: CurveRows, rotation: Array, spin: Array, turns: int) -> Turn
         combined.append(0.5 * (np.cross(x, second) - np.cross(y, first)))
     c = np.stack(combined, axis=1)
     return TurnRows(np.stack(residual, axis=1), c @ spin, -c @ rows.spin_rows)
+
+
+def numbers_at(
+    setup: Setup,
+    q: Array,
+    vertices: Array,
+    target: Target,
+    progress: float,
+    rows: ClearanceRows,
+    *,
+    motion: bool,
+) -> StepNumbers:
+    """The numbers of the QP of an arm at a configuration, as the general engine has them."""
+    at = QPInput(q, q, vertices, setup.torsion, target, target.goal(progress), progress, rows, motion)
+    return Linearisation(setup.layout, compiled=False).numbers(at.linear(setup.layout), rows)
+
+
+def solved(qp: StepQP) -> tuple[Array, Array]:
+    """Answer and equalities' multipliers, by row, of a whole QP, by PIQP behind qpsolvers; zero for other rows."""
+    equal = qp.row_lower == qp.row_upper
+    sides = qp.A[~equal]
+    G = scipy.sparse.vstack([sides, -sides]).tocsc()
+    h = np.concatenate([qp.row_upper[~equal], -qp.row_lower[~equal]])
+    kept = np.isfinite(h)
+    problem = qpsolvers.Problem(
+        scipy.sparse.csc_matrix(qp.P),
+        qp.q,
+        scipy.sparse.csc_matrix(G.tocsr()[kept]),
+        h[kept],
+        scipy.sparse.csc_matrix(qp.A[equal]),
+        qp.row_lower[equal],
+        qp.column_lower,
+        qp.column_upper,
+    )
+    found = qpsolvers.solve_problem(problem, solver="piqp", eps_abs=1e-10, eps_rel=1e-10)
+    assert found.found
+    multipliers = np.zeros(len(equal))
+    multipliers[equal] = found.y
+    return np.asarray(found.x), multipliers

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.truss import Truss
-from vgtm_qp.maneuver.arm_record import arm_record
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.result.manifest import make_manifest
 
@@ -111,7 +111,7 @@ def maneuver_of(
     whole = {"maneuver": {"steps": count - 1, "waypoint": waypoints}, **problem_of(problem or {})}
     manifest = make_manifest(
         whole,
-        arm_record(truss),
+        TrussArm(truss).record(),
         status=status,
         reached=reached,
         method="qp",

@@ -12,10 +12,8 @@ from typing import Any, get_args
 import jsonschema
 import numpy as np
 import pytest
-from vgtm_qp.step.arm import build_arm
 
 import vgtm_qp as vq
-from vgtm_qp.arm.truss.joints import member_ends
 from vgtm_qp.bench import contestants, measure, report, scenes
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
@@ -25,6 +23,7 @@ from vgtm_qp.cli import bench as command
 from vgtm_qp.cli import main
 from vgtm_qp.ipopt.linearised import NonlinearStep
 from vgtm_qp.maneuver.plan import Plan, make_plan
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
 from vgtm_qp.step.path import Path as TipPath
 from vgtm_qp.step.state import State
@@ -213,7 +212,7 @@ def midway() -> tuple[vq.Problem, State, State, Plan]:
 
 def tip_and_lengths(problem: vq.Problem, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     truss = build_arm(problem.replace({"method.solver": "piqp"})).truss
-    ends = member_ends(truss, X)
+    ends = truss.member_ends(X)
     return truss.tip_weights @ X[truss.tip], np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
 
@@ -228,7 +227,7 @@ def test_the_bare_pseudoinverse_moves_the_tip_to_first_order(midway: tuple[Any, 
         assert step.step(plan.path, here, goal, 0.2)
         tip, lengths = tip_and_lengths(problem, step.reached)
         fixed = ~build_arm(problem).truss.actuated
-        errors.append(np.abs(lengths - before.lengths)[fixed].max())
+        errors.append(np.abs(lengths - before.quantities)[fixed].max())
         assert np.abs(tip - plan.path.at(goal).position).max() < 1e-12
     assert 3.0 < errors[0] / errors[1] < 5.0
 
@@ -242,21 +241,21 @@ def test_the_nonlinear_program_is_solved_within_its_limits_and_not_worse_than_th
     here, goal = float(plan.marks[24]), float(plan.marks[25])
     assert step.step(plan.path, here, goal, goal - here)
     tip, lengths = tip_and_lengths(problem, step.reached)
-    arm = build_arm(problem)
-    fixed, low, high = ~arm.truss.actuated, *arm.truss.stroke.T
-    assert np.abs(lengths - before.lengths)[fixed].max() < 1e-9
+    setup = build_arm(problem)
+    fixed, low, high = ~setup.truss.actuated, *setup.truss.stroke.T
+    assert np.abs(lengths - before.quantities)[fixed].max() < 1e-9
     assert np.abs(tip - plan.path.at(goal).position).max() < 1e-9
     assert np.all((lengths > low - 1e-9) & (lengths < high + 1e-9))
-    assert arm.monitor.least(step.reached, after.time, among="obstacles")[0] > arm.safe - 1e-3
+    assert setup.monitor.least(step.reached, after.time, among="obstacles")[0] > setup.safe - 1e-3
 
     def cost(X: np.ndarray, lengths: np.ndarray) -> float:
         weights = problem.method.weights
-        moved, change = X - before.nodes, (lengths - before.lengths)[~fixed]
-        home = (lengths - arm.home_lengths)[~fixed]
+        moved, change = X - before.nodes, (lengths - before.quantities)[~fixed]
+        home = (lengths - setup.arm.home_quantities)[~fixed]
         terms = (weights.node_rate, moved), (weights.actuator_rate, change), (weights.stroke_centring, home)
         return 0.5 * sum(weight * float(np.sum(values**2)) for weight, values in terms)
 
-    assert cost(step.reached, lengths) < cost(after.nodes, after.lengths) + 1e-6
+    assert cost(step.reached, lengths) < cost(after.nodes, after.quantities) + 1e-6
 
 
 @pytest.mark.parametrize("name", ["eq28-sparse", "curve", "osqp", "piqp"])
@@ -296,10 +295,10 @@ def test_scenes_have_names_of_their_own_and_the_bays_that_were_asked_for() -> No
 )
 def test_scenes_begin_clear_and_can_be_reached(kind: Any, bays: int) -> None:
     scene = scenes.make_scenes((kind,), (bays,), ("elastic",))[0]
-    arm = build_arm(scene.problem.replace({"method.solver": "piqp"}))
+    setup = build_arm(scene.problem.replace({"method.solver": "piqp"}))
     assert scene.bays == bays
-    assert check_problem(scene.problem, arm) == []
-    assert find_warnings(scene.problem, arm) == []
+    assert check_problem(scene.problem, setup) == []
+    assert find_warnings(scene.problem, setup) == []
     assert len(scene.problem.obstacle) == {"cubes": 2, "clutter": 100, "tetrahedral": 0}[kind]
 
 
@@ -310,8 +309,8 @@ def test_every_step_of_a_longer_arm_has_a_cube_within_influence() -> None:
     for mark in plan.marks:
         assert resolver.follow(plan.path, value, float(mark)).status == "reached"
         value = float(mark)
-        least = resolver.arm.monitor.least(resolver.state.nodes, resolver.state.time, among="obstacles")[0]
-        assert resolver.arm.safe - 1e-9 <= least < resolver.arm.influence
+        least = resolver.setup.monitor.least(resolver.state.nodes, resolver.state.time, among="obstacles")[0]
+        assert resolver.setup.safe - 1e-9 <= least < resolver.setup.influence
         assert np.linalg.norm(resolver.tip()[0] - tip) > 0.02
         tip = resolver.tip()[0]
 

@@ -98,7 +98,8 @@ def drive(resolver, goals, dt=0.2):
             continue
         assert keeps_accelerations(truss, here, step.state)
         assert (
-            resolver.setup.monitor.least(step.state.nodes, step.state.time, among="obstacles")[0] >= 0.05 - 1e-9
+            resolver.setup.monitor.least(step.state.nodes, step.state.time, among="obstacles")[0]
+            >= 0.05 - 1e-9
         )
         before = here
     return steps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from steps import solved
 
 import vgtm_qp as vq
 
@@ -20,13 +21,14 @@ def resolver():
 def test_its_solution_is_the_first_motion_of_the_step(resolver):
     qp = resolver.build(position=GOAL)
     limits = (qp.row_lower.copy(), qp.row_upper.copy())
-    from vgtm_qp.qp.solvers import _Piqp
 
-    z, *_ = _Piqp()(qp, same_structure=False)
-    solution = resolver.step(position=GOAL)._solution
+    z, _ = solved(qp)
+    arm, solution = resolver.setup.arm, resolver.step(position=GOAL)._solution
     moved = {label.name: value for label, value in zip(qp.columns, z, strict=True)}
     np.testing.assert_allclose(
-        [moved[f"stroke: {name}"] for name in resolver._actuator_names], solution.actuators, atol=1e-7
+        [moved[f"stroke: {arm.quantity_names[k]}"] for k in arm.actuators],
+        solution.actuators,
+        atol=1e-7,
     )
     assert moved["progress along the path"] == pytest.approx(solution.progress, abs=1e-7)
     np.testing.assert_array_equal(limits, (qp.row_lower, qp.row_upper))

@@ -22,8 +22,8 @@ def free() -> vq.Problem:
 
 def found(problem: vq.Problem, changes: dict[str, Any]) -> tuple[list[vq.Mistake], list[vq.Mistake]]:
     changed = problem.replace(changes)
-    arm = build_arm(changed)
-    return check_problem(changed, arm), find_warnings(changed, arm)
+    setup = build_arm(changed)
+    return check_problem(changed, setup), find_warnings(changed, setup)
 
 
 def ball(center: list[float], radius: float, **more: Any) -> dict[str, Any]:
@@ -37,14 +37,14 @@ def waypoint(*position: float) -> dict[str, Any]:
 @pytest.mark.parametrize("name", sorted(vq.bundled_problems()))
 def test_no_bundled_problem_is_refused_or_doubted(name: str):
     problem = vq.load_problem(name)
-    arm = build_arm(problem)
-    assert check_problem(problem, arm) == []
-    assert find_warnings(problem, arm) == []
+    setup = build_arm(problem)
+    assert check_problem(problem, setup) == []
+    assert find_warnings(problem, setup) == []
 
 
 def test_an_obstacle_in_the_arm_is_refused_and_one_beside_it_doubted(free: vq.Problem):
-    arm = build_arm(free)
-    ends = arm.truss.home[arm.truss.members[arm.truss.member("L3-1")]]
+    setup = build_arm(free)
+    ends = setup.truss.home[setup.truss.members[setup.truss.member("L3-1")]]
     out = ends.mean(axis=0) * [1.0, 1.0, 0.0]
     out /= np.linalg.norm(out)
     reach = 0.2 + 0.03

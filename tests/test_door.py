@@ -172,7 +172,7 @@ def test_rows_of_tip_and_stations_are_the_derivatives_of_their_residuals(arm, tr
 def test_rows_of_clearances_are_the_derivatives_of_the_distances(arm):
     q, rng = bent(arm, 7), np.random.default_rng(2)
     points = arm.points(q)
-    beside = points[arm.bodies.points[len(arm.bodies) // 2]].mean(axis=0) + [0.31, 0.17, 0.05]
+    beside = points[arm.bodies.points[len(arm.bodies) // 2]].mean(axis=0) + np.array([0.31, 0.17, 0.05])
     monitor = Clearance(arm.bodies, [sphere("ball", beside, 0.1)], safe=0.05, influence=1.0)
     strokes = rng.normal(size=len(arm.actuators))
 
@@ -327,6 +327,103 @@ def test_a_chain_is_where_the_product_of_its_joints_says(serial):
         np.testing.assert_allclose(arm.end_effector.position(arm.nodes(q)), origins[-1], atol=1e-12)
 
 
-def test_a_serial_arm_has_no_result_file_and_solve_says_so():
-    with pytest.raises(vq.VgtmError, match=r"arm: .*\[truss\]"):
-        vq.solve(problem_of("serial"))
+def solved(name, **more):
+    """The whole maneuver of an arm, past a ball."""
+    problem = problem_of(name, **{**CLUTTER, **more})
+    tip = vq.Resolver(problem).tip()[0]
+    waypoint = [{"time": 10.0, "position": (tip + 8.0 * stride_of(make_arm(problem))).tolist()}]
+    return vq.solve(problem.replace({"maneuver.waypoint": waypoint, "maneuver.steps": 12}))
+
+
+@pytest.fixture(scope="module")
+def maneuvers():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VGTM_CC", "none")
+        return {name: solved(name) for name in [*TRUSSES, *SERIAL]}
+
+
+def test_certificates_hold_and_files_come_back_as_they_went(name, maneuvers, tmp_path):
+    maneuver = maneuvers[name]
+    assert maneuver.certificate.ok, maneuver.certificate.failures()
+    assert maneuver.steps >= 3
+    assert np.isfinite(maneuver.certificate.clearance_between.value)
+    again = vq.load_result(maneuver.save(tmp_path / "result.npz"))
+    assert set(again.arrays) == set(maneuver.arrays)
+    for key, array in maneuver.arrays.items():
+        np.testing.assert_array_equal(again.arrays[key], array)
+    serial = {"joints", "joint_names", "body_names"}
+    trusses = {"nodes", "members", "member_names", "member_actuated", "member_lengths"}
+    assert (set(again.arrays) & (serial | trusses)) == (serial if name in SERIAL else trusses)
+    assert vq.verify(again).ok
+    np.testing.assert_allclose(
+        again.nodes[0], make_arm(problem_of(name)).home[: again.nodes.shape[1]], atol=1e-12
+    )
+
+
+def test_a_certificate_finds_states_that_were_bent(name, maneuvers):
+    from dataclasses import replace
+
+    maneuver, rng = maneuvers[name], np.random.default_rng(3)
+    key = "joints" if name in SERIAL else "nodes"
+    bent_states = getattr(maneuver, key).copy()
+    bent_states[-1] += 1e-4 * rng.normal(size=bent_states[-1].shape)
+    found = vq.verify(replace(maneuver, **{key: bent_states}))
+    assert not found.ok
+    assert any(line.startswith(("tip error", "array error")) for line in found.failures())
+
+
+def test_a_ball_that_was_moved_into_the_way_is_found_between_states(name, maneuvers):
+    from dataclasses import replace
+
+    maneuver = maneuvers[name]
+    middle = maneuver.nodes[-2:, maneuver.members[-1]].mean(axis=(0, 1))
+    ball = {**maneuver.manifest["problem"]["obstacle"][0], "center": middle.tolist(), "radius": 0.01}
+    problem = {**maneuver.manifest["problem"], "obstacle": [ball]}
+    found = vq.verify(replace(maneuver, manifest={**maneuver.manifest, "problem": problem}))
+    assert found.clearance_between.value < 0.0
+    assert any(line.startswith("clearance between") for line in found.failures())
+
+
+def test_the_record_of_a_serial_arm_is_held_against_its_problem(maneuvers):
+    from dataclasses import replace
+
+    maneuver = maneuvers["serial"]
+    arm = maneuver.manifest["arm"]
+    for key, value in {
+        "rate": [1.0, *arm["rate"][1:]],
+        "axis": [[0.0, 1.0, 0.0], *arm["axis"][1:]],
+        "radius": [0.01] * len(arm["radius"]),
+        "tip": [0.0, 0.0, 0.5],
+    }.items():
+        changed = {**maneuver.manifest, "arm": {**arm, key: value}}
+        found = vq.verify(replace(maneuver, manifest=changed))
+        assert any("arm record" in line for line in found.contradictions), key
+    with pytest.raises(vq.VgtmError, match="joints"):
+        replace(maneuver, joints=maneuver.joints[:, 1:], joint_names=maneuver.joint_names[1:])
+
+
+def test_a_recorded_chain_bends_no_more_than_its_bound():
+    from vgtm_qp.result.chain import RecordedChain
+
+    for serial in SERIAL:
+        arm = make_arm(problem_of(serial))
+        chain, rng = RecordedChain(arm.record()), np.random.default_rng(4)
+        for size in (0.01, 0.3):
+            before = arm.home_configuration + 0.2 * rng.normal(size=arm.home_configuration.shape)
+            after = before + size * rng.normal(size=before.shape)
+            # What the base slides is straight.
+            ways = before + np.linspace(0.0, 1.0, 201)[:, None] * (after - before)
+            points = chain.placed(ways)[0]
+            np.testing.assert_allclose(points[0], arm.nodes(before)[: points.shape[1]], atol=1e-12)
+            second = np.linalg.norm(np.diff(points, n=2, axis=0), axis=2) * 200.0**2
+            assert second.max() <= chain.bend(before, after) * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("form", ["png", "html", "csv", "mcap", "ros"])
+def test_a_serial_maneuver_is_drawn_and_exported(form, maneuvers, tmp_path):
+    from vgtm_qp.export.formats import export_maneuver
+
+    path = export_maneuver(
+        maneuvers["serial"], tmp_path / f"snake.{'yaml' if form == 'ros' else form}", to=form
+    )
+    assert path.stat().st_size > 500

@@ -256,10 +256,11 @@ def test_fcl_and_its_guard_agree_with_the_closed_form(seed, round_numbers, shape
     # What has two rows is for the closed form to say; and a normal is one however near the two are.
     assert len(by_fcl) == len(exact)
     np.testing.assert_allclose(np.linalg.norm(by_fcl.normal, axis=1), 1.0, atol=1e-6)
-    reached = X[0] + by_fcl.t[:, None] * (X[1] - X[0])
+    reached = X[0] + by_fcl.weights[:, 1:2] * (X[1] - X[0])
     apart = by_fcl.distance > 0.0 if shape != "sphere" else np.ones(len(by_fcl), dtype=bool)
-    way = by_fcl.point + by_fcl.distance[:, None] * by_fcl.normal
-    np.testing.assert_allclose(way[apart], reached[apart], atol=1e-7)
+    for point in (reached - by_fcl.distance[:, None] * by_fcl.normal)[apart]:
+        on_surface = Clearance(capsules([(0, 1)], 0.0), [obstacle], safe=4.0, influence=5.0)
+        assert abs(on_surface.least(np.stack([point, point + 1e-9]))[0]) < 1e-7
 
 
 def test_parallel_member_has_two_rows():

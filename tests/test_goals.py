@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.linearise import Linearisation, Target
+from steps import numbers_at, solved
 
 import vgtm_qp as vq
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.full import FullBuilder
-from vgtm_qp.qp.solvers import _Piqp, make_solver
+from vgtm_qp.qp.solvers import make_solver
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
+from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.target import Target
 
 
 def three_bays(**changes):
@@ -33,25 +35,25 @@ def one_qp(penalty):
     arm = build_arm(problem)
     X = arm.truss.home
     arm.kinematics.evaluate(X)
-    start = arm.kinematics.tip_position(X)
+    start = arm.arm.end_effector.position(X)
     rotation = arm.kinematics.tip_rotation.copy()
     path = Path(
         np.array([0.0, 1.0]),
         np.stack([start, start + np.array([0.1, 0.02, -0.03])]),
         np.stack([rotation] * 2),
     )
-    lengths = arm.home_lengths[arm.truss.actuators]
+    lengths = arm.truss.home_lengths[arm.truss.actuators]
     target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
-    linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
-    rows = vq.Resolver(arm)._separation.rows(X, 0.0, 1.0, 0.1, {}, 0.0)
-    numbers = linearisation.numbers(X, arm.control_vertices, target, 0.0, rows, motion=True)
+    separation = Separation(arm.arm, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence))
+    rows = separation.rows(X, 0.0, 1.0, 0.1, {}, 0.0)
+    numbers = numbers_at(arm, X, arm.control_vertices, target, 0.0, rows, motion=True)
     return arm, CondensedSolver(arm.layout), numbers
 
 
 def test_an_elastic_goal_holds_exactly_while_its_penalty_exceeds_the_multiplier():
     arm, _, numbers = one_qp(1.0)
     qp = FullBuilder(replace(arm.layout, elastic_tip=False)).build(numbers)
-    _, multipliers, _, _ = _Piqp()(qp, same_structure=False)
+    _, multipliers = solved(qp)
     tip = [k for k, label in enumerate(qp.rows) if label.kind == "end effector"]
     greatest = float(np.abs(multipliers[tip]).max())
     assert greatest > 1e-3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from test_recovery import problem
+from recovery_problems import problem
 
 import vgtm_qp as vq
 
@@ -40,9 +40,9 @@ def test_an_arm_gives_way_to_a_ring_that_moves(ring):
     assert maneuver.status == "solved"
     assert maneuver.certificate.ok, maneuver.certificate.failures()
     careless = vq.solve(problem(**{"maneuver.waypoint": [{"time": 4.0, "position": [0.3, 0.1, 2.3]}]}))
-    arm = vq.Resolver(inside(ring, **changes)).arm
+    setup = vq.Resolver(inside(ring, **changes)).setup
     nearest = min(
-        arm.monitor.least(nodes, time, among="obstacles")[0]
+        setup.monitor.least(nodes, time, among="obstacles")[0]
         for nodes, time in zip(careless.nodes, careless.time, strict=True)
     )
     assert nearest < 0.08 - 1e-3

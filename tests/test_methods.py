@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from method_problems import MODULES, free_problem, run
-from vgtm_qp.step.arm import build_arm
-from vgtm_qp.step.linearise import Linearisation, Target
+from steps import numbers_at
 
 import vgtm_qp as vq
 from vgtm_qp.errors import CurveError
@@ -19,6 +18,8 @@ from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.target import Target
 
 ALL_TERMS = ["node_rate", "actuator_rate", "stroke_centring"]
 
@@ -41,20 +42,18 @@ def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra:
         }
     )
     resolver = ConventionalResolver(problem)
-    arm = resolver.arm
+    setup = resolver.setup
     plan = make_plan(problem, *resolver.tip())
     resolver.state = there.state
     start, end = float(plan.marks[11]), float(plan.marks[12])
     step = resolver.follow(plan.path, start, end)
     assert step.progress == 1.0, step.reason
 
-    unlimited = np.full(len(arm.truss.actuators), 1e9)
+    unlimited = np.full(len(setup.truss.actuators), 1e9)
     target = Target(plan.path, start, end, -unlimited, unlimited, there.state.time + 0.05)
-    linearisation = Linearisation(arm.layout, arm.kinematics, arm.task, arm.home_lengths)
-    numbers = linearisation.numbers(
-        np.array(there.state.nodes), np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True
-    )
-    answer = CondensedSolver(arm.layout).solve(numbers)
+    q = np.array(there.state.nodes)
+    numbers = numbers_at(setup, q, np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True)
+    answer = CondensedSolver(setup.layout).solve(numbers)
     assert answer.progress == pytest.approx(1.0, abs=1e-12)
     moved = resolver.state.nodes - there.state.nodes
     assert np.abs(moved).max() > 1e-3
@@ -87,9 +86,9 @@ def test_corrected_methods_keep_lengths_and_tip(module: str, name: str) -> None:
     problem = free_problem(module, name=name, tracking="recursive", correct=True)
     resolver = make_resolver(problem)
     run(resolver, problem)
-    arm = resolver.arm
-    fixed = arm.layout.fixed
-    np.testing.assert_allclose(resolver.state.lengths[fixed], arm.home_lengths[fixed], atol=1e-10)
+    setup = resolver.setup
+    fixed = setup.truss.fixed
+    np.testing.assert_allclose(resolver.state.quantities[fixed], setup.arm.home_quantities[fixed], atol=1e-10)
     np.testing.assert_allclose(resolver.tip()[0], problem.maneuver.waypoint[0].position, atol=1e-9)
 
 
@@ -100,8 +99,8 @@ def test_faithful_methods_drift_by_the_square_of_the_step(name: str) -> None:
         problem = free_problem("octahedral", steps=steps, name=name, tracking="recursive")
         resolver = make_resolver(problem)
         run(resolver, problem)
-        fixed = resolver.arm.layout.fixed
-        drift.append(np.abs(resolver.state.lengths - resolver.arm.home_lengths)[fixed].max())
+        fixed = resolver.setup.truss.fixed
+        drift.append(np.abs(resolver.state.quantities - resolver.setup.arm.home_quantities)[fixed].max())
     # Squares of half the displacement, twice as often.
     assert drift[0] / drift[1] == pytest.approx(2.0, abs=0.2)
 
@@ -125,7 +124,7 @@ def test_damping_and_truncation_change_the_answer_and_the_rank() -> None:
         return found
 
     plain = resolver()
-    rows = len(plain.arm.layout.fixed) + 3
+    rows = len(plain.setup.truss.fixed) + 3
     assert plain.rank == rows
     damped = resolver(variant="damped", damping=0.3)
     assert np.abs(damped.state.nodes - plain.state.nodes).max() > 1e-4
@@ -195,7 +194,7 @@ def test_torsion_coordinates_let_the_curve_steer_roll() -> None:
     rolled = Problem.from_dict(data)
     resolver = make_resolver(rolled)
     run(resolver, rolled)
-    np.testing.assert_allclose(resolver.arm.truss.tip_frame, np.eye(3))
+    np.testing.assert_allclose(resolver.setup.truss.tip_frame, np.eye(3))
     expected = make_plan(rolled, *resolver.tip()).path.at(1e9).rotation
     np.testing.assert_allclose(resolver.tip()[1], expected, atol=1e-9)
 
@@ -239,15 +238,15 @@ def test_the_curve_qp_keeps_every_limit_up_to_where_it_stops(tracking: str) -> N
 
 def test_the_potential_gradient_is_that_of_the_potential() -> None:
     problem = vq.load_problem("five_bay_two_cubes").replace({"method.solver": "piqp"})
-    arm = build_arm(problem)
+    setup = build_arm(problem)
     random = np.random.default_rng(0)
-    X = arm.truss.home + random.normal(scale=0.02, size=arm.truss.home.shape)
+    X = setup.truss.home + random.normal(scale=0.02, size=setup.truss.home.shape)
 
     def potential(nodes: np.ndarray) -> float:
-        distance = arm.monitor.near(nodes, 0.0, arm.influence).distance
-        return float(np.sum(0.5 * (arm.influence / distance - 1.0) ** 2))
+        distance = setup.monitor.near(nodes, 0.0, setup.influence).distance
+        return float(np.sum(0.5 * (setup.influence / distance - 1.0) ** 2))
 
-    gradient, blocks = potential_field(arm, X, 0.0)
+    gradient, blocks = potential_field(setup, X, 0.0)
     assert np.abs(gradient).max() > 0.1
     assert np.linalg.eigvalsh(blocks).min() > -1e-9
     for _ in range(5):
@@ -291,10 +290,60 @@ def test_a_moving_base_enters_the_conventional_solution() -> None:
     moving = Problem.from_dict(data)
     resolver = make_resolver(moving)
     states = run(resolver, moving)
-    base = resolver.arm.truss.base
+    base = resolver.setup.truss.base
     np.testing.assert_allclose(states[-1][base] - states[0][base], [[0.095, 0.0, 0.0475]] * 3, atol=2e-3)
-    fixed = resolver.arm.layout.fixed
-    np.testing.assert_allclose(resolver.state.lengths[fixed], resolver.arm.home_lengths[fixed], atol=1e-10)
+    fixed = resolver.setup.truss.fixed
+    np.testing.assert_allclose(
+        resolver.state.quantities[fixed], resolver.setup.arm.home_quantities[fixed], atol=1e-10
+    )
     data["method"] |= {"name": "curve-pseudoinverse", "tracking": "recursive"}
     with pytest.raises(CurveError, match="moving base"):
         make_resolver(Problem.from_dict(data))
+
+
+METHODS = {
+    "qp": {},
+    "qp, parallel": {"tracking": "parallel"},
+    "pseudoinverse": {"name": "pseudoinverse"},
+    "curve-pseudoinverse": {"name": "curve-pseudoinverse"},
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_tells_what_it_cannot_do_through_one_interface(method: str) -> None:
+    problem = free_problem("octahedral", **METHODS[method])
+    mover = make_resolver(problem)
+    plan = make_plan(problem, *mover.tip())
+    home = mover.state
+    step = mover.follow(plan.path, 0.0, float(plan.marks[0]))
+    assert step.state is mover.state
+    assert set(mover.phases.values()) != {0.0}
+    assert mover.brake(plan.path, 0.0, 1.0) is None
+    assert mover.too_near(home) == {}
+    stop = mover.explain(plan.path, 0.0, float(plan.marks[0]), last=step, state=home)
+    assert stop.names
+    assert mover.state is step.state
+    is_coupled = method == "qp"
+    assert mover.draws_vertices == is_coupled
+    assert (mover.again(problem) is not None) == is_coupled
+    assert (mover.solver is None) == ("pseudoinverse" in method)
+    assert (mover.rank is not None) == (method == "pseudoinverse")
+    mover.control_vertex_goals = {}
+    assert mover.control_vertex_goals == {}
+    if not is_coupled:
+        with pytest.raises(vq.GoalError, match="draws no control vertices"):
+            mover.control_vertex_goals = {3: [0.0, 0.0, 1.0]}
+
+
+@pytest.mark.parametrize("correct", [False, True])
+def test_a_curve_that_is_put_into_a_state_moves_on_from_there(correct: bool) -> None:
+    problem = free_problem("octahedral", name="curve-pseudoinverse", correct=correct)
+    resolver, other = CurveFirstResolver(problem), CurveFirstResolver(problem)
+    plan = make_plan(problem, *resolver.tip())
+    first, second = (float(mark) for mark in plan.marks[:2])
+    resolver.follow(plan.path, 0.0, first)
+    other.state = resolver.state
+    found = [mover.follow(plan.path, first, second).state.nodes for mover in (resolver, other)]
+    np.testing.assert_allclose(*found, atol=1e-12)
+    resolver.state = resolver.setup.home_state()
+    np.testing.assert_allclose(resolver.curve.position(1.0), resolver.tip()[0], atol=1e-12)

@@ -29,6 +29,8 @@ TABLES = {
     "[[truss.member]]": ("Member",),
     "[[truss.locked]]": ("Lock",),
     "[[truss.base_motion]]": ("BasePose",),
+    "[arm]": ("ArmTable",),
+    "[[arm.joint]]": ("Joint",),
     "[curve]": ("BezierCurve", "BSplineCurve", "BetaSplineCurve"),
     "[[curve.control_vertex_goals]]": ("VertexGoal",),
     "[end_effector]": ("EndEffector",),

@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 from arms import mast
+from recovery_problems import BASE, box, problem
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss import modules
@@ -15,35 +16,17 @@ from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver
 
-BASE = {
-    "name": "three bays",
-    "truss": {"module": "octahedral", "bays": 3, "stroke": [0.6, 1.5]},
-    "curve": {"control_vertices": 4},
-    "maneuver": {"steps": 20, "waypoint": [{"time": 4.0, "position": [0.0, 0.5, 2.2]}]},
-    "clearance": {"safe": 0.08, "influence": 0.5},
-    "method": {"retries": False},
-}
-
-
-def problem(**changes):
-    found = vq.Problem.from_dict(BASE)
-    return found.replace(changes) if changes else found
-
-
-def box(name, center, size, **more):
-    return {"name": name, "shape": "box", "center": center, "size": size, **more}
-
 
 def beside(gap):
     """Return a box whose face is `gap` from the surface of the home arm, on the side of x."""
-    home = Resolver(problem()).arm.truss
+    home = Resolver(problem()).setup.truss
     reach = float(home.home[:, 0].max()) + float(home.radius.max())
     return box("crate", [reach + gap + 0.25, 0.0, 1.2], [0.5, 2.0, 2.0])
 
 
 def test_an_arm_too_near_at_the_start_recovers_monotonically_and_says_so():
     resolver = Resolver(problem(obstacle=[beside(0.03)]))
-    arm = resolver.setup
+    setup = resolver.setup
     before = resolver._separation.shortfall(resolver.state.nodes, 0.0)
     assert before
     assert any("crate" in name for name in resolver._separation.names(before))
@@ -54,11 +37,11 @@ def test_an_arm_too_near_at_the_start_recovers_monotonically_and_says_so():
         after = resolver.state.shortfall
         for pair, distance in after.items():
             assert distance >= short[pair] - 1e-9
-        now = arm.monitor.least(resolver.state.nodes, resolver.state.time, among="obstacles")[0]
-        assert now >= min(least, arm.safe) - 1e-9
+        now = setup.monitor.least(resolver.state.nodes, resolver.state.time, among="obstacles")[0]
+        assert now >= min(least, setup.safe) - 1e-9
         short, least = dict(after), now
     assert not short
-    assert least >= arm.safe - 1e-9
+    assert least >= setup.safe - 1e-9
 
 
 def test_a_maneuver_from_a_start_that_is_too_near_is_solved_and_its_verification_tells():
@@ -133,7 +116,7 @@ def test_an_arm_gives_way_to_an_obstacle_that_comes_nearer(speed):
     assert maneuver.status == "solved"
     careless = vq.solve(problem()).nodes[-1]
     assert (
-        Resolver(problem(obstacle=[crate])).arm.monitor.least(careless, 4.0, among="obstacles")[0]
+        Resolver(problem(obstacle=[crate])).setup.monitor.least(careless, 4.0, among="obstacles")[0]
         < 0.08 - 1e-3
     )
 
@@ -141,7 +124,7 @@ def test_an_arm_gives_way_to_an_obstacle_that_comes_nearer(speed):
 def test_members_keep_a_quarter_of_safe_from_one_another_unless_told_otherwise():
     assert problem().clearance.between_members == pytest.approx(0.02)
     assert problem(**{"clearance.self_safe": 0.05}).clearance.between_members == 0.05
-    assert Resolver(problem()).arm.self_safe == pytest.approx(0.02)
+    assert Resolver(problem()).setup.self_safe == pytest.approx(0.02)
     for name in ("five_bay_two_cubes", "five_bay_two_cubes_pointing"):
         maneuver = vq.solve(vq.load_problem(name))
         assert (maneuver.status, len(maneuver.time)) == ("solved", 51)
@@ -173,11 +156,11 @@ def test_ends_of_offset_joints_stay_within_the_bound_of_their_chords(truss):
         start = truss.home + random.uniform(-0.05, 0.05, truss.home.shape)
         end = start + random.uniform(-size, size, start.shape)
         bound = chord_deviation(truss, start, end)
-        first, last = member_ends(truss, start), member_ends(truss, end)
+        first, last = truss.member_ends(start), truss.member_ends(end)
         worst = max(
             float(
                 np.linalg.norm(
-                    member_ends(truss, start + s * (end - start)) - (first + s * (last - first)), axis=2
+                    truss.member_ends(start + s * (end - start)) - (first + s * (last - first)), axis=2
                 ).max()
             )
             for s in np.linspace(0.05, 0.95, 19)

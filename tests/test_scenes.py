@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from vgtm_qp.step.arm import build_arm
 
 from vgtm_qp.ipopt.separating import IpoptStepper
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.study import Study
 from vgtm_qp.study.robustness import run, tasks, text
 from vgtm_qp.study.scenes import MODULES, SAFE, random_scene
@@ -12,21 +12,21 @@ from vgtm_qp.study.scenes import MODULES, SAFE, random_scene
 def test_a_scene_is_the_same_each_time_and_its_goal_is_a_clear_shape_of_its_arm(number):
     scene, again = random_scene(0, number), random_scene(0, number)
     assert scene.problem == again.problem
-    arm = build_arm(scene.problem, compiled=False)
-    states = [arm.truss.home]
+    setup = build_arm(scene.problem, compiled=False)
+    states = [setup.truss.home]
     if scene.reachable:
         states.append(scene.shape)
         goal = scene.problem.maneuver.waypoint[0]
-        arm.kinematics.evaluate(scene.shape)
-        np.testing.assert_allclose(arm.kinematics.tip_position(scene.shape), goal.position, atol=1e-12)
-        actuated = arm.truss.actuated
-        lengths = arm.kinematics.lengths
-        np.testing.assert_allclose(lengths[~actuated], arm.home_lengths[~actuated], atol=1e-9)
-        assert np.all(lengths >= arm.truss.stroke[:, 0] - 1e-9)
-        assert np.all(lengths <= arm.truss.stroke[:, 1] + 1e-9)
+        setup.kinematics.evaluate(scene.shape)
+        np.testing.assert_allclose(setup.arm.end_effector.position(scene.shape), goal.position, atol=1e-12)
+        actuated = setup.truss.actuated
+        lengths = setup.kinematics.quantities
+        np.testing.assert_allclose(lengths[~actuated], setup.arm.home_quantities[~actuated], atol=1e-9)
+        assert np.all(lengths >= setup.truss.stroke[:, 0] - 1e-9)
+        assert np.all(lengths <= setup.truss.stroke[:, 1] + 1e-9)
     for X in states:
-        assert arm.least_clearance(X, 0.0, "members") >= arm.self_safe
-        assert arm.least_clearance(X, 0.0, "obstacles") >= SAFE
+        assert setup.least_clearance(X, 0.0, "members") >= setup.self_safe
+        assert setup.least_clearance(X, 0.0, "obstacles") >= SAFE
 
 
 def test_scenes_of_a_seed_are_of_every_module_with_and_without_direction_and_reach():
@@ -44,17 +44,17 @@ def test_the_yardstick_keeps_lengths_strokes_and_clearance_and_meets_the_path():
 
     scene = random_scene(0, 19, steps=6)
     resolver = Resolver(build_arm(scene.problem, compiled=False))
-    arm = resolver.arm
+    setup = resolver.setup
     plan = make_plan(scene.problem, *resolver.tip())
-    states, values = IpoptStepper(arm).run(plan)
+    states, values = IpoptStepper(setup).run(plan)
     assert values[-1] == pytest.approx(plan.path.end)
     for state, value in zip(states[1:], values[1:], strict=True):
-        fixed = ~arm.truss.actuated
-        assert np.abs(state.lengths - arm.home_lengths)[fixed].max(initial=0.0) < 1e-9
-        assert np.all(state.lengths <= arm.truss.stroke[:, 1] + 1e-8)
-        assert arm.least_clearance(state.nodes, state.time, "obstacles") >= arm.safe - 1e-8
-        assert arm.least_clearance(state.nodes, state.time, "members") >= arm.self_safe - 1e-8
-        tip = arm.kinematics.tip_position(state.nodes)
+        fixed = ~setup.truss.actuated
+        assert np.abs(state.quantities - setup.arm.home_quantities)[fixed].max(initial=0.0) < 1e-9
+        assert np.all(state.quantities <= setup.truss.stroke[:, 1] + 1e-8)
+        assert setup.least_clearance(state.nodes, state.time, "obstacles") >= setup.safe - 1e-8
+        assert setup.least_clearance(state.nodes, state.time, "members") >= setup.self_safe - 1e-8
+        tip = setup.arm.end_effector.position(state.nodes)
         np.testing.assert_allclose(tip, plan.path.at(value).position, atol=1e-7)
 
 

@@ -118,10 +118,10 @@ def test_a_clutter_scene_is_the_same_each_time_and_clear_at_home() -> None:
     assert first.to_dict() == again.to_dict()
     assert clutter.scene(7, 6, 4, 40).to_dict()["obstacle"] != first.to_dict()["obstacle"]
     assert len(first.obstacle) == 6
-    from vgtm_qp.step.arm import build_arm
+    from vgtm_qp.step.build import build_arm
 
-    arm = build_arm(first.replace({"method.solver": "piqp"}))
-    assert arm.monitor.least(arm.truss.home, 0.0, among="obstacles")[0] > 0.08
+    setup = build_arm(first.replace({"method.solver": "piqp"}))
+    assert setup.monitor.least(setup.truss.home, 0.0, among="obstacles")[0] > 0.08
 
 
 def test_wilson_intervals_and_exponents() -> None:

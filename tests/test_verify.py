@@ -291,8 +291,6 @@ def offset_joints() -> Joints:
 
 
 def test_offset_joints_place_ends_and_bound_their_paths() -> None:
-    from vgtm_qp.arm.truss.joints import member_ends
-
     truss = tripod(offset_joints())
     rng = np.random.default_rng(2)
     maneuver = maneuver_of(truss.home[None], np.zeros(1), truss, status="blocked", reached=0.0)
@@ -302,7 +300,7 @@ def test_offset_joints_place_ends_and_bound_their_paths() -> None:
     for _ in range(10):
         before = truss.home + 0.05 * rng.normal(size=(5, 3))
         after = before + 0.1 * rng.normal(size=(5, 3))
-        np.testing.assert_allclose(arm.ends(before), member_ends(truss, before), atol=1e-14)
+        np.testing.assert_allclose(arm.ends(before), truss.member_ends(before), atol=1e-14)
         motion = MemberMotion(arm, np.array([0.0, 1.0]), np.stack([before, after]))
         bend = motion.bend(0, member)
         h = 1e-3

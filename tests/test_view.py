@@ -66,10 +66,10 @@ def test_the_tip_goes_where_it_is_wanted_and_rests_there(session: Session):
 def test_no_state_on_the_way_breaks_a_limit(session: Session):
     drawing, safe = session.drawing, session.problem.clearance.safe
     session.want_tip(session.tip + np.array([1.4, 0.4, -0.9]))
-    before = session.state.lengths
+    before = session.state.quantities
     for _ in range(80):
         session.advance(PERIOD)
-        lengths = session.state.lengths
+        lengths = session.state.quantities
         low, high = drawing.arm.stroke.T
         assert np.all(lengths >= low - 1e-9)
         assert np.all(lengths <= high + 1e-9)
@@ -142,7 +142,7 @@ def test_a_changed_setting_keeps_the_state_and_a_wrong_one_changes_nothing(sessi
 def test_a_state_of_a_result_can_be_taken_up(session: Session, maneuver: vq.Maneuver):
     session.put_at(maneuver.time[12], maneuver.nodes[12], maneuver.control_vertices[12])
     assert np.allclose(session.tip, maneuver.tip_position[12], atol=1e-12)
-    assert np.allclose(session.state.lengths, maneuver.member_lengths[12], atol=1e-12)
+    assert np.allclose(session.state.quantities, maneuver.member_lengths[12], atol=1e-12)
     session.want_tip(session.tip + np.array([0.0, 0.05, 0.0]))
     assert any(session.advance(PERIOD) for _ in range(20))
 

@@ -295,11 +295,6 @@ class Compiling:
         return self._function
 
 
-def compile_function(function: ca.Function) -> ca.Function:
-    """Return `function` compiled to machine code, or as it is where no compiler works."""
-    return Compiling(function).result()
-
-
 _waiting: weakref.WeakSet[Kernel] = weakref.WeakSet()
 
 

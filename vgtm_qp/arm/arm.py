@@ -427,6 +427,14 @@ class Arm(Protocol):
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
         ...
 
+    def record(self) -> dict[str, Any]:
+        """Return what verification needs to know of the arm, as JSON data."""
+        ...
+
+    def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
+        """Return the arrays of a result file that tell of configurations (T, ...) and quantities (T, M)."""
+        ...
+
     def motion_rows(self, *values: Array) -> MotionRows:
         """Return the rows from the values of ``ArmSymbols.motion``."""
         ...

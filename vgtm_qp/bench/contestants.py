@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.ipopt.linearised import NonlinearStep
-from vgtm_qp.methods import AnyResolver, make_resolver
-from vgtm_qp.methods.curve_first import CurveFirstResolver
+from vgtm_qp.methods import make_resolver
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
+from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import StepStatus
 from vgtm_qp.step.state import State
@@ -81,14 +81,12 @@ class ResolverStep:
     """A resolver of the package, with `changes` to the problem's method."""
 
     def __init__(self, problem: Problem, changes: dict[str, Any]) -> None:
-        self.resolver: AnyResolver = make_resolver(problem.replace(changes))
+        self.resolver: Mover = make_resolver(problem.replace(changes))
 
     def place(self, state: State) -> None:
         """See :class:`Contestant`."""
         resolver = self.resolver
-        if isinstance(resolver, CurveFirstResolver):
-            resolver.curve = replace(resolver.curve, control_vertices=state.control_vertices)
-        elif state.control_vertices.shape != resolver.state.control_vertices.shape:
+        if state.control_vertices.shape != resolver.state.control_vertices.shape:
             state = replace(state, control_vertices=resolver.state.control_vertices)
         resolver.state = state
 

@@ -15,9 +15,10 @@ def check(
     *,
     json: Json = False,
 ) -> int:
-    """Check a problem file: its keys and values, its truss, its obstacles and goals at the home pose."""
+    """Check a problem file: its keys and values, its arm, its obstacles and goals at the home pose."""
     from dataclasses import asdict
 
+    from vgtm_qp.arm.serial.arm import describe_chain
     from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.errors import ProblemError
     from vgtm_qp.problem import load_problem
@@ -31,7 +32,8 @@ def check(
     if mistakes:
         raise ProblemError(source, mistakes)
     warnings = find_warnings(loaded, setup)
-    truss = describe(setup.truss)
+    kind = "arm" if loaded.truss is None else "truss"
+    arm = describe_chain(setup.arm) if loaded.truss is None else describe(setup.truss)
     for warning in warnings:
         note(f"{source}: warning: {warning}")
     if json:
@@ -41,9 +43,9 @@ def check(
                 "name": loaded.name,
                 "valid": True,
                 "warnings": [asdict(warning) for warning in warnings],
-                "truss": asdict(truss),
+                kind: asdict(arm),
             }
         )
     else:
-        say(f"{source}: no mistakes\n{truss}")
+        say(f"{source}: no mistakes\n{arm}")
     return ExitCode.SOLVED

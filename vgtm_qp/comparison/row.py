@@ -64,7 +64,7 @@ def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
     drifting = member <= MEMBER_TOLERANCE and tip <= TIP_TOLERANCE
     others = [line for line in failures if not line.startswith(("member error", "tip error"))]
     between = certificate.clearance_between.value
-    travel = np.abs(np.diff(maneuver.member_lengths[:, maneuver.member_actuated], axis=0)).sum()
+    travel = np.abs(np.diff(maneuver.actuator_values, axis=0)).sum()
     reason = ", ".join(maneuver.blocked_by[:3]) if not done else next(iter([*others, *failures]), "")
     return Row(
         problem=problem,

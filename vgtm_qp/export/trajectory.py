@@ -48,13 +48,13 @@ uint32 nanosec"""
 
 
 def actuator_names(maneuver: Result) -> list[str]:
-    """Return the names of the actuated members, the joints of every trajectory here."""
-    return [str(name) for name in maneuver.member_names[maneuver.member_actuated]]
+    """Return the names of the actuated members or joints: the joints of every trajectory here."""
+    return list(maneuver.actuator_names)
 
 
 def actuator_lengths(maneuver: Result) -> Array:
-    """Return (T, n_a) lengths of the actuated members, m."""
-    return maneuver.member_lengths[:, maneuver.member_actuated]
+    """Return (T, n_a) lengths of the actuated members, m, or values of the actuated joints, rad or m."""
+    return maneuver.actuator_values
 
 
 def step_rates(maneuver: Result) -> Array:
@@ -77,13 +77,17 @@ def through_rates(maneuver: Result) -> Array:
 
 
 def write_csv(maneuver: Result, path: str | Path) -> Path:
-    """Write one row a state: time, length of each actuator, rate of each over the step before; m and s."""
-    names = actuator_names(maneuver)
+    """Write one row a state: time, value of each actuator, rate of each over the step before; m or rad, and s."""
+    names = list(zip(actuator_names(maneuver), maneuver.actuator_units, strict=True))
     path = Path(path)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(
-            ["time [s]", *(f"{name} [m]" for name in names), *(f"d {name}/dt [m/s]" for name in names)]
+            [
+                "time [s]",
+                *(f"{name} [{unit}]" for name, unit in names),
+                *(f"d {name}/dt [{unit}/s]" for name, unit in names),
+            ]
         )
         for row in np.column_stack([maneuver.time, actuator_lengths(maneuver), step_rates(maneuver)]):
             writer.writerow([repr(float(value)) for value in row])
@@ -91,7 +95,7 @@ def write_csv(maneuver: Result, path: str | Path) -> Path:
 
 
 def joint_trajectory(maneuver: Result) -> dict[str, Any]:
-    """Return the fields of a ``trajectory_msgs/msg/JointTrajectory``; its positions are lengths, m."""
+    """Return the fields of a ``trajectory_msgs/msg/JointTrajectory``; positions are lengths or joint values."""
     start = float(maneuver.time[0])
     points = [
         {

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
+from vgtm_qp.ipopt.symbols import OPTIONS, program_symbols
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.clearance import clearance_rows
@@ -41,7 +41,7 @@ class NonlinearStep:
         self._setup = setup = arm_without_curve(problem)
         truss, weights = setup.truss, problem.method.weights
         free = 3 * len(truss.free)
-        symbols = truss_symbols(truss)
+        symbols = program_symbols(truss)
         x, x0, lengths = symbols.x, ca.SX.sym("x0", free), symbols.lengths
         goal, across = ca.SX.sym("goal", 3), ca.SX.sym("across", 2, 3)
         rows = ca.SX.sym("rows", _PAIRS, free)

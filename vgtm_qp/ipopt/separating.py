@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.geometry.clearance import Contacts
-from vgtm_qp.ipopt.symbols import OPTIONS, truss_symbols
+from vgtm_qp.ipopt.symbols import OPTIONS, program_symbols
 from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.setup import Setup
@@ -43,7 +43,7 @@ class IpoptStepper:
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
-        self._symbols = truss_symbols(setup.truss)
+        self._symbols = program_symbols(setup.truss)
 
     def run(self, plan: Plan, halvings: int = 2, budget: float = 120.0) -> tuple[list[State], list[float]]:
         """Return the states along `plan` and the path values they stand at, up to where a step fails.
@@ -72,8 +72,8 @@ class IpoptStepper:
 
     def _step(self, state: State, goal: PathPoint, duration: float) -> State | None:
         setup = self.setup
-        truss, monitor = setup.truss, setup.monitor
-        tip = truss.tip_weights @ state.nodes[truss.tip]
+        monitor = setup.monitor
+        tip = setup.arm.end_effector.position(state.nodes)
         reach = 1.5 * float(np.linalg.norm(goal.position - tip)) + 0.1
         time = state.time + duration
         for _ in range(_RESOLVES):

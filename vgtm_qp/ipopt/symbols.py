@@ -20,7 +20,7 @@ OPTIONS: dict[str, Any] = {
 """Options of every program; the bounds are those of the arm, not relaxed ones."""
 
 
-class TrussSymbols(NamedTuple):
+class ProgramSymbols(NamedTuple):
     """A truss as expressions of the coordinates of its free nodes.
 
     Attributes
@@ -50,7 +50,7 @@ class TrussSymbols(NamedTuple):
         return normal
 
 
-def truss_symbols(truss: Truss) -> TrussSymbols:
+def program_symbols(truss: Truss) -> ProgramSymbols:
     """Return the expressions of a truss whose base is at rest."""
     x = ca.SX.sym("x", 3 * len(truss.free))
     column = {int(node): 3 * k for k, node in enumerate(truss.free)}
@@ -61,7 +61,7 @@ def truss_symbols(truss: Truss) -> TrussSymbols:
     ends = _member_ends(truss, nodes)
     lengths = ca.vertcat(*(ca.norm_2(a - b) for a, b in ends))
     tip = sum(weight * nodes[n] for weight, n in zip(truss.tip_weights, truss.tip, strict=True))
-    return TrussSymbols(x, nodes, ends, lengths, tip)
+    return ProgramSymbols(x, nodes, ends, lengths, tip)
 
 
 def _member_ends(truss: Truss, nodes: list[ca.SX]) -> list[tuple[ca.SX, ca.SX]]:

@@ -293,7 +293,7 @@ class _Page:
         maneuver = self._maneuver
         assert maneuver is not None
         at = np.array([moment])
-        nodes = resampled(maneuver.time, maneuver.nodes, at)[0]
+        q = resampled(maneuver.time, maneuver.configurations, at)[0]
         vertices = resampled(maneuver.time, maneuver.control_vertices, at)[0]
-        self._session.put_at(moment, nodes, vertices)
+        self._session.put_at(moment, q, vertices)
         self._draw()

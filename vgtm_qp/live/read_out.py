@@ -62,7 +62,7 @@ def _strokes(session: Session) -> str:
     share = session.drawing.stroke_share(session.state.quantities)
     names = [
         name
-        for name, moving in zip(session.drawing.arm.member_names, ~np.isnan(share), strict=True)
+        for name, moving in zip(session.drawing.arm.quantity_names, ~np.isnan(share), strict=True)
         if moving
     ]
     share = share[~np.isnan(share)]

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.maneuver.arm_record import arm_record
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
+from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.resolver import Resolver, Step, StepStatus
+from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.state import State, frozen
+from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.view.drawing import Drawing, drawing_of_problem
 
 Array = NDArray[np.float64]
@@ -62,9 +63,9 @@ class Session:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._resolver = _make_resolver(problem)
-        truss = self._resolver.setup.truss
+        arm = self._resolver.setup.arm
         self.drawing: Drawing = drawing_of_problem(
-            problem, arm_record(truss), truss.members, len(self.state.control_vertices)
+            problem, arm.record(), arm.bodies.joints, len(self.state.control_vertices)
         )
         self.target: Array = self.tip
         self.vertex_goals: dict[int, Array] = {}
@@ -76,8 +77,7 @@ class Session:
     @property
     def state(self) -> State:
         """Where the arm is."""
-        state: State = self._resolver.state
-        return state
+        return self._resolver.state
 
     @property
     def tip(self) -> Array:
@@ -86,13 +86,12 @@ class Session:
 
     def pose(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the tip."""
-        position, rotation = self._resolver.tip()
-        return position, rotation
+        return self._resolver.tip()
 
     @property
     def vertices_can_be_wanted(self) -> bool:
         """True where the method follows goals of control vertices."""
-        return hasattr(self._resolver, "control_vertex_goals") and bool(len(self.state.control_vertices))
+        return self._resolver.draws_vertices and bool(len(self.state.control_vertices))
 
     def want_tip(self, position: Array) -> None:
         """Ask for the tip at `position` (3,), m."""
@@ -111,17 +110,17 @@ class Session:
         """Put the arm into its home pose, at rest, and want nothing else."""
         self._put(self._resolver.setup.home_state())
 
-    def put_at(self, time: float, nodes: Array, control_vertices: Array) -> None:
-        """Put the arm at rest at `nodes` (N, 3) and `control_vertices` (V, 3), m; want nothing else."""
-        home: State = self._resolver.setup.home_state()
+    def put_at(self, time: float, q: Array, control_vertices: Array) -> None:
+        """Put the arm at rest in configuration `q` and at `control_vertices` (V, 3), m; want nothing else."""
+        arm, home = self._resolver.setup.arm, self._resolver.setup.home_state()
         self._put(
             replace(
                 home,
                 time=float(time),
-                q=(q := frozen(nodes)),
-                nodes=q,
+                q=frozen(q),
+                nodes=frozen(arm.nodes(q)),
                 control_vertices=frozen(control_vertices),
-                quantities=frozen(self.drawing.arm.lengths(nodes)),
+                quantities=frozen(arm.measured(q)),
             )
         )
 
@@ -165,7 +164,7 @@ class Session:
             np.array([0.0, 1.0]), np.stack([position, position + stride]), np.stack([rotation, rotation])
         )
         started, before = perf_counter(), self.state.nodes
-        step: Step = self._resolver.follow(path, 0.0, 1.0, dt=dt)
+        step = self._resolver.follow(path, 0.0, 1.0, dt=dt)
         self._step_time = perf_counter() - started
         self._last = step
         if step.status is StepStatus.REACHED:
@@ -199,7 +198,8 @@ class Session:
         )
 
 
-def _make_resolver(problem: Problem) -> Any:
+def _make_resolver(problem: Problem) -> Mover:
+    # A hand may draw control vertices, which the coupled QP alone follows.
     if problem.method.name == "qp":
         return Resolver(problem)
     return make_resolver(problem)

@@ -12,20 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
-from vgtm_qp.maneuver.arm_record import arm_record
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.maneuver.retries import DeadEnd, retries
-from vgtm_qp.methods import AnyResolver, make_resolver
+from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.result.manifest import make_manifest, mesh_record
-from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import check_problem
-from vgtm_qp.step.resolver import Resolver, Step, StepStatus
-from vgtm_qp.step.separation import Distances, Separation
-from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.state import State
+from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.verify import verify as check
 
@@ -70,10 +67,6 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
         The problem cannot be set up, or is not a Problem; no step was made.
     """
     check_is_problem(problem)
-    if problem.arm is not None:
-        expected = "[truss]: a Resolver steps serial arms, but result files and certificates take trusses alone in this version"
-        mistake = problem.mistake(("arm",), expected)
-        raise ProblemError(str(problem.source or problem.name), [mistake])
     started = perf_counter()
     resolver = make_resolver(problem)
     mistakes = check_problem(problem, resolver.setup)
@@ -87,7 +80,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     way = ""
     try:
         stop = _run(resolver, plan, record, progress)
-        if stop is not None and isinstance(resolver, Resolver):
+        if stop is not None:
             value = plan.path.start + record.rows["progress"][-1] * (plan.path.end - plan.path.start)
             dead_end = DeadEnd(
                 stop,
@@ -95,7 +88,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
                 resolver.setup.arm.height,
                 plan.path.at(value).velocity,
             )
-            way, record, stop = _retry(problem, record, dead_end, progress)
+            way, record, stop = _retry(problem, resolver, record, dead_end, progress)
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
     maneuver = _assemble(problem, resolver, record, stop, setup_time, way)
@@ -103,13 +96,14 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
 
 
 def _retry(
-    problem: Problem, record: _Record, dead_end: DeadEnd, progress: Progress | None
+    problem: Problem, first: Mover, record: _Record, dead_end: DeadEnd, progress: Progress | None
 ) -> tuple[str, _Record, Stop | None]:
     """Return name, record and stop of the attempt that comes furthest; the name is empty for the first attempt."""
     best: tuple[str, _Record, Stop | None] = ("", record, dead_end.stop)
     for name, other in retries(problem, dead_end):
-        # A kernel takes longer to compile than a maneuver to solve without it.
-        resolver = Resolver(build_arm(other, compiled=False))
+        resolver = first.again(other)
+        if resolver is None:
+            break
         plan = make_plan(other, *resolver.tip())
         tried = _Record()
         _add_state(tried, resolver, plan, 0.0, 0.0, dict.fromkeys(resolver.phases, 0.0))
@@ -121,7 +115,7 @@ def _retry(
     return best
 
 
-def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress | None) -> Stop | None:
+def _run(resolver: Mover, plan: Plan, record: _Record, progress: Progress | None) -> Stop | None:
     """Step along the plan; return why the arm stopped for good, or None if it reached the end."""
     value, start, end = plan.path.start, plan.path.start, plan.path.end
     stalled, last = 0, float(plan.marks[-1])
@@ -132,7 +126,7 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
         step = resolver.follow(plan.path, value, aim, dt=dt)
         seconds = perf_counter() - clock
         if step.status is StepStatus.BLOCKED:
-            return _stop(resolver, plan, value, aim, dt, step)
+            return resolver.explain(plan.path, value, aim, dt=dt, last=step)
         stop = _given_up(resolver, plan, value, aim, dt, step, before)
         if stop is not None and step.left_path:
             # From here on the arm would brake off the path; those states do not belong to the maneuver.
@@ -145,31 +139,31 @@ def _run(resolver: AnyResolver, plan: Plan, record: _Record, progress: Progress 
             return stop
         stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
         if stalled >= _STALLED_STEPS:
-            return _stop(resolver, plan, value, aim, dt, step)
+            return resolver.explain(plan.path, value, aim, dt=dt, last=step)
         if progress is not None:
             progress((value - start) / (end - start), step)
     return None
 
 
 def _given_up(
-    resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step, before: State
+    resolver: Mover, plan: Plan, value: float, mark: float, dt: float, step: Step, before: State
 ) -> Stop | None:
     """Return why the maneuver ends with a step in which the arm braked; None if it goes on afterwards.
 
     A hard tip may not be late, so braking ends it; any tip but an elastic one ends when it leaves the path.
     """
     mode = resolver.setup.tip_mode
-    if not step.braked or not isinstance(resolver, Resolver) or mode == "elastic":
+    if not step.braked or mode == "elastic":
         return None
     if mode != "hard" and not step.left_path:
         return None
     return resolver.explain(plan.path, value, mark, dt=dt, last=step, state=before)
 
 
-def _come_to_rest(resolver: AnyResolver, plan: Plan, record: _Record, value: float) -> None:
+def _come_to_rest(resolver: Mover, plan: Plan, record: _Record, value: float) -> None:
     """Record the steps in which the arm comes to rest on its path."""
     end = plan.path.end
-    while isinstance(resolver, Resolver) and value < end:
+    while value < end:
         known, clock = dict(resolver.phases), perf_counter()
         step = resolver.brake(plan.path, value, end)
         if step is None or step.left_path:
@@ -179,22 +173,16 @@ def _come_to_rest(resolver: AnyResolver, plan: Plan, record: _Record, value: flo
         _add_state(record, resolver, plan, value, perf_counter() - clock, phases)
 
 
-def _stop(resolver: AnyResolver, plan: Plan, value: float, mark: float, dt: float, step: Step) -> Stop:
-    if isinstance(resolver, Resolver):
-        return resolver.explain(plan.path, value, mark, dt=dt, last=step)
-    return Stop(StopKind.NONLINEAR, dict.fromkeys(step.blocked_by, 0.0), reason=step.reason)
-
-
 def _add_state(
-    record: _Record, resolver: AnyResolver, plan: Plan, value: float, seconds: float, phases: dict[str, float]
+    record: _Record, resolver: Mover, plan: Plan, value: float, seconds: float, phases: dict[str, float]
 ) -> None:
     state, setup = resolver.state, resolver.setup
     position, rotation = resolver.tip()
     target = plan.path.at(value)
     record.add(
         time=state.time,
-        nodes=state.nodes,
-        member_lengths=state.quantities,
+        configuration=state.q,
+        quantities=state.quantities,
         control_vertices=state.control_vertices,
         tip_position=position,
         tip_rotation=rotation,
@@ -210,47 +198,41 @@ def _add_state(
 
 def _assemble(
     problem: Problem,
-    resolver: AnyResolver,
+    resolver: Mover,
     record: _Record,
     stop: Stop | None,
     setup_time: float,
     way: str,
 ) -> Maneuver:
-    truss, task = resolver.setup.truss, resolver.setup.task
+    setup = resolver.setup
+    task = setup.task
     meshes = {
         obstacle.name: mesh_record(obstacle.file, len(pieces.pieces))
-        for obstacle, pieces in zip(problem.obstacle, resolver.setup.monitor.obstacles, strict=True)
+        for obstacle, pieces in zip(problem.obstacle, setup.monitor.obstacles, strict=True)
         if obstacle.shape == "mesh"
     }
     reached = float(record.rows["progress"][-1])
     manifest = make_manifest(
         problem.to_dict(),
-        arm_record(truss),
+        setup.arm.record(),
         status="solved" if stop is None else "blocked",
         reached=reached,
         blocked_by=() if stop is None else stop.names,
         stop=None if stop is None else stop.to_dict(),
         way_out=way,
-        recovered=_too_near(resolver.setup, record.rows["nodes"][0])
-        if isinstance(resolver, Resolver)
-        else None,
+        recovered=_too_near(resolver),
         method=problem.method.name,
-        solver=resolver.setup.solver if isinstance(resolver, Resolver) else resolver.solver,
+        solver=resolver.solver,
         setup_time=setup_time,
         directory=Path(problem.source).parent if problem.source else Path.cwd(),
         meshes=meshes,
     )
     # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank only.
-    manifest["jacobian_rank"] = getattr(resolver, "rank", None)
+    manifest["jacobian_rank"] = resolver.rank
     rotation = record.array("tip_target_rotation")
     count = len(record.rows["time"])
     return Maneuver(
         time=record.array("time"),
-        nodes=record.array("nodes"),
-        members=truss.members,
-        member_names=np.array(truss.member_names),
-        member_actuated=truss.actuated,
-        member_lengths=record.array("member_lengths"),
         control_vertices=record.array("control_vertices").reshape(count, -1, 3),
         tip_position=record.array("tip_position"),
         tip_rotation=record.array("tip_rotation"),
@@ -264,16 +246,15 @@ def _assemble(
         manifest=manifest,
         tip_target_rotation=rotation if task.turns == "orientation" else None,
         tip_target_pointing=rotation[:, :, 2] if task.turns == "pointing" else None,
+        **setup.arm.recorded(record.array("configuration"), record.array("quantities")),
     )
 
 
-def _too_near(setup: Setup, q: Array) -> dict[str, float]:
-    """Return the pairs below their clearance in the home pose `q`, and their distances, m."""
-    kept = Separation(setup.arm, setup.monitor, Distances(setup.safe, setup.self_safe, setup.influence))
+def _too_near(resolver: Mover) -> dict[str, float]:
+    """Return the pairs below their clearance in the home pose that the method drives apart, and their distances, m."""
+    names, kind = resolver.setup.monitor.names, resolver.setup.arm.bodies.kind
     found: dict[str, float] = {}
-    for pair, distance in kept.shortfall(q, 0.0).items():
-        name = (
-            setup.monitor.names.clearance(pair).removeprefix("clearance: member ").replace("/ member ", "/ ")
-        )
+    for pair, distance in resolver.too_near(resolver.setup.home_state()).items():
+        name = names.clearance(pair).removeprefix(f"clearance: {kind} ").replace(f"/ {kind} ", "/ ")
         found[name] = min(found.get(name, np.inf), distance)
     return found

@@ -37,8 +37,8 @@ class DenseSolution:
     """Eq. (28) with dense matrices, as the paper has it."""
 
     def __init__(self, layout: Layout, method: Method) -> None:
-        self._layout, self._method = layout, method
-        self._lengths = np.zeros((truss_of(layout.arm).member_count, layout.node_columns))
+        self._layout, self._truss, self._method = layout, truss_of(layout.arm), method
+        self._lengths = np.zeros((self._truss.member_count, layout.node_columns))
         self._tip, self._present = tip_columns(layout)
         self.rank: int | None = None
 
@@ -56,12 +56,12 @@ class DenseSolution:
         terms
             Null-space terms.
         """
-        layout, method = self._layout, self._method
-        lengths = truss_of(layout.arm).scatter.dense(gradient, self._lengths)
+        layout, truss, method = self._layout, self._truss, self._method
+        lengths = truss.scatter.dense(gradient, self._lengths)
         J = np.zeros((len(x), layout.node_columns))
         J[: len(tip), self._tip] = tip[:, self._present]
-        J[len(tip) :] = lengths[truss_of(layout.arm).fixed]
-        actuated = lengths[truss_of(layout.arm).actuators]
+        J[len(tip) :] = lengths[truss.fixed]
+        actuated = lengths[truss.actuators]
         hessian = terms.actuator * actuated.T @ actuated
         hessian[np.diag_indices_from(hessian)] += terms.node
         if terms.blocks is not None:
@@ -97,7 +97,7 @@ class SparseSolution:
 
     def __init__(self, layout: Layout, method: Method) -> None:
         truss = truss_of(layout.arm)
-        self._layout = layout
+        self._fixed = truss.fixed
         self._damping = method.damping**2 if method.variant == "damped" else 0.0
         self._tip, self._present = tip_columns(layout)
         nodes, actuators, members, tips = (
@@ -141,7 +141,7 @@ class SparseSolution:
         ]
         self._system = BandedSystem(np.concatenate(rows), np.concatenate(columns), int(self._parts[-1]))
         self._damped = np.zeros(members + tips)
-        self._damped[truss_of(layout.arm).fixed] = self._damped[members:] = -self._damping
+        self._damped[truss.fixed] = self._damped[members:] = -self._damping
         self.rank: int | None = members - actuators + tips
 
     def displacement(self, gradient: Array, tip: Array, x: Array, terms: Terms) -> Array:
@@ -156,7 +156,7 @@ class SparseSolution:
         values = np.concatenate([blocks, diagonal, lengths, lengths, ones, ones, ends, ends])
         rhs = np.zeros(u)
         rhs[:nodes], rhs[nodes:a] = -terms.node_gradient, -terms.actuator_gradient
-        rhs[a + truss_of(self._layout.arm).fixed] = x[len(tip) :]
+        rhs[a + self._fixed] = x[len(tip) :]
         rhs[y:] = x[: len(tip)]
         return self._system.solve(values, rhs)[:nodes]
 
@@ -179,7 +179,7 @@ class ConventionalResolver(MethodResolver):
         sparse = method.algebra == "sparse"
         self._solution = SparseSolution(layout, method) if sparse else DenseSolution(layout, method)
         self._correct = method.correct
-        self._home_fixed = self.setup.arm.home_quantities[truss_of(layout.arm).fixed]
+        self._home_fixed = self.setup.arm.home_quantities[self.setup.truss.fixed]
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
         setup, state = self.setup, self.state

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,7 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.rows.limits import actuator_box
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
+from vgtm_qp.step.state import State
 
 Array = NDArray[np.float64]
 
@@ -62,6 +65,10 @@ class CurveFirstResolver(MethodResolver):
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._correct, self._is_qp = method.correct, method.name == "qp"
         self.solver = CURVE_SOLVER if self._is_qp else None
+
+    def _placed(self, state: State) -> None:
+        if state.control_vertices.shape == self.curve.control_vertices.shape:
+            self.curve = replace(self.curve, control_vertices=state.control_vertices)
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
         if self._is_qp:

@@ -60,7 +60,7 @@ class CurveMotion:
             )
         if setup.task.turns == "orientation" and not spec.torsion_vertices:
             raise CurveError("orientation at the tip takes curve.torsion_vertices of 1 or more")
-        centres = np.einsum("fk,fkc->fc", truss.face_weights, truss.home[truss.faces])
+        centres = setup.arm.stations.centres(truss.home)
         steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
         self.s = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
         self.home = Curve(

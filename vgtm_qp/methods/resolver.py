@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from vgtm_qp.errors import CurveError, SolverError
+from vgtm_qp.errors import CurveError, GoalError, SolverError
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import vector_from_rotation
 from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path, PathPoint
-from vgtm_qp.step.resolver import Step, StepStatus
+from vgtm_qp.step.separation import Shortfall
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
+from vgtm_qp.step.step import Step, StepStatus
+from vgtm_qp.step.stops import Stop, StopKind
 
 Array = NDArray[np.float64]
 
@@ -26,11 +30,17 @@ MAX_CORRECTIONS = 30
 
 
 class MethodResolver(ABC):
-    """Moves an arm step by step, as :class:`vgtm_qp.step.resolver.Resolver` does, by one of the other methods."""
+    """Moves an arm step by step, see ``step.mover.Mover``, by one of the other methods.
+
+    It knows the arm's state after a step alone: nothing that brakes, drives pairs apart or follows control vertices.
+    """
+
+    draws_vertices = False
+    """Whether control vertices follow goals of their own."""
 
     def __init__(self, setup: Setup, step_limit: float | None) -> None:
         self.setup = setup
-        self.state = setup.home_state()
+        self._state = setup.home_state()
         self.phases = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
         self.rank: int | None = None
         """Rank of the Jacobian in the last step, None where the method does not reveal it."""
@@ -39,6 +49,26 @@ class MethodResolver(ABC):
         self._limit = step_limit
         self._steps = 0
         self._mark = 0.0
+
+    @property
+    def state(self) -> State:
+        """Where the arm is; may be set to another state of this arm."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state = state
+        self._placed(state)
+
+    @property
+    def control_vertex_goals(self) -> dict[int, Array]:
+        """Where control vertices are drawn to: nowhere."""
+        return {}
+
+    @control_vertex_goals.setter
+    def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
+        if goals:
+            raise GoalError("this method draws no control vertices; the QP does")
 
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
@@ -61,7 +91,7 @@ class MethodResolver(ABC):
         kinematics.evaluate(nodes)
         lengths = frozen(kinematics.quantities)
         before = self.state
-        self.state = State(
+        self._state = State(
             time=before.time + dt,
             q=(q := frozen(nodes)),
             nodes=q,
@@ -75,11 +105,41 @@ class MethodResolver(ABC):
         status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return _step(status, progress, self.state, "")
 
+    def brake(self, path: Path, start: float, end: float) -> Step | None:  # noqa: ARG002
+        """Return None: every state is one of rest."""
+        return None
+
+    def explain(
+        self,
+        path: Path,  # noqa: ARG002
+        start: float,  # noqa: ARG002
+        end: float,  # noqa: ARG002
+        *,
+        dt: float | None = None,  # noqa: ARG002
+        last: Step | None = None,
+        state: State | None = None,  # noqa: ARG002
+    ) -> Stop:
+        """Return what the `last` step said: the method knows no rows that hold the arm."""
+        if last is None:
+            return Stop(StopKind.NONLINEAR)
+        return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
+
+    def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
+        """Return no pairs: none is driven apart."""
+        return {}
+
+    def again(self, problem: Problem) -> Mover | None:  # noqa: ARG002
+        """Return None: there is no other attempt."""
+        return None
+
     def spend(self, phase: str) -> None:
         """Add the time since the last call to `phase`."""
         now = perf_counter()
         self.phases[phase] += now - self._mark
         self._mark = now
+
+    def _placed(self, state: State) -> None:  # noqa: B027
+        """Take over what else there is in a `state` in which the arm was put."""
 
     @abstractmethod
     def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arm.frames import frame_constants, frame_function
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.kinematics import member_function
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
@@ -23,7 +24,7 @@ class Entries:
 
     def __init__(self, layout: Layout, segment: Segment) -> None:
         truss = truss_of(layout.arm)
-        column = layout.node_column[truss_of(layout.arm).member_nodes[segment.fixed]]
+        column = layout.node_column[truss.member_nodes[segment.fixed]]
         row, slot = np.nonzero(column >= 0)
         axis = np.arange(3)
         self.member_source = ((row * column.shape[1] + slot)[:, None] * 3 + axis).ravel()
@@ -66,7 +67,7 @@ class SegmentSystem:
     ) -> None:
         truss = truss_of(layout.arm)
         self.segment = segment
-        self._nodes = truss_of(layout.arm).member_nodes[segment.fixed].ravel()
+        self._nodes = truss.member_nodes[segment.fixed].ravel()
         self._home = home_lengths[segment.fixed]
         self._face, self._weights = truss.faces[segment.face], truss.face_weights[segment.face]
         self._entries = Entries(layout, segment)
@@ -78,7 +79,7 @@ class SegmentSystem:
             self._constants.append(truss.joints.offset[segment.fixed].ravel())
         shape = len(segment.fixed), turns
         if shape not in kernels:
-            kernels[shape] = Kernel(_function(layout, *shape))
+            kernels[shape] = Kernel(_function(truss, *shape))
         self._kernel = kernels[shape]
         self._centre = np.zeros(3)
 
@@ -131,21 +132,19 @@ class SegmentSystem:
         return turn if self.segment.tracks == "orientation" else np.asarray(self.frame[:, :2].T @ turn)
 
 
-def _function(layout: Layout, members: int, turns: bool) -> ca.Function:
+def _function(truss: Truss, members: int, turns: bool) -> ca.Function:
     """Return (member nodes (3, Q m), face nodes, constants) -> lengths, gradients and, if it turns, frame and spin."""
-    slots = truss_of(layout.arm).member_nodes.shape[1]
+    slots = truss.member_nodes.shape[1]
     nodes, face = ca.MX.sym("nodes", 3, slots * members), ca.MX.sym("face", 3, 3)
     inputs, outputs = [nodes, face], []
     frame = [ca.MX.sym("cosines", 3), ca.MX.sym("sines", 3), ca.MX.sym("alignment", 3, 3)] if turns else []
     inputs += frame
     arguments = [nodes]
-    if truss_of(layout.arm).joints is not None:
+    if truss.joints is not None:
         offsets = ca.MX.sym("offsets", 3, 2 * members)
         inputs.append(offsets)
         arguments.append(offsets)
-    outputs += (
-        list(member_function(truss_of(layout.arm)).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
-    )
+    outputs += list(member_function(truss).map(members)(*arguments)) if members else [ca.MX(0, 0)] * 2
     if turns:
         outputs += list(frame_function(3)(face, *frame))
     return ca.Function("segment", inputs, outputs)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from vgtm_qp.methods.conventional import ConventionalResolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
-from vgtm_qp.methods.resolver import MethodResolver
 from vgtm_qp.problem import Problem
+from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.resolver import Resolver
 
-AnyResolver = Resolver | MethodResolver
 
-
-def make_resolver(problem: Problem) -> AnyResolver:
-    """Return the resolver that ``problem.method`` asks for; all of them have the same interface.
+def make_resolver(problem: Problem) -> Mover:
+    """Return what moves the arm of a problem by the method that ``problem.method`` asks for.
 
     Raises
     ------

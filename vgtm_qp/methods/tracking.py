@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
-from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.condensation import Condensation, CurveNodes, least_norm
@@ -45,7 +44,7 @@ class Tracker:
         parallel: bool,
     ) -> None:
         self.segments = tuple(segments)
-        self._free, self._columns = truss_of(layout.arm).free, layout.node_columns
+        self._free, self._columns = layout.arm.free, layout.node_columns
         self._kinematics = kinematics
         self._furthest = 2.0 * float(home_lengths.max())
         self._condensation: Condensation | None = None

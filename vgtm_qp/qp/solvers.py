@@ -107,12 +107,11 @@ class FullSolver:
         if np.any(qp.row_lower > qp.row_upper) or np.any(qp.column_lower > qp.column_upper):
             raise InfeasibleStepError("a lower bound is above its upper bound")
         z, y, w, iterations = self._answer(qp, same_structure=same)
+        if not all(np.isfinite(part).all() for part in (z, y, w)):
+            refuse_large(np.nan, np.nan, self._name)
         scale = relative(1.0, qp.q, y)
-        # Of an answer that is not finite a residual is NaN, and refused.
-        with np.errstate(invalid="ignore"):
-            primal, dual = qp.primal_residual(z), scale * qp.dual_residual(z, y, w)
-            pressing = qp.complementarity_residual(z, scale * y, scale * w)
-        refuse_large(primal, float(np.maximum(dual, pressing)), self._name)
+        dual = max(scale * qp.dual_residual(z, y, w), qp.complementarity_residual(z, scale * y, scale * w))
+        refuse_large(qp.primal_residual(z), dual, self._name)
         # Only a good answer is a warm start: NaN would stay in the solver for ever.
         self._structure = self.builder.structure
         return self.builder.solution(z, y, w, iterations)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,9 @@ LAYOUTS = {
     "member_names": ArrayLayout(("M",), "U"),
     "member_actuated": ArrayLayout(("M",), "b"),
     "member_lengths": ArrayLayout(("T", "M")),
+    "joints": ArrayLayout(("T", "J")),
+    "joint_names": ArrayLayout(("J",), "U"),
+    "body_names": ArrayLayout(("B",), "U"),
     "control_vertices": ArrayLayout(("T", "V", 3)),
     "tip_position": ArrayLayout(("T", 3)),
     "tip_rotation": ArrayLayout(("T", 3, 3)),
@@ -40,6 +43,15 @@ LAYOUTS = {
     "tip_target_rotation": ArrayLayout(("T", 3, 3), required=False),
     "tip_target_pointing": ArrayLayout(("T", 3), required=False),
 }
+
+OF_TRUSSES = ("nodes", "members", "member_names", "member_actuated", "member_lengths")
+OF_SERIAL_ARMS = ("joints", "joint_names", "body_names")
+
+
+def names_of(arrays: Collection[str]) -> list[str]:
+    """Return the names of the arrays that a result file of the kind of these may have."""
+    others = OF_TRUSSES if "joints" in arrays else OF_SERIAL_ARMS
+    return [name for name in LAYOUTS if name not in others]
 
 
 def plain(array: Any) -> NDArray[Any]:
@@ -56,11 +68,13 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Raise ResultError for the first array that is missing, unknown, malformed or holds no number."""
+    possible = names_of(arrays)
     for name in arrays:
-        if name not in LAYOUTS:
-            raise ResultError(f"array {name} is not one of a result file; those are {', '.join(LAYOUTS)}")
+        if name not in possible:
+            raise ResultError(f"array {name} is not one of a result file; those are {', '.join(possible)}")
     sizes: dict[str, int] = {}
-    for name, layout in LAYOUTS.items():
+    for name in possible:
+        layout = LAYOUTS[name]
         if name not in arrays:
             if layout.required:
                 raise ResultError(f"array {name} is missing")
@@ -78,9 +92,10 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
         if array.dtype.kind == "f" and (np.isnan(array).any() or (layout.finite and np.isinf(array).any())):
             row = int(np.argwhere(~np.isfinite(array))[0][0])
             raise ResultError(f"array {name} holds a value that is not a number, row {row}")
-    if sizes["T"] < 1 or sizes["N"] < 1:
-        raise ResultError("there is no state in it: array nodes is empty")
-    members = arrays["members"]
+    states = "joints" if "joints" in arrays else "nodes"
+    if min(arrays[states].shape[:2]) < 1:
+        raise ResultError(f"there is no state in it: array {states} is empty")
+    members = arrays.get("members", np.zeros(0))
     if members.size and (members.min() < 0 or members.max() >= sizes["N"]):
         raise ResultError(f"array members names a node outside 0..{sizes['N'] - 1}")
     if (np.diff(arrays["time"]) <= 0.0).any():

@@ -58,7 +58,7 @@ def make_manifest(
     problem : mapping
         The whole problem as JSON data, in the form of the problem file.
     arm : mapping
-        What `arm_record` returns.
+        What the arm's `record` returns.
     status : str
         One of `STATUSES`.
     reached : float

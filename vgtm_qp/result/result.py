@@ -9,12 +9,19 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.errors import ResultError
+from vgtm_qp.result.base import base_poses
 from vgtm_qp.result.certificate import Certificate
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.file import read_result, write_result
-from vgtm_qp.result.layout import LAYOUTS, check_arrays, frozen, plain
+from vgtm_qp.result.layout import check_arrays, frozen, names_of, plain
 from vgtm_qp.result.manifest import check_manifest
+from vgtm_qp.result.record import is_serial
 
 Array = NDArray[np.float64]
+
+_LEFT_OUT: Any = None
+"""Of a serial arm these follow from its joints."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -25,12 +32,6 @@ class Result:
     ----------
     time : (T,)
         Seconds, increasing.
-    nodes : (T, N, 3)
-        Node positions, m.
-    members, member_names, member_actuated : (M, 2), (M,), (M,)
-        The nodes, name and kind of each member.
-    member_lengths : (T, M)
-        m.
     control_vertices : (T, V, 3)
         Control vertices of the reference curve, m; V = 0 without a curve.
     tip_position, tip_rotation, tip_target_position : (T, 3), (T, 3, 3), (T, 3)
@@ -45,6 +46,14 @@ class Result:
         Plain data, see `make_manifest`.
     tip_target_rotation, tip_target_pointing : (T, 3, 3) or None, (T, 3) or None
         Targets of orientation or direction where they were tracked.
+    nodes : (T, N, 3)
+        Node positions, m; of a serial arm, which has none in its file: base, joints and tip.
+    members, member_names, member_actuated : (M, 2), (M,), (M,)
+        The nodes, name and kind of each member; of a serial arm: its links.
+    member_lengths : (T, M)
+        m.
+    joints, joint_names, body_names : (T, J), (J,), (B,), or None
+        Of a serial arm: joint values, rad or m, and the names of joints and links.
 
     Raises
     ------
@@ -53,11 +62,6 @@ class Result:
     """
 
     time: Array
-    nodes: Array
-    members: NDArray[np.int64]
-    member_names: NDArray[np.str_]
-    member_actuated: NDArray[np.bool_]
-    member_lengths: Array
     control_vertices: Array
     tip_position: Array
     tip_rotation: Array
@@ -71,14 +75,27 @@ class Result:
     manifest: dict[str, Any]
     tip_target_rotation: Array | None = None
     tip_target_pointing: Array | None = None
+    nodes: Array = _LEFT_OUT
+    members: NDArray[np.int64] = _LEFT_OUT
+    member_names: NDArray[np.str_] = _LEFT_OUT
+    member_actuated: NDArray[np.bool_] = _LEFT_OUT
+    member_lengths: Array = _LEFT_OUT
+    joints: Array | None = None
+    joint_names: NDArray[np.str_] | None = None
+    body_names: NDArray[np.str_] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and kinds; freeze copies of the arrays."""
-        arrays = {name: plain(getattr(self, name)) for name in LAYOUTS if getattr(self, name) is not None}
+        manifest = check_manifest(self.manifest)
+        object.__setattr__(self, "manifest", manifest)
+        arrays = {name: plain(array) for name, array in self.arrays.items()}
         check_arrays(arrays)
+        if self.joints is not None:
+            if not is_serial(manifest["arm"]):
+                raise ResultError("there are joints in it, but manifest.arm is not that of a serial arm")
+            arrays |= _links(RecordedChain(manifest["arm"]), self.configurations)
         for name, array in arrays.items():
             object.__setattr__(self, name, frozen(array))
-        object.__setattr__(self, "manifest", check_manifest(self.manifest))
 
     def __str__(self) -> str:
         """Return one paragraph: name, status, steps, what stopped it, what verification found."""
@@ -105,7 +122,41 @@ class Result:
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of the result file by name, those that this maneuver has."""
-        return {name: array for name in LAYOUTS if (array := getattr(self, name)) is not None}
+        kind = () if self.joints is None else ("joints",)
+        return {name: array for name in names_of(kind) if (array := getattr(self, name)) is not None}
+
+    @property
+    def configurations(self) -> Array:
+        """(T, N, 3) the nodes, m; of a serial arm (T, J + 6) joints, then position and rotation vector of its base."""
+        if self.joints is None:
+            return self.nodes
+        return np.concatenate([self.joints, base_poses(self.manifest["problem"], self.time)], axis=1)
+
+    @property
+    def actuator_names(self) -> tuple[str, ...]:
+        """Actuated members, or joints of a serial arm."""
+        if self.joint_names is None:
+            return tuple(self.member_names[self.member_actuated].tolist())
+        return tuple(self.joint_names[self._moving_joints].tolist())
+
+    @property
+    def actuator_values(self) -> Array:
+        """(T, n_a) lengths of the actuated members, m, or values of the joints, rad or m."""
+        if self.joints is None:
+            return self.member_lengths[:, self.member_actuated]
+        return self.joints[:, self._moving_joints]
+
+    @property
+    def actuator_units(self) -> tuple[str, ...]:
+        """``"m"`` or ``"rad"``."""
+        if self.joints is None:
+            return ("m",) * int(self.member_actuated.sum())
+        turns = np.asarray(self.manifest["arm"]["revolute"], dtype=np.bool_)[self._moving_joints]
+        return tuple("rad" if turn else "m" for turn in turns)
+
+    @property
+    def _moving_joints(self) -> NDArray[np.bool_]:
+        return np.asarray(self.manifest["arm"]["actuated"], dtype=np.bool_)
 
     @property
     def status(self) -> str:
@@ -211,3 +262,20 @@ class Result:
         """
         arrays, manifest = read_result(Path(path))
         return cls(**arrays, manifest=manifest)
+
+
+def _links(chain: RecordedChain, q: Array) -> dict[str, NDArray[Any]]:
+    """Return points and links of a serial arm at configurations (T, J + 6), in the terms of nodes and members."""
+    if q.shape[1] != len(chain.quantity_names) + 6:
+        raise ResultError(
+            f"array joints holds {q.shape[1] - 6} joints; manifest.arm describes {len(chain.quantity_names)}"
+        )
+    points = chain.placed(q)[0]
+    ends = chain.ends(points)
+    return {
+        "nodes": points,
+        "members": chain.links,
+        "member_names": np.array(chain.member_names),
+        "member_actuated": np.zeros(len(chain.links), dtype=np.bool_),
+        "member_lengths": np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2),
+    }

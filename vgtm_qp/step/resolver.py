@@ -21,7 +21,7 @@ from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import excess_of_freedom, unreachable_tip
 from vgtm_qp.step.goals import duration, path_to
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.separation import Distances, Separation, Shortfall
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import State, frozen
@@ -44,13 +44,18 @@ _ROUNDING = float(np.finfo(float).eps)
 
 
 class Resolver:
-    """Moves one arm step by step. Not to be shared by threads: use one per thread.
+    """Moves one arm step by step, see ``step.mover.Mover``. Not to be shared by threads: use one per thread.
 
     Raises
     ------
     ProblemError
         The end effector is asked for coordinates that no actuator can start to change.
     """
+
+    rank: int | None = None
+    """None: a QP does not reveal the rank of a Jacobian."""
+    draws_vertices = True
+    """Whether control vertices follow goals of their own."""
 
     def __init__(self, problem: Problem | Setup) -> None:
         setup = problem if isinstance(problem, Setup) else build_arm(problem)
@@ -376,6 +381,15 @@ class Resolver:
         return explain(
             self.setup, self._separation, state, path, start, end, limits, reason, pressing, failed
         )
+
+    def too_near(self, state: State) -> Shortfall:
+        """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
+        return self._separation.shortfall(state.q, state.time)
+
+    def again(self, problem: Problem) -> Resolver:
+        """Return what tries a maneuver once more from home, for a problem that resolves the redundancy differently."""
+        # A kernel takes longer to compile than a maneuver to solve without it.
+        return Resolver(build_arm(problem, compiled=False))
 
 
 def _tracking_error(setup: Setup) -> TrackingError | None:

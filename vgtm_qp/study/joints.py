@@ -9,11 +9,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
-from vgtm_qp.arm.truss.arm import truss_of
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.comparison.markdown import markdown_table
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import load_problem
-from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.study.drawing import MARKS, label, panels
 from vgtm_qp.study.workers import Row, Task
@@ -45,22 +44,22 @@ def run(problem: str, offset: float) -> Row:
     errors = []
     for row in range(len(maneuver.time)):
         change = maneuver.member_lengths[row] - maneuver.member_lengths[0]
-        if not _place(kinematics, setup.layout, X, setup.arm.home_quantities + change):
+        if not _place(kinematics, truss, X, setup.arm.home_quantities + change):
             break
         errors.append(float(np.linalg.norm(setup.arm.end_effector.position(X) - maneuver.tip_position[row])))
     return {"tip_error": max(errors), "posed": len(errors) - 1, "steps": maneuver.steps}
 
 
-def _place(kinematics: Kinematics, layout: Layout, X: Array, lengths: Array) -> bool:
+def _place(kinematics: Kinematics, truss: Truss, X: Array, lengths: Array) -> bool:
     """Move the nodes in place until all members have their lengths (Newton, damped); whether they can."""
-    free = truss_of(layout.arm).free
+    free = truss.free
     for _ in range(60):
         kinematics.evaluate(X)
         error = lengths - kinematics.quantities
         worst = float(np.abs(error).max())
         if worst < _TOLERANCE:
             return True
-        J = truss_of(layout.arm).scatter.dense(kinematics.gradient)
+        J = truss.scatter.dense(kinematics.gradient)
         X[free] += min(1.0, 0.2 / worst) * np.linalg.solve(J, error).reshape(-1, 3)
     return False
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
+from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.result.record import is_serial, numbers
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -17,8 +19,13 @@ _DENSE_UNKNOWNS = 300
 """Above this many free coordinates singular values come from a sparse factorisation."""
 
 
+def recorded_arm(record: Mapping[str, Any], members: Index) -> RecordedArm | RecordedChain:
+    """Return the arm of a manifest's record; `members` (M, 2) are the nodes of each."""
+    return RecordedChain(record) if is_serial(record) else RecordedArm(record, members)
+
+
 class RecordedArm:
-    """A truss as the manifest records it (``arm_record``).
+    """A truss as the manifest records it (``TrussArm.record``).
 
     Attributes
     ----------
@@ -39,27 +46,29 @@ class RecordedArm:
 
     def __init__(self, record: Mapping[str, Any], members: Index) -> None:
         count = len(members)
+        if is_serial(record):
+            raise ResultError("this is the result of a serial arm; expected that of a truss")
         try:
-            self.home = _numbers(record, "home", (None, 3))
+            self.home = numbers(record, "home", (None, 3))
             nodes = len(self.home)
             self.base = _indices(record["base"], "base", nodes)
             self.member_names = tuple(str(name) for name in record["member_names"])
             self.actuated = np.asarray(record["actuated"], dtype=np.bool_)
-            self.length = _numbers(record, "length", (count,))
-            self.stroke = _numbers(record, "stroke", (count, 2))
-            self.rate = _numbers(record, "rate", (count,))
-            self.acceleration = _numbers(record, "acceleration", (count,))
-            self.radius = _numbers(record, "radius", (count,))
+            self.length = numbers(record, "length", (count,))
+            self.stroke = numbers(record, "stroke", (count, 2))
+            self.rate = numbers(record, "rate", (count,))
+            self.acceleration = numbers(record, "acceleration", (count,))
+            self.radius = numbers(record, "radius", (count,))
             tip, joints = record["tip"], record["joints"]
             self.tip = _indices(tip["nodes"], "tip.nodes", nodes)
-            self.tip_weights = _numbers(tip, "weights", (len(self.tip),))
-            self.tip_frame = _numbers(tip, "frame", (3, 3))
+            self.tip_weights = numbers(tip, "weights", (len(self.tip),))
+            self.tip_frame = numbers(tip, "frame", (3, 3))
             if joints is None:
                 self.triangle = np.arange(nodes)[:, None]
                 self.offset = np.zeros((count, 2, 3))
             else:
                 self.triangle = _indices(joints["triangle"], "joints.triangle", nodes).reshape(nodes, 3)
-                self.offset = _numbers(joints, "offset", (count, 2, 3))
+                self.offset = numbers(joints, "offset", (count, 2, 3))
         except KeyError as error:
             raise ResultError(f"manifest.arm lacks {error}") from None
         except (TypeError, ValueError) as error:
@@ -69,6 +78,27 @@ class RecordedArm:
         self.members = members
         self.free = np.setdiff1d(np.arange(nodes), self.base)
         self._tip_fit = polygon_frame(self.home[self.tip], None) if self.has_tip_frame else None
+
+    unit, rigid_body = "m", "fixed member"
+
+    @property
+    def quantity_names(self) -> tuple[str, ...]:
+        """Names of what moves the arm and of what is fixed: its members."""
+        return self.member_names
+
+    @property
+    def stretches(self) -> NDArray[np.bool_]:
+        """(M,) bodies that change their lengths."""
+        return np.asarray(self.actuated)
+
+    @property
+    def home_quantities(self) -> Array:
+        """(M,) the lengths at home, m."""
+        return self.length
+
+    def quantities(self, nodes: Array) -> Array:
+        """Return (T, M) member lengths, m, at node positions (T, N, 3)."""
+        return np.stack([self.lengths(state) for state in nodes])
 
     @property
     def has_tip_frame(self) -> bool:
@@ -225,17 +255,6 @@ def _extremes(G: NDArray[Any]) -> tuple[float, float]:
 
 def _unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
-def _numbers(record: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> Array:
-    """Return ``record[key]`` as floats of that shape, inf for None."""
-    array = np.asarray(record[key], dtype=np.float64)
-    array = np.where(np.isnan(array), np.inf, array)
-    if array.ndim != len(shape) or any(
-        size not in (None, found) for size, found in zip(shape, array.shape, strict=True)
-    ):
-        raise ResultError(f"manifest.arm.{key} has shape {array.shape}; expected {shape}")
-    return array
 
 
 def _indices(values: Any, key: str, nodes: int) -> Index:

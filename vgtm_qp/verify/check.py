@@ -10,10 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
+from vgtm_qp.result.base import base_poses
 from vgtm_qp.result.certificate import Certificate, Measure
+from vgtm_qp.result.chain import RecordedChain, turns
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import RecordedArm
-from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Encounters, Least, MemberMotion
+from vgtm_qp.verify.arm import RecordedArm, recorded_arm
+from vgtm_qp.verify.clearance import (
+    RESOLUTION,
+    AgainstBody,
+    AgainstMembers,
+    ChainMotion,
+    Encounters,
+    Least,
+    MemberMotion,
+    motion_of,
+)
 from vgtm_qp.verify.obstacles import read_obstacles, rotation_matrix
 from vgtm_qp.verify.path import check_path
 from vgtm_qp.verify.recovery import excuse_recovering
@@ -66,14 +77,14 @@ def verify(maneuver: Result) -> Certificate:
     """
     manifest = maneuver.manifest
     problem = manifest["problem"]
-    arm = RecordedArm(manifest["arm"], maneuver.members)
+    arm = recorded_arm(manifest["arm"], maneuver.members)
     if maneuver.nodes.shape[1] != len(arm.home):
         raise ResultError(
             f"array nodes holds {maneuver.nodes.shape[1]} nodes; manifest.arm describes {len(arm.home)}"
         )
-    motion = MemberMotion(arm, maneuver.time, maneuver.nodes)
-    lengths = np.linalg.norm(motion.ends[:, :, 1] - motion.ends[:, :, 0], axis=2)
-    names = arm.member_names
+    states = maneuver.configurations
+    motion = motion_of(arm, maneuver.time, states)
+    lengths, names, unit = arm.quantities(states), arm.quantity_names, arm.unit
 
     bodies, wrong, notes = read_obstacles(
         problem, manifest.get("meshes") or {}, Path(manifest.get("directory") or ".")
@@ -94,27 +105,33 @@ def verify(maneuver: Result) -> Certificate:
         at, between, _ = _clearances(motion, against)
         self_at, self_between, _ = _clearances(motion, members)
 
-    tip = arm.tip_position(maneuver.nodes)
-    rotation = np.stack([arm.tip_rotation(state) for state in maneuver.nodes])
+    tip = arm.tip_position(states)
+    rotation = np.stack([arm.tip_rotation(state) for state in states])
     path = check_path(maneuver, tip)
     moved = _base_error(arm, maneuver, problem)
     differences = {
-        "member_lengths": np.abs(maneuver.member_lengths - lengths),
         "tip_position": np.abs(maneuver.tip_position - tip),
         "tip_rotation": np.abs(maneuver.tip_rotation - rotation),
         "clearance": _clearance_difference(maneuver.clearance, clearance, arm),
         "self_clearance": _clearance_difference(maneuver.self_clearance, self_clearance, arm),
     }
+    if maneuver.joints is None:
+        differences["member_lengths"] = np.abs(maneuver.member_lengths - lengths)
     furthest = max(differences, key=lambda name: float(np.max(differences[name], initial=0.0)))
-    values = _singular_values(arm, maneuver.nodes)
-    if len(maneuver.nodes) > _FEW_STATES and 3 * len(arm.free) > _MANY_UNKNOWNS:
+    values = _singular_values(arm, states)
+    if len(states) > _FEW_STATES and 3 * len(arm.free) > _MANY_UNKNOWNS:
         notes.append(f"singular values are those of {_FEW_STATES} states")
 
     return Certificate(
-        member_error=_worst(_held(arm, problem, maneuver.time, lengths), "m", MEMBER_TOLERANCE, names),
+        member_error=_worst(_held(arm, problem, maneuver.time, lengths), unit, MEMBER_TOLERANCE, names),
         base_error=_worst(moved, "m", MEMBER_TOLERANCE, [f"node {k}" for k in arm.base]),
-        stroke_violation=_worst(_beyond_stroke(arm, lengths), "m", LIMIT_TOLERANCE, names),
-        rate_violation=_worst(_beyond_rate(arm, maneuver.time, lengths), "m/s", LIMIT_TOLERANCE, names),
+        stroke_violation=_worst(_beyond_stroke(arm, lengths), unit, LIMIT_TOLERANCE, names),
+        rate_violation=_worst(
+            _beyond_rate(arm, maneuver.time, lengths),
+            f"{unit}/s".replace("rad or m", "(rad or m)"),
+            LIMIT_TOLERANCE,
+            names,
+        ),
         acceleration_violation=_worst(
             np.where(
                 _locking_rows(arm, problem, maneuver.time),
@@ -152,7 +169,9 @@ def verify(maneuver: Result) -> Certificate:
     )
 
 
-def _clearances(motion: MemberMotion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
+def _clearances(
+    motion: MemberMotion | ChainMotion, encounters: Sequence[Encounters]
+) -> tuple[Least, Least, Array]:
     """Return the least clearance at states, a bound of it between them, and the least at each state (T,)."""
     count = len(motion.time)
     each = [
@@ -170,7 +189,7 @@ def _clearances(motion: MemberMotion, encounters: Sequence[Encounters]) -> tuple
     return at, between, np.array([least.value for least in each])
 
 
-def _clearance_difference(stored: Array, found: Array, arm: RecordedArm) -> Array:
+def _clearance_difference(stored: Array, found: Array, arm: RecordedArm | RecordedChain) -> Array:
     """Return (T,) how far clearances differ; how deep a member is inside an obstacle is not compared."""
     floor = -float(arm.radius.min(initial=np.inf))
     with np.errstate(invalid="ignore"):
@@ -178,16 +197,16 @@ def _clearance_difference(stored: Array, found: Array, arm: RecordedArm) -> Arra
     return np.asarray(np.where(stored == found, 0.0, difference))
 
 
-def _held(arm: RecordedArm, problem: Mapping[str, Any], time: Array, lengths: Array) -> Array:
+def _held(arm: RecordedArm | RecordedChain, problem: Mapping[str, Any], time: Array, lengths: Array) -> Array:
     """Return (T, M) how far fixed members are from their lengths, and locked ones from where they stuck."""
-    errors = np.where(arm.actuated, 0.0, np.abs(lengths - arm.length))
-    for entry in (problem.get("truss") or {}).get("locked") or ():
+    errors = np.where(arm.actuated, 0.0, np.abs(lengths - arm.home_quantities))
+    for entry in (problem.get("truss") or problem.get("arm") or {}).get("locked") or ():
         name, since = (
             (entry, 0.0) if isinstance(entry, str) else (entry["member"], float(entry.get("time", 0.0)))
         )
-        if name not in arm.member_names:
+        if name not in arm.quantity_names:
             continue
-        k = arm.member_names.index(name)
+        k = arm.quantity_names.index(name)
         rows = np.flatnonzero(time >= since - _INSTANT)
         if len(rows):
             errors[rows, k] = np.maximum(errors[rows, k], np.abs(lengths[rows, k] - lengths[rows[0], k]))
@@ -197,60 +216,31 @@ def _held(arm: RecordedArm, problem: Mapping[str, Any], time: Array, lengths: Ar
 def _jams_between_rows(maneuver: Result, problem: Mapping[str, Any]) -> list[str]:
     """Return the members that lock at a time which no row has: nothing says what length they stuck at."""
     found = []
-    for entry in (problem.get("truss") or {}).get("locked") or ():
+    for entry in (problem.get("truss") or problem.get("arm") or {}).get("locked") or ():
         since = 0.0 if isinstance(entry, str) else float(entry.get("time", 0.0))
         if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > _INSTANT:
             found.append(f"{entry['member']} locks at {since:g} s, where there is no state")
     return found
 
 
-def _locking_rows(arm: RecordedArm, problem: Mapping[str, Any], time: Array) -> Array:
+def _locking_rows(arm: RecordedArm | RecordedChain, problem: Mapping[str, Any], time: Array) -> Array:
     """Return (T - 2, M) whether an acceleration is that of a member which stops because it locks."""
-    middle = np.zeros((max(len(time) - 2, 0), len(arm.member_names)), dtype=bool)
-    for entry in (problem.get("truss") or {}).get("locked") or ():
-        if not isinstance(entry, str) and entry["member"] in arm.member_names:
+    middle = np.zeros((max(len(time) - 2, 0), len(arm.quantity_names)), dtype=bool)
+    for entry in (problem.get("truss") or problem.get("arm") or {}).get("locked") or ():
+        if not isinstance(entry, str) and entry["member"] in arm.quantity_names:
             since = float(entry.get("time", 0.0))
-            middle[:, arm.member_names.index(entry["member"])] = np.abs(time[1:-1] - since) <= _INSTANT
+            middle[:, arm.quantity_names.index(entry["member"])] = np.abs(time[1:-1] - since) <= _INSTANT
     return middle
 
 
-def _base_error(arm: RecordedArm, maneuver: Result, problem: Mapping[str, Any]) -> Array:
-    """Return (T, N_c) how far base nodes are from where the problem holds them, m.
-
-    A base that moves, eqs. (7)-(8), goes from pose to pose on straight lines and single-axis rotations, from its home
-    pose at time 0 on, and stays in the last one.
-    """
-    home = arm.home[arm.base]
-    poses = (problem.get("truss") or {}).get("base_motion") or ()
-    shift = np.array([(0.0, 0.0, 0.0), *(pose.get("position") or (0.0,) * 3 for pose in poses)], dtype=float)
-    turn = [np.eye(3)]
-    turn += [
-        rotation_matrix(np.array(pose.get("rotation_vector") or (0.0,) * 3, dtype=float)) for pose in poses
-    ]
-    knots = np.array([0.0, *(float(pose["time"]) for pose in poses)])
-    errors = np.zeros((len(maneuver.time), len(arm.base)))
-    for row, time in enumerate(maneuver.time):
-        k = int(np.clip(np.searchsorted(knots, time, side="right") - 1, 0, max(len(knots) - 2, 0)))
-        share = 0.0
-        if len(knots) > 1:
-            share = float(np.clip((time - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0))
-        after = min(k + 1, len(knots) - 1)
-        part = rotation_matrix(share * _rotation_vector(turn[after] @ turn[k].T)) @ turn[k]
-        placed = home @ part.T + (1.0 - share) * shift[k] + share * shift[after]
-        errors[row] = np.linalg.norm(maneuver.nodes[row, arm.base] - placed, axis=1)
-    return errors
+def _base_error(arm: RecordedArm | RecordedChain, maneuver: Result, problem: Mapping[str, Any]) -> Array:
+    """Return (T, N_c) how far base nodes are from where the problem holds them, m."""
+    poses = base_poses(problem, maneuver.time)
+    placed = arm.home[arm.base] @ np.swapaxes(turns(poses[:, 3:]), 1, 2) + poses[:, None, :3]
+    return np.asarray(np.linalg.norm(maneuver.nodes[:, arm.base] - placed, axis=2))
 
 
-def _rotation_vector(rotation: Array) -> Array:
-    """Return the rotation vector (3,), rad, of a rotation by less than half a turn."""
-    twist = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    sine, cosine = float(np.linalg.norm(twist)) / 2.0, (float(np.trace(rotation)) - 1.0) / 2.0
-    return np.asarray(twist * (0.5 if sine < 1e-9 else float(np.arctan2(sine, cosine)) / (2.0 * sine)))
-
-
-def _member_angle(motion: MemberMotion) -> Least:
+def _member_angle(motion: MemberMotion | ChainMotion) -> Least:
     """Return the least angle at any state between two members that share a node, rad."""
     members = motion.arm.members
     node = members.reshape(-1)
@@ -271,19 +261,19 @@ def _member_angle(motion: MemberMotion) -> Least:
     return least
 
 
-def _beyond_stroke(arm: RecordedArm, lengths: Array) -> Array:
+def _beyond_stroke(arm: RecordedArm | RecordedChain, lengths: Array) -> Array:
     """Return (T, M) how far actuated members are outside their strokes, m."""
     outside = np.maximum(arm.stroke[:, 0] - lengths, lengths - arm.stroke[:, 1])
     return np.asarray(np.where(arm.actuated, np.maximum(outside, 0.0), 0.0))
 
 
-def _beyond_rate(arm: RecordedArm, time: Array, lengths: Array) -> Array:
+def _beyond_rate(arm: RecordedArm | RecordedChain, time: Array, lengths: Array) -> Array:
     """Return (T - 1, M) how far mean rates over the steps pass their limits, m/s."""
     rates = np.diff(lengths, axis=0) / np.diff(time)[:, None]
     return np.asarray(np.where(arm.actuated, np.maximum(np.abs(rates) - arm.rate, 0.0), 0.0))
 
 
-def _beyond_acceleration(arm: RecordedArm, time: Array, lengths: Array) -> Array:
+def _beyond_acceleration(arm: RecordedArm | RecordedChain, time: Array, lengths: Array) -> Array:
     """Return (T - 2, M) how far accelerations pass their limits, m/s^2.
 
     An acceleration is the change of the mean rate from step to step over the time between their middles.
@@ -294,7 +284,7 @@ def _beyond_acceleration(arm: RecordedArm, time: Array, lengths: Array) -> Array
     return np.asarray(np.where(arm.actuated, np.maximum(np.abs(changes) - arm.acceleration, 0.0), 0.0))
 
 
-def _singular_values(arm: RecordedArm, nodes: Array) -> Array:
+def _singular_values(arm: RecordedArm | RecordedChain, nodes: Array) -> Array:
     """Return (S, 3) least of the length Jacobian, least and greatest of the tip's, at S states."""
     states = np.arange(len(nodes))
     if 3 * len(arm.free) > _MANY_UNKNOWNS:
@@ -334,8 +324,10 @@ def _least_of(values: Array, unit: str) -> Measure:
     return Measure(float(values.min()) if len(values) else None, unit, None, "least")
 
 
-def _record_contradictions(maneuver: Result, arm: RecordedArm) -> list[str]:
+def _record_contradictions(maneuver: Result, arm: RecordedArm | RecordedChain) -> list[str]:
     """Return where the arm record disagrees with the arrays, with itself or with the problem."""
+    if isinstance(arm, RecordedChain):
+        return _chain_contradictions(maneuver, arm)
     found = []
     if tuple(maneuver.member_names.tolist()) != arm.member_names:
         found.append("array member_names differs from the arm record")
@@ -366,6 +358,50 @@ def _record_contradictions(maneuver: Result, arm: RecordedArm) -> list[str]:
         if differing:
             more = f" and {len(differing) - 1} more members" if len(differing) > 1 else ""
             found.append(f"the arm record's {name} differs from the problem's at {differing[0]}{more}")
+    return found
+
+
+def _chain_contradictions(maneuver: Result, arm: RecordedChain) -> list[str]:
+    """Return where the record of a serial arm disagrees with the arrays or with the problem."""
+    found = []
+    for name, given, recorded in (
+        ("joint_names", maneuver.joint_names, arm.quantity_names),
+        ("body_names", maneuver.body_names, arm.member_names),
+    ):
+        if given is None or tuple(given.tolist()) != recorded:
+            found.append(f"array {name} differs from the arm record")
+    table = maneuver.manifest["problem"].get("arm") or {}
+    joints = {str(joint["name"]): joint for joint in table.get("joint") or ()}
+    if tuple(joints) != arm.quantity_names:
+        return [*found, "the joints of the arm record are not those of the problem"]
+    origin = (0.0, 0.0, 0.0)
+    for k, (name, joint) in enumerate(joints.items()):
+        axis = np.array(joint["axis"], dtype=float)
+        limits = joint.get("limits") or (-np.inf, np.inf)
+        wanted = {
+            "axis": (arm.axis[k], axis / np.linalg.norm(axis)),
+            "position": (arm.position[k], joint.get("position") or origin),
+            "rotation": (
+                arm.rotation[k],
+                rotation_matrix(np.array(joint.get("rotation_vector") or origin, dtype=float)),
+            ),
+            "home": (arm.home_quantities[k], joint.get("home") or 0.0),
+            "limits": (arm.stroke[k], limits),
+            "rate": (arm.rate[k], np.inf if joint.get("rate") is None else joint["rate"]),
+            "acceleration": (
+                arm.acceleration[k],
+                np.inf if joint.get("acceleration") is None else joint["acceleration"],
+            ),
+            "kind": (float(arm.revolute[k]), float(joint.get("kind", "revolute") == "revolute")),
+        }
+        for key, (recorded, given) in wanted.items():
+            if not np.allclose(recorded, given, rtol=0.0, atol=LIMIT_TOLERANCE):
+                found.append(f"the arm record's {key} of joint {name} differs from the problem's")
+    if not np.allclose(arm.tip, table.get("tip") or origin, rtol=0.0, atol=LIMIT_TOLERANCE):
+        found.append("the arm record's tip differs from the problem's")
+    radius = table.get("link_radius")
+    if radius is not None and not np.allclose(arm.radius, radius, rtol=0.0, atol=LIMIT_TOLERANCE):
+        found.append("the arm record's link radius differs from the problem's")
     return found
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.distance import Separation, segment_segment
 from vgtm_qp.verify.obstacles import Body
@@ -78,6 +79,47 @@ class MemberMotion:
         return np.asarray(np.where(np.isnan(bound), 0.0, bound).max(axis=1))
 
 
+@dataclass(frozen=True)
+class ChainMotion:
+    """A moving serial arm, whose joints move straight from state to state; see :class:`MemberMotion`.
+
+    Attributes
+    ----------
+    nodes : (T, J + 6)
+        Configurations.
+    """
+
+    arm: RecordedChain
+    time: Array
+    nodes: Array
+    ends: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Place the ends of all links at all states."""
+        object.__setattr__(self, "ends", self.arm.ends(self.arm.placed(self.nodes)[0]))
+
+    def ends_between(self, step: int, member: Index, share: Array) -> Array:
+        """Return (P, 2, 3) the ends, m, of links (P,) at shares (P,) of the motion from state `step` to the next."""
+        before, after = self.nodes[step], self.nodes[step + 1]
+        # Many pairs are asked about at few instants.
+        instants, which = np.unique(share, return_inverse=True)
+        points = self.arm.placed(before + instants[:, None] * (after - before))[0]
+        return np.asarray(points[which[:, None], self.arm.links[member]])
+
+    def bend(self, step: int, member: Index) -> Array:
+        """Return (P,) an upper bound, m, of |d2 r / d share2| of the links' ends in the motion from state `step`."""
+        return np.full(len(member), self.arm.bend(self.nodes[step], self.nodes[step + 1]))
+
+
+def motion_of(
+    arm: RecordedArm | RecordedChain, time: Array, configurations: Array
+) -> MemberMotion | ChainMotion:
+    """Return the motion of an arm through its configurations: nodes (T, N, 3), or joints and base (T, J + 6)."""
+    if isinstance(arm, RecordedChain):
+        return ChainMotion(arm, time, configurations)
+    return MemberMotion(arm, time, configurations)
+
+
 def _norm(vectors: Array) -> Array:
     return np.asarray(np.linalg.norm(vectors, axis=-1))
 
@@ -126,7 +168,7 @@ class Least:
 class Encounters(ABC):
     """All pairs of one member and one other thing that must keep apart."""
 
-    def __init__(self, motion: MemberMotion) -> None:
+    def __init__(self, motion: MemberMotion | ChainMotion) -> None:
         self.motion = motion
         self.held_from: dict[tuple[int, int], int] = {}
         """First state at which each pair counts; pairs that are missing count from the first state on."""
@@ -258,7 +300,7 @@ class Encounters(ABC):
 class AgainstBody(Encounters):
     """Members against the convex pieces of one obstacle, seen from its moving centre."""
 
-    def __init__(self, motion: MemberMotion, body: Body) -> None:
+    def __init__(self, motion: MemberMotion | ChainMotion, body: Body) -> None:
         super().__init__(motion)
         self.body = body
         corners = body.corners

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.problem import Problem
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.verify.arm import RecordedArm, recorded_arm
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -72,7 +73,7 @@ class Drawing:
     """
 
     name: str
-    arm: RecordedArm
+    arm: RecordedArm | RecordedChain
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
 
@@ -85,15 +86,20 @@ class Drawing:
         return np.asarray(self.curve_weights @ control_vertices)
 
     def stroke_share(self, lengths: Array) -> Array:
-        """Return (M,) lengths (M,) as shares of the stroke, 0 to 1 for longest; NaN for fixed members."""
+        """Return (M,) lengths or joint values (M,) as shares of the stroke, 0 to 1.
+
+        NaN for those that are fixed or have no limits.
+        """
         low, high = self.arm.stroke.T
         share = np.full(len(low), np.nan)
-        moving = self.arm.actuated & (high > low)
+        moving = self.arm.actuated & (high > low) & np.isfinite(high - low)
         share[moving] = np.clip((lengths - low)[moving] / (high - low)[moving], 0.0, 1.0)
         return share
 
     def colours(self, lengths: Array) -> Array:
-        """Return (M, 3) colours, 0 to 1: blue for short to red for long, grey for fixed members."""
+        """Return (M, 3) colours, 0 to 1: blue for short to red for long, grey for fixed members and links."""
+        if isinstance(self.arm, RecordedChain):
+            return np.tile(FIXED_COLOUR, (len(lengths), 1))
         share = self.stroke_share(lengths)
         colours = stroke_colours(np.nan_to_num(share, nan=0.5))
         colours[np.isnan(share)] = FIXED_COLOUR
@@ -117,19 +123,21 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
     manifest = maneuver.manifest
     return _drawing(
         manifest["problem"],
-        RecordedArm(manifest["arm"], maneuver.members),
+        recorded_arm(manifest["arm"], maneuver.members),
         maneuver.control_vertices.shape[1],
         Path(manifest.get("directory") or "."),
     )
 
 
 def drawing_of_problem(problem: Problem, record: Mapping[str, Any], members: Index, vertices: int) -> Drawing:
-    """Return the drawing of a problem from the `arm_record` of its arm and number of control vertices."""
+    """Return the drawing of a problem from the record of its arm and number of control vertices."""
     directory = problem.source.parent if problem.source else Path.cwd()
-    return _drawing(problem.to_dict(), RecordedArm(record, members), vertices, directory)
+    return _drawing(problem.to_dict(), recorded_arm(record, members), vertices, directory)
 
 
-def _drawing(problem: Mapping[str, Any], arm: RecordedArm, vertices: int, directory: Path) -> Drawing:
+def _drawing(
+    problem: Mapping[str, Any], arm: RecordedArm | RecordedChain, vertices: int, directory: Path
+) -> Drawing:
     weights = np.zeros((0, vertices))
     spec = problem.get("curve")
     if vertices and spec:

@@ -396,12 +396,12 @@ def _draw_legend(figure: Figure, drawing: Drawing, obstacles: bool) -> None:
     strokes = np.unique(arm.stroke[arm.actuated].round(9), axis=0)
     low, high = strokes[0] if len(strokes) == 1 else (0.0, 1.0)
     label = "length of actuated members (m)" if len(strokes) == 1 else "actuated members, share of the stroke"
-    if arm.actuated.any():
+    if arm.stretches.any():
         bar = figure.add_axes((_MARGIN / width, 0.52 / height, 2.3 / width, 0.09 / height))
         colours = ListedColormap(stroke_colours(np.linspace(0.0, 1.0, 256)).tolist())
         scalar = mpl.cm.ScalarMappable(Normalize(low, high), colours)
         figure.colorbar(scalar, cax=bar, orientation="horizontal", label=label)
-    handles: list[Any] = [Line2D([], [], color=FIXED_COLOUR, linewidth=2.6, label="fixed member")]
+    handles: list[Any] = [Line2D([], [], color=FIXED_COLOUR, linewidth=2.6, label=arm.rigid_body)]
     if drawing.curve_weights.size:
         handles += [
             Line2D([], [], color=CURVE_COLOUR, linewidth=1.4, label="reference curve"),

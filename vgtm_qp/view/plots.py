@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.verify.arm import recorded_arm
 from vgtm_qp.verify.check import TIP_TOLERANCE
 from vgtm_qp.verify.path import check_path
 
@@ -70,10 +70,11 @@ def plot_strokes(maneuver: Result, *, axes: Axes | None = None) -> Figure:
     In m where all have the same stroke, as parts of it, %, where not. The members that come nearest to a limit
     are named; the others are grey.
     """
-    arm = RecordedArm(maneuver.manifest["arm"], maneuver.members)
-    actuators = np.flatnonzero(arm.actuated)
+    arm = recorded_arm(maneuver.manifest["arm"], maneuver.members)
+    limited = np.isfinite(arm.stroke[arm.actuated]).all(axis=1)
+    actuators = np.flatnonzero(arm.actuated)[limited]
     low, high = arm.stroke[actuators].T
-    lengths = maneuver.member_lengths[:, actuators]
+    lengths = maneuver.actuator_values[:, limited]
     share = (lengths - low) / np.where(high > low, high - low, 1.0)
     alike = bool(len(actuators)) and np.ptp(low) == 0.0 and np.ptp(high) == 0.0
     values, bottom, top = (lengths, low[0], high[0]) if alike else (100.0 * share, 0.0, 100.0)
@@ -82,13 +83,18 @@ def plot_strokes(maneuver: Result, *, axes: Axes | None = None) -> Figure:
         for k in order[_NAMED:][::-1]:
             axes.plot(maneuver.time, values[:, k], color="0.78", linewidth=0.8)
         for k, colour, dash in zip(order[:_NAMED], _COLOURS, _DASHES, strict=False):
-            name = arm.member_names[actuators[k]]
+            name = arm.quantity_names[actuators[k]]
             axes.plot(maneuver.time, values[:, k], color=colour, linestyle=dash, label=name)
         room = 0.08 * (top - bottom)
         axes.axhspan(bottom - room, bottom, **_FORBIDDEN)
         axes.axhspan(top, top + room, **_FORBIDDEN)
         axes.set_ylim(bottom - room, top + room)
-        axes.set(xlabel="time (s)", ylabel="actuator length (m)" if alike else "part of the stroke (%)")
+        axes.set(
+            xlabel="time (s)",
+            ylabel=f"actuator {'length (m)' if maneuver.joints is None else 'value (rad or m)'}"
+            if alike
+            else "part of the stroke (%)",
+        )
         _set_time(axes, maneuver)
         axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), title="nearest a limit")
     return _figure(axes)

@@ -74,8 +74,8 @@ class ArmScene:
         self._groups = [
             (index, self._add_members(name, ends[index], arm.radius[index], drawing.colours(lengths)[index]))
             for name, index in (
-                ("fixed", np.flatnonzero(~arm.actuated)),
-                ("actuated", np.flatnonzero(arm.actuated)),
+                ("fixed", np.flatnonzero(~arm.stretches)),
+                ("actuated", np.flatnonzero(arm.stretches)),
             )
             if len(index)
         ]
@@ -110,7 +110,7 @@ class ArmScene:
                 position, wxyz, span = _placement(ends[index])
                 handle.batched_positions = numbers(position)
                 handle.batched_wxyzs = numbers(wxyz)
-                if self._drawing.arm.actuated[index].any():
+                if self._drawing.arm.stretches[index].any():
                     scales = np.array(handle.batched_scales)
                     scales[:, 2] = numbers(span)
                     handle.batched_scales = scales

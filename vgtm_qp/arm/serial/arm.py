@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.arm import Label, MotionPattern, Pose, Stations, Tip
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
 from vgtm_qp.arm.frames import frames_at
-from vgtm_qp.arm.serial.chain import Array, Chain, Index, Mask, chain_function
+from vgtm_qp.arm.record import or_none
+from vgtm_qp.arm.serial.chain import Array, Index, Mask, SerialChain, chain_function
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies, capsules
@@ -138,7 +140,7 @@ class SerialArm:
     bays = None
     leaves_chords = True
 
-    def __init__(self, chain: Chain) -> None:
+    def __init__(self, chain: SerialChain) -> None:
         self.chain = chain
         self.node_names, self.quantity_names = chain.node_names, chain.names
         self.stroke, self.rate, self.acceleration = chain.limits, chain.rate, chain.acceleration
@@ -192,14 +194,15 @@ class SerialArm:
     @cached_property
     def bodies(self) -> Bodies:
         """Links between successive origins; those of joints in one place are joined as if they were one."""
-        chain = self.chain
-        first = np.arange(1, len(chain) + 1)
-        place = np.concatenate([[0], np.cumsum(chain.lengths[1:] > 0.0)])
-        kept = np.flatnonzero(chain.lengths[1:] > 0.0)
-        points = np.stack([first, first + 1], axis=1)[kept]
+        chain, count = self.chain, len(self.chain)
+        apart = (chain.lengths[1:] > 0.0) | ~chain.revolute
+        place = np.arange(count + 2)
+        for node in range(count, 0, -1):
+            place[node] = node if apart[node - 1] else place[node + 1]
+        kept = np.flatnonzero(apart)
+        points = np.stack([kept + 1, kept + 2], axis=1)
         names = [chain.names[j] for j in kept]
-        joints = np.stack([place[:-1], place[1:]], axis=1)[kept]
-        return capsules(points, chain.radius, names, joints=joints, kind="link")
+        return capsules(points, chain.radius, names, joints=place[points], kind="link")
 
     @cached_property
     def motion_pattern(self) -> MotionPattern:
@@ -299,6 +302,40 @@ class SerialArm:
         """See ``arm.Arm``."""
         return ChainSymbols(self, constants)
 
+    def record(self) -> dict[str, Any]:
+        """See ``arm.Arm``.
+
+        Keys: ``kind``, ``joint_names``, ``revolute``, ``axis``, ``position``, ``rotation`` (in the frame of the one
+        before), ``home``, ``stroke``, ``rate``, ``acceleration``, ``actuated``, ``tip`` in the last frame and
+        ``tip_frame`` at home; of the bodies ``body_names``, ``radius``, ``links`` (their points: base, joints, tip) and
+        ``joined`` (their ends; bodies with one in common are neighbours). None means no limit.
+        """
+        chain, bodies = self.chain, self.bodies
+        return {
+            "kind": self.kind,
+            "joint_names": list(chain.names),
+            "revolute": chain.revolute.tolist(),
+            "axis": chain.axis.tolist(),
+            "position": chain.position.tolist(),
+            "rotation": chain.rotation.tolist(),
+            "home": chain.home.tolist(),
+            "stroke": [or_none(limits) for limits in chain.limits],
+            "rate": or_none(chain.rate),
+            "acceleration": or_none(chain.acceleration),
+            "actuated": self.actuated.tolist(),
+            "tip": chain.tip.tolist(),
+            "tip_frame": self.end_effector.frame.tolist(),
+            "body_names": list(bodies.names),
+            "radius": bodies.radius.tolist(),
+            "links": bodies.points.tolist(),
+            "joined": bodies.joints.tolist(),
+        }
+
+    def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:  # noqa: ARG002
+        """See ``arm.Arm``: the base's pose follows from the problem."""
+        names = {"joint_names": np.array(self.chain.names), "body_names": np.array(self.bodies.names)}
+        return {"joints": quantities, **names}
+
     def motion_rows(self, *values: Array) -> ChainRows:
         """See ``arm.Arm``: K column by column, and r."""
         response, rhs = values
@@ -313,3 +350,40 @@ def _leaning(frame: Array, direction: Array) -> Array:
         return frame
     angle = float(np.arctan2(sine, frame[:, 2] @ direction / np.linalg.norm(direction)))
     return np.asarray(rotation_from_vector(angle / sine * axis) @ frame)
+
+
+@dataclass(frozen=True)
+class ChainDescription:
+    """The counts of a serial arm.
+
+    Attributes
+    ----------
+    joints, actuated, links, stations : int
+    length : float
+        Of the way from the base over the joints to the tip at home, m.
+    hard : bool
+        Whether all stations can keep their positions on the curve at home.
+    """
+
+    joints: int
+    actuated: int
+    links: int
+    stations: int
+    length: float
+    hard: bool
+
+    def __str__(self) -> str:
+        """Return two lines."""
+        can = "can" if self.hard else "cannot"
+        return (
+            f"serial arm of {self.joints} joints, {self.actuated} of them actuated, {self.links} links, "
+            f"{self.length:.6g} m long\n"
+            f"{self.stations} stations track the curve; they {can} keep their positions on it exactly"
+        )
+
+
+def describe_chain(arm: Arm) -> ChainDescription:
+    """Return the counts of a serial arm."""
+    count, stations = len(arm.quantity_names), arm.stations
+    hard = "position" in stations.trackable
+    return ChainDescription(count, len(arm.actuators), len(arm.bodies), len(stations) - 1, arm.height, hard)

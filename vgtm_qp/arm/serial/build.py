@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from vgtm_qp.arm.serial.chain import Chain
+from vgtm_qp.arm.serial.chain import SerialChain
 from vgtm_qp.problem.arm import ArmTable
 from vgtm_qp.rotation import rotation_from_vector
 
 
-def build_chain(spec: ArmTable) -> Chain:
+def build_chain(spec: ArmTable) -> SerialChain:
     """Return the joints of a validated table; those locked from the start are stuck at home."""
     joints, stuck = spec.joint, {lock.member for lock in spec.locked if lock.time == 0.0}
     axis = np.array([joint.axis for joint in joints], dtype=float)
     free = (-np.inf, np.inf)
-    return Chain(
+    return SerialChain(
         names=tuple(joint.name for joint in joints),
         revolute=np.array([joint.kind == "revolute" for joint in joints]),
         axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),

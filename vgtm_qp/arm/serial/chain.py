@@ -15,7 +15,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class SerialChain:
     """J joints, base first, each placed in the frame of the one before.
 
     Attributes
@@ -110,7 +110,7 @@ def turned(vector: ca.SX) -> ca.SX:
     return ca.SX.eye(3) + (ca.sin(angle) / angle) * cross + ((1.0 - ca.cos(angle)) / square) * (cross @ cross)
 
 
-def chain_function(chain: Chain) -> ca.Function:
+def chain_function(chain: SerialChain) -> ca.Function:
     """Return (q, axes (3, J), positions (3, J), rotations (3, 3 J), tip (3)) -> nodes (3, N) and d nodes / d joints.
 
     The configuration q (J + 6) holds the joints' values, then position, m, and rotation vector, rad, of the base. The

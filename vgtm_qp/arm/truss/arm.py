@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
+from vgtm_qp.arm.record import or_none
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.arm.truss.kinematics import EndKinematics, TrussKinematics
@@ -223,6 +225,51 @@ class TrussArm:
     def symbols(self, constants: Constants) -> TrussSymbols:
         """See ``arm.Arm``."""
         return TrussSymbols(self.truss, constants)
+
+    def record(self) -> dict[str, Any]:
+        """See ``arm.Arm``.
+
+        Keys: ``module``, ``bays``, ``node_names``, ``home`` (N, 3), ``base`` (indices of given nodes),
+        ``member_names``, ``actuated``, ``length`` (M, at home), ``stroke`` (M, 2), ``rate``, ``acceleration``,
+        ``radius`` (M), ``tip`` (``nodes``, ``weights``, ``frame`` at home) and ``joints`` (``triangle``, ``offset``,
+        see ``truss.Joints``; None for pin joints). Lengths in m; None means no limit.
+        """
+        truss = self.truss
+        joints = truss.joints
+        ends = truss.home[truss.members]
+        pin_lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+        return {
+            "module": truss.module,
+            "bays": truss.bays,
+            "node_names": list(truss.node_names),
+            "home": truss.home.tolist(),
+            "base": np.flatnonzero(truss.base).tolist(),
+            "member_names": list(truss.member_names),
+            "actuated": truss.actuated.tolist(),
+            "length": (pin_lengths if joints is None else truss.home_lengths).tolist(),
+            "stroke": truss.stroke.tolist(),
+            "rate": or_none(truss.rate),
+            "acceleration": or_none(truss.acceleration),
+            "radius": truss.radius.tolist(),
+            "tip": {
+                "nodes": truss.tip.tolist(),
+                "weights": truss.tip_weights.tolist(),
+                "frame": truss.tip_frame.tolist(),
+            },
+            "joints": None
+            if joints is None
+            else {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
+        }
+
+    def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
+        """See ``arm.Arm``."""
+        return {
+            "nodes": q,
+            "members": self.truss.members,
+            "member_names": np.array(self.truss.member_names),
+            "member_actuated": self.truss.actuated,
+            "member_lengths": quantities,
+        }
 
     def motion_rows(self, *values: Array) -> LengthRows:
         """See ``arm.Arm``: gradients (3 Q M,) and right-hand sides (M,)."""

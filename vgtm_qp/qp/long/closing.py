@@ -21,7 +21,7 @@ TOO_FAR = 1e-2
 """Lengths that are further off than this, m, are not worth trying."""
 
 
-class Closing:
+class ChainClosing:
     """Repeats a sweep of ``elimination.Positions.function`` until the errors vanish.
 
     Attributes

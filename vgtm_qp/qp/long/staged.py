@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dtrtrs
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
-from vgtm_qp.qp.long.closing import Closing
+from vgtm_qp.qp.long.closing import ChainClosing
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import Sweep
 from vgtm_qp.qp.long.working_set import Answer, Point, RowNumbers, RowTable, solve_rows
@@ -156,9 +156,9 @@ class StagedSolver:
         sweep()
         return sweep.outputs[1].reshape(-1, motions.shape[1]).take(self._soft, axis=0)
 
-    def closing(self) -> Closing:
+    def closing(self) -> ChainClosing:
         """Return what brings members to their lengths with the Jacobian of the QP solved last."""
-        return Closing(self.chain, self._elimination.close(), [self._forward_head, self._forward_gains])
+        return ChainClosing(self.chain, self._elimination.close(), [self._forward_head, self._forward_gains])
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""

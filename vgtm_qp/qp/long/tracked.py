@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dtrtrs
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
-from vgtm_qp.qp.long.closing import Closing
+from vgtm_qp.qp.long.closing import ChainClosing
 from vgtm_qp.qp.long.elimination import Elimination, Positions
 from vgtm_qp.qp.long.sparse_symbols import nonzeros, offsets, small_inverse
 from vgtm_qp.qp.long.staged import SINGULAR
@@ -181,9 +181,9 @@ class TrackedSolver:
         """See ``solvers.StepSolver``."""
         return None
 
-    def closing(self) -> Closing:
+    def closing(self) -> ChainClosing:
         """Return what brings fixed members to their lengths and keeps the faces on the curve, as the QP solved last."""
-        return Closing(self.chain, self._graphs.hold(), [self.data.head, self._following.outputs[1]])
+        return ChainClosing(self.chain, self._graphs.hold(), [self.data.head, self._following.outputs[1]])
 
     def columns(self, table: RowTable, rows: Index) -> Array:
         """Return (size, len(rows)) L^-1 A' of the given rows A, where H = L L'."""

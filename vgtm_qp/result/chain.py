@@ -1,0 +1,161 @@
+"""A serial arm from its record in the manifest: where its joints and links are, in plain NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import ResultError
+from vgtm_qp.result.record import numbers
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class RecordedChain:
+    """A serial arm as the manifest records it (``SerialArm.record``).
+
+    A configuration (J + 6,) holds the joints' values, rad or m, then position, m, and rotation vector,
+    rad, of the base.
+
+    Attributes
+    ----------
+    quantity_names, member_names : tuple of str
+        Joints, and links.
+    actuated, home_quantities, stroke, rate, acceleration : (J,), (J,), (J, 2), (J,), (J,)
+        Of the joints; infinite where there is no limit.
+    base : (1,) int
+        The point that the problem places.
+    links, members : (B, 2) int
+        The points of each link, counted from the base over the joints to the tip; and its ends, of which neighbours
+        have one in common.
+    radius, length : (B,)
+        Of the links, m.
+    """
+
+    unit, rigid_body = "rad or m", "link"
+    has_pin_joints = False
+
+    def __init__(self, record: Mapping[str, Any]) -> None:
+        try:
+            self.quantity_names = tuple(str(name) for name in record["joint_names"])
+            self.member_names = tuple(str(name) for name in record["body_names"])
+            joints, links = len(self.quantity_names), len(self.member_names)
+            self.revolute = np.asarray(record["revolute"], dtype=np.bool_)
+            self.actuated = np.asarray(record["actuated"], dtype=np.bool_)
+            self.axis = numbers(record, "axis", (joints, 3))
+            self.position = numbers(record, "position", (joints, 3))
+            self.rotation = numbers(record, "rotation", (joints, 3, 3))
+            self.home_quantities = numbers(record, "home", (joints,))
+            self.stroke = numbers(record, "stroke", (joints, 2))
+            self.stroke[np.isinf(self.stroke[:, 0]), 0] = -np.inf
+            self.rate = numbers(record, "rate", (joints,))
+            self.acceleration = numbers(record, "acceleration", (joints,))
+            self.tip = numbers(record, "tip", (3,))
+            self.tip_frame = numbers(record, "tip_frame", (3, 3))
+            self.radius = numbers(record, "radius", (links,))
+            self.links = np.asarray(record["links"], dtype=np.int64).reshape(links, 2)
+            self.members = np.asarray(record["joined"], dtype=np.int64).reshape(links, 2)
+        except KeyError as error:
+            raise ResultError(f"manifest.arm lacks {error}") from None
+        except (TypeError, ValueError) as error:
+            raise ResultError(f"manifest.arm is malformed: {error}") from None
+        if self.revolute.shape != (joints,) or self.actuated.shape != (joints,):
+            raise ResultError(f"manifest.arm does not describe {joints} joints")
+        if links and not (self.links.min() >= 0 and self.links.max() < joints + 2):
+            raise ResultError(f"manifest.arm.links names a point outside 0..{joints + 1}")
+        self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
+        home = np.concatenate([self.home_quantities, np.zeros(6)])[None]
+        points, _, frames = self.placed(home)
+        self.home, self._home_tip = points[0], frames[0]
+        self.length = np.linalg.norm(np.diff(self.home[self.links], axis=1)[:, 0], axis=1)
+        self._reaches = self._greatest_reaches()
+
+    @property
+    def stretches(self) -> NDArray[np.bool_]:
+        """(B,) bodies that are drawn as changing their lengths: none."""
+        return np.zeros(len(self.links), dtype=np.bool_)
+
+    def placed(self, q: Array) -> tuple[Array, Array, Array]:
+        """Return points (P, J + 2, 3), m, axes (P, J, 3) and last frames (P, 3, 3) at configurations (P, J + 6)."""
+        count = len(self.quantity_names)
+        at, frame = q[:, count : count + 3], turns(q[:, count + 3 :])
+        points, axes = [at], []
+        for j in range(count):
+            at = at + frame @ self.position[j]
+            frame = frame @ self.rotation[j]
+            axes.append(frame @ self.axis[j])
+            points.append(at)
+            if self.revolute[j]:
+                frame = frame @ turns(q[:, j, None] * self.axis[j])
+            else:
+                at = at + q[:, j, None] * axes[-1]
+        points.append(at + frame @ self.tip)
+        return np.stack(points, axis=1), np.stack(axes, axis=1), frame
+
+    def ends(self, points: Array) -> Array:
+        """Return (..., B, 2, 3) the ends of the links where the points (..., J + 2, 3) are."""
+        return np.asarray(points[..., self.links, :])
+
+    def lengths(self, points: Array) -> Array:
+        """Return (B,) the lengths of the links, m, where the points (J + 2, 3) are."""
+        ends = self.ends(points)
+        return np.asarray(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
+
+    def quantities(self, q: Array) -> Array:
+        """Return (T, J) the joints' values at configurations (T, J + 6)."""
+        return q[:, : len(self.quantity_names)]
+
+    def tip_position(self, q: Array) -> Array:
+        """Return (T, 3) the end effector's position, m."""
+        return np.asarray(self.placed(q)[0][:, -1])
+
+    def tip_rotation(self, q: Array) -> Array:
+        """Return (3, 3) the end effector's attitude at a configuration (J + 6,): that at home, turned."""
+        return np.asarray(self.placed(q[None])[2][0] @ self._home_tip.T @ self.tip_frame)
+
+    def singular_values(self, q: Array) -> tuple[float, float, float] | None:
+        """Return 1, for joints are the configuration, and least and greatest singular value of the tip's Jacobian."""
+        points, axes, _ = self.placed(q[None])
+        arms = np.cross(axes[0], points[0, -1] - points[0, 1:-1])
+        jacobian = np.where(self.revolute[:, None], arms, axes[0])[self.actuated]
+        if not len(jacobian):
+            return None
+        values = np.linalg.svd(jacobian, compute_uv=False)
+        return 1.0, float(values[-1]) if len(values) == 3 else 0.0, float(values[0])
+
+    def bend(self, before: Array, after: Array) -> float:
+        """Return a bound, m, of |d2 r / d share2| of any point of the arm as the configuration moves straight.
+
+        A point's velocity is a sum over the joints before it of w a x (r - o) and v a. The axes a turn with the joints
+        before them, and r - o changes by no more than what the joints from there on do to it.
+        """
+        joints = np.abs(after - before)[: len(self.quantity_names)]
+        turn, slide = np.where(self.revolute, joints, 0.0), np.where(self.revolute, 0.0, joints)
+        base = 2.0 * float(np.linalg.norm(after[-3:] - before[-3:]))
+        turn, slide = np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
+        earlier = np.cumsum(turn) - turn
+        beyond = np.cumsum((turn * self._reaches + slide)[::-1])[::-1]
+        return float(turn @ (2.0 * earlier * self._reaches + beyond) + slide @ earlier)
+
+    def _greatest_reaches(self) -> Array:
+        """Return (J + 1,) how far the tip may be from the base and from each joint, m."""
+        ways = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
+        slides = np.where(self.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
+        after = np.cumsum((ways[1:] + slides)[::-1])[::-1]
+        return np.concatenate([[after[0] + ways[0]], after])
+
+
+def turns(vectors: Array) -> Array:
+    """Return (P, 3, 3) the rotations by |v| about each of the vectors (P, 3), rad."""
+    angle = np.linalg.norm(vectors, axis=-1)[:, None, None]
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
+    # sinc is sin(pi x) / (pi x).
+    return np.asarray(
+        np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
+    )
