@@ -119,7 +119,8 @@ def _axis(rotation: Any, twist: Any, cosine: Any) -> Any:
     first = ca.logic_and(outer[0, 0] >= outer[1, 1], outer[0, 0] >= outer[2, 2])
     other = ca.if_else(outer[1, 1] >= outer[2, 2], outer[:, 1], outer[:, 2])
     column = ca.if_else(first, outer[:, 0], other)
-    return column * (ca.if_else(ca.dot(column, twist) < 0, -1.0, 1.0) / ca.sqrt(ca.dot(column, column) + TINY))
+    sense = ca.if_else(ca.dot(column, twist) < 0, -1.0, 1.0)
+    return column * (sense / ca.sqrt(ca.dot(column, column) + TINY))
 
 
 def worth_closing(error: Any, motion: Any) -> Any:
