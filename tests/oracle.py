@@ -158,9 +158,10 @@ _AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
 
 
 def shortest_turn(start: Array, end: Array) -> Array:
-    """Return the rotation vector (3,) that turns one direction to another about what both are normal to."""
+    """Return the rotation vector (3,) that turns one direction to another, not its opposite, about their normal."""
     axis = np.cross(start, end)
-    return np.asarray(axis / norm(axis) * np.arctan2(norm(axis), start @ end))
+    sine = float(norm(axis))
+    return np.asarray(axis * (np.arctan2(sine, start @ end) / sine) if sine > 0.0 else np.zeros(3))
 
 
 def tip_turn(rows: Sequence[str], rotation: Array, goal: Array) -> Array:
@@ -416,7 +417,9 @@ def condensed(layout: Layout, asked: StepInput, given: dict[str, Array]) -> dict
         tracking = 1.0 if layout.hard_tracking else weights.tracking
         turning = np.ones(R) if layout.hard_turns else [weights.tangent, weights.tangent, weights.roll][:R]
         parts.append(np.sqrt(tracking) * stacked(centres, -position, given["position_rhs"]))
-        parts.append(np.tile(np.sqrt(turning), K)[:, None] * stacked(turned, curve.reshape(-1, size), residual))
+        parts.append(
+            np.tile(np.sqrt(turning), K)[:, None] * stacked(turned, curve.reshape(-1, size), residual)
+        )
         if layout.spacings:
             still = np.zeros((layout.spacings, count + 1))
             stretch = stacked(still, given["curve.spacing"], given["curve.spacing_rhs"])
