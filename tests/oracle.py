@@ -158,9 +158,10 @@ _AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
 
 
 def shortest_turn(start: Array, end: Array) -> Array:
-    """Return the rotation vector (3,) that turns one direction to another about what both are normal to."""
+    """Return the rotation vector (3,) that turns one direction to another, not its opposite, about their normal."""
     axis = np.cross(start, end)
-    return np.asarray(axis / norm(axis) * np.arctan2(norm(axis), start @ end))
+    sine = float(norm(axis))
+    return np.asarray(axis * (np.arctan2(sine, start @ end) / sine) if sine > 0.0 else np.zeros(3))
 
 
 def tip_turn(rows: Sequence[str], rotation: Array, goal: Array) -> Array:
@@ -360,3 +361,80 @@ def check_numbers(
         group, _, key = name.rpartition(".")
         got = own[name] if name in own else getattr(getattr(found, group) if group else found, key)
         np.testing.assert_allclose(got, value, rtol=1e-11, atol=tolerance, err_msg=name)
+
+
+# The step over what actuators, base and path leave free.
+
+
+def condensed(layout: Layout, asked: StepInput, given: dict[str, Array]) -> dict[str, Array]:
+    """Return a step's QP over d_a, the q coordinates of the curve that its base leaves free, and the progress.
+
+    Given are its :func:`numbers`. Found are rows (L, n_a + q + 1), whose squares are the objective's and whose last
+    column is their constant; those of the tip (n_e, n_a + q + 1); bounds (n_a + q + 1 + n_e,) of unknowns and tip;
+    what else there is of the gradient but for the goals of control vertices; and offset (V, 3) and normal (3,) of the
+    curve's base.
+    """
+    truss, weights, V = truss_of(layout.arm), layout.weights, layout.vertices
+    count, size, tracked = len(truss.actuators), 3 * layout.vertices + layout.torsion, layout.tracked
+    jacobian = given["motion"][:, : 3 * len(truss.free)]
+    known = np.column_stack([np.eye(truss.member_count)[:, truss.actuators], given["motion_rhs"]])
+    free = np.linalg.solve(jacobian, known)
+    nodes = np.zeros((truss.node_count, 3, count + 1))
+    nodes[truss.base, :, -1] = (asked.base - asked.q)[truss.base]
+    nodes[truss.free] = free.reshape(-1, 3, count + 1)
+
+    offset, normal, own = np.zeros((V, 3)), np.zeros(3), np.zeros(0)
+    basis = np.zeros((size, layout.free_curve))
+    if V:
+        axes = given["base_axes"]
+        normal, offset[0] = np.cross(axes[0], axes[1]), given["base_displacement"]
+        offset[1] = offset[0] + given["base_rhs"] @ axes
+        basis[3:6, 0], basis[6:, 1:] = normal, np.eye(size - 6)
+        pull = weights.curve_rate * offset + bending_gradient(
+            asked.motion * asked.vertices + offset, weights.smoothness
+        )
+        own = np.pad(pull.reshape(-1), (0, layout.torsion)) @ basis
+    start = np.pad(offset.reshape(-1), (0, layout.torsion))
+
+    def stacked(over_nodes: Array, over_curve: Array, constant: Array) -> Array:
+        last = constant.reshape(-1) + over_nodes[:, -1] + over_curve @ start
+        return np.column_stack([over_nodes[:, :-1], over_curve @ basis, last])
+
+    parts = [np.sqrt(weights.node_rate) * stacked(free, np.zeros((len(free), size)), np.zeros(len(free)))]
+    if V:
+        K, R = len(tracked), layout.turns
+        names = "curve.turn_rhs", "curve.turn_face", "curve.turn_curve"
+        if layout.general is None:
+            names = "tangent_rhs", "tangent_face", "tangent_curve"
+            given = {**given, "curve.position": np.einsum("kv,cd->kcvd", layout.curve_weights, np.eye(3))}
+        residual, face, curve = (given[name] for name in names)
+        if layout.general is None:
+            curve = np.einsum("kac,kv->kavc", curve, layout.curve_slopes)
+        corners = nodes[truss.faces[tracked]]
+        centres = np.einsum("kf,kfcn->kcn", truss.face_weights[tracked], corners).reshape(3 * K, -1)
+        turned = np.einsum("krf,kfn->krn", face, corners.reshape(K, 9, -1)).reshape(R * K, -1)
+        position = given["curve.position"].reshape(3 * K, size)
+        tracking = 1.0 if layout.hard_tracking else weights.tracking
+        turning = np.ones(R) if layout.hard_turns else [weights.tangent, weights.tangent, weights.roll][:R]
+        parts.append(np.sqrt(tracking) * stacked(centres, -position, given["position_rhs"]))
+        parts.append(
+            np.tile(np.sqrt(turning), K)[:, None] * stacked(turned, curve.reshape(-1, size), residual)
+        )
+        if layout.spacings:
+            still = np.zeros((layout.spacings, count + 1))
+            stretch = stacked(still, given["curve.spacing"], given["curve.spacing_rhs"])
+            parts.append(np.sqrt(weights.spacing) * stretch)
+    tip = given["tip_jacobian"] @ nodes[truss.tip].reshape(-1, count + 1)
+    missing, unbounded = given["tip_rhs"] - tip[:, -1], np.full(layout.free_curve, 1e30)
+    none = np.zeros((len(tip), layout.free_curve))
+    ends = (given["lower"], [given["progress_lower"]]), (given["upper"], [given["progress_upper"]])
+    return {
+        "rows": np.concatenate(parts),
+        "tip": np.column_stack([tip[:, :-1], none, -given["tip_rate"]]),
+        "lower": np.concatenate([ends[0][0], -unbounded, ends[0][1], missing]),
+        "upper": np.concatenate([ends[1][0], unbounded, ends[1][1], missing]),
+        "gradient": np.concatenate([given["actuator_gradient"], own, [given["progress_gradient"]]]),
+        "curvature": np.array([given["progress_curvature"]]),
+        "offset": offset,
+        "normal": normal,
+    }

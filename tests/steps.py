@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,11 +12,12 @@ from arms import random_pose
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics, Pose
+from vgtm_qp.curve.families import make_family
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
-from vgtm_qp.qp.shape import CurveRows
+from vgtm_qp.qp.shape import CurveRows, CurveShape
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
@@ -25,6 +27,42 @@ Array = NDArray[np.float64]
 
 MOVED_BASE = Pose(np.array([0.01, 0.0, 0.02]), rotation_from_vector([0.01, -0.02, 0.015]))
 """A base that turned and moved a little."""
+
+
+SHAPES: dict[str, dict[str, Any]] = {
+    "arc-length": {"by_arc_length": True},
+    "torsion": {"torsion": 2, "tracks_roll": True},
+    "spacing": {"spacing": True},
+    "everything": {"by_arc_length": True, "torsion": 1, "tracks_roll": True, "spacing": True},
+}
+
+
+def shaped(
+    layout: Layout,
+    shape: str | None = None,
+    *,
+    family: str = "bezier",
+    goals: tuple[int, ...] = (),
+    hard: bool = False,
+    **weights: float,
+) -> Layout:
+    """The layout with a curve that is more than its tables."""
+    curve = make_family(family, layout.vertices)
+    nodes = layout.tracked / layout.tracked[-1]
+    options = dict(SHAPES[shape]) if shape else {}
+    if options.pop("spacing", False):
+        options["spacing"] = np.full(len(nodes), 0.7)
+    options["roll"] = np.linspace(0.1, -0.2, len(nodes))
+    return replace(
+        layout,
+        curve_weights=curve.weights(nodes),
+        curve_slopes=curve.weights(nodes, 1),
+        shape=CurveShape(curve, nodes, **options),
+        vertex_goals=goals,
+        hard_tracking=hard,
+        hard_turns=hard,
+        weights=layout.weights.model_copy(update={"spacing": 0.3, **weights}),
+    )
 
 
 def make_step(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import TRUSSES, make_layout, random_pose
-from steps import assert_same_answer, make_step, pressing, turn_rows
+from steps import SHAPES, assert_same_answer, make_step, pressing, shaped, turn_rows
 
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.curve.families import make_family
@@ -28,34 +28,6 @@ TRACKS = {"hexapod": ("position", "orientation"), "longeron": ("x", "pointing")}
 def _without_a_compiler(monkeypatch):
     """The graphs themselves are what is compared; so many of them would keep a compiler busy for minutes."""
     monkeypatch.setenv("VGTM_CC", "none")
-
-
-SHAPES = {
-    "arc-length": {"by_arc_length": True},
-    "torsion": {"torsion": 2, "tracks_roll": True},
-    "spacing": {"spacing": True},
-    "everything": {"by_arc_length": True, "torsion": 1, "tracks_roll": True, "spacing": True},
-}
-
-
-def shaped(layout, shape=None, *, family="bezier", goals=(), hard=False, **weights):
-    """The layout with a curve that is more than its tables."""
-    family = make_family(family, layout.vertices)
-    nodes = layout.tracked / layout.tracked[-1]
-    options = dict(SHAPES[shape]) if shape else {}
-    if options.pop("spacing", False):
-        options["spacing"] = np.full(len(nodes), 0.7)
-    options["roll"] = np.linspace(0.1, -0.2, len(nodes))
-    return replace(
-        layout,
-        curve_weights=family.weights(nodes),
-        curve_slopes=family.weights(nodes, 1),
-        shape=CurveShape(family, nodes, **options),
-        vertex_goals=goals,
-        hard_tracking=hard,
-        hard_turns=hard,
-        weights=layout.weights.model_copy(update={"spacing": 0.3, **weights}),
-    )
 
 
 def engines(name, *, joint_offset=0.0, track=None, vertices=5, **options):

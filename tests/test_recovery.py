@@ -15,6 +15,7 @@ from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver
+from vgtm_qp.step.separation import Distances, Separation
 
 
 def beside(gap):
@@ -27,9 +28,10 @@ def beside(gap):
 def test_an_arm_too_near_at_the_start_recovers_monotonically_and_says_so():
     resolver = Resolver(problem(obstacle=[beside(0.03)]))
     setup = resolver.setup
-    before = resolver._separation.shortfall(resolver.state.nodes, 0.0)
+    kept = Separation(setup.arm, setup.monitor, Distances(setup.safe, setup.self_safe, setup.influence))
+    before = kept.shortfall(resolver.state.q, 0.0)
     assert before
-    assert any("crate" in name for name in resolver._separation.names(before))
+    assert any("crate" in name for name in kept.names(before))
     short, least = dict(before), min(before.values())
     tip, _ = resolver.tip()
     for k in range(12):
@@ -227,13 +229,16 @@ def test_contacts_with_two_cubes_do_not_jolt_the_arm_and_what_they_add_is_within
 
 def test_an_arm_at_rest_need_not_flee_from_an_obstacle_that_only_comes_nearer():
     crate = box("crate", [1.3, 0.0, 1.5], [0.5, 2.0, 2.0], velocity=[-0.3, 0.0, 0.0])
-    resolver = Resolver(problem(obstacle=[crate]))
-    rows = resolver._separation.rows(resolver.state.nodes, 0.0, 1.0, 2.0, {}, 0.0)
-    near = [k for k in range(len(rows)) if "crate" in rows.name(k)]
-    assert near
-    assert max(rows.lower[k] for k in near) < 0.0
+
+    def of_the_crate(resolver):
+        """Lower bounds of its rows in the QP of a step of one second that goes nowhere."""
+        qp = resolver.build(position=resolver.tip()[0], dt=1.0)
+        return [qp.row_lower[k] for k, row in enumerate(qp.rows) if row.name.endswith(" / crate")]
+
+    coming = of_the_crate(Resolver(problem(obstacle=[crate])))
+    assert coming
+    assert max(coming) < 0.0
     resting = Resolver(problem(obstacle=[{**crate, "velocity": [0.0, 0.0, 0.0]}]))
-    still = resting._separation.rows(resting.state.nodes, 0.0, 1.0, 2.0, {}, 0.0)
-    least = max(still.lower[k] for k in range(len(still)) if "crate" in still.name(k))
+    least = max(of_the_crate(resting))
     room = resting.setup.monitor.least(resting.state.nodes, 0.0, among="obstacles")[0] - resting.setup.safe
     assert least == pytest.approx(-0.4 * room, abs=1e-3)

@@ -19,7 +19,7 @@ from vgtm_qp.compiled import Kernel, compiler
 from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.fused_settle import _gain
-from vgtm_qp.step import stops
+from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, StepStatus
 from vgtm_qp.step.stops import StopKind
 
@@ -137,7 +137,8 @@ def test_an_attempt_whose_function_has_no_value_falls_back_or_is_refused(monkeyp
         raise EvaluationError("no value")
 
     with monkeypatch.context() as patch:
-        patch.setattr(FusedSolver, "_settle", fail)
+        for method in ("take", "settle"):
+            patch.setattr(FusedSolver, method, fail)
         step = resolver.step(position=goal)
         assert step.status is StepStatus.BLOCKED
         assert step.solver_failed
@@ -154,8 +155,13 @@ def test_why_an_arm_stops_is_told_of_a_pose_whose_lengths_do_not_determine_it(mo
     flat = LengthRows(truss, np.zeros((truss.member_count, slots, 3)), np.zeros(truss.member_count))
     with pytest.raises(SolverError, match="singular"):
         flat.response()
-    monkeypatch.setattr(stops, "_Program", singular)
-    stop = stops.explain(*([None] * 7), "because", {})
+    resolver = Resolver(vq.load_problem("five_bay_free"))
+    tip, rotation = resolver.tip()
+    path = Path(np.array([0.0, 1.0]), np.stack([tip, tip + 0.1]), np.stack([rotation, rotation]))
+    last = replace(resolver.step(position=tip), reason="because")
+    assert resolver.explain(path, 0.0, 1.0, last=last).kind is not StopKind.SINGULAR
+    monkeypatch.setattr(type(resolver.setup.kinematics), "motion", singular)
+    stop = resolver.explain(path, 0.0, 1.0, last=last)
     assert stop.kind is StopKind.SINGULAR
     assert stop.reason == "because"
 

@@ -33,8 +33,11 @@ stands still progress costs nothing, and any positive number serves.
 CLOSED = 2e-8
 """A tip error of a state that a motion need not close, m or rad: within what an accepted state may have."""
 
-_PARALLEL = 1e-12
-"""Directions whose cross product is shorter are parallel or opposite."""
+_OPPOSITE = 1e-9
+"""A direction that is no further than this from the opposite one, rad, is reached by half a turn about any axis."""
+
+_HALF_TURN = 1e-4
+"""Sine of a turn near half a one below which its axis is taken from the symmetric part of the rotation."""
 
 
 def row_names(track: Sequence[str]) -> tuple[str, ...]:
@@ -89,27 +92,35 @@ def error(rows: Sequence[str], position: Any, rotation: Any, goal: Any, turned: 
     if "tip direction 1" in rows:
         twist, cosine = ca.cross(rotation[:, 2], turned[:, 2]), ca.dot(rotation[:, 2], turned[:, 2])
         # Towards the opposite direction every way is as long: about the tip's own x-axis.
-        opposite = ca.logic_and(ca.dot(twist, twist) < _PARALLEL**2, cosine < 0)
-        twist = ca.if_else(opposite, _PARALLEL * rotation[:, 0], twist)
+        turn = _turn(twist, cosine, _OPPOSITE, rotation[:, 0])
     elif "tip rotation x" in rows:
         relative = turned @ rotation.T
         twist, cosine = ca.inv_skew((relative - relative.T) / 2), (ca.trace(relative) - 1) / 2
-        half = ca.logic_and(ca.dot(twist, twist) < _PARALLEL**2, cosine < 0)
-        twist = ca.if_else(half, _PARALLEL * _half_turn_axis(relative), twist)
+        turn = _turn(twist, cosine, _HALF_TURN, _axis(relative, twist, cosine))
     else:
         return (goal - position)[axes(rows)]
-    sine = ca.sqrt(ca.dot(twist, twist) + TINY)
-    turn = twist * (ca.atan2(sine, cosine) / sine)
     return ca.vertcat((goal - position)[axes(rows)], turned_axes(rows, rotation) @ turn)
 
 
-def _half_turn_axis(relative: Any) -> Any:
-    """Return the axis (3, 1) of a rotation by half a turn, whose antisymmetric part says nothing of it."""
-    columns = (relative + ca.DM.eye(3)) / 2
-    first, second, third = (columns[k, k] for k in range(3))
-    axis = ca.if_else(second > first, columns[:, 1], columns[:, 0])
-    axis = ca.if_else(third > ca.fmax(first, second), columns[:, 2], axis)
-    return axis / ca.norm_2(axis)
+def _turn(twist: Any, cosine: Any, least: float, axis: Any) -> Any:
+    """Return the turn (3,) of a `twist` (3,), its axis times its sine; about `axis` (3,) if near half a turn.
+
+    That is where the sine is below `least`, so that the twist does not say what its axis is.
+    """
+    sine = ca.sqrt(ca.dot(twist, twist) + TINY)
+    angle = ca.atan2(sine, cosine)
+    is_half = ca.logic_and(ca.dot(twist, twist) < least**2, cosine < 0)
+    return ca.if_else(is_half, angle * axis, twist * (angle / sine))
+
+
+def _axis(rotation: Any, twist: Any, cosine: Any) -> Any:
+    """Return the axis (3,) of a rotation (3, 3) by more than a quarter of a turn, in the sense of its twist (3,)."""
+    outer = (rotation + rotation.T) / 2 - cosine * ca.DM.eye(3)
+    first = ca.logic_and(outer[0, 0] >= outer[1, 1], outer[0, 0] >= outer[2, 2])
+    other = ca.if_else(outer[1, 1] >= outer[2, 2], outer[:, 1], outer[:, 2])
+    column = ca.if_else(first, outer[:, 0], other)
+    sense = ca.if_else(ca.dot(column, twist) < 0, -1.0, 1.0)
+    return column * (sense / ca.sqrt(ca.dot(column, column) + TINY))
 
 
 def worth_closing(error: Any, motion: Any) -> Any:

@@ -1,0 +1,119 @@
+"""The condensed QP from one compiled call, and the linearisation, against plain equations at random configurations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+from arms import TRUSSES, make_layout
+from steps import SHAPES, make_step, shaped
+
+from vgtm_qp.problem.method import Weights
+from vgtm_qp.qp.fused_rows import row_function
+from vgtm_qp.qp.linearise import Linearisation
+from vgtm_qp.step.target import QPInput
+
+FRAMED = [name for name in TRUSSES if name != "graph"]
+TRACKS = [("position",), ("y",), ("x", "z"), ("z", "orientation"), ("orientation",)]
+CURVES = ["tables", "none", "hard", "hard turns", *SHAPES, "hard torsion", "drawn"]
+
+
+@pytest.fixture(autouse=True)
+def _without_a_compiler(monkeypatch):
+    monkeypatch.setenv("VGTM_CC", "none")
+
+
+def curved(truss, track, curve="tables", family="bezier", weights=None):
+    """A layout whose curve is plain tables, absent, held by the stations, of a shape, or drawn to goals."""
+    layout, _ = make_layout(truss, track, vertices=0 if curve == "none" else 6, weights=weights)
+    if curve in SHAPES:
+        return shaped(layout, curve, family=family)
+    if curve in ("hard", "hard turns"):
+        return replace(layout, hard_tracking=True, hard_turns=curve == "hard turns")
+    if curve == "hard torsion":
+        return shaped(layout, "torsion", family=family, hard=True)
+    return shaped(layout, family=family, goals=(2, 4)) if curve == "drawn" else layout
+
+
+def asked_at_random(layout, seed, *, base, progress, motion):
+    """What a QP is asked for at a configuration, its Jacobians at another one, and its clearance rows."""
+    rng = np.random.default_rng(seed)
+    X, Y, vertices, target, rows = make_step(layout, layout.arm.kinematics(compiled=False), rng, base=base)
+    goals = np.full(vertices.shape, np.nan)
+    if layout.vertex_goals:
+        goals[2], goals[4] = vertices[2] + [0.3, 0.0, 0.0], vertices[4] + [0.0, 0.002, 0.0]
+    target, torsion = replace(target, vertex_goals=goals), 0.1 * rng.normal(size=layout.torsion)
+    goal = target.goal(progress)
+    return QPInput(X, Y, vertices, torsion, target, goal, progress, rows, motion).linear(layout), rows
+
+
+def compare(layout, seeds=range(1)):
+    """Compare both forms of the QP with the equations."""
+    linearisation, kernel = Linearisation(layout, compiled=False), row_function(layout).kernel(compiled=False)
+    for seed in seeds:
+        for motion, progress, base in ((True, 0.0, False), (True, 0.3, True), (False, 0.7, True)):
+            asked, rows = asked_at_random(layout, seed, base=base, progress=progress, motion=motion)
+            given = oracle.numbers(layout, asked)
+            oracle.check_numbers(linearisation.numbers(asked, rows), given, layout, 1e-11)
+            wanted = oracle.condensed(layout, asked, given)
+            asked.load(kernel)
+            kernel()
+            stack, tip, *rest = (output.copy() for output in kernel.outputs)
+            size = len(wanted["gradient"])
+            found = {"rows": stack.reshape(size, -1).T, "tip": tip.reshape(-1, size)}
+            names = "lower", "upper", "gradient", "curvature", "offset", "normal"
+            found |= dict(zip(names, rest, strict=True))
+            # A response is as large as the pose is near to a singular one.
+            scale = 1.0 + float(np.abs(wanted["rows"]).max())
+            for name, value in wanted.items():
+                bounded = np.abs(value) < 1e29
+                got = found[name].reshape(value.shape)
+                np.testing.assert_array_equal(np.abs(got) < 1e29, bounded, err_msg=name)
+                np.testing.assert_allclose(
+                    got[bounded], value[bounded], rtol=0.0, atol=1e-11 * scale, err_msg=name
+                )
+
+
+@pytest.mark.parametrize("joint_offset", [0.0, 0.1])
+@pytest.mark.parametrize("name", FRAMED)
+def test_every_module_and_joint(name, joint_offset):
+    compare(curved(TRUSSES[name](joint_offset=joint_offset), ("position", "pointing")), range(3))
+
+
+@pytest.mark.parametrize("track", TRACKS, ids="+".join)
+def test_every_coordinate_of_a_tip(track):
+    compare(curved(TRUSSES["hexapod"](), track), range(2))
+
+
+@pytest.mark.parametrize("family", ["bezier", "b-spline", "beta-spline"])
+@pytest.mark.parametrize("curve", CURVES)
+def test_every_curve(curve, family):
+    compare(curved(TRUSSES["hexapod"](), ("position",), curve, family))
+
+
+@pytest.mark.parametrize("curve", ["hard", "everything", "drawn"])
+@pytest.mark.parametrize("name", ["double-octahedral", "longeron", "tetrahedral-2", "tetrahedral-123"])
+def test_other_modules_with_other_curves(name, curve):
+    compare(curved(TRUSSES[name](joint_offset=0.05), ("position", "pointing"), curve))
+
+
+def test_every_weight_counts_where_it_should():
+    rng, names = np.random.default_rng(1), Weights.model_fields
+    weights = Weights(**dict(zip(names, rng.uniform(0.2, 3.0, len(names)).tolist(), strict=True)))
+    layout = curved(TRUSSES["hexapod"](), ("position", "orientation"), "everything")
+    compare(replace(layout, weights=weights))
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_numbers_are_arrays_of_their_own(compiled, monkeypatch):
+    monkeypatch.delenv("VGTM_CC")
+    layout = curved(TRUSSES["octahedral"](), ("position",))
+    linearisation = Linearisation(layout, compiled=compiled)
+    (first, rows), (second, _) = (
+        asked_at_random(layout, seed, base=False, progress=0.0, motion=True) for seed in range(2)
+    )
+    kept = linearisation.numbers(first, rows)
+    linearisation.numbers(second, rows)
+    oracle.check_numbers(kept, oracle.numbers(layout, first), layout)
