@@ -216,7 +216,7 @@ class CurveMotion:
         return displaced(curve, x[:size]), float(x[-1]), active
 
     def _rows(self, curve: Curve) -> Array:
-        """Return the rows of eq. (37) at the tip, then those that hold the base: (n_e + 5, D)."""
+        """Return the rows of the tip, then those that hold the base: (n_e + 5, D)."""
         task, size = self._task, curve.coordinates
         rows = [curve.position_jacobian(1.0)[task.axes]]
         if task.turns:

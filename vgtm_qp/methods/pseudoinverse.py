@@ -67,7 +67,7 @@ def weighted(J: Array, weight: Array, *, damping: float = 0.0) -> Inverse:
 
 
 def projector(inverse: Inverse, J: Array) -> Array:
-    """Return the null-space projector 1 - J^+ J of eq. (28), (n, n)."""
+    """Return the null-space projector 1 - J^+ J, (n, n)."""
     return np.asarray(np.eye(J.shape[1]) - inverse.matrix @ J)
 
 

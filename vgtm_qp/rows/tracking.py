@@ -8,7 +8,7 @@ import casadi as ca
 
 
 def gap(centre: Any, point: Any) -> Any:
-    """Return (3,) the station's position less the curve's, m: eq. (39) for r(s, p) of eq. (32)."""
+    """Return (3,) the station's position less the curve's, m: eq. (39) for r(s, p)."""
     return centre - point
 
 

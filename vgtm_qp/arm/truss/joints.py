@@ -73,7 +73,7 @@ def joint_triangles(
     stage: Index,
     chosen: Mapping[int, tuple[int, ...]] | None = None,
 ) -> Index:
-    """Return (N, 3) the nodes whose triangle orients each node's joint, eq. (13), the node itself first.
+    """Return (N, 3) the nodes whose triangle orients each node's joint, the node itself first.
 
     The two others are neighbours of the same or an earlier stage, so that no member's length depends on a
     later stage. Neighbours of the node's own stage come first, then the triangle with the largest sine.

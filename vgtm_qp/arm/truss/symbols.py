@@ -93,13 +93,13 @@ class TrussSymbols:
         return lengths.T, ca.vec(gradients)
 
     def motion(self, X: ca.MX, at: ca.MX, moved: ca.MX) -> list[ca.MX]:
-        """See ``arm.ArmSymbols``: gradients and the rows' right-hand sides, eqs. (22)-(24)."""
+        """See ``arm.ArmSymbols``: gradients and the rows' right-hand sides, eq. (22)."""
         lengths, _ = self._lengths(X)
         _, gradients = self._lengths(at)
         return [gradients, self._missing(lengths, gradients, moved)]
 
     def _missing(self, lengths: ca.MX, gradients: ca.MX, moved: ca.MX) -> ca.MX:
-        """Return (M, 1) what fixed lengths lack, less what the base's displacement (3, N) gives them, eq. (23)."""
+        """Return (M, 1) what fixed lengths lack, less what the base's displacement (3, N) gives them."""
         corners = self._truss.member_nodes
         terms = gradients * ca.vec(moved[:, corners.reshape(-1).tolist()])
         base_rate = ca.sum1(ca.reshape(terms, 3 * corners.shape[1], len(corners))).T

@@ -131,7 +131,7 @@ class Truss:
         return LengthScatter(self.member_nodes, self.free, self.node_count)
 
     def member_ends(self, X: Array) -> Array:
-        """Return (M, 2, 3) where each member's ends r_ik are, eq. (13), for node positions `X` (N, 3), m."""
+        """Return (M, 2, 3) where each member's ends r_ik are for node positions `X` (N, 3), m."""
         return joint_ends(X, self.members, self.joints)
 
     @cached_property
