@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from geometry_reference import octahedral_arm, segment_distance
+from brute_force import brute_force
+from geometry_reference import octahedral_arm
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -9,30 +10,7 @@ from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
 
-SHIFT = {"box": [0], "sphere": [0], "cylinder": [0], "triangle": [0, 3, 6]}
 TETRAHEDRON = ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-
-
-def piece_at(clearance, piece, time):
-    row = clearance.pieces.parameters[piece].copy()
-    for first in SHIFT[str(clearance.pieces.shape[piece])]:
-        row[first : first + 3] += time * clearance.pieces.velocity[piece]
-    return row
-
-
-def brute_force(clearance, X, time):
-    """Surface distance of each pair (member, other, is_self); minus the radii where axes intersect."""
-    ends = X[clearance.bodies.points].reshape(-1, 6)
-    distances = {}
-    for m, radius in enumerate(clearance.bodies.radius):
-        for p, shape in enumerate(clearance.pieces.shape):
-            axis = segment_distance(str(shape), ends[m], piece_at(clearance, p, time))
-            distances[m, p, False] = axis - radius
-        for k in range(m + 1, len(clearance.bodies.radius) if clearance.self_collision else 0):
-            if not set(clearance.bodies.points[m]) & set(clearance.bodies.points[k]):
-                axis = segment_distance("segment", ends[m], ends[k])
-                distances[m, k, True] = axis - radius - clearance.bodies.radius[k]
-    return distances
 
 
 def random_scene(rng, *, still=False, round_numbers=False):

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_problem_mistakes import ARM, GRAPH, VALID
+from problem_texts import ARM, GRAPH, VALID
 
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.problem import Problem, load_problem

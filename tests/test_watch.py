@@ -2,8 +2,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from brute_force import brute_force
 from scipy.spatial.transform import Rotation
-from test_geometry_clearance import brute_force
 
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance

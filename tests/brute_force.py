@@ -1,0 +1,27 @@
+"""The distance of every pair of a monitor, one by one."""
+
+from geometry_reference import segment_distance
+
+SHIFT = {"box": [0], "sphere": [0], "cylinder": [0], "triangle": [0, 3, 6]}
+
+
+def piece_at(clearance, piece, time):
+    row = clearance.pieces.parameters[piece].copy()
+    for first in SHIFT[str(clearance.pieces.shape[piece])]:
+        row[first : first + 3] += time * clearance.pieces.velocity[piece]
+    return row
+
+
+def brute_force(clearance, X, time):
+    """Surface distance of each pair (member, other, is_self); minus the radii where axes intersect."""
+    ends = X[clearance.bodies.points].reshape(-1, 6)
+    distances = {}
+    for m, radius in enumerate(clearance.bodies.radius):
+        for p, shape in enumerate(clearance.pieces.shape):
+            axis = segment_distance(str(shape), ends[m], piece_at(clearance, p, time))
+            distances[m, p, False] = axis - radius
+        for k in range(m + 1, len(clearance.bodies.radius) if clearance.self_collision else 0):
+            if not set(clearance.bodies.points[m]) & set(clearance.bodies.points[k]):
+                axis = segment_distance("segment", ends[m], ends[k])
+                distances[m, k, True] = axis - radius - clearance.bodies.radius[k]
+    return distances
