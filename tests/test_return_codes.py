@@ -11,17 +11,19 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from arms import make_layout
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.lengths import LengthRows
-from vgtm_qp.compiled import Kernel, compiler
+from vgtm_qp.compiled import Kernel, compiler, finish_compiling
 from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.fused import FusedSolver
-from vgtm_qp.qp.fused_settle import _gain
+from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver, StepStatus
 from vgtm_qp.step.stops import StopKind
+from vgtm_qp.step.target import QPInput, Target
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -51,28 +53,39 @@ def test_a_function_without_a_value_at_its_first_call_raises():
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
-def test_the_gain_of_a_tip_that_cannot_be_moved_is_zero(compiled, tmp_path, monkeypatch):
+def test_a_tip_that_cannot_be_moved_is_not_settled(compiled, tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
-    count, rows = 4, 3
-    gram, tip, free = ca.MX.sym("gram", count, count), ca.MX.sym("tip", count, rows), ca.MX.sym("free", count)
-    kernel = Kernel(
-        ca.Function("gain", [gram, tip, free], [ca.densify(_gain(gram, ca.MX(1.0), tip, free > 0.5))]),
-        compiled=compiled,
-    )
-    rng = np.random.default_rng(0)
-    kernel.inputs[0][:] = np.eye(count).reshape(-1)
-    kernel.inputs[1][:] = rng.normal(size=count * rows)
-    kernel.inputs[2][:] = 1.0
-    kernel()
-    usual = kernel.outputs[0].copy()
-    assert np.abs(usual).max() > 0.1
-    for held in ((1, 1, 0, 0), (0, 0, 0, 0)):
-        kernel.inputs[2][:] = held
-        kernel()
-        assert not kernel.outputs[0].any()
-    kernel.inputs[2][:] = 1.0
-    kernel()
-    np.testing.assert_array_equal(kernel.outputs[0], usual)
+    if not compiled:
+        monkeypatch.setenv("VGTM_CC", "none")
+    layout, _ = make_layout(modules.octahedral(2), vertices=0)
+    solver = FusedSolver(layout)
+    finish_compiling()
+    arm, curve = layout.arm, np.zeros((0, 3))
+    q, lengths = arm.home_configuration, arm.home_quantities[arm.actuators]
+    tip, rotation = arm.end_effector.position(arm.nodes(q)), arm.end_effector.frame
+    still = Path(np.array([0.0, 1.0]), np.stack([tip, tip]), np.stack([rotation, rotation]))
+
+    def settled(*free):
+        """Tip errors before and after settling from a QP in which but a few actuators may move."""
+        width = np.isin(np.arange(len(lengths)), free).astype(float)
+        target = Target(still, 0.0, 1.0, lengths - width, lengths + width, 1.0)
+        asked = QPInput(
+            q, q, curve, np.zeros(0), target, target.goal(0.0), 0.0, ClearanceRows(), motion=False
+        )
+        solver.load(asked.linear(layout))
+        solver.ask(ClearanceRows())
+        to = tip + np.array([1e-3, -2e-3, 1e-3])
+        closed, before, after = solver.settle(q, curve, lengths - 1.0, lengths + 1.0, to, rotation)
+        return closed.q, before, after
+
+    usual, before, after = settled(*range(len(lengths)))
+    assert before > 1e-3
+    assert after < 1e-9
+    for free in ((), (2, 3)):
+        there, before, after = settled(*free)
+        np.testing.assert_allclose(there, q, rtol=0.0, atol=1e-12)
+        assert after == before > 1e-3
+    np.testing.assert_array_equal(settled(*range(len(lengths)))[0], usual)
 
 
 def lie(monkeypatch, change):

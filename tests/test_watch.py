@@ -2,9 +2,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from arms import TRUSSES
 from brute_force import brute_force
 from scipy.spatial.transform import Rotation
 
+from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.pairs import Pair
@@ -155,6 +157,17 @@ def test_scenes_that_are_watched():
     assert not watched(members=[(k, k + 1) for k in range(200)])
 
 
+def compare(first, second, X, **reach):
+    """Compare the contacts that two monitors find; return how many they are."""
+    found = [monitor.near(X, **reach, tracked=True) for monitor in (first, second)]
+    orders = [np.lexsort((c.weights[:, 1], c.other, c.body, c.is_self)) for c in found]
+    first, second = (c.select(order) for c, order in zip(found, orders, strict=True))
+    assert [first.name(k) for k in range(len(first))] == [second.name(k) for k in range(len(second))]
+    for column in ("distance", "normal", "points", "weights", "normal_speed"):
+        np.testing.assert_allclose(getattr(first, column), getattr(second, column), atol=1e-9)
+    return len(first)
+
+
 def test_contacts_are_the_same_whichever_way_they_are_found():
     """By the watch and from the lists, at positions that are overwritten in place."""
     compared = 0
@@ -165,16 +178,22 @@ def test_contacts_are_the_same_whichever_way_they_are_found():
         Y = X.copy()
         for state in walk(X, rng, 12, 0.05):
             Y[:] = state
-            found = [
-                monitor.near(Y, self_reach=0.3, fcl_reach=0.2, tracked=True) for monitor in (watched, listed)
-            ]
-            orders = [np.lexsort((c.weights[:, 1], c.other, c.body, c.is_self)) for c in found]
-            first, second = (c.select(order) for c, order in zip(found, orders, strict=True))
-            assert [first.name(k) for k in range(len(first))] == [second.name(k) for k in range(len(second))]
-            for column in ("distance", "normal", "points", "weights", "normal_speed"):
-                np.testing.assert_allclose(getattr(first, column), getattr(second, column), atol=1e-9)
-            compared += len(first)
+            compared += compare(watched, listed, Y, self_reach=0.3, fcl_reach=0.2)
     assert compared > 100
+
+
+@pytest.mark.parametrize("name", ["octahedral", "longeron", "graph"])
+def test_members_that_end_in_offset_joints_are_watched_too(name):
+    arm = TrussArm(TRUSSES[name](joint_offset=0.1))
+    obstacles = [box("box", [0.8, 0.0, 0.9], [0.3, 0.3, 0.3]), sphere("ball", [-0.7, 0.5, 1.0], 0.15)]
+    watched, listed = (
+        Clearance(arm.bodies, obstacles, safe=0.08, influence=0.5, watch=watch) for watch in (True, False)
+    )
+    assert watched.is_watched
+    assert not listed.is_watched
+    states = walk(arm.home_configuration, np.random.default_rng(1), 12, 0.02)
+    reach = {"self_reach": 0.5, "fcl_reach": 0.5}
+    assert sum(compare(watched, listed, arm.points(state), **reach) for state in states) > 50
 
 
 def test_a_motion_is_proven_from_where_it_starts_though_its_array_was_overwritten():
