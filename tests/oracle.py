@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.linearise import StepInput, TipGoal
+from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.numbers import StepNumbers
+from vgtm_qp.rows.tip import TipGoal
 
 Array = NDArray[Any]
 Index = NDArray[np.int64]

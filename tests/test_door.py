@@ -14,9 +14,10 @@ from vgtm_qp.arm.build import make_arm
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import sphere
 from vgtm_qp.problem import Problem
-from vgtm_qp.qp.linearise import Linearisation, StepInput, TipGoal
+from vgtm_qp.qp.linearise import Linearisation, StepInput
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.clearance import clearance_rows
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.engine import FusedEngine, GeneralEngine
 
@@ -216,10 +217,20 @@ def check_deviation(arm, seed, size):
     assert np.abs(arm.nodes(end) - arm.nodes(start)).max() <= arm.travel(end - start) + 1e-12
 
 
-def test_points_leave_their_chords_by_no_more_than_is_said(arm):
-    if not arm.leaves_chords:
-        pytest.skip("its points move on straight lines")
+@pytest.mark.parametrize("name", ["offset joints", *SERIAL])
+def test_points_leave_their_chords_by_no_more_than_is_said(name):
+    arm = make_arm(problem_of(name))
+    assert arm.leaves_chords
     check_deviation(arm)
+
+
+@pytest.mark.parametrize("name", ["octahedral", "hexapod"])
+def test_points_of_pin_joints_stay_on_their_chords(name):
+    arm = make_arm(problem_of(name))
+    assert not arm.leaves_chords
+    start, end = bent(arm, 1), bent(arm, 2)
+    half = arm.points(0.5 * (start + end))
+    np.testing.assert_allclose(half, 0.5 * (arm.points(start) + arm.points(end)), atol=1e-14)
 
 
 CLUTTER = {
@@ -269,8 +280,6 @@ def test_steps_reach_their_goals_keep_their_limits_and_stay_clear(name, solver):
 @pytest.mark.parametrize("hard", [False, True])
 def test_both_engines_take_the_same_steps(name, hard):
     method = {"hard_tracking": hard}
-    if hard and "position" not in make_arm(problem_of(name)).stations.trackable:
-        pytest.skip("its stations cannot keep to a curve")
     problem = problem_of(name, method=method, **CLUTTER)
     fast, plain = vq.Resolver(build_arm(problem)), vq.Resolver(build_arm(problem, compiled=False))
     assert isinstance(fast.setup.engine, FusedEngine)
@@ -303,6 +312,52 @@ def test_a_moving_base_carries_every_arm(name):
     wanted = arm.home[arm.base] @ turn.T + 0.6 * np.array([0.1, 0.0, 0.05])
     np.testing.assert_allclose(resolver.state.nodes[arm.base], wanted, atol=1e-9)
     np.testing.assert_allclose(resolver.tip()[0], goal, atol=1e-6)
+
+
+TURNING = [
+    {"time": t, "rotation_vector": [0.0, 0.0, angle]}
+    for t, angle in ((3.0, 2.9), (4.0, 3.6), (8.0, 6.4), (9.0, 6.6))
+]
+
+
+@pytest.mark.parametrize("serial", list(SERIAL))
+def test_stations_are_as_many_as_can_keep_to_the_curve(serial):
+    arm = make_arm(problem_of(serial))
+    assert arm.stations.trackable == ("position",)
+    every = arm.chain.every
+    assert not make_arm(serial_problem({**SERIAL[serial], "every": every - 1})).stations.trackable
+
+
+def test_a_straight_snake_has_stations_that_it_cannot_hold():
+    joints = [{**joint, "home": 0.0} for joint in chain()["joint"]]
+    arm = make_arm(serial_problem(chain(joint=joints)))
+    assert not arm.stations.trackable
+    assert len(arm.stations) == 4
+
+
+def test_a_base_may_turn_on_past_half_a_turn_and_past_a_whole_one():
+    resolver = vq.Resolver(serial_problem({**chain(), "base_motion": TURNING}, curve={"control_vertices": 4}))
+    away = resolver.tip()[0]
+    while resolver.state.time < 9.0 - 1e-9:
+        then = resolver.setup.base_at(resolver.state.time + 0.05)
+        step = resolver.step(position=then.rotation @ away, dt=0.05)
+        assert step.status is vq.StepStatus.REACHED, (resolver.state.time, step.reason)
+    np.testing.assert_allclose(resolver.state.q[-3:], [0.0, 0.0, 6.6], atol=1e-9)
+
+
+def test_the_base_that_verification_places_turns_on_too():
+    from vgtm_qp.result.base import base_poses
+    from vgtm_qp.step.base import BaseMotion
+
+    problem = serial_problem({**chain(), "base_motion": TURNING})
+    times = np.linspace(0.0, 10.0, 301)
+    poses = base_poses(problem.to_dict(), times)
+    assert np.abs(np.diff(poses[:, 3:], axis=0)).max() < 0.05
+    motion = BaseMotion(problem.arm.base_motion)
+    for time, pose in zip(times, poses, strict=True):
+        np.testing.assert_allclose(
+            Rotation.from_rotvec(pose[3:]).as_matrix(), motion.pose(time).rotation, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("serial", list(SERIAL))

@@ -6,9 +6,8 @@ import numpy as np
 import oracle
 import pytest
 
-from vgtm_qp.qp.linearise import TipGoal
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.rows.tip import row_names, tip_function
+from vgtm_qp.rows.tip import TipGoal, row_names, tip_function
 
 TRACKS = [("position",), ("y",), ("x", "z"), ("position", "pointing"), ("z", "orientation"), ("orientation",)]
 

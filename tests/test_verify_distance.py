@@ -10,6 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from vgtm_qp.result.rotation import rotation_matrix
 from vgtm_qp.verify.distance import (
     segment_ball,
     segment_box,
@@ -17,7 +18,7 @@ from vgtm_qp.verify.distance import (
     segment_segment,
     segment_triangle,
 )
-from vgtm_qp.verify.obstacles import BallBody, BoxBody, CylinderBody, MeshBody, rotation_matrix
+from vgtm_qp.verify.obstacles import BallBody, BoxBody, CylinderBody, MeshBody
 
 Array = NDArray[np.float64]
 

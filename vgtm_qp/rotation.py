@@ -34,6 +34,17 @@ def vector_from_rotation(rotation: Array) -> Array:
     return np.asarray(angle * axis / np.linalg.norm(axis))
 
 
+def vector_near(rotation: Array, near: Array) -> Array:
+    """Return of all rotation vectors (3,), rad, of a (3, 3) rotation the one nearest to another's, `near` (3,).
+
+    So the vector of what turns on and on does not jump at half a turn.
+    """
+    vector = vector_from_rotation(rotation)
+    angle = float(np.linalg.norm(vector))
+    axis = vector / angle if angle > 1e-9 else near / max(float(np.linalg.norm(near)), 1e-9)
+    return np.asarray(vector + 2.0 * np.pi * np.round((near - vector) @ axis / (2.0 * np.pi)) * axis)
+
+
 def turn_between(start: Array, end: Array) -> Array:
     """Return the rotation vector (3,), rad, that takes unit vector `start` to unit vector `end` the short way."""
     axis = np.cross(start, end)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +101,14 @@ class Tip:
     def position(self, X: Array) -> Array:
         """Return (3,) the position of the end effector where the nodes are at `X` (N, 3), m."""
         return np.asarray(self.weights @ X.take(self.nodes, axis=0))
+
+
+class Description(Protocol):
+    """A dataclass of counts, whose text is for people."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __str__(self) -> str: ...
 
 
 class MotionPattern(NamedTuple):
@@ -425,6 +433,10 @@ class Arm(Protocol):
 
     def travel(self, motion: Array) -> float:
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
+        ...
+
+    def describe(self) -> Description:
+        """Return the arm's counts, and what they allow."""
         ...
 
     def record(self) -> dict[str, Any]:

@@ -59,6 +59,13 @@ def frame_constants(home: Array, rotation: Array) -> tuple[Array, Array, Array]:
     return np.cos(angles), np.sin(angles), np.stack([first, second, normal], axis=0) @ rotation
 
 
+def frame_tables(home: Array, rotations: Array) -> tuple[Array, Array, Array]:
+    """Return `frame_constants` of F frames as rows: cosines and sines (F, K), and the alignments' columns (3 F, 3)."""
+    constants = [frame_constants(points, rotation) for points, rotation in zip(home, rotations, strict=True)]
+    cosines, sines, alignments = (np.stack(column) for column in zip(*constants, strict=True))
+    return cosines, sines, alignments.transpose(0, 2, 1).reshape(-1, 3)
+
+
 def frames_at(X: ca.MX, home: Array, rotations: Array, nodes: Index) -> list[ca.MX]:
     """Return rotations (3, 3F) and spins (3, 3KF) of F frames of K nodes each, from all nodes `X` (3, N).
 
@@ -70,8 +77,6 @@ def frames_at(X: ca.MX, home: Array, rotations: Array, nodes: Index) -> list[ca.
     """
     if not len(home):
         return [ca.MX(0, 0), ca.MX(0, 0)]
-    constants = [frame_constants(points, rotation) for points, rotation in zip(home, rotations, strict=True)]
-    cosines, sines, alignments = (np.stack(column) for column in zip(*constants, strict=True))
     function = frame_function(home.shape[1]).map(len(home))
-    arguments = [ca.DM(cosines.T), ca.DM(sines.T), ca.DM(np.concatenate(alignments, axis=1))]
+    arguments = (ca.DM(table.T) for table in frame_tables(home, rotations))
     return list(function(X[:, nodes.reshape(-1).tolist()], *arguments))

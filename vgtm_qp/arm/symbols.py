@@ -1,18 +1,21 @@
-"""What symbolic arms are made of: constants that are bound once, and the frames of their stations."""
+"""What symbolic arms are made of: constants that are bound once, rotations, and the frames of their stations."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.frames import frame_constants, frame_function
+from vgtm_qp.arm.frames import frame_function, frame_tables
 from vgtm_qp.compiled import Kernel
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+_TINY = 1e-30
 
 
 class Constants:
@@ -49,13 +52,9 @@ class Frames:
     """Frames of F stations with K nodes each, with their constants."""
 
     def __init__(self, home: Array, rotations: Array, nodes: Index, constants: Constants, name: str) -> None:
-        values = [frame_constants(points, frame) for points, frame in zip(home, rotations, strict=True)]
-        cosines, sines, alignments = (np.stack(column) for column in zip(*values, strict=True))
-        self._arguments = [
-            constants.add(f"{name}_cosines", cosines),
-            constants.add(f"{name}_sines", sines),
-            constants.add(f"{name}_alignments", alignments.transpose(0, 2, 1).reshape(-1, 3)),
-        ]
+        names = (f"{name}_cosines", f"{name}_sines", f"{name}_alignments")
+        tables = zip(names, frame_tables(home, rotations), strict=True)
+        self._arguments = [constants.add(name, table) for name, table in tables]
         self._columns = nodes.reshape(-1).tolist()
         self._function = frame_function(home.shape[1]).map(len(home))
 
@@ -63,3 +62,10 @@ class Frames:
         """Return rotations (3, 3F) and spins (3, 3KF) at positions (3, N)."""
         rotation, spin = self._function(X[:, self._columns], *self._arguments)
         return rotation, spin
+
+
+def rotated(vector: Any) -> Any:
+    """Return the (3, 3) rotation by |vector| about it (Rodrigues), smooth at zero; `vector` (3, 1), rad."""
+    square = ca.dot(vector, vector) + _TINY
+    angle, cross = ca.sqrt(square), ca.skew(vector)
+    return ca.DM.eye(3) + (ca.sin(angle) / angle) * cross + ((1.0 - ca.cos(angle)) / square) * (cross @ cross)

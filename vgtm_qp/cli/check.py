@@ -18,8 +18,6 @@ def check(
     """Check a problem file: its keys and values, its arm, its obstacles and goals at the home pose."""
     from dataclasses import asdict
 
-    from vgtm_qp.arm.serial.arm import describe_chain
-    from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.errors import ProblemError
     from vgtm_qp.problem import load_problem
     from vgtm_qp.step.build import build_arm
@@ -33,7 +31,7 @@ def check(
         raise ProblemError(source, mistakes)
     warnings = find_warnings(loaded, setup)
     kind = "arm" if loaded.truss is None else "truss"
-    arm = describe_chain(setup.arm) if loaded.truss is None else describe(setup.truss)
+    arm = setup.arm.describe()
     for warning in warnings:
         note(f"{source}: warning: {warning}")
     if json:

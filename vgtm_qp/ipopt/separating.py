@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vgtm_qp.geometry.clearance import Contacts
 from vgtm_qp.ipopt.symbols import OPTIONS, program_symbols
 from vgtm_qp.maneuver.plan import Plan
-from vgtm_qp.step.path import PathPoint
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 
@@ -70,7 +70,7 @@ class IpoptStepper:
                 values.append(value if share < 1.0 else float(mark))
         return states, values
 
-    def _step(self, state: State, goal: PathPoint, duration: float) -> State | None:
+    def _step(self, state: State, goal: TipGoal, duration: float) -> State | None:
         setup = self.setup
         monitor = setup.monitor
         tip = setup.arm.end_effector.position(state.nodes)
@@ -100,7 +100,7 @@ class IpoptStepper:
             reach *= 2.0
         return None
 
-    def _solve(self, state: State, goal: PathPoint, duration: float, pairs: Contacts) -> Array | None:
+    def _solve(self, state: State, goal: TipGoal, duration: float, pairs: Contacts) -> Array | None:
         setup = self.setup
         truss = setup.truss
         actuators = truss.actuators
@@ -131,7 +131,7 @@ class IpoptStepper:
         X[truss.free] = np.asarray(answer["x"]).reshape(-1)[: len(start)].reshape(-1, 3)
         return X
 
-    def _goal_rows(self, goal: PathPoint) -> tuple[ca.SX, Array]:
+    def _goal_rows(self, goal: TipGoal) -> tuple[ca.SX, Array]:
         task = self.setup.task
         rows = [(self._symbols.tip - goal.position)[task.axes.tolist()]]
         count = len(task.axes)

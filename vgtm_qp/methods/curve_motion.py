@@ -17,7 +17,7 @@ from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_v
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE, pose_displacement
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import turn_between, vector_from_rotation
-from vgtm_qp.step.path import PathPoint
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ class CurveMotion:
         return CurveNodes(curve.position(s), frame)
 
     def follow(
-        self, curve: Curve, here: PathPoint, goal: PathPoint, time: float, X: Array, *, correct: bool
+        self, curve: Curve, here: TipGoal, goal: TipGoal, time: float, X: Array, *, correct: bool
     ) -> Curve:
         """Return the curve after a step by eq. (38), from the pose `here` on the path to `goal`.
 
@@ -110,7 +110,7 @@ class CurveMotion:
         curve = displaced(curve, dp)
         return self.corrected(curve, goal) if correct else curve
 
-    def corrected(self, curve: Curve, goal: PathPoint) -> Curve:
+    def corrected(self, curve: Curve, goal: TipGoal) -> Curve:
         """Return the curve that ends at `goal`, by Newton's method and least displacements.
 
         Raises
@@ -155,8 +155,8 @@ class CurveMotion:
     def follow_qp(
         self,
         curve: Curve,
-        piece: tuple[PathPoint, PathPoint],
-        now: PathPoint,
+        piece: tuple[TipGoal, TipGoal],
+        now: TipGoal,
         progress: float,
         time: float,
         X: Array,
@@ -234,7 +234,7 @@ class CurveMotion:
         turn = turned if task.turns == "orientation" else curve.frame(1.0)[:, :2].T @ turned
         return np.concatenate([moved[task.axes], turn])
 
-    def _error(self, curve: Curve, goal: PathPoint) -> Array:
+    def _error(self, curve: Curve, goal: TipGoal) -> Array:
         turned = np.zeros(3)
         if self._task.turns:
             frame = curve.frame(1.0)

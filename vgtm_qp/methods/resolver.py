@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from vgtm_qp.errors import CurveError, GoalError, SolverError
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import vector_from_rotation
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.mover import Mover
-from vgtm_qp.step.path import Path, PathPoint
+from vgtm_qp.step.path import Path
 from vgtm_qp.step.separation import Shortfall
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
@@ -172,7 +173,7 @@ def arm_without_curve(problem: Problem) -> Setup:
     return build_arm(problem.replace(changes))
 
 
-def pose_displacement(start: PathPoint, end: PathPoint) -> tuple[Array, Array]:
+def pose_displacement(start: TipGoal, end: TipGoal) -> tuple[Array, Array]:
     """Return the displacement (3,), m, and the rotation vector (3,), rad, from one pose to another."""
     return end.position - start.position, vector_from_rotation(end.rotation @ start.rotation.T)
 

@@ -9,6 +9,7 @@ from vgtm_qp.qp.graph import StationSymbols, StepGraph
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED
 from vgtm_qp.rows import curve as curve_rows
+from vgtm_qp.rows.tip import progress_gradient
 
 
 def row_function(layout: Layout) -> Bound:
@@ -95,7 +96,7 @@ def row_function(layout: Layout) -> Bound:
             ca.vertcat(
                 motion * centring * (graph.strokes - home),
                 curve_gradient,
-                graph.curvature * (graph.progress - 2.0),
+                progress_gradient(graph.curvature, graph.progress),
             ),
             graph.curvature,
             offset,

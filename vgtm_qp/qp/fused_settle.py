@@ -5,11 +5,10 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.symbols import Bound, Constants
+from vgtm_qp.arm.symbols import Bound, Constants, rotated
 from vgtm_qp.qp.graph import tip_frames
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.settle import AT_BOUND, LEFT, SETTLED, SETTLING_STEPS, WORST_CONDITION
-from vgtm_qp.rows.tip import TINY
 from vgtm_qp.rows.tip import error as tip_error
 
 NEAR = 24
@@ -71,7 +70,7 @@ def settle_function(layout: Layout) -> Bound:
     left = (1.0 - reached) * ca.fmax(ca.norm_inf(velocity), ca.norm_inf(spin))
     reached = ca.if_else(left <= LEFT, 1.0, reached)
     gone = taken * (reached - progress)
-    goal_position, goal_rotation = goal + gone * velocity, _turned(gone * spin) @ turned
+    goal_position, goal_rotation = goal + gone * velocity, rotated(gone * spin) @ turned
 
     vertices_after = vertices
     if layout.vertices:
@@ -133,14 +132,6 @@ def settle_function(layout: Layout) -> Bound:
         "settle", [*inputs, *constants.symbols], [ca.densify(output) for output in outputs]
     )
     return Bound(function, constants.values)
-
-
-def _turned(vector: ca.MX) -> ca.MX:
-    """Return the (3, 3) rotation by |vector| about it (Rodrigues), smooth at zero."""
-    square = ca.dot(vector, vector) + TINY
-    angle = ca.sqrt(square)
-    cross = ca.skew(vector)
-    return ca.MX.eye(3) + (ca.sin(angle) / angle) * cross + ((1.0 - ca.cos(angle)) / square) * (cross @ cross)
 
 
 def _gain(gram: ca.MX, stiffness: ca.MX, tip: ca.MX, free: ca.MX) -> ca.MX:

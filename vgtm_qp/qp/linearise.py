@@ -14,17 +14,9 @@ from vgtm_qp.qp.graph import StationSymbols, StepGraph
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers
 from vgtm_qp.qp.shape import CurveRows
+from vgtm_qp.rows.tip import TipGoal, progress_gradient
 
 Array = NDArray[np.float64]
-
-
-class TipGoal(NamedTuple):
-    """Where the end effector is to be, position (3,), m, and rotation (3, 3), and its rates per unit of progress."""
-
-    position: Array
-    rotation: Array
-    velocity: Array
-    spin: Array
 
 
 class StepInput(NamedTuple):
@@ -144,7 +136,7 @@ class Linearisation:
             tip_rhs=error,
             progress_lower=1.0 - asked.progress if layout.elastic_tip else -asked.progress,
             progress_upper=1.0 - asked.progress,
-            progress_gradient=float(curvature[0]) * (asked.progress - 2.0),
+            progress_gradient=progress_gradient(float(curvature[0]), asked.progress),
             progress_curvature=float(curvature[0]),
             position_rhs=gap,
             tangent_face=face if general is None else np.zeros((count, 2, 9)),

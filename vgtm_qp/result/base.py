@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.result.rotation import continued
+
 Array = NDArray[np.float64]
 
 
@@ -32,5 +34,6 @@ def base_poses(problem: Mapping[str, Any], times: Array) -> Array:
         share = float(np.clip((time - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0))
         between = (turn[k + 1] * turn[k].inv()).as_rotvec()
         found[row, :3] = (1.0 - share) * shift[k] + share * shift[k + 1]
-        found[row, 3:] = (Rotation.from_rotvec(share * between) * turn[k]).as_rotvec()
+        vector = (Rotation.from_rotvec(share * between) * turn[k]).as_rotvec()
+        found[row, 3:] = continued(vector, found[row - 1, 3:] if row else np.zeros(3))
     return found

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.record import numbers
+from vgtm_qp.result.rotation import rotations
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -82,7 +83,7 @@ class RecordedChain:
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
         """Return points (P, J + 2, 3), m, axes (P, J, 3) and last frames (P, 3, 3) at configurations (P, J + 6)."""
         count = len(self.quantity_names)
-        at, frame = q[:, count : count + 3], turns(q[:, count + 3 :])
+        at, frame = q[:, count : count + 3], rotations(q[:, count + 3 :])
         points, axes = [at], []
         for j in range(count):
             at = at + frame @ self.position[j]
@@ -90,7 +91,7 @@ class RecordedChain:
             axes.append(frame @ self.axis[j])
             points.append(at)
             if self.revolute[j]:
-                frame = frame @ turns(q[:, j, None] * self.axis[j])
+                frame = frame @ rotations(q[:, j, None] * self.axis[j])
             else:
                 at = at + q[:, j, None] * axes[-1]
         points.append(at + frame @ self.tip)
@@ -147,15 +148,3 @@ class RecordedChain:
         slides = np.where(self.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
         after = np.cumsum((ways[1:] + slides)[::-1])[::-1]
         return np.concatenate([[after[0] + ways[0]], after])
-
-
-def turns(vectors: Array) -> Array:
-    """Return (P, 3, 3) the rotations by |v| about each of the vectors (P, 3), rad."""
-    angle = np.linalg.norm(vectors, axis=-1)[:, None, None]
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-    # sinc is sin(pi x) / (pi x).
-    return np.asarray(
-        np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
-    )

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from vgtm_qp.errors import GoalError, nearest
+
+Array = NDArray[np.float64]
 
 _ROWS = {
     "position": ("tip x", "tip y", "tip z"),
@@ -19,7 +23,7 @@ _ROWS = {
 }
 _AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
 
-TINY = 1e-30
+_TINY = 1e-30
 """A square that keeps the root of another one smooth at zero."""
 
 SHORT_WAY = 0.01
@@ -38,6 +42,28 @@ _OPPOSITE = 1e-9
 
 _HALF_TURN = 1e-4
 """Sine of a turn near half a one below which its axis is taken from the symmetric part of the rotation."""
+
+
+class TipGoal(NamedTuple):
+    """A pose that the end effector is to have, and its rates.
+
+    Attributes
+    ----------
+    position, velocity : (3,)
+        m, and m per unit of the path variable or of progress.
+    rotation : (3, 3)
+    spin : (3,)
+        Angular velocity in the base frame, rad per unit of the same.
+    """
+
+    position: Array
+    rotation: Array
+    velocity: Array
+    spin: Array
+
+    def over(self, span: float) -> TipGoal:
+        """Return the same with rates per unit of progress along a piece of path of that `span`."""
+        return TipGoal(self.position, self.rotation, self.velocity * span, self.spin * span)
 
 
 def row_names(track: Sequence[str]) -> tuple[str, ...]:
@@ -107,7 +133,7 @@ def _turn(twist: Any, cosine: Any, least: float, axis: Any) -> Any:
 
     That is where the sine is below `least`, so that the twist does not say what its axis is.
     """
-    sine = ca.sqrt(ca.dot(twist, twist) + TINY)
+    sine = ca.sqrt(ca.dot(twist, twist) + _TINY)
     angle = ca.atan2(sine, cosine)
     is_half = ca.logic_and(ca.dot(twist, twist) < least**2, cosine < 0)
     return ca.if_else(is_half, angle * axis, twist * (angle / sine))
@@ -120,7 +146,7 @@ def _axis(rotation: Any, twist: Any, cosine: Any) -> Any:
     other = ca.if_else(outer[1, 1] >= outer[2, 2], outer[:, 1], outer[:, 2])
     column = ca.if_else(first, outer[:, 0], other)
     sense = ca.if_else(ca.dot(column, twist) < 0, -1.0, 1.0)
-    return column * (sense / ca.sqrt(ca.dot(column, column) + TINY))
+    return column * (sense / ca.sqrt(ca.dot(column, column) + _TINY))
 
 
 def worth_closing(error: Any, motion: Any) -> Any:
@@ -140,6 +166,14 @@ def progress_weight(rate: Any) -> Any:
     """
     way = ca.norm_2(rate)
     return ca.if_else(way > 1e-6, way * ca.fmax(way, SHORT_WAY), 1.0)
+
+
+def progress_gradient(curvature: Any, progress: Any) -> Any:
+    """Return the objective's slope along the progress, m^2, where so much of it is made.
+
+    It pulls towards a progress of 2, so that the end of the piece, at 1, is never its minimum but a bound.
+    """
+    return curvature * (progress - 2.0)
 
 
 def tip_function(rows: Sequence[str]) -> ca.Function:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arm.arm import Arm, Kinematics, Pose
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import beyond, norm
-from vgtm_qp.step.path import PathPoint
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.task import TipTask
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Acceptance:
         base: Pose | None,
         lower: Array,
         upper: Array,
-        goal: PathPoint | None,
+        goal: TipGoal | None,
         *curve: Array,
     ) -> str:
         """Return what is wrong with a configuration, or an empty string.
@@ -97,7 +97,7 @@ class Acceptance:
                 return f"the new state has its tip {off:.3g} m or rad from its goal"
         return ""
 
-    def _tip_error(self, q: Array, X: Array, goal: PathPoint) -> float:
+    def _tip_error(self, q: Array, X: Array, goal: TipGoal) -> float:
         """Return the greatest error of the tip, m or rad."""
         position, task = self._arm.end_effector.position(X), self._task
         if task.turns is None:

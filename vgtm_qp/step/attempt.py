@@ -13,9 +13,9 @@ from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.engine import Accuracy, Engine, Move
-from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.separation import Separation, Shortfall
 from vgtm_qp.step.state import State, sealed
 from vgtm_qp.step.target import QPInput, Target
@@ -278,7 +278,7 @@ class Attempt:
         box, curve = (target.lower, target.upper), (move.vertices, move.torsion)
         return self.acceptance.flaw(move.closed, state.q, target.base, *box, goal, *curve)
 
-    def _expected(self, target: Target, goal: PathPoint, guess: Array) -> float:
+    def _expected(self, target: Target, goal: TipGoal, guess: Array) -> float:
         """Return about how far a node moves in the step, m; anything where the arm was at rest."""
         last = self.arm.travel(guess)
         if last == 0.0 or target.base is not None:

@@ -24,9 +24,9 @@ from vgtm_qp.qp.long.values import PeriodValues
 from vgtm_qp.qp.long.working_set import RowNumbers
 from vgtm_qp.qp.numbers import StepSolution
 from vgtm_qp.qp.settle import held
+from vgtm_qp.rows.tip import TipGoal, progress_gradient
 from vgtm_qp.step.closing import Closing, enough_length, within
 from vgtm_qp.step.engine import Accuracy, Engine, enough_tip_error
-from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
 
@@ -112,8 +112,7 @@ class ChainEngine(Engine):
         rotation, spin = np.eye(3), None
         if self._task.turns is not None:
             rotation, spin = self._tip_frames[0].at(X[tip.nodes])[0], self._tip_frames[1].at(Y[tip.nodes])[1]
-        span = target.end - target.start
-        ahead = PathPoint(goal.position, goal.rotation, goal.velocity * span, goal.spin * span)
+        ahead = goal.over(target.end - target.start)
         error, rate, across, weight = self._task.residual(tip.position(X), rotation, ahead, motion=motion)
         length = self._values.lengths[actuators]
         curvature = weights.progress * weight
@@ -125,7 +124,7 @@ class ChainEngine(Engine):
             tip_rhs=error,
             progress_lower=-progress,
             progress_upper=1.0 - progress,
-            progress_gradient=curvature * (progress - 2.0),
+            progress_gradient=progress_gradient(curvature, progress),
             progress_curvature=curvature,
             clearance=rows,
             actuator_gradient=weights.stroke_centring * (length - self._home_lengths[actuators])
@@ -147,7 +146,7 @@ class ChainEngine(Engine):
         centre = stations.weights[0] @ first
         self._data.hold_base(centre - vertices[0], axes, -axes @ (vertices[1] - vertices[0]))
 
-    def settle(self, X: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
+    def settle(self, X: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         """See ``engine.Engine``."""
         bounds = target.lower, target.upper
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.rank import rank
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
 from vgtm_qp.errors import Mistake
 from vgtm_qp.geometry.bodies import capsules
@@ -14,13 +15,10 @@ from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.problem.table import Place, shown
-from vgtm_qp.step.path import PathPoint
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
-
-_RANK_TOLERANCE = 1e-8
-"""Singular values of the tip's Jacobian below this share of the greatest one count as zero."""
 
 _POINT = 1e-6
 """Length of the member that stands for a point, m; distances are told to no more digits."""
@@ -47,7 +45,7 @@ def unreachable_tip(problem: Problem, setup: Setup) -> Iterator[Mistake]:
     To first order at the home pose: eq. (6) holds at full row rank only. A straight octahedral arm cannot roll.
     """
     arm, task, kinematics = setup.arm, setup.task, setup.kinematics
-    goal = PathPoint(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    goal = TipGoal(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
     kinematics.evaluate(arm.home_configuration)
     jacobian = task.rows(arm.home, kinematics, goal).jacobian
     moved, _ = kinematics.motion().response()
@@ -56,10 +54,10 @@ def unreachable_tip(problem: Problem, setup: Setup) -> Iterator[Mistake]:
     response = jacobian @ every[arm.end_effector.nodes].reshape(jacobian.shape[1], len(arm.actuators))
     response[len(task.axes) :] *= arm.height
     values = np.linalg.svd(response, compute_uv=False)
-    rank = int(np.count_nonzero(values > _RANK_TOLERANCE * values.max(initial=0.0)))
-    if rank < len(jacobian):
+    reached = rank(values)
+    if reached < len(jacobian):
         reasons = "; ".join(arm.unreachable())
-        found = f"this arm at home has rank {rank} of {len(jacobian)} in these"
+        found = f"this arm at home has rank {reached} of {len(jacobian)} in these"
         why = f" and cannot start: {reasons}" if reasons else ""
         yield problem.mistake(
             ("end_effector", "track"), f"coordinates that the actuators can change one by one; {found}{why}"

@@ -28,8 +28,8 @@ from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 from vgtm_qp.qp.residual import FailedStepError, InfeasibleStepError
 from vgtm_qp.qp.settle import LEFT, SETTLING_STEPS, held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.closing import Closing
-from vgtm_qp.step.path import PathPoint
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
 
@@ -153,7 +153,7 @@ class Engine(ABC):
         """Return the QP's answer; raise ``SolverError`` instead of a wrong one."""
 
     @abstractmethod
-    def settle(self, q: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
+    def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         """Return the configuration near `q`, its quantities closed and the tip at `goal`; None where a QP is due."""
 
     def drawn(self, layout: Layout) -> Engine | None:  # noqa: ARG002
@@ -237,7 +237,7 @@ class GeneralEngine(Engine):
         self._vertices = asked.vertices + solution.vertices
         return solution
 
-    def settle(self, q: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
+    def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`; an elastic tip that had to leave its path is not moved."""
         if not self.layout.elastic_tip or self._last is None:
             return self._settled(q, target, goal, accuracy)
@@ -248,7 +248,7 @@ class GeneralEngine(Engine):
         closed = self._closing.close(q, target.lower, target.upper, accuracy.member)
         return closed if closed.error <= accuracy.member else None
 
-    def _settled(self, q: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
+    def _settled(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         bounds = target.lower, target.upper
 
         def tip_error(closed: Closed) -> Array:
@@ -275,7 +275,7 @@ class GeneralEngine(Engine):
     def _settled_by_motion(
         self,
         q: Array,
-        goal: PathPoint,
+        goal: TipGoal,
         bounds: tuple[Array, Array],
         accuracy: Accuracy,
         free: NDArray[np.bool_],
@@ -370,7 +370,7 @@ class FusedEngine(Engine):
         self._vertices = asked.vertices + solution.vertices
         return solution
 
-    def settle(self, q: Array, target: Target, goal: PathPoint, accuracy: Accuracy) -> Closed | None:
+    def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
         closed, before, after = self._solver.settle(
             q, self._vertices, target.lower, target.upper, goal.position, goal.rotation

@@ -11,27 +11,9 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import GoalError
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
+from vgtm_qp.rows.tip import TipGoal
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class PathPoint:
-    """A pose on a path and its rate with the path variable.
-
-    Attributes
-    ----------
-    position, velocity : (3,)
-        m, and m per unit of the path variable.
-    rotation : (3, 3)
-    spin : (3,)
-        Angular velocity in the base frame, rad per unit of the path variable.
-    """
-
-    position: Array
-    rotation: Array
-    velocity: Array
-    spin: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +64,7 @@ class Path:
         """Last value of the path variable, s."""
         return float(self.knots[-1])
 
-    def at(self, value: float) -> PathPoint:
+    def at(self, value: float) -> TipGoal:
         """Return pose and rate at `value`; the rate is that of the piece which follows."""
         knots = self._knots
         k = min(max(bisect_right(knots, value) - 1, 0), len(knots) - 2)
@@ -94,7 +76,7 @@ class Path:
             position = self.positions[k + 1]
         else:
             position = self.positions[k] + along * self._velocity[k]
-        return PathPoint(position, rotation, self._velocity[k], self._spin[k])
+        return TipGoal(position, rotation, self._velocity[k], self._spin[k])
 
     def is_straight(self, start: float, end: float) -> bool:
         """Whether the rates are the same all the way between two values."""

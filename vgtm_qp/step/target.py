@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm, Pose
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.linearise import StepInput, TipGoal
+from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.path import Path, PathPoint
+from vgtm_qp.rows.tip import TipGoal
+from vgtm_qp.step.path import Path
 
 Array = NDArray[np.float64]
 
@@ -45,7 +46,7 @@ class Target:
     base: Pose | None = None
     vertex_goals: Array | None = None
 
-    def goal(self, progress: float) -> PathPoint:
+    def goal(self, progress: float) -> TipGoal:
         """Return the tip's goal at a progress of 0 to 1."""
         return self.path.at(self.start + progress * (self.end - self.start))
 
@@ -60,7 +61,7 @@ class QPInput(NamedTuple):
     vertices, torsion : (V, 3), (T,)
         The curve, m and rad.
     target : Target
-    goal : PathPoint
+    goal : TipGoal
         The tip's, at `progress`.
     progress : float
         How much of the target's piece of path lies behind the tip, 0 to 1.
@@ -74,7 +75,7 @@ class QPInput(NamedTuple):
     vertices: Array
     torsion: Array
     target: Target
-    goal: PathPoint
+    goal: TipGoal
     progress: float
     rows: ClearanceRows
     motion: bool
@@ -85,7 +86,6 @@ class QPInput(NamedTuple):
         if shape is not None:
             curve = shape.rows(self.vertices, self.torsion, base_frame(arm, target.base))
         nodes = arm.nodes(self.q)
-        span = target.end - target.start
         return StepInput(
             q=self.q,
             at=self.at,
@@ -95,9 +95,7 @@ class QPInput(NamedTuple):
             upper=target.upper,
             motion=self.motion,
             progress=self.progress,
-            goal=TipGoal(
-                self.goal.position, self.goal.rotation, self.goal.velocity * span, self.goal.spin * span
-            ),
+            goal=self.goal.over(target.end - target.start),
             curve=curve,
             vertex_goals=target.vertex_goals,
         )

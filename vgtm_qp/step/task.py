@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arm.arm import Arm, Kinematics
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError
-from vgtm_qp.rows.tip import axes, row_names, tip_function
-from vgtm_qp.step.path import PathPoint
+from vgtm_qp.rows.tip import TipGoal, axes, row_names, tip_function
 
 Array = NDArray[np.float64]
 
@@ -48,7 +47,7 @@ class TipTask:
         self._position_jacobian = np.kron(tip.weights, np.eye(3))[self.axes]
 
     def residual(
-        self, position: Array, rotation: Array, goal: PathPoint, *, motion: bool = False
+        self, position: Array, rotation: Array, goal: TipGoal, *, motion: bool = False
     ) -> tuple[Array, Array, Array, float]:
         """Return error (n_e,) goal minus value, rate (n_e,) along the path, turned axes (r, 3) and weight of progress.
 
@@ -64,11 +63,11 @@ class TipTask:
         error, rate, across, weight = self._rows.outputs
         return error.copy(), rate.copy(), across.reshape(3, -1).T.copy(), float(weight[0])
 
-    def error(self, position: Array, rotation: Array, goal: PathPoint) -> float:
+    def error(self, position: Array, rotation: Array, goal: TipGoal) -> float:
         """Return the greatest error, m or rad."""
         return float(np.abs(self.residual(position, rotation, goal)[0]).max(initial=0.0))
 
-    def rows(self, X: Array, kinematics: Kinematics, goal: PathPoint, spin: Array | None = None) -> TipRows:
+    def rows(self, X: Array, kinematics: Kinematics, goal: TipGoal, spin: Array | None = None) -> TipRows:
         """Return the rows at nodes `X` (N, 3), at which the kinematics was evaluated, towards `goal`.
 
         `spin` (3, 3 K_tip) are the tip's angular-velocity rows if they are to be taken elsewhere.

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.base import base_poses
 from vgtm_qp.result.certificate import Certificate, Measure
-from vgtm_qp.result.chain import RecordedChain, turns
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.result import Result
+from vgtm_qp.result.rotation import rotation_matrix, rotations
 from vgtm_qp.verify.arm import RecordedArm, recorded_arm
 from vgtm_qp.verify.clearance import (
     RESOLUTION,
@@ -25,7 +26,7 @@ from vgtm_qp.verify.clearance import (
     MemberMotion,
     motion_of,
 )
-from vgtm_qp.verify.obstacles import read_obstacles, rotation_matrix
+from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.verify.path import check_path
 from vgtm_qp.verify.recovery import excuse_recovering
 
@@ -237,7 +238,7 @@ def _locking_rows(arm: RecordedArm | RecordedChain, problem: Mapping[str, Any], 
 def _base_error(arm: RecordedArm | RecordedChain, maneuver: Result, problem: Mapping[str, Any]) -> Array:
     """Return (T, N_c) how far base nodes are from where the problem holds them, m."""
     poses = base_poses(problem, maneuver.time)
-    placed = arm.home[arm.base] @ np.swapaxes(turns(poses[:, 3:]), 1, 2) + poses[:, None, :3]
+    placed = arm.home[arm.base] @ np.swapaxes(rotations(poses[:, 3:]), 1, 2) + poses[:, None, :3]
     return np.asarray(np.linalg.norm(maneuver.nodes[:, arm.base] - placed, axis=2))
 
 

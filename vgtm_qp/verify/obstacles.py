@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.result.rotation import rotation_matrix
 from vgtm_qp.verify.distance import (
     Separation,
     segment_ball,
@@ -218,16 +219,6 @@ def read_obstacles(
         else:
             contradictions.append(f"obstacle {name} has the unknown shape {shape!r}")
     return bodies, contradictions, notes
-
-
-def rotation_matrix(vector: Array) -> Array:
-    """Return (3, 3) the rotation by |vector| rad about `vector` (3,) (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
 
 
 def _read_mesh(

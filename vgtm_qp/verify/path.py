@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.obstacles import rotation_matrix
+from vgtm_qp.result.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 

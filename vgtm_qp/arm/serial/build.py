@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vgtm_qp.arm.serial.chain import SerialChain
@@ -14,7 +16,7 @@ def build_chain(spec: ArmTable) -> SerialChain:
     joints, stuck = spec.joint, {lock.member for lock in spec.locked if lock.time == 0.0}
     axis = np.array([joint.axis for joint in joints], dtype=float)
     free = (-np.inf, np.inf)
-    return SerialChain(
+    chain = SerialChain(
         names=tuple(joint.name for joint in joints),
         revolute=np.array([joint.kind == "revolute" for joint in joints]),
         axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),
@@ -27,7 +29,20 @@ def build_chain(spec: ArmTable) -> SerialChain:
         ),
         home=np.array([joint.home for joint in joints], dtype=float),
         tip=np.array(spec.tip, dtype=float),
-        every=spec.every or -(-len(joints) // max(1, (len(joints) - len(stuck)) // 3)),
+        every=spec.every or 1,
         locked=np.array([joint.name in stuck for joint in joints]),
         radius=spec.link_radius,
     )
+    return chain if spec.every else replace(chain, every=_every(chain))
+
+
+def _every(chain: SerialChain) -> int:
+    """Return the least distance of stations, in joints, at which all of them can keep to the curve at once at home.
+
+    Where there is none, as at the straight home of a snake, there is a station for every three actuators.
+    """
+    joints, tip = len(chain), len(chain) + 1
+    for every in range(1, joints + 1):
+        if chain.holds_origins([*range(1 + every, joints + 1, every), tip]):
+            return every
+    return -(-joints // max(1, int((~chain.locked).sum()) // 3))

@@ -1,13 +1,18 @@
-"""A serial arm as data, and where its nodes are as a CasADi function of its joints."""
+"""A serial arm as data, and where its nodes are as CasADi functions of its configuration."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from vgtm_qp.arm.rank import rank
+from vgtm_qp.arm.symbols import rotated
+from vgtm_qp.rotation import rotation_from_vector, turn_between
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -93,63 +98,112 @@ class SerialChain:
         beside = len(self) + 2
         return np.array([(o, beside + 2 * k, beside + 2 * k + 1) for k, o in enumerate(origins)])
 
-    def geometry(self) -> list[Array]:
-        """Return what :func:`chain_function` takes beside the configuration, each flattened column by column."""
-        return [
-            self.axis.reshape(-1),
-            self.position.reshape(-1),
-            self.rotation.transpose(0, 2, 1).reshape(-1),
-            self.tip,
-        ]
+    @cached_property
+    def geometry(self) -> dict[str, Array]:
+        """What the functions take beside the configuration, the columns of each as rows: (J, 3), (3 J, 3), (1, 3)."""
+        return {
+            "axes": self.axis,
+            "positions": self.position,
+            "rotations": self.rotation.transpose(0, 2, 1).reshape(-1, 3),
+            "tip": self.tip[None],
+        }
 
+    @cached_property
+    def nodes(self) -> ca.Function:
+        """(q, axes (3, J), positions (3, J), rotations (3, 3 J), tip (3)) -> nodes (3, N), see :attr:`moving`."""
+        arguments, nodes, _ = self._graph
+        return ca.Function("chain_nodes", arguments, [nodes])
 
-def turned(vector: ca.SX) -> ca.SX:
-    """Return the (3, 3) rotation by |vector| about it (Rodrigues), smooth at zero."""
-    square = ca.dot(vector, vector) + 1e-30
-    angle, cross = ca.sqrt(square), ca.skew(vector)
-    return ca.SX.eye(3) + (ca.sin(angle) / angle) * cross + ((1.0 - ca.cos(angle)) / square) * (cross @ cross)
+    @cached_property
+    def moving(self) -> ca.Function:
+        """The same arguments -> nodes (3, N), and their geometric Jacobian (3 N, J).
 
+        The configuration q (J + 6) holds the joints' values, then position, m, and rotation vector, rad, of the base. A
+        node moves across the axis of each revolute joint before it, and along that of each prismatic one.
+        """
+        arguments, nodes, jacobian = self._graph
+        return ca.Function("chain", arguments, [nodes, jacobian])
 
-def chain_function(chain: SerialChain) -> ca.Function:
-    """Return (q, axes (3, J), positions (3, J), rotations (3, 3 J), tip (3)) -> nodes (3, N) and d nodes / d joints.
+    @cached_property
+    def _at_home(self) -> tuple[Array, Array]:
+        parts = (part.T for part in self.geometry.values())
+        nodes, jacobian = self.moving(np.concatenate([self.home, np.zeros(6)]), *parts)
+        return np.asarray(nodes, dtype=float).T, np.asarray(jacobian, dtype=float).reshape(-1, 3, len(self))
 
-    The configuration q (J + 6) holds the joints' values, then position, m, and rotation vector, rad, of the base. The
-    Jacobian (3 N, J) is the geometric one: a node moves across the axis of each revolute joint before it, and along
-    that of each prismatic one.
-    """
-    count = len(chain)
-    q, axes = ca.SX.sym("q", count + 6), ca.SX.sym("axes", 3, count)
-    positions, rotations = ca.SX.sym("positions", 3, count), ca.SX.sym("rotations", 3, 3 * count)
-    tip = ca.SX.sym("tip", 3)
-    origin, frame = q[count : count + 3], turned(q[count + 3 :])
-    nodes, after = [origin], [0]
-    stations = [(origin, frame, 0)]
-    joints: list[tuple[ca.SX, ca.SX]] = []
-    for j in range(count):
-        origin = origin + frame @ positions[:, j]
-        frame = frame @ rotations[:, 3 * j : 3 * j + 3]
-        axis = frame @ axes[:, j]
-        joints.append((axis, origin))
-        nodes.append(origin)
-        after.append(j)
-        if chain.revolute[j]:
-            frame = frame @ turned(q[j] * axes[:, j])
-        else:
-            origin = origin + q[j] * axis
-        if j in chain.tracked:
-            # A prismatic joint carries its station along.
-            stations.append((nodes[-1], frame, j + 1))
-    end = origin + frame @ tip
-    nodes.append(end)
-    after.append(count)
-    stations.append((end, frame, count))
-    for place, attitude, joint in stations:
-        nodes += [place + chain.spread * attitude[:, 0], place + chain.spread * attitude[:, 1]]
-        after += [joint, joint]
-    jacobian = ca.SX(3 * len(nodes), count)
-    for n, (node, last) in enumerate(zip(nodes, after, strict=True)):
-        for j, (axis, at) in enumerate(joints[:last]):
-            moved = ca.cross(axis, node - at) if chain.revolute[j] else axis
-            jacobian[3 * n : 3 * n + 3, j] = moved
-    results = [ca.horzcat(*nodes), ca.densify(jacobian)]
-    return ca.Function("chain", [q, axes, positions, rotations, tip], results)
+    @property
+    def home_nodes(self) -> Array:
+        """(N, 3) the nodes at home, m."""
+        return self._at_home[0]
+
+    @cached_property
+    def actuators(self) -> Index:
+        """(n_a,) joints that are not stuck."""
+        return np.flatnonzero(~self.locked)
+
+    @cached_property
+    def base(self) -> Mask:
+        """(N,) nodes that move with the base alone."""
+        return np.isin(np.arange(len(self.node_names)), [0, 1, *self.station_nodes[0]])
+
+    @cached_property
+    def free(self) -> Index:
+        """(N - N_c,) the other nodes."""
+        return np.flatnonzero(~self.base)
+
+    @cached_property
+    def station_frames(self) -> Array:
+        """(F, 3, 3) rotations of the stations at home; their z-axes lie along the arm."""
+        frames = [np.eye(3)]
+        for before, after in pairwise(self.home_nodes[self.station_nodes[:, 0]]):
+            way = after - before
+            turn = turn_between(frames[-1][:, 2], way / np.linalg.norm(way))
+            frames.append(rotation_from_vector(turn) @ frames[-1])
+        return np.stack(frames)
+
+    def holds_origins(self, nodes: ArrayLike) -> bool:
+        """Whether the origins at `nodes` (K,) can be held in place one by one, by rank at home."""
+        _, jacobian = self._at_home
+        places = np.asarray(nodes)
+        rows = jacobian[places][:, :, self.actuators].reshape(3 * len(places), len(self.actuators))
+        full = 0 < len(rows) <= len(self.actuators)
+        return full and rank(np.linalg.svd(rows, compute_uv=False)) == len(rows)
+
+    @cached_property
+    def _graph(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
+        count = len(self)
+        q, axes = ca.SX.sym("q", count + 6), ca.SX.sym("axes", 3, count)
+        positions, rotations = ca.SX.sym("positions", 3, count), ca.SX.sym("rotations", 3, 3 * count)
+        tip = ca.SX.sym("tip", 3)
+        origin, frame = q[count : count + 3], rotated(q[count + 3 :])
+        nodes, after = [origin], [0]
+        stations = [(origin, frame, 0)]
+        joints: list[tuple[ca.SX, ca.SX]] = []
+        for j in range(count):
+            origin = origin + frame @ positions[:, j]
+            frame = frame @ rotations[:, 3 * j : 3 * j + 3]
+            axis = frame @ axes[:, j]
+            joints.append((axis, origin))
+            nodes.append(origin)
+            after.append(j)
+            if self.revolute[j]:
+                frame = frame @ rotated(q[j] * axes[:, j])
+            else:
+                origin = origin + q[j] * axis
+            if j in self.tracked:
+                # Its station turns with a joint, but stays where a slide begins.
+                stations.append((nodes[-1], frame, j + 1 if self.revolute[j] else j))
+        end = origin + frame @ tip
+        nodes.append(end)
+        after.append(count)
+        stations.append((end, frame, count))
+        for place, attitude, joint in stations:
+            nodes += [place + self.spread * attitude[:, 0], place + self.spread * attitude[:, 1]]
+            after += [joint, joint]
+        columns, rest = [], ca.SX.zeros(3)
+        for j, (axis, at) in enumerate(joints):
+            turns = bool(self.revolute[j])
+            moved = (ca.cross(axis, node - at) if turns else axis for node in nodes)
+            columns.append(
+                ca.vertcat(*(m if j < last else rest for m, last in zip(moved, after, strict=True)))
+            )
+        return [q, axes, positions, rotations, tip], ca.horzcat(*nodes), ca.densify(ca.horzcat(*columns))

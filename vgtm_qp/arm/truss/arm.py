@@ -14,7 +14,7 @@ from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.chords import chord_deviation
 from vgtm_qp.arm.truss.kinematics import EndKinematics, TrussKinematics
 from vgtm_qp.arm.truss.lengths import LengthRows
-from vgtm_qp.arm.truss.mobility import describe
+from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.reach import hollow, longest_ways
 from vgtm_qp.arm.truss.symbols import TrussSymbols
 from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
@@ -225,6 +225,10 @@ class TrussArm:
     def symbols(self, constants: Constants) -> TrussSymbols:
         """See ``arm.Arm``."""
         return TrussSymbols(self.truss, constants)
+
+    def describe(self) -> TrussDescription:
+        """See ``arm.Arm``."""
+        return describe(self.truss)
 
     def record(self) -> dict[str, Any]:
         """See ``arm.Arm``.

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.linalg import splu
 
+from vgtm_qp.arm.rank import rank
 from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, length_jacobian
 from vgtm_qp.arm.truss.kinematics import TrussKinematics
 from vgtm_qp.arm.truss.truss import Array, Index, Truss
-
-RANK_TOLERANCE = 1e-8
-"""Singular values of a tip or face Jacobian below this fraction of the greatest one count as zero."""
 
 _ROLL_REASON = (
     ": where the arm is straight, a twist of two faces makes one of a node's two fixed longerons longer "
@@ -133,7 +131,7 @@ def trackable_coordinates(truss: Truss, *, face_stride: int = 1) -> tuple[str, .
     tracked: tuple[str, ...] = ()
     for coordinate, count in (("position", 3), ("pointing", 5), ("orientation", 6)):
         rows = local[:, :count].reshape(-1, local.shape[-1])
-        if rows.shape[0] > rows.shape[1] or _rank(rows) < rows.shape[0]:
+        if rows.shape[0] > rows.shape[1] or rank(np.linalg.svd(rows, compute_uv=False)) < rows.shape[0]:
             break
         tracked += (coordinate,)
     return tracked
@@ -159,7 +157,7 @@ def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
     scaled = response.copy()
     scaled[3:] *= _size(truss)
     left, values, _ = np.linalg.svd(scaled)
-    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
+    tip_rank = rank(values)
     fixed = int(np.count_nonzero(~truss.actuated))
     return TrussDescription(
         module=truss.module,
@@ -172,9 +170,9 @@ def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
         trackable=truss.trackable,
         face_stride=truss.face_stride,
         determinacy=report,
-        tip_rank=rank,
+        tip_rank=tip_rank,
         tip_coordinates=len(response),
-        unreachable=tuple(_in_words(twist, truss) for twist in _roll_first(left[:, rank:], truss).T),
+        unreachable=tuple(_in_words(twist, truss) for twist in _roll_first(left[:, tip_rank:], truss).T),
     )
 
 
@@ -190,11 +188,6 @@ def _pose_rows(truss: Truss, nodes: Index, weights: Array, spin: Array | None) -
 def _size(truss: Truss) -> float:
     """Length that makes angular velocities comparable with velocities, m."""
     return float(np.ptp(truss.home, axis=0).max())
-
-
-def _rank(rows: Array) -> int:
-    values = np.linalg.svd(rows, compute_uv=False)
-    return int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
 
 
 def _roll_first(missing: Array, truss: Truss) -> Array:
