@@ -147,7 +147,7 @@ def test_lock_at_run_time_holds_and_is_named():
         active.update(step.active)
         np.testing.assert_allclose(step.state.quantities[index], kept.quantities[index], atol=1e-10)
     assert {"locked: B1-1", "locked: B2-2"} <= active
-    with pytest.raises(GoalError, match=r"L1-1.*fixed length"):
+    with pytest.raises(GoalError, match=r"L1-1.*is fixed"):
         resolver.lock("L1-1")
     with pytest.raises(GoalError, match='did you mean "B1-2"'):
         resolver.lock("B1_2")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from arms import arm_problem, make_layout
@@ -20,6 +22,7 @@ from vgtm_qp.rows.clearance import clearance_rows
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.engine import FusedEngine, GeneralEngine
+from vgtm_qp.step.path import Path
 
 H = 1e-6
 
@@ -519,3 +522,42 @@ def test_an_arm_that_cannot_be_moved_is_refused_by_the_key_that_is_to_blame(mist
             )
         )
     assert key in str(raised.value)
+
+
+WIDE = chain(10, joint=[{**joint, "limits": [-2.5, 2.5]} for joint in chain(10)["joint"]])
+STOPS = {
+    "its own links": (
+        WIDE,
+        {"clearance": {"safe": 0.1, "self_safe": 0.1}},
+        [0.0, 0.0, 0.4],
+        r"link \w+ / link \w+$",
+    ),
+    "a ball": (
+        chain(),
+        {"obstacle": [{"name": "ball", "shape": "sphere", "center": [0.9, -0.9, 1.3], "radius": 0.3}]},
+        [0.9, -0.9, 1.3],
+        r"link \w+ / ball$",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", STOPS)
+def test_what_stops_a_serial_arm_is_named_as_what_it_is(what):
+    arm, more, towards, name = STOPS[what]
+    resolver = vq.Resolver(serial_problem(arm, curve={"control_vertices": 4}, **more))
+    for _ in range(200):
+        (here, rotation), last = resolver.tip(), resolver.state
+        stride = 0.03 * (towards - here) / np.linalg.norm(towards - here)
+        step = resolver.step(position=here + stride)
+        if step.progress < 1e-3 or np.linalg.norm(resolver.tip()[0] - towards) < 0.03:
+            break
+    path = Path(np.array([0.0, 1.0]), np.stack([here, here + stride]), np.stack([rotation, rotation]))
+    stop = resolver.explain(path, 0.0, 1.0, last=step, state=last)
+    assert stop.kind.value == ("obstacle" if what == "a ball" else "members")
+    assert stop.obstacles == (("ball",) if what == "a ball" else ())
+    assert re.search(name, stop.names[0])
+
+
+def test_a_lock_of_what_an_arm_has_not_names_what_it_has():
+    with pytest.raises(vq.GoalError, match=r'"p9", which there is not; actuators are p1, y1'):
+        vq.Resolver(problem_of("serial")).lock("p9")

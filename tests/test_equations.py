@@ -88,7 +88,7 @@ def _functions(tree: ast.AST, owner: str) -> Iterator[tuple[str, ast.FunctionDef
 def table() -> dict[int, set[str]]:
     """Return which functions the table in README.md names for each equation."""
     found: dict[int, set[str]] = {}
-    lines = (PACKAGE.parent / "README.md").read_text(encoding="utf-8").splitlines()
+    lines = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8").splitlines()
     for line in lines[lines.index("| equation | what | where |") + 2 :]:
         if not line.startswith("|"):
             break

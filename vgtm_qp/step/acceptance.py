@@ -85,17 +85,22 @@ class Acceptance:
             return f"the new state has its base {off:.3g} m from where it is"
         values, enough = arm.measured(q), self._member + rounding
         self._least[self._actuators], self._greatest[self._actuators] = lower, upper
-        off = norm(beyond(values, self._least, self._greatest))
-        if not off <= enough:
-            return f"the new state has a member {off:.3g} m from the lengths it may have"
-        off = norm(values - closed.quantities)
-        if not off <= enough:
-            return f"the new state has a member {off:.3g} m from the length that it is said to have"
+        out = beyond(values, self._least, self._greatest)
+        if not norm(out) <= enough:
+            return f"the new state has {self._worst(out)} from the values it may have"
+        wrong = values - closed.quantities
+        if not norm(wrong) <= enough:
+            return f"the new state has {self._worst(wrong)} from the value that it is said to have"
         if goal is not None:
             off = self._tip_error(q, X, goal)
             if not off <= self._tip + rounding:
                 return f"the new state has its tip {off:.3g} m or rad from its goal"
         return ""
+
+    def _worst(self, errors: Array) -> str:
+        """Return which quantity is furthest off, and how far; of NaN the first."""
+        k = int(np.argmax(np.abs(errors)))
+        return f"{self._arm.quantity_names[k]} {abs(errors[k]):.3g} m or rad"
 
     def _tip_error(self, q: Array, X: Array, goal: TipGoal) -> float:
         """Return the greatest error of the tip, m or rad."""

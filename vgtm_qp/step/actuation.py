@@ -70,10 +70,10 @@ class Actuation:
             No actuator has that name.
         """
         if name not in self.names:
-            what = "has a fixed length" if name in self._arm.quantity_names else "is no member"
+            what = "is fixed" if name in self._arm.quantity_names else "there is not"
             names = ", ".join(self.names[:6]) + (", ..." if len(self.names) > 6 else "")
             hint = nearest(name, self.names)
-            raise GoalError(f'cannot lock "{name}", which {what}; actuated members are {names}{hint}')
+            raise GoalError(f'cannot lock "{name}", which {what}; actuators are {names}{hint}')
         k = self.names.index(name)
         self.stroke[k] = state.quantities[self._actuators[k]]
         self._held[k] = True

@@ -159,7 +159,7 @@ def explain(
         kind = StopKind.OUT_OF_REACH if _outward(setup.arm, state, path, start) else StopKind.SINGULAR
         if share <= _SINGULAR:
             return Stop(kind, reason=reason)
-        kinds = [_kind(name) for name in pressing]
+        kinds = [_kind(setup, name) for name in pressing]
         other = (
             StopKind.ACCELERATION if reason.startswith((CANNOT_BRAKE, BASE_MOVES_ON)) else StopKind.NONLINEAR
         )
@@ -195,11 +195,11 @@ def _obstacles(setup: Setup, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _kind(name: str) -> StopKind:
+def _kind(setup: Setup, name: str) -> StopKind:
     """Return what the row of that name is about."""
     first = name.split(":")[0]
     if first == "clearance":
-        return StopKind.MEMBERS if " / member " in name else StopKind.OBSTACLE
+        return StopKind.OBSTACLE if _obstacles(setup, [name]) else StopKind.MEMBERS
     return StopKind(first)
 
 
@@ -222,7 +222,7 @@ class _Program:
         end: float,
         limits: Limits,
     ) -> None:
-        arm, kinematics = setup.arm, setup.kinematics
+        arm, kinematics, self._setup = setup.arm, setup.kinematics, setup
         kinematics.evaluate(state.q)
         response, _ = kinematics.motion().response()
         count = len(arm.actuators)
@@ -293,7 +293,7 @@ class _Program:
         if k >= near:
             side = self._limits.low_kind if k < near + actuators else self._limits.high_kind
             return side[(k - near) % actuators]
-        return _kind(self._rows.name(k))
+        return _kind(self._setup, self._rows.name(k))
 
 
 def _outward(arm: Arm, state: State, path: Path, start: float) -> bool:
