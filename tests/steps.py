@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import qpsolvers
@@ -17,7 +17,7 @@ from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
-from vgtm_qp.qp.shape import CurveRows, CurveShape
+from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
@@ -108,33 +108,6 @@ def assert_same_answer(found: Any, wanted: Any, tolerance: float = 1e-10) -> Non
         np.testing.assert_allclose(
             getattr(found, which), getattr(wanted, which), atol=tolerance, err_msg=which
         )
-
-
-class TurnRows(NamedTuple):
-    """Turns between faces and curve: (K, R) residuals, rows over the faces' nodes (K, R, 9) and the curve (K, R, D)."""
-
-    residual: Array
-    face: Array
-    curve: Array
-
-
-def turn_rows(rows: CurveRows, rotation: Array, spin: Array, turns: int) -> TurnRows:
-    """Return the turns between faces, `rotation` (K, 3, 3) and `spin` (K, 3, 9), and the curve's frames.
-
-    The first two are cosines between the face's x and y axes and the tangent, the third the sine of the roll. Each is
-    a function of the relative rotation alone: its rate is c . (face's less curve's angular velocity).
-    """
-    frame = rows.frame
-    x, y = rotation[:, :, 0], rotation[:, :, 1]
-    tangent = frame[:, :, 2]
-    residual = [np.einsum("kc,kc->k", axis, tangent) for axis in (x, y)]
-    combined = [np.cross(axis, tangent) for axis in (x, y)]
-    if turns == 3:
-        first, second = frame[:, :, 0], frame[:, :, 1]
-        residual.append(0.5 * np.einsum("kc,kc->k", x, second) - 0.5 * np.einsum("kc,kc->k", y, first))
-        combined.append(0.5 * (np.cross(x, second) - np.cross(y, first)))
-    c = np.stack(combined, axis=1)
-    return TurnRows(np.stack(residual, axis=1), c @ spin, -c @ rows.spin_rows)
 
 
 def numbers_at(
