@@ -83,7 +83,7 @@ def solve(
     if json:
         document(summary | written)
     else:
-        say(_report(summary))
+        say(_report(summary, serial=maneuver.joints is not None))
         say("\n".join(f"{name}: {path}" for name, path in {"result": str(result), **written}.items()))
     if "interrupted" in maneuver.blocked_by:
         note(f"vgtm: interrupted; what was solved is in {result}")
@@ -112,7 +112,10 @@ def _changed(problem: Problem, changes: dict[str, Any]) -> Problem:
         raise ProblemError("command line", mistakes) from None
 
 
-def _report(summary: dict[str, Any]) -> str:
+def _report(summary: dict[str, Any], *, serial: bool) -> str:
+    body, fixed, unit = (
+        ("links", "locked joints", "rad or m") if serial else ("members", "fixed members", "m")
+    )
     verified = "verified" if summary["verified"] else "VERIFICATION FAILED"
     lines = [f"{summary['name']}: {summary['status']}, {verified}"]
     if summary["blocked_by"]:
@@ -128,10 +131,10 @@ def _report(summary: dict[str, Any]) -> str:
         ("path covered", f"{100 * summary['reached']:.4g} % in {summary['steps']} steps"),
         ("clearance at states", _number(summary["min_clearance"], "m", "nothing near")),
         ("clearance between states", _number(summary["min_clearance_between"], "m", "nothing near")),
-        ("clearance of members from members", _number(summary["min_self_clearance"], "m", "not watched")),
-        ("error of fixed members", _number(summary["max_member_error"], "m")),
-        ("stroke violation", _number(summary["max_stroke_violation"], "m")),
-        ("rate violation", _number(summary["max_rate_violation"], "m/s")),
+        (f"clearance of {body} from {body}", _number(summary["min_self_clearance"], "m", "not watched")),
+        (f"error of {fixed}", _number(summary["max_member_error"], unit)),
+        ("stroke violation", _number(summary["max_stroke_violation"], unit)),
+        ("rate violation", _number(summary["max_rate_violation"], f"({unit})/s" if serial else "m/s")),
         ("tip error", _number(summary["max_tip_error"], "m", "not tracked")),
         ("tip direction error", _number(summary["max_tip_direction_error"], "rad", "not tracked")),
         ("time of a step, median and 99 %", f"{_milliseconds(step['median'])}, {_milliseconds(step['p99'])}"),

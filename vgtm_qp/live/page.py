@@ -85,10 +85,10 @@ class _Page:
         self._settings: dict[str, Any] = {}
         self._playing, self._moment, self._message = False, 0.0, ""
         state = session.state
-        self._scene = ArmScene(server, session.drawing, state.nodes, state.control_vertices)
+        self._scene = ArmScene(server, session.drawing, session.nodes, state.control_vertices)
         path = make_plan(session.problem, *session.pose()).path.positions
         self._scene.add_path("/path", path)
-        nodes = maneuver.nodes if maneuver else state.nodes[None]
+        nodes = maneuver.nodes if maneuver else session.nodes[None]
         self._scene.look(camera_for(session.drawing, nodes, path))
         self._target = self._add_handle("/tip target", session.target, 0.085, _TARGET_COLOUR, self._drag_tip)
         colour = tuple(round(255 * channel) for channel in CURVE_COLOUR)
@@ -144,7 +144,7 @@ class _Page:
 
     def _draw(self) -> None:
         session = self._session
-        self._scene.move(session.state.nodes, session.state.control_vertices, session.state.time)
+        self._scene.move(session.nodes, session.state.control_vertices, session.state.time)
         self._target.position = session.target
         for i, handle in self._vertices.items():
             handle.position = session.vertex_goals.get(i, session.state.control_vertices[i])

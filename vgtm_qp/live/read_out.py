@@ -19,7 +19,7 @@ def read_out(session: Session, message: str) -> str:
     safe = session.problem.clearance.safe
     rows = [
         ("clearance", _distance(reading.clearance, safe), reading.nearest),
-        ("members apart", _distance(reading.self_clearance, -np.inf), ""),
+        (f"{session.drawing.arm.body}s apart", _distance(reading.self_clearance, -np.inf), ""),
         ("tip to target", f"{1000 * float(np.linalg.norm(session.target - session.tip)):.1f} mm", ""),
         (
             "step",
@@ -44,7 +44,7 @@ def read_out(session: Session, message: str) -> str:
     return (
         "<div style='font-size:0.8rem;line-height:1.35;padding:0.2em 0.8em'>"
         f"{notice}<div style='min-height:2.7em'>{outcome}</div><table>{cells}</table>"
-        f"<div style='color:#6b7280;margin-top:0.4em'>strokes, shortest to longest</div>{_strokes(session)}"
+        f"<div style='color:#6b7280;margin-top:0.4em'>strokes, least to greatest</div>{_strokes(session)}"
         f"<div style='color:#6b7280;margin-top:0.4em'>active constraints</div>"
         f"<ul style='margin:0;padding-left:1.2em;min-height:5.4em'>{active}</ul></div>"
     )

@@ -75,6 +75,11 @@ class Session:
         self._last: Step | None = None
 
     @property
+    def nodes(self) -> Array:
+        """(N, 3) the nodes that are drawn, m: a serial arm has others beside its stations."""
+        return self.state.nodes[: len(self.drawing.arm.home)]
+
+    @property
     def state(self) -> State:
         """Where the arm is."""
         return self._resolver.state

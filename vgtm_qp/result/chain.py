@@ -37,7 +37,7 @@ class RecordedChain:
         Of the links, m.
     """
 
-    unit, rigid_body = "rad or m", "link"
+    unit, body, rigid_body = "rad or m", "link", "link"
     has_pin_joints = False
 
     def __init__(self, record: Mapping[str, Any]) -> None:

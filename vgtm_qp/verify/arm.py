@@ -79,7 +79,7 @@ class RecordedArm:
         self.free = np.setdiff1d(np.arange(nodes), self.base)
         self._tip_fit = polygon_frame(self.home[self.tip], None) if self.has_tip_frame else None
 
-    unit, rigid_body = "m", "fixed member"
+    unit, body, rigid_body = "m", "member", "fixed member"
 
     @property
     def quantity_names(self) -> tuple[str, ...]:
