@@ -317,17 +317,16 @@ def curve_numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
         residuals = [tilts(*pair) for pair in pairs]
         derivatives = [tilt_rows(*pair) for pair in pairs]
         curve = [by_slope for _, by_slope in derivatives]
-        names = "tangent_rhs", "tangent_face", "tangent_curve"
     else:
         frames = list(zip(rotations, given.frame, strict=True))
         residuals = [turns(*pair, layout.turns) for pair in frames]
         derivatives = [turn_rows(*pair, layout.turns) for pair in frames]
         curve = [by_curve @ row for (_, by_curve), row in zip(derivatives, given.spin_rows, strict=True)]
-        names = "curve.turn_rhs", "curve.turn_face", "curve.turn_curve"
-        found["curve.position"] = given.position_rows
-        found["curve.spacing"] = given.spacing_rows
-        found["curve.spacing_rhs"] = asked.motion * given.spacing
+        found["curve.position_rows"] = given.position_rows
+        found["curve.spacing_rows"] = given.spacing_rows
+        found["spacing_rhs"] = asked.motion * given.spacing
     face = [by_face @ row for (by_face, _), row in zip(derivatives, spins, strict=True)]
+    names = "tangent_rhs", "tangent_face", "tangent_curve"
     for name, value in zip(names, (closes_turns * np.array(residuals), face, curve), strict=True):
         found[name] = np.array(value)
     return found
@@ -404,17 +403,17 @@ def condensed(layout: Layout, asked: StepInput, given: dict[str, Array]) -> dict
     parts = [np.sqrt(weights.node_rate) * stacked(free, np.zeros((len(free), size)), np.zeros(len(free)))]
     if V:
         K, R = len(tracked), layout.turns
-        names = "curve.turn_rhs", "curve.turn_face", "curve.turn_curve"
+        residual, face, curve = (given[name] for name in ("tangent_rhs", "tangent_face", "tangent_curve"))
         if layout.general is None:
-            names = "tangent_rhs", "tangent_face", "tangent_curve"
-            given = {**given, "curve.position": np.einsum("kv,cd->kcvd", layout.curve_weights, np.eye(3))}
-        residual, face, curve = (given[name] for name in names)
-        if layout.general is None:
+            given = {
+                **given,
+                "curve.position_rows": np.einsum("kv,cd->kcvd", layout.curve_weights, np.eye(3)),
+            }
             curve = np.einsum("kac,kv->kavc", curve, layout.curve_slopes)
         corners = nodes[truss.faces[tracked]]
         centres = np.einsum("kf,kfcn->kcn", truss.face_weights[tracked], corners).reshape(3 * K, -1)
         turned = np.einsum("krf,kfn->krn", face, corners.reshape(K, 9, -1)).reshape(R * K, -1)
-        position = given["curve.position"].reshape(3 * K, size)
+        position = given["curve.position_rows"].reshape(3 * K, size)
         tracking = 1.0 if layout.hard_tracking else weights.tracking
         turning = np.ones(R) if layout.hard_turns else [weights.tangent, weights.tangent, weights.roll][:R]
         parts.append(np.sqrt(tracking) * stacked(centres, -position, given["position_rhs"]))
@@ -423,7 +422,7 @@ def condensed(layout: Layout, asked: StepInput, given: dict[str, Array]) -> dict
         )
         if layout.spacings:
             still = np.zeros((layout.spacings, count + 1))
-            stretch = stacked(still, given["curve.spacing"], given["curve.spacing_rhs"])
+            stretch = stacked(still, given["curve.spacing_rows"], given["spacing_rhs"])
             parts.append(np.sqrt(weights.spacing) * stretch)
     tip = given["tip_jacobian"] @ nodes[truss.tip].reshape(-1, count + 1)
     missing, unbounded = given["tip_rhs"] - tip[:, -1], np.full(layout.free_curve, 1e30)

@@ -10,7 +10,9 @@ constant and only A's values change.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +143,19 @@ class FullBuilder:
             ],
             format="csc",
         )
-        self._rows_i, self._rows_j, self._row_labels = self._fixed_pattern()
+        self._fixed = self._fixed_rows()
+        starts = np.cumsum([0, *(len(rows.labels) for rows in self._fixed)])
+        self.fixed_rows = int(starts[-1])
+        self._row_labels = tuple(label for rows in self._fixed for label in rows.labels)
+        entries = [
+            (entry, start) for rows, start in zip(self._fixed, starts, strict=False) for entry in rows.entries
+        ]
+        self._rows_i = np.concatenate([entry.rows.reshape(-1) + start for entry, start in entries])
+        self._rows_j = np.concatenate([entry.columns.reshape(-1) for entry, _ in entries])
+        self.tip_rows = np.arange(starts[1], starts[2])
+        self.gap_rows = np.arange(starts[min(3, len(starts) - 1)], self.fixed_rows)
+        self.gaps = np.arange(self.column["position"].start, self.column["spacing"].stop)
+        self.hard_gaps = self.gaps[: layout.hard_rows]
         self._column_labels = self._columns()
         self._pattern: tuple[bytes, ...] | None = None
         self._matrix = sparse.csc_matrix((0, self.size))
@@ -162,17 +176,16 @@ class FullBuilder:
     def build(self, numbers: StepNumbers) -> StepQP:
         """Return the QP with the values of `numbers`."""
         layout, clearance = self.layout, numbers.clearance
-        fixed_rows = len(self._row_labels)
         columns = layout.node_column[clearance.nodes]
         present = columns >= 0
         pattern = (columns.tobytes(),)
         if pattern != self._pattern:
             k, slot = np.nonzero(present)
-            i = np.repeat(fixed_rows + k, 3)
+            i = np.repeat(self.fixed_rows + k, 3)
             j = (columns[k, slot][:, None] + np.arange(3)).reshape(-1)
             rows = np.concatenate([self._rows_i, i])
             cols = np.concatenate([self._rows_j, j])
-            total = fixed_rows + len(clearance)
+            total = self.fixed_rows + len(clearance)
             keys = cols * total + rows
             unique, position = np.unique(keys, return_inverse=True)
             indptr = np.searchsorted(unique, np.arange(self.size + 1) * total)
@@ -183,7 +196,8 @@ class FullBuilder:
         self._labels = self._row_labels + tuple(
             Label(clearance.name(k), "clearance", "m") for k in range(len(clearance))
         )
-        values = np.concatenate([self._fixed_values(numbers), clearance.coefficients[present].reshape(-1)])
+        fixed = [entry.values(numbers).reshape(-1) for rows in self._fixed for entry in rows.entries]
+        values = np.concatenate([*fixed, clearance.coefficients[present].reshape(-1)])
         self._matrix.data[:] = np.bincount(self._order, weights=values, minlength=len(self._matrix.data))
 
         q = np.zeros(self.size)
@@ -204,17 +218,7 @@ class FullBuilder:
             column_lower[self.column["position"]] = column_upper[self.column["position"]] = 0.0
         if layout.hard_turns:
             column_lower[self.column["tangent"]] = column_upper[self.column["tangent"]] = 0.0
-        equal = np.concatenate(
-            [
-                numbers.motion.rhs,
-                numbers.tip_rhs,
-                numbers.base_displacement if layout.vertices else np.zeros(0),
-                numbers.base_rhs if layout.vertices else np.zeros(0),
-                -numbers.position_rhs.reshape(-1),
-                -(numbers.tangent_rhs if numbers.curve is None else numbers.curve.turn_rhs).reshape(-1),
-                np.zeros(0) if numbers.curve is None else -numbers.curve.spacing_rhs,
-            ]
-        )
+        equal = np.concatenate([rows.rhs(numbers).reshape(-1) for rows in self._fixed])
         return StepQP(
             self._hessian,
             q,
@@ -275,114 +279,125 @@ class FullBuilder:
             ]
         return (*labels, Label("progress along the path", "progress", "1"))
 
-    def _fixed_pattern(self) -> tuple[Index, Index, tuple[Label, ...]]:
-        """Return row and column of every entry above the clearance rows, in the order of `_fixed_values`."""
+    def _fixed_rows(self) -> list[_Rows]:
+        """Return the rows above the clearances: the arm's own, the tip's, the curve's base, its gaps."""
         layout, arm, column = self.layout, self.layout.arm, self.column
-        stations, word, tips = arm.stations, arm.stations.word, arm.end_effector.nodes
-        rows: list[Index] = []
-        cols: list[Index] = []
-        labels: list[Label] = []
-
-        def add(i: Index, j: Index) -> None:
-            rows.append(np.asarray(i, dtype=np.int64).reshape(-1) + len(labels))
-            cols.append(np.asarray(j, dtype=np.int64).reshape(-1))
-
-        # Columns of the arm's own rows are those of the nodes and actuators, which come first.
-        add(arm.motion_pattern.rows, arm.motion_pattern.columns)
-        labels += arm.motion_pattern.labels
-        tip = len(layout.tip_rows)
-        tip_columns = layout.node_column[tips]
+        pattern, tip, axis = arm.motion_pattern, np.arange(len(layout.tip_rows)), np.arange(3)
+        tip_columns = layout.node_column[arm.end_effector.nodes]
         present = np.repeat(tip_columns >= 0, 3)
-        flat = (tip_columns[:, None] + np.arange(3)).reshape(-1)[present]
-        add(np.repeat(np.arange(tip), len(flat)), np.tile(flat, tip))
-        add(np.arange(tip), np.full(tip, column["progress"].start))
+        flat = (tip_columns[:, None] + axis).reshape(-1)[present]
+        tip_entries = [
+            _Entries(*_grid(tip, flat), lambda numbers: numbers.tip_jacobian[:, present]),
+            _Entries(tip, np.full(len(tip), self.size - 1), lambda numbers: -numbers.tip_rate),
+        ]
         if layout.elastic_tip:
-            add(np.tile(np.arange(tip), 2), np.arange(column["slack"].start, column["slack"].stop))
-        labels += [Label(name, "end effector", unit(name)) for name in layout.tip_rows]
-        if not layout.vertices:
-            return np.concatenate(rows), np.concatenate(cols), tuple(labels)
+            slack = np.arange(column["slack"].start, column["slack"].stop)
+            signs = np.repeat([1.0, -1.0], len(tip))
+            tip_entries.append(_Entries(np.tile(tip, 2), slack, lambda _: signs))
+        rows = [
+            # Columns of the arm's own rows are those of the nodes and actuators, which come first.
+            _Rows(
+                pattern.labels,
+                [_Entries(pattern.rows, pattern.columns, lambda numbers: numbers.motion.values)],
+                lambda numbers: numbers.motion.rhs,
+            ),
+            _Rows(
+                [Label(name, "end effector", unit(name)) for name in layout.tip_rows],
+                tip_entries,
+                lambda numbers: numbers.tip_rhs,
+            ),
+        ]
+        return rows + self._curve_rows() if layout.vertices else rows
 
-        vertex = column["vertices"].start
-        add(np.arange(3), vertex + np.arange(3))
-        labels += [Label(f"curve base {a}", "curve base", "m") for a in "xyz"]
-        add(np.repeat(np.arange(2), 6), np.tile(vertex + np.arange(6), 2))
-        labels += [Label(f"curve base tangent {a}", "curve base", "m") for a in "xy"]
-
-        tracked = len(layout.tracked)
+    def _curve_rows(self) -> list[_Rows]:
+        layout, stations, column = self.layout, self.layout.arm.stations, self.column
+        first, word, count, turns = column["vertices"].start, stations.word, len(layout.tracked), layout.turns
+        curve = np.arange(first, column["torsion"].stop)
         faces = layout.node_column[stations.nodes[layout.tracked]]
         k, slot = np.nonzero(faces >= 0)
-        axis = np.arange(3)
-        add(3 * k[:, None] + axis, faces[k, slot][:, None] + axis)
+        axis, turn = np.arange(3), np.arange(turns)
+        weights = np.repeat(stations.weights[layout.tracked][k, slot], 3)
+        at_turn = np.broadcast_to((turns * k[:, None] + turn)[..., None], (len(k), turns, 3))
+        over_face = np.broadcast_to((faces[k, slot][:, None] + axis)[:, None, :], (len(k), turns, 3))
         if layout.general is None:
-            i, v = np.nonzero(layout.curve_weights)
-            add(3 * i[:, None] + axis, vertex + 3 * v[:, None] + axis)
+            moves = np.kron(layout.curve_weights != 0.0, np.eye(3)).nonzero()
+            leans = np.kron(layout.curve_slopes != 0.0, np.ones((turns, 3))).nonzero()
         else:
-            curve = np.arange(vertex, column["torsion"].stop)
-            add(*(grid.reshape(-1) for grid in np.meshgrid(np.arange(3 * tracked), curve, indexing="ij")))
-        add(np.arange(3 * tracked), column["position"].start + np.arange(3 * tracked))
-        labels += [Label(f"track: {word} {f} {a}", "tracking", "m") for f in layout.tracked for a in "xyz"]
+            moves, leans = (np.ones((rows * count, len(curve))).nonzero() for rows in (3, turns))
 
-        turns = layout.turns
-        shape = (len(k), turns, 3)
-        add(
-            np.broadcast_to((turns * k[:, None] + np.arange(turns))[..., None], shape),
-            np.broadcast_to((faces[k, slot][:, None] + axis)[:, None, :], shape),
-        )
-        if layout.general is None:
-            i, v = np.nonzero(layout.curve_slopes)
-            shape = (len(i), 2, 3)
-            add(
-                np.broadcast_to((2 * i[:, None] + np.arange(2))[..., None], shape),
-                np.broadcast_to((vertex + 3 * v[:, None] + axis)[:, None, :], shape),
-            )
-        else:
-            add(*(grid.reshape(-1) for grid in np.meshgrid(np.arange(turns * tracked), curve, indexing="ij")))
-        add(np.arange(turns * tracked), column["tangent"].start + np.arange(turns * tracked))
-        labels += [
-            Label(f"tilt: {word} {f} {a}", "tangent", "rad") for f in layout.tracked for a in self._turns
-        ]
-        if layout.spacings:
-            pieces = np.arange(layout.spacings)
-            add(*(grid.reshape(-1) for grid in np.meshgrid(pieces, curve, indexing="ij")))
-            add(pieces, column["spacing"].start + pieces)
-            labels += [Label(f"spacing: piece {k}", "spacing", "m") for k in pieces]
-        return np.concatenate(rows), np.concatenate(cols), tuple(labels)
+        def base_axes(numbers: StepNumbers) -> Array:
+            return np.concatenate([-numbers.base_axes, numbers.base_axes], axis=1)
 
-    def _fixed_values(self, numbers: StepNumbers) -> Array:
-        layout, arm = self.layout, self.layout.arm
-        present = np.repeat(layout.node_column[arm.end_effector.nodes] >= 0, 3)
-        values = [
-            numbers.motion.values,
-            numbers.tip_jacobian[:, present].reshape(-1),
-            -numbers.tip_rate,
+        def turned(numbers: StepNumbers) -> Array:
+            return np.asarray(numbers.tangent_face.reshape(-1, turns, 3, 3)[k, :, slot])
+
+        def gap(name: str) -> _Entries:
+            columns = np.arange(column[name].start, column[name].stop)
+            return _Entries(np.arange(len(columns)), columns, lambda _: np.full(len(columns), -1.0))
+
+        def spacing(numbers: StepNumbers) -> Array:
+            return np.zeros(0) if numbers.curve is None else numbers.curve.spacing_rows
+
+        base = [
+            _Entries(axis, curve[:3], lambda _: np.ones(3)),
+            _Entries(*_grid(3 + np.arange(2), curve[:6]), base_axes),
         ]
-        if layout.elastic_tip:
-            values += [np.repeat([1.0, -1.0], len(layout.tip_rows))]
-        if layout.vertices:
-            faces = arm.stations.nodes[layout.tracked]
-            k, slot = np.nonzero(layout.node_column[faces] >= 0)
-            weights = arm.stations.weights[layout.tracked][k, slot]
-            given = numbers.curve
-            turned = numbers.tangent_face if given is None else given.turn_face
-            tangent = turned.reshape(-1, layout.turns, 3, 3)[k, :, slot]
-            if given is None:
-                i, v = np.nonzero(layout.curve_weights)
-                position = np.repeat(-layout.curve_weights[i, v], 3)
-                ii, vv = np.nonzero(layout.curve_slopes)
-                slope = numbers.tangent_curve[ii] * layout.curve_slopes[ii, vv][:, None, None]
-            else:
-                position, slope = -given.position, given.turn_curve
-            base = np.concatenate([-numbers.base_axes, numbers.base_axes], axis=1)
-            values += [
-                np.ones(3),
-                base.reshape(-1),
-                np.repeat(weights, 3),
-                position.reshape(-1),
-                np.full(3 * len(layout.tracked), -1.0),
-                tangent.reshape(-1),
-                slope.reshape(-1),
-                np.full(layout.turns * len(layout.tracked), -1.0),
-            ]
-            if layout.spacings and given is not None:
-                values += [given.spacing.reshape(-1), np.full(layout.spacings, -1.0)]
-        return np.concatenate(values)
+        position = [
+            _Entries(3 * k[:, None] + axis, faces[k, slot][:, None] + axis, lambda _: weights),
+            _Entries(moves[0], curve[moves[1]], lambda numbers: -numbers.curve_rows(layout)[0][moves]),
+            gap("position"),
+        ]
+        tangent = [
+            _Entries(at_turn, over_face, turned),
+            _Entries(leans[0], curve[leans[1]], lambda numbers: numbers.curve_rows(layout)[1][leans]),
+            gap("tangent"),
+        ]
+        pieces = np.arange(layout.spacings)
+        names = [*(f"base {a}" for a in "xyz"), *(f"base tangent {a}" for a in "xy")]
+        return [
+            _Rows(
+                [Label(f"curve {name}", "curve base", "m") for name in names],
+                base,
+                lambda numbers: np.concatenate([numbers.base_displacement, numbers.base_rhs]),
+            ),
+            _Rows(
+                [Label(f"track: {word} {f} {a}", "tracking", "m") for f in layout.tracked for a in "xyz"],
+                position,
+                lambda numbers: -numbers.position_rhs,
+            ),
+            _Rows(
+                [
+                    Label(f"tilt: {word} {f} {a}", "tangent", "rad")
+                    for f in layout.tracked
+                    for a in self._turns
+                ],
+                tangent,
+                lambda numbers: -numbers.tangent_rhs,
+            ),
+            _Rows(
+                [Label(f"spacing: piece {piece}", "spacing", "m") for piece in pieces],
+                [_Entries(*_grid(pieces, curve), spacing), gap("spacing")],
+                lambda numbers: -numbers.spacing_rhs,
+            ),
+        ]
+
+
+class _Entries(NamedTuple):
+    """Some entries of a kind of row: their rows, from its first one on, their columns and their values."""
+
+    rows: Index
+    columns: Index
+    values: Callable[[StepNumbers], Array]
+
+
+class _Rows(NamedTuple):
+    """A kind of row: its labels, its entries and its right-hand sides."""
+
+    labels: Sequence[Label]
+    entries: Sequence[_Entries]
+    rhs: Callable[[StepNumbers], Array]
+
+
+def _grid(rows: Index, columns: Index) -> tuple[Index, Index]:
+    """Return the row and column of every entry of a dense block."""
+    return np.repeat(rows, len(columns)), np.tile(columns, len(rows))

@@ -12,7 +12,7 @@ from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.graph import StationSymbols, StepGraph
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, CurveNumbers, StepNumbers
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 
@@ -115,17 +115,7 @@ class Linearisation:
             turn = np.zeros_like(turn)
         face = face.reshape(count, 9, turns).transpose(0, 2, 1)
         curve = curve.reshape(count, curve.size // max(count * turns, 1), turns).transpose(0, 2, 1)
-        general = None
-        if asked.curve is not None:
-            spacing = asked.curve.spacing
-            general = CurveNumbers(
-                position=asked.curve.position_rows,
-                turn_face=face,
-                turn_curve=curve,
-                turn_rhs=turn,
-                spacing=asked.curve.spacing_rows,
-                spacing_rhs=spacing if moves else 0.0 * spacing,
-            )
+        spacing = np.zeros(0) if asked.curve is None else asked.curve.spacing
         return StepNumbers(
             motion=layout.arm.motion_rows(*motion),
             lower=asked.lower - strokes,
@@ -139,15 +129,16 @@ class Linearisation:
             progress_gradient=progress_gradient(float(curvature[0]), asked.progress),
             progress_curvature=float(curvature[0]),
             position_rhs=gap,
-            tangent_face=face if general is None else np.zeros((count, 2, 9)),
-            tangent_curve=curve if general is None else np.zeros((count, 2, 3)),
-            tangent_rhs=turn if general is None else np.zeros((count, 2)),
+            tangent_face=face,
+            tangent_curve=curve,
+            tangent_rhs=turn,
             vertex_gradient=pull,
             base_displacement=shift,
             base_axes=base_axes,
             base_rhs=base_rhs,
             clearance=clearance,
-            curve=general,
+            spacing_rhs=spacing if moves else 0.0 * spacing,
+            curve=asked.curve,
         )
 
 

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import MotionRows
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.shape import CurveRows
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -59,43 +61,19 @@ class ClearanceRows:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class CurveNumbers:
-    """Rows of a curve that is more than its tables, over its D = 3 V + T coordinates d_c.
-
-    They are::
-
-        gap     = C d_rho - position d_c + position_rhs           m
-        turn    = turn_face d_rho[face] + turn_curve d_c + turn_rhs   rad
-        stretch = spacing d_c + spacing_rhs                       m
-
-    Attributes
-    ----------
-    position : (K, 3, D)
-    turn_face, turn_curve, turn_rhs : (K, R, 9), (K, R, D), (K, R)
-    spacing, spacing_rhs : (S, D), (S,)
-    """
-
-    position: Array
-    turn_face: Array
-    turn_curve: Array
-    turn_rhs: Array
-    spacing: Array
-    spacing_rhs: Array
-
-
 @dataclass
 class StepNumbers:
     """Numbers of one QP at one configuration; displacements d over the step are the unknowns.
 
-    With W and W' the curve weights::
+    With W and W' the curve weights, and d_c = (d_p, torsion) the D = 3 V + T coordinates of the curve::
 
         the arm's rows: d_rho = K d_a + r                          m
         lower <= d_a <= upper                                      m
         tip_jacobian d_rho[tip] - tip_rate d_alpha = tip_rhs       m or rad
         progress_lower <= d_alpha <= progress_upper                1
-        gap     = C d_rho - W d_p  + position_rhs                  m
+        gap     = C d_rho - W d_p + position_rhs                   m
         tangent = tangent_face d_rho[face] + tangent_curve . (W' d_p) + tangent_rhs   rad
+        stretch = spacing rows d_c + spacing_rhs                   m
         d_p[0]  = base_displacement, base_axes (d_p[1] - d_p[0]) = base_rhs            m
         clearance rows
 
@@ -109,16 +87,18 @@ class StepNumbers:
     tip_rate, tip_rhs : (n_e,)
     progress_lower, progress_upper, progress_gradient, progress_curvature : float
     position_rhs : (K, 3)
-    tangent_face : (K, 2, 9)
+    tangent_face : (K, R, 9)
     tangent_curve : (K, 2, 3)
-    tangent_rhs : (K, 2)
+        Or (K, R, D) over d_c, where the curve is more than its tables.
+    tangent_rhs : (K, R)
     vertex_gradient : (V, 3)
     base_displacement : (3,)
     base_axes : (2, 3)
     base_rhs : (2,)
     clearance : ClearanceRows
-    curve : CurveNumbers or None
-        In the place of the curve's tables and the tangent rows, where ``Layout.general`` is given.
+    spacing_rhs : (S,)
+    curve : CurveRows or None
+        In the place of the curve's tables, where ``Layout.general`` is given.
     """
 
     motion: MotionRows
@@ -141,7 +121,18 @@ class StepNumbers:
     base_axes: Array
     base_rhs: Array
     clearance: ClearanceRows
-    curve: CurveNumbers | None = None
+    spacing_rhs: Array = field(default_factory=lambda: np.zeros(0))
+    curve: CurveRows | None = None
+
+    def curve_rows(self, layout: Layout) -> tuple[Array, Array]:
+        """Return what d_c does to points and turns at the curve's nodes: (3 K, D) and (R K, D), eqs. (32)-(36)."""
+        if self.curve is not None:
+            position, turn = self.curve.position_rows, self.tangent_curve
+        else:
+            position = layout.curve_weights[:, None, :, None] * np.eye(3)[:, None, :]
+            turn = self.tangent_curve[:, :, None, :] * layout.curve_slopes[:, None, :, None]
+        size = 3 * layout.vertices + layout.torsion
+        return position.reshape(-1, size), turn.reshape(-1, size)
 
 
 @dataclass(frozen=True)
