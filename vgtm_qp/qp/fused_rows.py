@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import casadi as ca
 
 from vgtm_qp.arm.symbols import Bound, Constants
@@ -22,17 +24,7 @@ def row_function(layout: Layout) -> Bound:
     """
     constants, arm, weights = Constants(), layout.arm, layout.weights
     graph = StepGraph(layout, arm.symbols(constants), constants)
-    hard, turned = layout.hard_tracking, layout.hard_turns
-    node_rate, centring, tracking, tangent, roll, curve_rate, smoothness, spacing = graph.weights(
-        weights.node_rate,
-        weights.stroke_centring,
-        1.0 if hard else weights.tracking,
-        1.0 if turned else weights.tangent,
-        1.0 if turned else weights.roll,
-        weights.curve_rate,
-        weights.smoothness,
-        weights.spacing,
-    )
+    node_rate, centring = graph.weights(weights.node_rate, weights.stroke_centring)
     response = graph.symbols.response(graph.q, graph.at, graph.moved)
     actuators, free, rows = len(arm.actuators), layout.free_curve, len(layout.tip_rows)
     place = {int(node): 3 * k for k, node in enumerate(arm.free)}
@@ -50,59 +42,65 @@ def row_function(layout: Layout) -> Bound:
 
     tip_rows = graph.tip_jacobian @ displacement(arm.end_effector.nodes.tolist())
     top = ca.sqrt(node_rate) * response
-    gaps: list[ca.MX] = []
-    tilts: list[ca.MX] = []
-    curve_gradient = ca.MX.zeros(0, 1)
-    offset, motion = graph.offset, graph.motion
-    if layout.vertices:
-        station = _condensed_station(layout, actuators)
-        every = offset if layout.general is None else ca.vertcat(ca.vec(offset), ca.MX.zeros(layout.torsion))
-        turn_scale = ca.sqrt(ca.vertcat(tangent, tangent, roll)[: layout.turns])
-        for k, face in enumerate(layout.tracked.tolist()):
-            moving = displacement(arm.stations.nodes[face].tolist())
-            gap, tilt = station(
-                *graph.station(k),
-                moving,
-                every,
-                graph.normal,
-                1.0 if hard else motion,
-                1.0 if turned else motion,
-            )
-            gaps.append(ca.sqrt(tracking) * gap)
-            tilts.append(ca.repmat(turn_scale, 1, gap.shape[1]) * tilt)
-        if layout.spacings:
-            pieces, piece_rows = graph.given[4], graph.given[5].T
-            stretch = ca.horzcat(
-                curve_rows.free_columns(piece_rows, graph.normal), motion * pieces + piece_rows @ every
-            )
-            fixed = ca.MX.zeros(layout.spacings, actuators)
-            tilts.append(ca.sqrt(spacing) * ca.horzcat(fixed, stretch))
-        top = ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, free), top[:, -1])
-        bend = ca.DM(layout.polygon_bending)
-        pull = curve_rate * offset + smoothness * ((offset + motion * graph.vertices) @ bend)
-        curve_gradient = ca.vertcat(
-            ca.dot(pull[:, 1], graph.normal), ca.vec(pull[:, 2:]), ca.MX.zeros(layout.torsion)
-        )
+    top = ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, free), top[:, -1])
     home = graph.symbols.home[arm.actuators.tolist()]
     unbounded = ca.DM.ones(free) * UNBOUNDED
     value = graph.tip_error - tip_rows[:, -1]
     return graph.bound(
         "rows",
         [
-            ca.vertcat(top, *gaps, *tilts),
+            ca.vertcat(top, *(_tracking_rows(graph, displacement) if layout.vertices else ())),
             ca.horzcat(tip_rows[:, :-1], ca.MX.zeros(rows, free), -graph.tip_rate).T,
             ca.vertcat(graph.lower - graph.strokes, -unbounded, -graph.progress, value),
             ca.vertcat(graph.upper - graph.strokes, unbounded, 1.0 - graph.progress, value),
             ca.vertcat(
-                motion * centring * (graph.strokes - home),
-                curve_gradient,
+                graph.motion * centring * (graph.strokes - home),
+                _curve_gradient(graph),
                 progress_gradient(graph.curvature, graph.progress),
             ),
             graph.curvature,
-            offset,
+            graph.offset,
             graph.normal,
         ],
     )
+
+
+def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX]) -> list[ca.MX]:
+    """Return the rows of all gaps, then turns, then spacings, times the roots of their weights; of hard rows, by 1."""
+    layout, arm, weights = graph.layout, graph.layout.arm, graph.layout.weights
+    hard, turned, actuators = layout.hard_tracking, layout.hard_turns, len(arm.actuators)
+    tracking, tangent, roll, spacing = graph.weights(
+        1.0 if hard else weights.tracking,
+        1.0 if turned else weights.tangent,
+        1.0 if turned else weights.roll,
+        weights.spacing,
+    )
+    station, motion, offset = _condensed_station(layout, actuators), graph.motion, graph.offset
+    every = offset if layout.general is None else ca.vertcat(ca.vec(offset), ca.MX.zeros(layout.torsion))
+    turn_scale = ca.sqrt(ca.vertcat(tangent, tangent, roll)[: layout.turns])
+    closed = 1.0 if hard else motion, 1.0 if turned else motion
+    gaps, tilts = [], []
+    for k, face in enumerate(layout.tracked.tolist()):
+        moving = displacement(arm.stations.nodes[face].tolist())
+        gap, tilt = station(*graph.station(k), moving, every, graph.normal, *closed)
+        gaps.append(ca.sqrt(tracking) * gap)
+        tilts.append(ca.repmat(turn_scale, 1, gap.shape[1]) * tilt)
+    if layout.spacings:
+        pieces, rows = graph.given[4], graph.given[5].T
+        stretch = ca.horzcat(curve_rows.free_columns(rows, graph.normal), motion * pieces + rows @ every)
+        tilts.append(ca.sqrt(spacing) * ca.horzcat(ca.MX.zeros(layout.spacings, actuators), stretch))
+    return gaps + tilts
+
+
+def _curve_gradient(graph: StepGraph) -> ca.MX:
+    """Return (q, 1) the gradient of the curve's own objectives in its free coordinates."""
+    layout = graph.layout
+    if not layout.vertices:
+        return ca.MX.zeros(0, 1)
+    curve_rate, smoothness = graph.weights(layout.weights.curve_rate, layout.weights.smoothness)
+    bend = ca.DM(layout.polygon_bending)
+    pull = curve_rate * graph.offset + smoothness * ((graph.offset + graph.motion * graph.vertices) @ bend)
+    return ca.vertcat(ca.dot(pull[:, 1], graph.normal), ca.vec(pull[:, 2:]), ca.MX.zeros(layout.torsion))
 
 
 def _condensed_station(layout: Layout, actuators: int) -> ca.Function:

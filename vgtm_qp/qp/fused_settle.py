@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import casadi as ca
 import numpy as np
 
+from vgtm_qp.arm.arm import ArmSymbols
 from vgtm_qp.arm.symbols import Bound, Constants, rotated
 from vgtm_qp.qp.graph import tip_frames
 from vgtm_qp.qp.layout import Layout
@@ -33,53 +36,38 @@ def settle_function(layout: Layout) -> Bound:
     and the answer's primal and dual residuals, see :mod:`vgtm_qp.qp.residual`; q before it was settled.
     """
     constants, arm = Constants(), layout.arm
-    symbols = arm.symbols(constants)
+    symbols, qp = arm.symbols(constants), _SolvedQP(layout)
     q = ca.MX.sym("q", *symbols.shape)
-    count, columns = len(arm.actuators), layout.node_columns
+    count = len(arm.actuators)
     lower, upper = ca.MX.sym("lower", count), ca.MX.sym("upper", count)
-    is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
-    held = symbols.held(layout.tracked.tolist()) if is_plain else None
     frames = tip_frames(layout, constants) if arm.end_effector.has_frame else None
     goal, turned = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
     velocity, spin, progress = ca.MX.sym("velocity", 3), ca.MX.sym("spin", 3), ca.MX.sym("progress")
-    size, tip_rows = count + layout.free_curve + 1, len(layout.tip_rows)
-    equal = tip_rows + layout.hard_rows + NEAR
-    low, high = (ca.MX.sym(name, size + equal) for name in ("low", "high"))
-    constraint, multipliers = ca.MX.sym("C", size, equal), ca.MX.sym("multipliers", size + equal)
-    hessian, gradient, answer = ca.MX.sym("H", size, size), ca.MX.sym("g", size), ca.MX.sym("answer", size)
-    rows, gram = ca.MX.sym("R", layout.least_squares, size), ca.MX.sym("gram", count, count)
-    offset, normal = ca.MX.sym("offset", 3, layout.vertices), ca.MX.sym("normal", 3)
     vertices, taken = ca.MX.sym("p", 3, layout.vertices), ca.MX.sym("taken")
-    weights = layout.weights
-    stiffness, scale = ca.vertsplit(
-        constants.add(
-            "scale",
-            np.array([weights.actuator_rate + weights.stroke_centring, 1.0 / np.sqrt(weights.node_rate)]),
-        )
+    scales = np.array(
+        [
+            layout.weights.actuator_rate + layout.weights.stroke_centring,
+            1.0 / np.sqrt(layout.weights.node_rate),
+        ]
     )
+    stiffness, scale = ca.vertsplit(constants.add("scale", scales))
 
     def tip(q: ca.MX) -> tuple[ca.MX, ca.MX]:
         X = symbols.nodes(q)
         position = X[:, arm.end_effector.nodes.tolist()] @ ca.DM(arm.end_effector.weights)
         return position, ca.MX.eye(3) if frames is None else frames.at(X)[0]
 
-    chosen = answer[:count]
-    response = rows[:columns, :count]
-    moved = taken * scale * (response @ chosen + rows[:columns, -1])
-    reached = ca.fmin(ca.fmax(progress + answer[-1], 0.0), 1.0)
+    reached = ca.fmin(ca.fmax(progress + qp.answer[-1], 0.0), 1.0)
     left = (1.0 - reached) * ca.fmax(ca.norm_inf(velocity), ca.norm_inf(spin))
     reached = ca.if_else(left <= LEFT, 1.0, reached)
     gone = taken * (reached - progress)
-    goal_position, goal_rotation = goal + gone * velocity, rotated(gone * spin) @ turned
+    goal_pose = goal + gone * velocity, rotated(gone * spin) @ turned
+    moved = taken * scale * (qp.response @ qp.actuators + qp.particular)
+    vertices_after = vertices + taken * qp.curve_displacement()
+    start = symbols.along(q, symbols.coordinates(moved, taken * qp.actuators))
 
-    vertices_after = vertices
-    if layout.vertices:
-        free_curve = answer[count : size - 1 - layout.torsion]
-        change = ca.horzcat(
-            ca.MX.zeros(3), free_curve[0] * normal, ca.reshape(free_curve[1:], 3, layout.vertices - 2)
-        )
-        vertices_after = vertices + taken * (offset + change)
-    start = symbols.along(q, symbols.coordinates(moved, taken * chosen))
+    is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
+    held = symbols.held(layout.tracked.tolist()) if is_plain else None
     if held is None:
         end = symbols.closed(symbols.closed(start, lower, upper), lower, upper)
     else:
@@ -87,51 +75,111 @@ def settle_function(layout: Layout) -> Bound:
         end = start
         for _ in range(_HELD_STEPS):
             end = held(end, points)
-    first = error = tip_error(layout.tip_rows, *tip(end), goal_position, goal_rotation)
+    first = error = tip_error(layout.tip_rows, *tip(end), *goal_pose)
     if not layout.hard_rows:
-        free = ca.logic_and(chosen > low[:count] + AT_BOUND, chosen < high[:count] - AT_BOUND)
-        gain = _gain(gram, stiffness, constraint[:count, :tip_rows], free)
-        settling = symbols.coordinates(scale * (response @ gain), gain)
-        at, off, by = (
-            ca.MX.sym("at", *symbols.shape),
-            ca.MX.sym("off", tip_rows),
-            ca.MX.sym("by", *settling.shape),
-        )
-        nearer = symbols.closed(symbols.along(at, by @ off), lower, upper)
-        rest = [lower, upper, by, goal, turned, *constants.symbols]
-        again = ca.Function(
-            "again", [at, off, *rest], [nearer, tip_error(layout.tip_rows, *tip(nearer), goal, turned)]
-        )
-        enough = ca.Function("enough", [at, off, *rest], [at, off])
-        either = ca.Function.if_else("either", again, enough)
-        given = [lower, upper, settling, goal_position, goal_rotation, *constants.symbols]
+        gain = qp.gain(stiffness)
+        settling = symbols.coordinates(scale * (qp.response @ gain), gain)
+        step = _settling_step(layout, symbols, constants, tip, settling.shape)
         for _ in range(SETTLING_STEPS):
-            end, error = either(ca.norm_2(error) > SETTLED, end, error, *given)
-    position, rotation = tip(end)
+            is_off = ca.norm_2(error) > SETTLED
+            end, error = step(is_off, end, error, lower, upper, settling, *goal_pose, *constants.symbols)
     quantities = symbols.quantities(end)
-
-    values = ca.vertcat(answer, constraint.T @ answer)
-    beyond = ca.fmax(ca.fmax(values - high, low - values), 0.0)
-    stationarity = hessian @ answer + gradient + multipliers[:size] + constraint @ multipliers[size:]
     measures = [
         symbols.error(quantities, lower, upper),
-        ca.norm_2(first),
-        ca.norm_2(error),
-        reached,
-        ca.norm_inf(moved),
-        ca.norm_2(beyond),
-        ca.norm_2(stationarity) / (1.0 + ca.norm_2(gradient) + ca.norm_2(multipliers)),
+        *(ca.norm_2(first), ca.norm_2(error), reached, ca.norm_inf(moved)),
+        *qp.residuals(),
     ]
     inputs = [
         *(q, lower, upper, goal, turned, velocity, spin, progress),
-        *(rows, constraint, low, high, offset, normal, vertices),
-        *(hessian, gradient, answer, multipliers, gram, taken),
+        *(qp.rows, qp.constraint, qp.low, qp.high, qp.offset, qp.normal, vertices),
+        *(qp.hessian, qp.linear, qp.answer, qp.multipliers, qp.gram, taken),
     ]
-    outputs = [end, quantities, position, rotation, vertices_after, ca.vertcat(*measures), start]
+    outputs = [end, quantities, *tip(end), vertices_after, ca.vertcat(*measures), start]
     function = ca.Function(
         "settle", [*inputs, *constants.symbols], [ca.densify(output) for output in outputs]
     )
     return Bound(function, constants.values)
+
+
+def _settling_step(
+    layout: Layout,
+    symbols: ArmSymbols,
+    constants: Constants,
+    tip: Callable[[ca.MX], tuple[ca.MX, ca.MX]],
+    shape: tuple[int, int],
+) -> ca.Function:
+    """Return the function of (is_off, q, error, lower, upper, gain, goal pose, constants) that corrects q and error.
+
+    The gain of that `shape` says how coordinates bring the tip to its goal; where the tip `is_off` no more, nothing is
+    changed.
+    """
+    count = len(layout.arm.actuators)
+    q, error = ca.MX.sym("q", *symbols.shape), ca.MX.sym("error", len(layout.tip_rows))
+    lower, upper, gain = ca.MX.sym("lower", count), ca.MX.sym("upper", count), ca.MX.sym("gain", *shape)
+    pose = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
+    nearer = symbols.closed(symbols.along(q, gain @ error), lower, upper)
+    arguments = [q, error, lower, upper, gain, *pose, *constants.symbols]
+    again = ca.Function("again", arguments, [nearer, tip_error(layout.tip_rows, *tip(nearer), *pose)])
+    return ca.Function.if_else("either", again, ca.Function("enough", arguments, [q, error]))
+
+
+class _SolvedQP:
+    """The condensed QP and its answer, as arguments of :func:`settle_function`.
+
+    Attributes
+    ----------
+    rows : (L, n)
+        Of the objective, the nodes' displacements first: their `response` (3 (N - N_c), n_a) and `particular` part.
+    constraint : (n, m)
+        Transposed.
+    low, high, multipliers : (n + m,)
+    hessian, linear : (n, n), (n,)
+    gram : (n_a, n_a)
+    offset, normal : (3, V), (3,)
+    answer, actuators : (n,), (n_a,)
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout, count = layout, len(layout.arm.actuators)
+        self._size = size = count + layout.free_curve + 1
+        self._tip = len(layout.tip_rows)
+        equal = self._tip + layout.hard_rows + NEAR
+        self.low, self.high = (ca.MX.sym(name, size + equal) for name in ("low", "high"))
+        self.constraint, self.multipliers = (
+            ca.MX.sym("C", size, equal),
+            ca.MX.sym("multipliers", size + equal),
+        )
+        self.hessian, self.linear = ca.MX.sym("H", size, size), ca.MX.sym("g", size)
+        self.rows, self.gram = ca.MX.sym("R", layout.least_squares, size), ca.MX.sym("gram", count, count)
+        self.offset, self.normal = ca.MX.sym("offset", 3, layout.vertices), ca.MX.sym("normal", 3)
+        self.answer = ca.MX.sym("answer", size)
+        self.actuators, columns = self.answer[:count], layout.node_columns
+        self.response, self.particular = self.rows[:columns, :count], self.rows[:columns, -1]
+
+    def curve_displacement(self) -> ca.MX:
+        """Return (3, V) the displacements of the control vertices."""
+        layout = self._layout
+        if not layout.vertices:
+            return self.offset
+        free = self.answer[len(layout.arm.actuators) : self._size - 1 - layout.torsion]
+        rest = ca.reshape(free[1:], 3, layout.vertices - 2)
+        return self.offset + ca.horzcat(ca.MX.zeros(3), free[0] * self.normal, rest)
+
+    def residuals(self) -> tuple[ca.MX, ca.MX]:
+        """Return the answer's primal and dual residuals, see :mod:`vgtm_qp.qp.residual`."""
+        values = ca.vertcat(self.answer, self.constraint.T @ self.answer)
+        beyond = ca.fmax(ca.fmax(values - self.high, self.low - values), 0.0)
+        of_bounds, of_rows = self.multipliers[: self._size], self.multipliers[self._size :]
+        stationarity = self.hessian @ self.answer + self.linear + of_bounds + self.constraint @ of_rows
+        forces = 1.0 + ca.norm_2(self.linear) + ca.norm_2(self.multipliers)
+        return ca.norm_2(beyond), ca.norm_2(stationarity) / forces
+
+    def gain(self, stiffness: ca.MX) -> ca.MX:
+        """Return :func:`_gain` of the actuators that the answer leaves between their bounds."""
+        count = len(self._layout.arm.actuators)
+        low, high = self.low[:count], self.high[:count]
+        free = ca.logic_and(self.actuators > low + AT_BOUND, self.actuators < high - AT_BOUND)
+        return _gain(self.gram, stiffness, self.constraint[:count, : self._tip], free)
 
 
 def _gain(gram: ca.MX, stiffness: ca.MX, tip: ca.MX, free: ca.MX) -> ca.MX:
