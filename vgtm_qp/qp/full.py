@@ -10,9 +10,9 @@ constant and only A's values change.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,42 +107,19 @@ class FullBuilder:
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        arm, weights = layout.arm, layout.weights
-        tracked, vertices = len(layout.tracked), layout.vertices
-        sizes = {
-            "nodes": layout.node_columns,
-            "actuators": len(arm.actuators),
-            "vertices": 3 * vertices,
-            "torsion": layout.torsion,
-            "position": 3 * tracked,
-            "tangent": layout.turns * tracked,
-            "spacing": layout.spacings,
-            "slack": 2 * len(layout.tip_rows) if layout.elastic_tip else 0,
-            "progress": 1,
-        }
-        ends = np.cumsum(list(sizes.values()))
+        kinds = self._columns()
+        ends = np.cumsum([len(labels) for labels, _ in kinds.values()]).tolist()
+        self.size = ends[-1]
         self.column = {
-            name: slice(int(end - size), int(end))
-            for (name, size), end in zip(sizes.items(), ends, strict=True)
+            name: slice(end - len(labels), end)
+            for (name, (labels, _)), end in zip(kinds.items(), ends, strict=True)
         }
-        self.size = int(ends[-1])
-        diagonal = [
-            np.full(sizes["nodes"], weights.node_rate),
-            np.full(sizes["actuators"], weights.actuator_rate + weights.stroke_centring),
+        self._column_labels = tuple(label for labels, _ in kinds.values() for label in labels)
+        blocks = [
+            block if np.ndim(block) else sparse.identity(len(labels)) * block
+            for labels, block in kinds.values()
         ]
-        self._hessian = sparse.block_diag(
-            [
-                sparse.diags(np.concatenate(diagonal)),
-                np.kron(layout.vertex_hessian, np.eye(3)),
-                weights.curve_rate * np.eye(layout.torsion),
-                sparse.diags(np.full(sizes["position"], 0.0 if layout.hard_tracking else weights.tracking)),
-                sparse.diags(0.0 * layout.turn_weights if layout.hard_turns else layout.turn_weights),
-                sparse.diags(np.full(sizes["spacing"], weights.spacing)),
-                sparse.diags(np.full(sizes["slack"], slack_curvature(weights.end_effector))),
-                np.ones((1, 1)),
-            ],
-            format="csc",
-        )
+        self._hessian = sparse.block_diag(blocks, format="csc")
         self._fixed = self._fixed_rows()
         starts = np.cumsum([0, *(len(rows.labels) for rows in self._fixed)])
         self.fixed_rows = int(starts[-1])
@@ -156,12 +133,10 @@ class FullBuilder:
         self.gap_rows = np.arange(starts[min(3, len(starts) - 1)], self.fixed_rows)
         self.gaps = np.arange(self.column["position"].start, self.column["spacing"].stop)
         self.hard_gaps = self.gaps[: layout.hard_rows]
-        self._column_labels = self._columns()
         self._pattern: tuple[bytes, ...] | None = None
         self._matrix = sparse.csc_matrix((0, self.size))
         self._order: Index = np.zeros(0, dtype=np.int64)
         self._labels: tuple[Label, ...] = ()
-        self._keep: Index = np.zeros(0, dtype=np.int64)
 
     @property
     def _turns(self) -> str:
@@ -250,34 +225,52 @@ class FullBuilder:
             tip_slack=float(np.max(z[self.column["slack"]], initial=0.0)),
         )
 
-    def _columns(self) -> tuple[Label, ...]:
-        layout, arm = self.layout, self.layout.arm
-        axes, word = "xyz", arm.stations.word
-        labels = [
-            Label(f"node {arm.node_names[n]} {a}", "node displacement", "m") for n in arm.free for a in axes
-        ]
-        labels += [
-            Label(f"stroke: {arm.quantity_names[m]}", "actuator displacement", unit)
-            for m, unit in zip(arm.actuators, arm.actuator_units, strict=True)
-        ]
-        labels += [
-            Label(f"control vertex p{i} {a}", "control vertex displacement", "m")
-            for i in range(layout.vertices)
-            for a in axes
-        ]
-        labels += [Label(f"torsion {j + 1}", "torsion", "rad") for j in range(layout.torsion)]
-        labels += [Label(f"gap: {word} {k} {a}", "tracking gap", "m") for k in layout.tracked for a in axes]
-        labels += [
-            Label(f"tilt: {word} {k} {a}", "tangent gap", "rad") for k in layout.tracked for a in self._turns
-        ]
-        labels += [Label(f"stretch: piece {k}", "spacing gap", "m") for k in range(layout.spacings)]
-        if layout.elastic_tip:
-            labels += [
-                Label(f"tip slack {name.removeprefix('tip ')}{sign}", "tip slack", unit(name))
-                for sign in "+-"
-                for name in layout.tip_rows
-            ]
-        return (*labels, Label("progress along the path", "progress", "1"))
+    def _columns(self) -> dict[str, tuple[list[Label], Any]]:
+        """Return each kind of column: its labels, and its block of the Hessian or the one value on its diagonal."""
+        layout, arm, weights = self.layout, self.layout.arm, self.layout.weights
+        word, tracked = arm.stations.word, layout.tracked
+        nodes = [arm.node_names[n] for n in arm.free]
+        actuators = zip((arm.quantity_names[m] for m in arm.actuators), arm.actuator_units, strict=True)
+        slacks = [(name, sign) for sign in "+-" for name in layout.tip_rows] if layout.elastic_tip else []
+
+        def labels(text: str, kind: str, unit: str, of: Iterable[object], axes: str = "xyz") -> list[Label]:
+            return [Label(f"{text}{name} {axis}".rstrip(), kind, unit) for name in of for axis in axes]
+
+        return {
+            "nodes": (labels("node ", "node displacement", "m", nodes), weights.node_rate),
+            "actuators": (
+                [Label(f"stroke: {name}", "actuator displacement", of) for name, of in actuators],
+                weights.actuator_rate + weights.stroke_centring,
+            ),
+            "vertices": (
+                labels("control vertex p", "control vertex displacement", "m", range(layout.vertices)),
+                np.kron(layout.vertex_hessian, np.eye(3)),
+            ),
+            "torsion": (
+                labels("torsion ", "torsion", "rad", range(1, layout.torsion + 1), " "),
+                weights.curve_rate,
+            ),
+            "position": (
+                labels(f"gap: {word} ", "tracking gap", "m", tracked),
+                0.0 if layout.hard_tracking else weights.tracking,
+            ),
+            "tangent": (
+                labels(f"tilt: {word} ", "tangent gap", "rad", tracked, self._turns),
+                sparse.diags(layout.turn_weights * (not layout.hard_turns)),
+            ),
+            "spacing": (
+                labels("stretch: piece ", "spacing gap", "m", range(layout.spacings), " "),
+                weights.spacing,
+            ),
+            "slack": (
+                [
+                    Label(f"tip slack {name.removeprefix('tip ')}{sign}", "tip slack", unit(name))
+                    for name, sign in slacks
+                ],
+                slack_curvature(weights.end_effector),
+            ),
+            "progress": ([Label("progress along the path", "progress", "1")], np.ones((1, 1))),
+        }
 
     def _fixed_rows(self) -> list[_Rows]:
         """Return the rows above the clearances: the arm's own, the tip's, the curve's base, its gaps."""

@@ -131,7 +131,6 @@ class _Osqp:
 
     def __init__(self) -> None:
         self._solver: object = None
-        self._bounded: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
 
     def __call__(self, qp: StepQP, *, same_structure: bool) -> tuple[Array, Array, Array, int]:
         import osqp
