@@ -17,11 +17,11 @@ import vgtm_qp as vq
 from vgtm_qp.bench import contestants, measure, report, scenes
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
+from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.bench.measure import Breakdown, Pairs, Spent, Timing, run_alone, run_in_turn
 from vgtm_qp.bench.tables import render
 from vgtm_qp.cli import bench as command
 from vgtm_qp.cli import main
-from vgtm_qp.ipopt.linearised import NonlinearStep
 from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings

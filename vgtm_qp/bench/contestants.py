@@ -9,8 +9,8 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.errors import SolverError
-from vgtm_qp.ipopt.linearised import NonlinearStep
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem

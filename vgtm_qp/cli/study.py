@@ -27,9 +27,6 @@ def study(
     short: Annotated[bool, Parameter(negative="", help="a quick look: fewer and smaller runs")] = False,
     scenes: Annotated[int | None, Parameter(help="number of random scenes, of robustness")] = None,
     seed: Annotated[int | None, Parameter(help="seed of the random scenes, of robustness")] = None,
-    ipopt: Annotated[
-        bool, Parameter(negative="", help="solve them by IPOPT too, step by step, of robustness")
-    ] = False,
     output: Annotated[Path, Parameter(name=["--output", "-o"], help="folder of the results")] = Path(
         "studies"
     ),
@@ -53,7 +50,7 @@ def study(
         raise GoalError(f"--workers must be 1 or more, not {workers}")
     if scenes is not None and scenes < 1:
         raise GoalError(f"--scenes must be 1 or more, not {scenes}")
-    given = {"scenes": scenes, "seed": seed, "ipopt": ipopt or None}
+    given = {"scenes": scenes, "seed": seed}
     options = {key: value for key, value in given.items() if value is not None}
     for name in titles:
         Study.named(name).tasks(short=short, **options)

@@ -118,7 +118,7 @@ def run_study(
     progress
         Called with the numbers of tasks done and in all.
     options
-        Of the study: ``scenes``, ``seed`` and ``ipopt`` of robustness.
+        Of the study: ``scenes`` and ``seed`` of robustness.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def run_study(
     failed = [row for row in rows if "failed" in row]
     lines = [f"## {study.title}", "", study.text(rows).strip(), ""]
     lines += [f"Not counted: a run that failed, {row['failed']}" for row in failed]
-    given = (f" --{key}" if value is True else f" --{key} {value}" for key, value in (options or {}).items())
+    given = (f" --{key} {value}" for key, value in (options or {}).items())
     again = f"vgtm study {name}{' --short' if short else ''}{''.join(given)}"
     lines += [f"Measured on: {sentence(found)}. Made again by `{again}`.", ""]
     (place / f"{name}.md").write_text("\n".join(lines))

@@ -1,7 +1,7 @@
-"""The program whose structure is fixed: built once, started from the last answer, for the benchmark.
+"""A step as one nonlinear program over the node positions, by IPOPT: the yardstick of general-purpose optimisation.
 
-Clearances enter linearised, as they do in the QP. With exact distances, and rebuilt when the near pairs change, it
-would take several times as long.
+Its structure is fixed: it is built once and started from the last answer. Clearances enter linearised, as they do in
+the QP. With exact distances, and rebuilt when the near pairs change, it would take several times as long.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.ipopt.symbols import OPTIONS, program_symbols
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.clearance import clearance_rows
@@ -24,7 +23,13 @@ Array = NDArray[np.float64]
 
 _PAIRS = 24
 _OPTIONS: dict[str, Any] = {
-    **OPTIONS,
+    "print_time": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": 1e-9,
+    "ipopt.constr_viol_tol": 1e-10,
+    # The bounds are those of the arm, not relaxed ones.
+    "ipopt.bound_relax_factor": 0.0,
     "ipopt.max_iter": 200,
     "ipopt.warm_start_init_point": "yes",
     "ipopt.warm_start_bound_push": 1e-6,
@@ -35,23 +40,25 @@ _OPTIONS: dict[str, Any] = {
 
 
 class NonlinearStep:
-    """Steps of a truss whose base is at rest: exact lengths and tip, the QP's truss terms."""
+    """Steps of a truss of pin joints whose base is at rest: exact lengths and tip, the QP's truss terms."""
 
     def __init__(self, problem: Problem) -> None:
         self._setup = setup = arm_without_curve(problem)
-        truss, weights = setup.truss, problem.method.weights
+        truss, weights, actuators = setup.truss, problem.method.weights, setup.truss.actuators.tolist()
         free = 3 * len(truss.free)
-        symbols = program_symbols(truss)
-        x, x0, lengths = symbols.x, ca.SX.sym("x0", free), symbols.lengths
+        x, x0 = ca.SX.sym("x", free), ca.SX.sym("x0", free)
         goal, across = ca.SX.sym("goal", 3), ca.SX.sym("across", 2, 3)
         rows = ca.SX.sym("rows", _PAIRS, free)
+        nodes = ca.SX(ca.DM(truss.home.T))
+        nodes[:, truss.free.tolist()] = ca.reshape(x, 3, -1)
+        lengths = ca.vertcat(*(ca.norm_2(nodes[:, i] - nodes[:, j]) for i, j in truss.members.tolist()))
         before = ca.substitute(lengths, x, x0)
-        ends = [(symbols.tip - goal)[setup.task.axes.tolist()]]
+        corners = nodes[:, truss.tip.tolist()]
+        end = (corners @ truss.tip_weights - goal)[setup.task.axes.tolist()]
         if setup.task.turns:
             # The normal of the tip's triangle is the z-axis of its frame.
-            ends.append(ca.mtimes(across, symbols.tip_normal(truss)))
-        end = ca.vertcat(*ends)
-        actuators = truss.actuators.tolist()
+            normal = ca.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            end = ca.vertcat(end, across @ normal)
         changed = (lengths - before)[actuators]
         off_home = lengths[actuators] - setup.arm.home_quantities[truss.actuators]
         objective = 0.5 * (
@@ -60,7 +67,7 @@ class NonlinearStep:
             + weights.stroke_centring * ca.sumsqr(off_home)
         )
         parameters = ca.vertcat(x0, goal, ca.vec(across), ca.vec(rows))
-        g = ca.vertcat(lengths, end, ca.mtimes(rows, x - x0))
+        g = ca.vertcat(lengths, end, rows @ (x - x0))
         self._solver = ca.nlpsol("step", "ipopt", {"x": x, "p": parameters, "f": objective, "g": g}, _OPTIONS)
         self._ends = int(end.numel())
         self._rows = np.zeros((_PAIRS, free))
@@ -68,11 +75,11 @@ class NonlinearStep:
         self._state = setup.home_state()
 
     def place(self, state: State) -> None:
-        """Stand in `state`."""
+        """See :class:`~vgtm_qp.bench.contestants.Contestant`."""
         self._state = state
 
     def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
-        """Move to the value `end` of `path` in `dt` seconds; False where IPOPT fails."""
+        """See :class:`~vgtm_qp.bench.contestants.Contestant`; False where IPOPT fails."""
         setup, state = self._setup, self._state
         truss, actuators = setup.truss, setup.truss.actuators
         here, goal = state.nodes[truss.free].reshape(-1), path.at(end)
