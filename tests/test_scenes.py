@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.study import Study
-from vgtm_qp.study.robustness import run, tasks, text
+from vgtm_qp.study.robustness import draw, run, tasks, text
 from vgtm_qp.study.scenes import MODULES, SAFE, random_scene
 
 
@@ -42,7 +41,6 @@ def test_the_study_tells_what_was_solved_and_what_stopped_the_rest():
     rows = [{**task, **run(**task)} for task in tasks(True, scenes=2, seed=0)]
     assert all(not row["failures"] for row in rows)
     assert all((row["status"] == "solved") != bool(row["stop"]) for row in rows)
-    study = Study.named("robustness")
-    assert "scenes 0 to 1" in study.text(rows)
-    assert study.draw(rows).axes
+    assert "scenes 0 to 1" in text(rows)
+    assert draw(rows).axes
     assert text([]) == "No scene was run."

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import study_tasks
 
+from vgtm_qp.comparison.statistics import exponent, wilson_interval
 from vgtm_qp.errors import GoalError
 from vgtm_qp.study import STUDIES, clutter, run_study
 from vgtm_qp.study import study as study_module
-from vgtm_qp.study.statistics import exponent, wilson_interval
 from vgtm_qp.study.workers import run_dask, run_here, run_processes
 
 

@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from vgtm_qp.arm.truss.build import build_truss
     from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.arm.truss.truss import Truss
-    from vgtm_qp.comparison.compare import compare
-    from vgtm_qp.comparison.report import Report
+    from vgtm_qp.comparison.compare import Report, compare
     from vgtm_qp.errors import (
         CurveError,
         ExportError,
@@ -52,8 +51,7 @@ _HOMES = {
     "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),
     "vgtm_qp.maneuver.many": ("solve_many",),
     "vgtm_qp.maneuver.solve": ("solve",),
-    "vgtm_qp.comparison.compare": ("compare",),
-    "vgtm_qp.comparison.report": ("Report",),
+    "vgtm_qp.comparison.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
     "vgtm_qp.step.resolver": ("Resolver", "Step", "StepStatus"),
     "vgtm_qp.arm.truss.build": ("build_truss",),

@@ -42,10 +42,10 @@ def study(
     # Before NumPy is imported: times and processes are for one BLAS thread each.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from vgtm_qp.errors import GoalError
-    from vgtm_qp.study import STUDIES, Study, run_study
+    from vgtm_qp.study import STUDIES, find_study, run_study, study_tasks
 
     wanted = list(STUDIES) if names == ["all"] else names
-    titles = {name: Study.named(name).title for name in wanted}
+    titles = {name: find_study(name).TITLE for name in wanted}
     if workers < 1:
         raise GoalError(f"--workers must be 1 or more, not {workers}")
     if scenes is not None and scenes < 1:
@@ -53,7 +53,7 @@ def study(
     given = {"scenes": scenes, "seed": seed}
     options = {key: value for key, value in given.items() if value is not None}
     for name in titles:
-        Study.named(name).tasks(short=short, **options)
+        study_tasks(name, short=short, **options)
     written = []
     for name, title in titles.items():
         with _bar(title, shown=not json) as progress:

@@ -1,13 +1,16 @@
-"""The same maneuver by several methods: one row of measured numbers for each, failures included."""
+"""The same maneuver by several methods: a report with one row of measured numbers for each, failures included."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
-from vgtm_qp.comparison.report import Report
 from vgtm_qp.comparison.row import Row, make_row
+from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.errors import VgtmError
-from vgtm_qp.machine import machine
+from vgtm_qp.machine import machine, sentence
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.methods.presets import DEFAULT_METHODS, check_methods, with_method
@@ -15,7 +18,76 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.step.resolver import Step
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Progress = Callable[[str, float, Step], None]
+
+_NUMBERS = {
+    "tip error [m]": ("tip_error", 1.0, ".1e"),
+    "member drift [m]": ("member_drift", 1.0, ".1e"),
+    "least clearance [m]": ("least_clearance", 1.0, ".4f"),
+    "stroke beyond [m]": ("stroke_violation", 1.0, ".3g"),
+    "rate beyond [m/s]": ("rate_violation", 1.0, ".3g"),
+    "travel [m]": ("actuator_travel", 1.0, ".2f"),
+    "step [ms]": ("step_time", 1e3, ".2f"),
+}
+"""Columns of the table: the number of the row, its factor, and its format."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Report:
+    """What a comparison found.
+
+    Attributes
+    ----------
+    rows : tuple of Row
+    maneuvers : dict
+        The maneuvers by (problem, method); a method that was refused is missing.
+    machine : dict
+        What the times belong to.
+    """
+
+    rows: tuple[Row, ...]
+    maneuvers: dict[tuple[str, str], Maneuver]
+    machine: dict[str, str]
+
+    def __str__(self) -> str:
+        return self.markdown()
+
+    def __repr__(self) -> str:
+        solved = ", ".join(f"{row.method} {'solved' if row.solved else 'not'}" for row in self.rows)
+        return f"<Report: {solved}>"
+
+    def row(self, method: str) -> Row:
+        """Return the first row of a method."""
+        return next(row for row in self.rows if row.method == method)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return rows and machine as JSON data."""
+        return {"machine": self.machine, "rows": [asdict(row) for row in self.rows]}
+
+    def json(self) -> str:
+        """Return the report as JSON."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False)
+
+    def markdown(self) -> str:
+        """Return the report as Markdown tables, one a problem, and the machine."""
+        header = ("method", "solved", "path", *_NUMBERS, "why not")
+        parts = []
+        for name in dict.fromkeys(row.problem for row in self.rows):
+            rows = [_cells(row) for row in self.rows if row.problem == name]
+            parts.append(f"### {name}\n\n{markdown_table(header, rows)}")
+        return "\n\n".join([*parts, f"Measured on: {sentence(self.machine)}."]) + "\n"
+
+    def figure(self) -> Figure:
+        """Return one figure: the end state of every method, clearance and member drift along the path."""
+        from vgtm_qp.comparison.figure import plot_comparison
+
+        return plot_comparison(self.rows, self.maneuvers)
+
+    def __add__(self, other: Report) -> Report:
+        return Report(self.rows + other.rows, {**self.maneuvers, **other.maneuvers}, self.machine)
 
 
 def compare(
@@ -44,13 +116,9 @@ def compare(
     """
     check_is_problem(problem)
     check_methods(methods)
-    rows, maneuvers = [], {}
-    for name in methods:
-        row, maneuver = run_method(problem, name, progress=progress)
-        rows.append(row)
-        if maneuver is not None:
-            maneuvers[problem.name, name] = maneuver
-    return Report(tuple(rows), maneuvers, machine())
+    found = {name: run_method(problem, name, progress=progress) for name in methods}
+    maneuvers = {(problem.name, name): maneuver for name, (_, maneuver) in found.items() if maneuver}
+    return Report(tuple(found[name][0] for name in methods), maneuvers, machine())
 
 
 def run_method(
@@ -66,3 +134,14 @@ def run_method(
         reason = str(error).splitlines()[0]
         return Row(problem.name, name, False, False, "refused", 0.0, 0, reason), None
     return make_row(problem.name, name, maneuver), maneuver
+
+
+def _cells(row: Row) -> list[str]:
+    found = [(getattr(row, key), factor, form) for key, factor, form in _NUMBERS.values()]
+    return [
+        row.method,
+        "yes" if row.solved else "drifts" if row.kept else "no",
+        f"{100 * row.reached:.0f} %",
+        *("-" if value is None else format(factor * value, form) for value, factor, form in found),
+        row.reason,
+    ]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
 from vgtm_qp.comparison.row import Row
 from vgtm_qp.maneuver.maneuver import Maneuver
-from vgtm_qp.view.drawing import obstacle_meshes
+from vgtm_qp.view.drawing import drawing_of_maneuver
 
 Array = NDArray[np.float64]
 
@@ -58,15 +58,22 @@ def _draw_maneuver(axes: Axes, row: Row, maneuver: Maneuver | None, limits: tupl
         axes.fill(*outline.T, color="0.75", zorder=0)
     last = len(maneuver.time) - 1
     for index, shade in ((0, 0.25), (last // 2, 0.45), (last, 1.0)):
-        ends = maneuver.nodes[index][maneuver.members][:, :, [0, 2]]
-        actuated = maneuver.member_actuated
-        axes.add_collection(LineCollection(list(ends[~actuated]), colors="0.35", linewidths=0.7, alpha=shade))
-        axes.add_collection(
-            LineCollection(list(ends[actuated]), colors="tab:blue", linewidths=0.9, alpha=shade)
-        )
+        draw_members(axes, maneuver.nodes[index], maneuver.members, maneuver.member_actuated, shade)
     axes.plot(*maneuver.tip_position[:, [0, 2]].T, color="tab:red", linewidth=0.8)
     if not row.solved:
         axes.set_xlabel(_folded(row.reason), fontsize=6.0)
+
+
+def draw_members(
+    axes: Axes, nodes: ArrayLike, members: ArrayLike, actuated: ArrayLike, shade: float = 1.0
+) -> None:
+    """Draw members (M, 2) between `nodes` (N, 3) as seen along y: fixed ones grey, actuated ones blue."""
+    ends = np.asarray(nodes)[np.asarray(members, dtype=int)][:, :, [0, 2]]
+    on = np.asarray(actuated, dtype=bool)
+    for some, colour, width in ((~on, "0.4", 0.7), (on, "tab:blue", 0.9)):
+        axes.add_collection(LineCollection(list(ends[some]), colors=colour, linewidths=width, alpha=shade))
+    axes.set_aspect("equal")
+    axes.autoscale_view()
 
 
 def _draw_curves(
@@ -102,9 +109,8 @@ def _draw_curves(
 
 def _outlines(maneuver: Maneuver) -> list[Array]:
     """Return the outlines (K, 2) of the obstacles at the end, seen along y."""
-    entries = maneuver.manifest["problem"].get("obstacle", ())
     outlines = []
-    for mesh in obstacle_meshes(entries, Path(maneuver.manifest["directory"])):
+    for mesh in drawing_of_maneuver(maneuver).obstacles:
         points = (mesh.vertices + mesh.position(float(maneuver.time[-1])))[:, [0, 2]]
         outlines.append(points[ConvexHull(points).vertices])
     return outlines
@@ -122,6 +128,4 @@ def _limits(maneuvers: list[Maneuver]) -> tuple[Array, Array]:
 
 
 def _folded(text: str, width: int = 36) -> str:
-    import textwrap
-
     return "\n".join(textwrap.wrap(text, width)[:3])

@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.build import build_truss
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.problem import Problem
+from vgtm_qp.step.setup import Setup
 
-DURATION = 10.0
+Array = NDArray[np.float64]
+
+_TOLERANCE = 1e-11
 
 
 def bending_problem(
@@ -36,7 +40,7 @@ def bending_problem(
         "name": f"{bays} bays, {module}",
         "truss": {"module": module, "bays": bays, **truss},
         "curve": {"family": "bezier", "control_vertices": vertices},
-        "maneuver": {"steps": steps, "waypoint": [{"time": DURATION, "position": [0.0, 0.0, 1.0]}]},
+        "maneuver": {"steps": steps, "waypoint": [{"time": 10.0, "position": [0.0, 0.0, 1.0]}]},
         "clearance": {"safe": 0.08, "influence": 0.5},
     }
     built = built_truss(Problem.from_dict(data))
@@ -54,3 +58,32 @@ def built_truss(problem: Problem) -> Truss:
     """Return the truss of a problem that has one."""
     assert problem.truss is not None, "a serial arm"
     return build_truss(problem.truss)
+
+
+def bring_lengths(
+    setup: Setup, X: Array, lengths: Array, *, tries: int, longest: float = np.inf, singular: float = 0.0
+) -> bool:
+    """Move the nodes `X` (N, 3) in place until all members have `lengths` (M,), m, by Newton's method.
+
+    Return False if they do not after `tries` iterations, each of which changes lengths by `longest` at most, or if a
+    pose on the way has a least singular value below `singular`.
+    """
+    for _ in range(tries):
+        setup.kinematics.evaluate(X)
+        error = lengths - setup.kinematics.quantities
+        worst = float(np.abs(error).max())
+        if worst < _TOLERANCE:
+            return True
+        if singular and least_singular_value(setup) < singular:
+            return False
+        jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
+        X[setup.truss.free] += min(1.0, longest / worst) * np.linalg.solve(jacobian, error).reshape(-1, 3)
+    return False
+
+
+def least_singular_value(setup: Setup) -> float:
+    """Return that of the length Jacobian where the kinematics was evaluated last, 0 where it is not finite."""
+    jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
+    if not np.all(np.isfinite(jacobian)):
+        return 0.0
+    return float(np.linalg.svd(jacobian, compute_uv=False)[-1])

@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.comparison.compare import run_method
-from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.comparison.statistics import wilson_interval
+from vgtm_qp.comparison.tables import crossed_table
 from vgtm_qp.geometry import shapes
-from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.arms import bending_problem, built_truss
 from vgtm_qp.study.drawing import MARKS, label, panels
-from vgtm_qp.study.statistics import wilson_interval
+from vgtm_qp.study.scenes import is_clear
 from vgtm_qp.study.workers import Row, Task
 
 TITLE = "Clutter: success over random scenes"
@@ -33,7 +32,6 @@ _METHODS = (
     "curve-pseudoinverse-obstacles",
 )
 _BAYS = 5
-_SAFE = 0.08
 _TRIES = 400
 
 
@@ -60,7 +58,6 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
     goal = (aside * np.cos(azimuth), aside * np.sin(azimuth), -random.uniform(0.3, 0.7) * aside)
     problem = bending_problem(_BAYS, steps=steps, goal=goal)
     truss = built_truss(problem)
-    bodies = TrussArm(truss).bodies
     target = np.array(problem.maneuver.waypoint[0].position)  # type: ignore[union-attr]
     found: list[dict[str, Any]] = []
     for _ in range(_TRIES):
@@ -71,9 +68,7 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
         center = [radius * np.cos(angle), radius * np.sin(angle), random.uniform(0.3, 1.05) * truss.height]
         if np.linalg.norm(np.maximum(np.abs(target - center) - edge / 2, 0.0)) < 0.6:
             continue
-        cube = shapes.box("cube", center, edge)
-        home = Clearance(bodies, [cube], safe=_SAFE, influence=0.5, self_collision=False)
-        if home.least(truss.home)[0] < _SAFE + 0.02:
+        if not is_clear(truss, shapes.box("cube", center, edge), truss.home):
             continue
         name = f"cube {len(found) + 1}"
         found.append({"name": name, "shape": "box", "center": [float(c) for c in center], "size": edge})
@@ -98,19 +93,13 @@ def draw(rows: Sequence[Row]) -> Figure:
     densities = sorted({row["cubes"] for row in rows})
     methods = rows[0]["methods"] if rows else []
     for k, (mark, method) in enumerate(zip(MARKS, methods, strict=False)):
-        shares, low, high = [], [], []
-        for density in densities:
-            done, count = _count(rows, method, density)
-            share = done / count
-            least, most = wilson_interval(done, count)
-            shares.append(share)
-            low.append(max(share - least, 0.0))
-            high.append(max(most - share, 0.0))
-        places = np.array(densities) + 0.08 * (k - len(methods) / 2)
+        counts = [_count(rows, method, density) for density in densities]
+        shares = np.array([done / count for done, count in counts])
+        low, high = np.transpose([wilson_interval(*count) for count in counts])
         axes[0].errorbar(
-            places,
+            np.array(densities) + 0.08 * (k - len(methods) / 2),
             shares,
-            [low, high],
+            np.maximum([shares - low, high - shares], 0.0),
             marker=mark,
             markersize=4,
             linestyle="--",
@@ -127,23 +116,27 @@ def text(rows: Sequence[Row]) -> str:
     """Give successes with their intervals."""
     if not rows:
         return "No scene was run."
+    methods = rows[0]["methods"]
     densities = sorted({row["cubes"] for row in rows})
-    counts = {density: _count(rows, rows[0]["methods"][0], density)[1] for density in densities}
-    table = []
-    for method in rows[0]["methods"]:
-        cells = []
-        for density in densities:
-            done, count = _count(rows, method, density)
-            low, high = wilson_interval(done, count)
-            cells.append(f"{done} ({100 * low:.0f}-{100 * high:.0f} %)")
-        table.append((method, *cells))
-    header = ("solved (95 % interval)", *[f"{d} cubes, of {counts[d]}" for d in densities])
+    table = crossed_table(
+        ("solved (95 % interval)",),
+        {density: f"{density} cubes, of {_count(rows, methods[0], density)[1]}" for density in densities},
+        {
+            (method,): {density: _cell(*_count(rows, method, density)) for density in densities}
+            for method in methods
+        },
+    )
     return (
         f"Five octahedral bays, seed {rows[0]['seed']}, scenes numbered from 0 at each density. Solved: the whole "
         "path, every stroke and every clearance kept at and between the states, members and tip off by at most 1 mm. "
         f"No scene is known to have a solution, so that the QP's misses are not all its own."
-        f"\n\n{markdown_table(header, table)}"
+        f"\n\n{table}"
     )
+
+
+def _cell(done: int, count: int) -> str:
+    low, high = wilson_interval(done, count)
+    return f"{done} ({100 * low:.0f}-{100 * high:.0f} %)"
 
 
 def _count(rows: Sequence[Row], method: str, density: int) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.comparison.figure import draw_members
+from vgtm_qp.comparison.statistics import exponent
+from vgtm_qp.comparison.tables import crossed_table
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.study.arms import bending_problem
-from vgtm_qp.study.drawing import MARKS, draw_truss, label, mark_bays, panels
-from vgtm_qp.study.statistics import exponent
+from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels
 from vgtm_qp.study.workers import Row, Task
 
 Array = NDArray[np.float64]
@@ -52,12 +54,9 @@ def run(module: str, bays: int, steps: int) -> Row:
     problem = bending_problem(bays, steps=steps, goal=(0.3, 0.1, -0.1), module=module, vertices=5, **sizes)
     resolver = CurveFirstResolver(with_method(problem, "curve-pseudoinverse-obstacles"))
     plan = make_plan(problem, *resolver.tip())
-    value = plan.path.start
-    for mark in plan.marks:
-        done = resolver.follow(plan.path, value, float(mark))
-        if done.reason:
-            return {"failed": done.reason}
-        value = float(mark)
+    for start, end in pairwise([plan.path.start, *plan.marks.tolist()]):
+        if reason := resolver.follow(plan.path, start, end).reason:
+            return {"failed": reason}
     nodes, truss, curve = resolver.state.nodes, resolver.setup.truss, resolver.curve
     resolver.setup.kinematics.evaluate(nodes)
     points = curve.position(np.linspace(0.0, 1.0, 4001))
@@ -95,38 +94,35 @@ def draw(rows: Sequence[Row]) -> Figure:
     figure, axes = panels(2, 3, width=3.0, height=2.9)
     shown = [row for row in rows if row["module"] == "octahedral" and "nodes" in row][:3]
     for panel, row in zip(axes, shown, strict=False):
-        draw_truss(panel, np.array(row["nodes"]), np.array(row["members"]), np.array(row["actuated"]))
+        draw_members(panel, row["nodes"], row["members"], row["actuated"])
         panel.plot(*np.array(row["curve"])[:, [0, 2]].T, color="tab:red", linewidth=1.0)
         label(panel, "x [m]", "z [m]", f"{row['bays']} bays", legend=False)
     for panel in axes[len(shown) : 3]:
         panel.set_axis_off()
     for panel, (key, name) in zip(axes[3:], _MEASURES.items(), strict=True):
-        for k, (mark, module) in enumerate(zip(MARKS, _MODULES, strict=False)):
+        for k, module in enumerate(_MODULES):
             mine = [row for row in rows if row["module"] == module]
             if mine and max(row[key] for row in mine) > _EXACT:
-                values = [row[key] for row in mine]
-                style: dict[str, Any] = {"color": f"C{k}", "marker": mark, "markersize": 4, "label": module}
-                panel.loglog([row["bays"] for row in mine], values, "--", **style)
+                draw_line(panel, k, module, [row["bays"] for row in mine], [row[key] for row in mine])
+        label(panel, "bays", name, log="xy")
         mark_bays(panel, [row["bays"] for row in rows])
-        label(panel, "bays", name)
     return figure
 
 
 def text(rows: Sequence[Row]) -> str:
     """Give the order of convergence of each measure."""
-    bays = sorted({row["bays"] for row in rows})
-    table = []
+    columns = {n: f"{n} bays" for n in sorted({row["bays"] for row in rows})}
+    lines = {}
     for module in _MODULES:
         mine = {row["bays"]: row for row in rows if row["module"] == module}
         for key, name in _MEASURES.items():
             values = [row[key] for row in mine.values()]
             order = f"{-exponent(list(mine), values):.2f}" if min(values, default=0.0) > _EXACT else "exact"
-            cells = [f"{mine[n][key]:.1e}" if n in mine else "-" for n in bays]
-            table.append((module, name, *cells, order))
-    header = ("module", "", *[f"{n} bays" for n in bays], "order")
+            lines[module, name] = {n: f"{row[key]:.1e}" for n, row in mine.items()} | {"order": order}
+    table = crossed_table(("module", ""), columns | {"order": "order"}, lines)
     return (
         f"An arm of {_HEIGHT:g} m, bent by 0.3 of its height, with bays the smaller the more there are; its faces "
         "track the curve exactly. The order is that of the fit error = c / bays^order. A bay that meets a position "
         "alone leaves its face's direction free: where that does not converge, the ripple of section 4.5 is seen."
-        f"\n\n{markdown_table(header, table)}"
+        f"\n\n{table}"
     )

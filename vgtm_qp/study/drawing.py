@@ -1,4 +1,4 @@
-"""What the studies' figures share: one style, side views of trusses and curves."""
+"""What the studies' figures share: panels of one size and style, lines with marks, labelled axes."""
 
 from __future__ import annotations
 
@@ -6,17 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
-def panels(
-    rows: int = 1, columns: int = 1, *, width: float = 3.4, height: float = 2.9
-) -> tuple[Figure, list[Axes]]:
+def panels(rows: int, columns: int, *, width: float, height: float) -> tuple[Figure, list[Axes]]:
     """Return a figure of panels of the same size, in inches."""
     figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
     axes = np.ravel(figure.subplots(rows, columns, squeeze=False)).tolist()
@@ -25,10 +22,19 @@ def panels(
     return figure, axes
 
 
-def label(axes: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
-    """Name the axes."""
+def draw_line(axes: Axes, k: int, name: str, x: ArrayLike, y: ArrayLike, style: str = "--") -> None:
+    """Draw the k-th line of a panel, with a mark and colour of its own."""
+    axes.plot(x, y, style, color=f"C{k}", marker=MARKS[k], markersize=4, label=name)
+
+
+def label(axes: Axes, x: str, y: str, title: str = "", *, legend: bool = True, log: str = "") -> None:
+    """Name the axes; those in `log`, of ``"xy"``, are logarithmic."""
     axes.set_xlabel(x, fontsize=8)
     axes.set_ylabel(y, fontsize=8)
+    if "x" in log:
+        axes.set_xscale("log")
+    if "y" in log:
+        axes.set_yscale("log")
     if title:
         axes.set_title(title, fontsize=8)
     if legend:
@@ -39,16 +45,3 @@ def mark_bays(axes: Axes, bays: Sequence[int]) -> None:
     """Mark the numbers of bays on a logarithmic axis, and no others."""
     axes.set_xticks(sorted(set(bays)), [str(n) for n in sorted(set(bays))])
     axes.xaxis.set_minor_locator(NullLocator())
-
-
-def draw_truss(axes: Axes, nodes: Array, members: Array, actuated: Array, shade: float = 1.0) -> None:
-    """Draw members (M, 2) between `nodes` (N, 3) as seen along y: fixed ones grey, actuated ones blue."""
-    ends = np.asarray(nodes)[np.asarray(members, dtype=int)][:, :, [0, 2]]
-    on = np.asarray(actuated, dtype=bool)
-    axes.add_collection(LineCollection(list(ends[~on]), colors="0.4", linewidths=0.7, alpha=shade))
-    axes.add_collection(LineCollection(list(ends[on]), colors="tab:blue", linewidths=0.9, alpha=shade))
-    axes.set_aspect("equal")
-    axes.autoscale_view()
-
-
-MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")

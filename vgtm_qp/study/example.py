@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from vgtm_qp.comparison.compare import run_method
-from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.comparison.figure import draw_members
+from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.problem import load_problem
-from vgtm_qp.study.drawing import draw_truss, label, panels
+from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.workers import Row, Task
 
 TITLE = "Figure 8: a five-bay arm between two cubes"
@@ -58,7 +59,7 @@ def draw(rows: Sequence[Row]) -> Figure:
             for x, _, z, edge in row["cubes"]:
                 panel.add_patch(Rectangle((x - edge / 2, z - edge / 2), edge, edge, color="0.8"))
             frame = row["frames"][j]
-            draw_truss(panel, np.array(frame["nodes"]), np.array(row["members"]), np.array(row["actuated"]))
+            draw_members(panel, frame["nodes"], row["members"], row["actuated"])
             label(panel, "x [m]", "z [m]", f"{row['method']}\nstep {frame['step']}", legend=False)
             panel.title.set_fontsize(6.5)
             panel.set_xlim(-1.8, 2.1)
@@ -77,7 +78,7 @@ def text(rows: Sequence[Row]) -> str:
                 f"{100 * row['reached']:.0f} %",
                 f"{row['least_clearance']:.4f}",
                 f"{row['stroke_violation']:.3g}",
-                row["reason"].replace("|", "/"),
+                row["reason"],
             )
             for row in rows
         ],

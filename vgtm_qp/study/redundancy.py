@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.compare import run_method
-from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.comparison.tables import crossed_table
 from vgtm_qp.curve import degree_of_redundancy
 from vgtm_qp.problem import load_problem
-from vgtm_qp.study.drawing import MARKS, label, panels
+from vgtm_qp.study.drawing import draw_line, label, panels
 from vgtm_qp.study.workers import Row, Task
 
 TITLE = "Variable degree of redundancy: the number of control vertices"
@@ -49,40 +48,36 @@ def run(problem: str, method: str, vertices: int) -> Row:
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw reach, travel of the solved ones, and step time."""
     figure, axes = panels(1, 3, width=3.4, height=3.1)
-    for mark, case in zip(MARKS, _CASES, strict=False):
+    for k, case in enumerate(_CASES):
         mine = _of(rows, case)
         if not mine:
             continue
-        style: dict[str, Any] = {
-            "marker": mark,
-            "markersize": 4,
-            "linestyle": "--",
-            "label": f"{case[0]}: {case[1]}",
-        }
-        axes[0].plot([r["vertices"] for r in mine], [r["reached"] for r in mine], **style)
-        done = [r for r in mine if r["solved"]]
-        axes[1].plot([r["vertices"] for r in done], [r["travel"] for r in done], **style)
-        timed = [r for r in mine if r["step_time"] is not None]
-        axes[2].semilogy([r["vertices"] for r in timed], [1e3 * r["step_time"] for r in timed], **style)
+        done = [row for row in mine if row["solved"]]
+        timed = [row for row in mine if row["step_time"] is not None]
+        for panel, some, key, factor in (
+            (axes[0], mine, "reached", 1.0),
+            (axes[1], done, "travel", 1.0),
+            (axes[2], timed, "step_time", 1e3),
+        ):
+            vertices, values = [row["vertices"] for row in some], [factor * row[key] for row in some]
+            draw_line(panel, k, ": ".join(case), vertices, values)
     label(axes[0], "control vertices", "part of the path", "how far")
     label(axes[1], "control vertices", "actuator travel [m]", "solved maneuvers", legend=False)
-    label(axes[2], "control vertices", "median step [ms]", "time", legend=False)
+    label(axes[2], "control vertices", "median step [ms]", "time", legend=False, log="y")
     return figure
 
 
 def text(rows: Sequence[Row]) -> str:
     """Give the table."""
     vertices = sorted({row["vertices"] for row in rows})
-    table = []
-    for case in _CASES:
-        mine = {row["vertices"]: row for row in _of(rows, case)}
-        if mine:
-            cells = [_cell(mine[v]) if v in mine else "-" for v in vertices]
-            table.append((f"{case[0]}: {case[1]}", *cells))
-    header = ("path covered; travel [m]", *[f"V = {v} ({degree_of_redundancy(v, 3)})" for v in vertices])
+    table = crossed_table(
+        ("path covered; travel [m]",),
+        {v: f"V = {v} ({degree_of_redundancy(v, 3)})" for v in vertices},
+        {(": ".join(case),): {row["vertices"]: _cell(row) for row in _of(rows, case)} for case in _CASES},
+    )
     return (
         "In brackets the free motions of the curve once base and tip are held, 3 V - 5 - 3. A curve with more of them "
-        f"than the arm means nothing to it; one with too few may not pass.\n\n{markdown_table(header, table)}"
+        f"than the arm means nothing to it; one with too few may not pass.\n\n{table}"
     )
 
 

@@ -8,11 +8,11 @@ from time import process_time
 
 from matplotlib.figure import Figure
 
-from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.comparison.statistics import wilson_interval
+from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.scenes import random_scene
-from vgtm_qp.study.statistics import wilson_interval
 from vgtm_qp.study.workers import Row, Task
 
 TITLE = "Robustness: random scenes of every module"
@@ -76,32 +76,26 @@ def text(rows: Sequence[Row]) -> str:
     if not rows:
         return "No scene was run."
     broken = sum(bool(row["failures"]) for row in rows)
+    groups = {
+        "goal reachable by construction": [row for row in rows if row["reachable"]],
+        "any goal": [row for row in rows if not row["reachable"]],
+        "with a direction of the tip": [row for row in rows if row["directed"]],
+    }
+    for module in sorted({row["module"] for row in rows}):
+        groups[module] = [row for row in rows if row["module"] == module]
     parts = [
         f"Seed {rows[0]['seed']}, scenes 0 to {max(row['number'] for row in rows)}, {rows[0]['steps']} steps each. "
         f"{_of(rows)} solved; states that break a tolerance by the independent check: in {broken} scenes.",
-        markdown_table(
-            ("", "solved"),
-            [
-                ("goal reachable by construction", _of([row for row in rows if row["reachable"]])),
-                ("any goal", _of([row for row in rows if not row["reachable"]])),
-                ("with a direction of the tip", _of([row for row in rows if row["directed"]])),
-                *(
-                    (module, _of([row for row in rows if row["module"] == module]))
-                    for module in sorted({row["module"] for row in rows})
-                ),
-            ],
-        ),
+        markdown_table(("", "solved"), [(name, _of(some)) for name, some in groups.items()]),
     ]
-    ways = Counter(row["way_out"] for row in rows if row["way_out"] and row["status"] == "solved")
-    if ways:
-        parts.append(
-            "Solved by another way out: " + ", ".join(f"{way} {n}" for way, n in ways.most_common()) + "."
-        )
-    stops = Counter(row["stop"] for row in rows if row["stop"])
-    if stops:
-        parts.append(
-            "The others stopped by: " + ", ".join(f"{kind} {n}" for kind, n in stops.most_common()) + "."
-        )
+    solved = [row for row in rows if row["status"] == "solved"]
+    for words, key, some in (
+        ("Solved by another way out", "way_out", solved),
+        ("The others stopped by", "stop", rows),
+    ):
+        counts = Counter(row[key] for row in some if row[key]).most_common()
+        if counts:
+            parts.append(f"{words}: {', '.join(f'{name} {count}' for name, count in counts)}.")
     return "\n\n".join(parts)
 
 

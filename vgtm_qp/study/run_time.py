@@ -8,12 +8,12 @@ from time import thread_time
 import numpy as np
 from matplotlib.figure import Figure
 
-from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.comparison.statistics import exponent
+from vgtm_qp.comparison.tables import crossed_table
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import make_resolver, with_method
 from vgtm_qp.study.arms import bending_problem
-from vgtm_qp.study.drawing import MARKS, label, mark_bays, panels
-from vgtm_qp.study.statistics import exponent
+from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels
 from vgtm_qp.study.workers import Row, Task
 
 TITLE = "Figure 9: run time against the number of bays"
@@ -89,20 +89,13 @@ def draw(rows: Sequence[Row]) -> Figure:
     """Draw time against bays, without and with cubes."""
     figure, axes = panels(1, 2, width=4.2, height=3.6)
     for panel, cubes, names in zip(axes, (False, True), (_NAMES, _WITH_CUBES), strict=True):
-        for mark, (method, name) in zip(MARKS, names.items(), strict=False):
+        for k, (method, name) in enumerate(names.items()):
             mine = _of(rows, method, cubes)
-            line = "-" if method == "qp" else "--" if method.startswith("curve") else ":"
-            panel.loglog(
-                [r["bays"] for r in mine],
-                [r["time"] for r in mine],
-                line,
-                marker=mark,
-                markersize=4,
-                label=name,
-            )
-        mark_bays(panel, [row["bays"] for row in rows if row["cubes"] is cubes])
+            style = "-" if method == "qp" else "--" if method.startswith("curve") else ":"
+            draw_line(panel, k, name, [r["bays"] for r in mine], [r["time"] for r in mine], style)
         title = "two cubes, clearance watched" if cubes else "no obstacles"
-        label(panel, "bays", f"processor time of {_STEPS} steps [s]", title)
+        label(panel, "bays", f"processor time of {_STEPS} steps [s]", title, log="xy")
+        mark_bays(panel, [row["bays"] for row in rows if row["cubes"] is cubes])
     return figure
 
 
@@ -117,22 +110,16 @@ def text(rows: Sequence[Row]) -> str:
         bays = sorted({row["bays"] for row in rows if row["cubes"] is cubes})
         if not bays:
             continue
-        table = []
+        lines = {}
         for method, name in names.items():
-            mine = {row["bays"]: row for row in _of(rows, method, cubes)}
-            cells = [
-                f"{1e3 * mine[n]['time']:.0f}" + ("*" if mine[n]["reason"] else "") if n in mine else "-"
-                for n in bays
-            ]
-            fit = [n for n in mine if n >= _FIT_FROM]
-            growth = f"n^{exponent(fit, [mine[n]['time'] for n in fit]):.2f}" if len(fit) > 1 else "-"
-            table.append((name, *cells, growth))
-        header = (
-            "with two cubes [ms]" if cubes else "no obstacles [ms]",
-            *[f"{n} bays" for n in bays],
-            "growth",
-        )
-        parts.append(markdown_table(header, table))
+            mine = _of(rows, method, cubes)
+            cells = {row["bays"]: f"{1e3 * row['time']:.0f}" + "*" * bool(row["reason"]) for row in mine}
+            fit = [(row["bays"], row["time"]) for row in mine if row["bays"] >= _FIT_FROM]
+            growth = f"n^{exponent(*zip(*fit, strict=True)):.2f}" if len(fit) > 1 else "-"
+            lines[(name,)] = cells | {"growth": growth}
+        corner = "with two cubes [ms]" if cubes else "no obstacles [ms]"
+        columns = {n: f"{n} bays" for n in bays} | {"growth": "growth"}
+        parts.append(crossed_table((corner,), columns, lines))
     parts.append(
         f"Growth fitted from {_FIT_FROM} bays on; * broke down on the way. All run from Python: with few bays its "
         "calls take the time, not the arithmetic. The QP's step and the kinematics are compiled; the recursive form is "

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
@@ -15,6 +16,7 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
+from vgtm_qp.study.arms import bring_lengths, least_singular_value
 
 Array = NDArray[np.float64]
 
@@ -109,7 +111,7 @@ def random_shape(setup: Setup, random: np.random.Generator) -> Array:
     least, most = 0.15 * truss.height, random.uniform(0.3, 0.9) * truss.height
     furthest = truss.home
     kinematics.evaluate(truss.home)
-    singular = _LEAST_SINGULAR_VALUE * _least_singular_value(setup)
+    singular = _LEAST_SINGULAR_VALUE * least_singular_value(setup)
     for _ in range(20):
         X = truss.home.copy()
         wanted = _random_lengths(setup, random)
@@ -117,7 +119,7 @@ def random_shape(setup: Setup, random: np.random.Generator) -> Array:
         for share in np.arange(1, _SHARES + 1) / _SHARES:
             goal = setup.arm.home_quantities.copy()
             goal[actuators] += share * (wanted - goal[actuators])
-            if not _newton(setup, X, goal, singular):
+            if not bring_lengths(setup, X, goal, tries=8, singular=singular):
                 break
             if setup.monitor.least(setup.arm.points(X), among="members")[0] < SAFE:
                 break
@@ -155,28 +157,6 @@ def _random_lengths(setup: Setup, random: np.random.Generator) -> Array:
     return np.asarray(home + wave * room)
 
 
-def _least_singular_value(setup: Setup) -> float:
-    jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
-    if not np.all(np.isfinite(jacobian)):
-        return 0.0
-    return float(np.linalg.svd(jacobian, compute_uv=False)[-1])
-
-
-def _newton(setup: Setup, X: Array, lengths: Array, singular: float) -> bool:
-    """Bring all lengths to `lengths` (M,) in place; False where the pose is singular or Newton's method fails."""
-    free = setup.truss.free
-    for _ in range(8):
-        setup.kinematics.evaluate(X)
-        error = lengths - setup.kinematics.quantities
-        if float(np.max(np.abs(error))) < 1e-11:
-            return True
-        if _least_singular_value(setup) < singular:
-            return False
-        jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
-        X[free] += np.linalg.solve(jacobian, error).reshape(-1, 3)
-    return False
-
-
 def _cubes(
     setup: Setup, random: np.random.Generator, shape: Array | None, count: int
 ) -> list[dict[str, Any]]:
@@ -200,7 +180,7 @@ def _cubes(
         center = anchor + offset * (random.uniform(0.1, 1.2) + edge / 2) / np.linalg.norm(offset)
         vector = random.normal(size=3) * (random.random() < 0.5)
         cube = shapes.box("", center.tolist(), edge, rotation_from_vector(vector))
-        if any(_distance(setup, cube, X) < SAFE + _ROOM for X in states):
+        if not all(is_clear(truss, cube, X) for X in states):
             continue
         local = np.abs((passage - center) @ rotation_from_vector(vector)) - edge / 2
         if float(np.linalg.norm(np.maximum(local, 0.0), axis=1).min()) < SAFE + 0.1:
@@ -217,8 +197,8 @@ def _cubes(
     return cubes
 
 
-def _distance(setup: Setup, obstacle: shapes.Obstacle, X: Array) -> float:
-    truss = setup.truss
-    between_nodes = capsules(truss.members, truss.radius)
-    monitor = Clearance(between_nodes, [obstacle], safe=SAFE, influence=0.5, self_collision=False)
-    return monitor.least(X)[0]
+def is_clear(truss: Truss, obstacle: shapes.Obstacle, X: Array) -> bool:
+    """Whether members between nodes at `X` (N, 3) keep the safe distance from an obstacle, with some room."""
+    members = capsules(truss.members, truss.radius)
+    monitor = Clearance(members, [obstacle], safe=SAFE, influence=0.5, self_collision=False)
+    return monitor.least(X)[0] >= SAFE + _ROOM

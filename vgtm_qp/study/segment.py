@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from vgtm_qp.comparison.markdown import markdown_table
+from vgtm_qp.comparison.figure import draw_members
+from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.study.arms import bending_problem
-from vgtm_qp.study.drawing import draw_truss, label, panels
+from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.workers import Row, Task
 
 TITLE = "Figure 7: a segment tracks a moving curve"
@@ -39,17 +40,13 @@ def run(module: str, steps: int) -> Row:
     inside = set(truss.faces[_FACES[0] : _FACES[1] + 1].ravel().tolist())
     members = [k for k, (a, b) in enumerate(truss.members.tolist()) if a in inside and b in inside]
     wanted = {round(k * steps / (_FRAMES - 1)) for k in range(_FRAMES)}
-    frames, value, gap, angle = [], plan.path.start, 0.0, 0.0
-    for step in range(steps + 1):
-        if step:
-            mark = float(plan.marks[step - 1])
-            done = resolver.follow(plan.path, value, mark)
-            if done.reason:
-                return {"failed": done.reason}
-            value = mark
+    marks = [plan.path.start, *plan.marks.tolist()]
+    frames, gap, angle = [], 0.0, 0.0
+    for step, mark in enumerate(marks):
+        if step and (reason := resolver.follow(plan.path, marks[step - 1], mark).reason):
+            return {"failed": reason}
         resolver.setup.kinematics.evaluate(resolver.state.nodes)
-        segments = resolver.tracker.segments
-        faces = np.array([segment.face for segment in segments])
+        faces = np.array([segment.face for segment in resolver.tracker.segments])
         s = resolver.motion.s[faces]
         centres = resolver.setup.arm.stations.centres(resolver.state.nodes)[faces]
         gap = max(gap, float(np.abs(centres - resolver.curve.position(s)).max()))
@@ -75,7 +72,7 @@ def draw(rows: Sequence[Row]) -> Figure:
         for j, frame in enumerate(row["frames"]):
             panel = axes[_FRAMES * i + j]
             panel.plot(*np.array(frame["curve"])[:, [0, 2]].T, color="tab:red", linewidth=0.9)
-            draw_truss(panel, np.array(frame["nodes"]), np.array(row["members"]), np.array(row["actuated"]))
+            draw_members(panel, frame["nodes"], row["members"], row["actuated"])
             label(panel, "x [m]", "z [m]", f"{row['module']}, step {frame['step']}", legend=False)
             panel.set_xlim(-1.2, 3.8)
             panel.set_ylim(-0.3, 8.4)

@@ -1,16 +1,15 @@
-"""A study: its tasks, where their rows are kept, and what is written of them; the list of all studies."""
+"""The list of all studies, and how each is run: its tasks, where their rows are kept, what is written of them."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.machine import machine, sentence
@@ -30,66 +29,61 @@ STUDIES = {
     "clutter": "vgtm_qp.study.clutter",
     "robustness": "vgtm_qp.study.robustness",
 }
-"""The module of each study: ``TITLE``, ``TIMED``, ``tasks(short)``, ``run(**task)``, ``draw(rows)``, ``text(rows)``."""
+"""The module of each study."""
 
 
-@dataclass(frozen=True)
-class Study:
-    """One study.
+class Study(Protocol):
+    """What the module of a study has.
 
     Attributes
     ----------
-    name, title : str
-    timed : bool
+    TITLE : str
+    TIMED : bool
         Its rows hold times that tasks beside it would falsify, so that its tasks run one at a time.
+    tasks
+        Return the keyword arguments of each run, as JSON data: fewer and smaller ones for a `short` look.
+    run
+        Return the row of one task, as JSON data.
+    draw, text
+        Return the figure of the rows, and what they say, in a paragraph and tables.
     """
 
-    name: str
-    title: str
-    timed: bool
-    _module: Any
+    TITLE: str
+    TIMED: bool
+    tasks: Callable[..., list[Task]]
+    run: Callable[..., Row]
+    draw: Callable[[Sequence[Row]], Figure]
+    text: Callable[[Sequence[Row]], str]
 
-    @classmethod
-    def named(cls, name: str) -> Study:
-        """Return a study by its name.
 
-        Raises
-        ------
-        GoalError
-            There is no such study.
-        """
-        if name not in STUDIES:
-            raise GoalError(f'no study "{name}"{nearest(name, STUDIES)}; choices: {", ".join(STUDIES)}, all')
-        module = import_module(STUDIES[name])
-        return cls(name, module.TITLE, module.TIMED, module)
+def find_study(name: str) -> Study:
+    """Return a study by its name.
 
-    def tasks(self, *, short: bool = False, **options: Any) -> list[Task]:
-        """Return the keyword arguments of each run, as JSON data; `short` for a quick look.
+    Raises
+    ------
+    GoalError
+        There is no such study.
+    """
+    if name not in STUDIES:
+        raise GoalError(f'no study "{name}"{nearest(name, STUDIES)}; choices: {", ".join(STUDIES)}, all')
+    return cast(Study, import_module(STUDIES[name]))
 
-        Raises
-        ------
-        GoalError
-            The study has no such option.
-        """
-        known = list(signature(self._module.tasks).parameters)[1:]
-        for name in options:
-            if name not in known:
-                choices = ", ".join(known) or "none"
-                raise GoalError(f'study "{self.name}" has no option "{name}"; it has {choices}')
-        return list(self._module.tasks(short, **options))
 
-    def draw(self, rows: Sequence[Row]) -> Figure:
-        """Return the study's figure."""
-        return self._module.draw([row for row in rows if "failed" not in row])  # type: ignore[no-any-return]
+def study_tasks(name: str, *, short: bool = False, **options: Any) -> list[Task]:
+    """Return the tasks of a study.
 
-    def text(self, rows: Sequence[Row]) -> str:
-        """Return what the rows say, in a paragraph and tables."""
-        return str(self._module.text([row for row in rows if "failed" not in row]))
-
-    @property
-    def function(self) -> str:
-        """The function of a task, as ``"module:name"``."""
-        return f"{STUDIES[self.name]}:run"
+    Raises
+    ------
+    GoalError
+        There is no such study, or it has no such option.
+    """
+    study = find_study(name)
+    known = list(signature(study.tasks).parameters)[1:]
+    for option in options:
+        if option not in known:
+            choices = ", ".join(known) or "none"
+            raise GoalError(f'study "{name}" has no option "{option}"; it has {choices}')
+    return study.tasks(short, **options)
 
 
 def run_study(
@@ -127,49 +121,35 @@ def run_study(
     MissingExtraError
         A cluster is asked for and Dask is not installed.
     """
-    from vgtm_qp.view.figure import save_figure
-
-    study = Study.named(name)
+    study, options = find_study(name), options or {}
+    tasks = study_tasks(name, short=short, **options)
     place = folder / name
     place.mkdir(parents=True, exist_ok=True)
-    tasks = study.tasks(short=short, **(options or {}))
     log = place / "rows.jsonl"
     known = _known_rows(log)
-    keys = [_key(task) for task in tasks]
+    keys = [hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:16] for task in tasks]
     left = [k for k, key in enumerate(keys) if key not in known]
     done = len(tasks) - len(left)
-    if progress is not None:
-        progress(done, len(tasks))
-    with log.open("a") as file:
-        for k, row in _run(study, [tasks[k] for k in left], workers, dask):
-            number = left[k]
-            known[keys[number]] = row
-            file.write(json.dumps({"key": keys[number], "task": tasks[number], "row": row}) + "\n")
-            file.flush()
-            done += 1
-            if progress is not None:
-                progress(done, len(tasks))
-    rows = [{**tasks[k], **known[key]} for k, key in enumerate(keys)]
-    found = machine()
-    _write_json(place / f"{name}.json", {"study": name, "title": study.title, "machine": found, "rows": rows})
-    _write_csv(place / f"{name}.csv", rows)
-    save_figure(study.draw(rows), place / f"{name}.pdf")
-    failed = [row for row in rows if "failed" in row]
-    lines = [f"## {study.title}", "", study.text(rows).strip(), ""]
-    lines += [f"Not counted: a run that failed, {row['failed']}" for row in failed]
-    given = (f" --{key} {value}" for key, value in (options or {}).items())
-    again = f"vgtm study {name}{' --short' if short else ''}{''.join(given)}"
-    lines += [f"Measured on: {sentence(found)}. Made again by `{again}`.", ""]
-    (place / f"{name}.md").write_text("\n".join(lines))
-    return place
-
-
-def _run(study: Study, tasks: list[Task], workers: int, dask: str | None) -> Iterator[tuple[int, Row]]:
+    report = progress or (lambda _done, _total: None)
+    report(done, len(tasks))
+    function, waiting = f"{STUDIES[name]}:run", [tasks[k] for k in left]
     if dask is not None:
-        return run_dask(study.function, tasks, dask)
-    if workers > 1:
-        return run_processes(study.function, tasks, 1 if study.timed else workers)
-    return run_here(study.function, tasks)
+        answers = run_dask(function, waiting, dask)
+    elif workers > 1:
+        answers = run_processes(function, waiting, 1 if study.TIMED else workers)
+    else:
+        answers = run_here(function, waiting)
+    with log.open("a") as file:
+        for finished, (k, row) in enumerate(answers, start=done + 1):
+            key = keys[left[k]]
+            known[key] = row
+            file.write(json.dumps({"key": key, "task": waiting[k], "row": row}) + "\n")
+            file.flush()
+            report(finished, len(tasks))
+    rows = [{**task, **known[key]} for task, key in zip(tasks, keys, strict=True)]
+    given = "".join(f" --{key} {value}" for key, value in options.items())
+    _write(study, place, rows, f"vgtm study {name}{' --short' if short else ''}{given}")
+    return place
 
 
 def _known_rows(log: Path) -> dict[str, Row]:
@@ -186,17 +166,21 @@ def _known_rows(log: Path) -> dict[str, Row]:
     return rows
 
 
-def _key(task: Task) -> str:
-    return hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:16]
+def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None:
+    """Write rows, figure and text into the folder of a study; failed rows are in the data and named in the text."""
+    from vgtm_qp.view.figure import save_figure
 
-
-def _write_json(path: Path, data: dict[str, Any]) -> None:
-    path.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
-
-
-def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    name, found = place.name, machine()
+    data = {"study": name, "title": study.TITLE, "machine": found, "rows": rows}
+    (place / f"{name}.json").write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
     flat = [{key: value for key, value in row.items() if not isinstance(value, list | dict)} for row in rows]
-    with path.open("w", newline="") as file:
+    with (place / f"{name}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys(key for row in flat for key in row)))
         writer.writeheader()
         writer.writerows(flat)
+    counted = [row for row in rows if "failed" not in row]
+    save_figure(study.draw(counted), place / f"{name}.pdf")
+    lines = [f"## {study.TITLE}", "", study.text(counted).strip(), ""]
+    lines += [f"Not counted: a run that failed, {row['failed']}" for row in rows if "failed" in row]
+    lines += [f"Measured on: {sentence(found)}. Made again by `{command}`.", ""]
+    (place / f"{name}.md").write_text("\n".join(lines))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 from vgtm_qp.errors import MissingExtraError
+from vgtm_qp.machine import pin_threads
 
 Task = dict[str, Any]
 Row = dict[str, Any]
@@ -50,13 +51,13 @@ def run_processes(
     row says so.
     """
     again: list[int] = []
-    for k, row in _pool(function, tasks, list(range(len(tasks))), workers, hang):
+    for k, row in _pool(function, enumerate(tasks), workers, hang):
         if row is None:
             again.append(k)
         else:
             yield k, row
     for k in again:
-        for _, row in _pool(function, tasks, [k], 1, hang):
+        for _, row in _pool(function, [(k, tasks[k])], 1, hang):
             yield k, row or {"failed": f"its process died, or took longer than {hang:g} s, twice"}
 
 
@@ -87,28 +88,25 @@ def run_dask(function: str, tasks: Sequence[Task], address: str) -> Iterator[tup
 
 
 class _Worker:
-    """A process that answers one task at a time."""
+    """A process that answers one task at a time, and the time at which it counts as hung."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        # Inherited by the new process before it imports NumPy: one BLAS thread a worker.
-        before = os.environ.get("OPENBLAS_NUM_THREADS")
-        os.environ["OPENBLAS_NUM_THREADS"] = "1"
-        try:
-            self._process.start()
-        finally:
-            if before is None:
-                del os.environ["OPENBLAS_NUM_THREADS"]
-            else:
-                os.environ["OPENBLAS_NUM_THREADS"] = before
+        self._process.start()
         theirs.close()
-        self.number, self.started, self.begun = -1, 0.0, False
 
     def give(self, function: str, number: int, task: Task) -> None:
-        self.number, self.started, self.begun = number, time.monotonic(), False
+        self.number, self.deadline = number, time.monotonic() + HANG
         self.pipe.send((function, task))
+
+    def answer(self) -> Row | None:
+        """Return what it says, None if it died."""
+        try:
+            return dict(self.pipe.recv())
+        except (EOFError, OSError):
+            return None
 
     def stop(self) -> None:
         self._process.kill()
@@ -117,38 +115,32 @@ class _Worker:
 
 
 def _pool(
-    function: str, tasks: Sequence[Task], numbers: list[int], workers: int, hang: float
+    function: str, tasks: Iterable[tuple[int, Task]], workers: int, hang: float
 ) -> Iterator[tuple[int, Row | None]]:
-    """Yield number and row of each task, None where its process died or hung."""
-    waiting = list(numbers)
+    """Yield number and row of each numbered task, None where its process died or hung."""
+    # Inherited by the processes before they import NumPy.
+    pin_threads()
+    waiting = deque(tasks)
     busy: list[_Worker] = []
     try:
         while waiting or busy:
             while waiting and len(busy) < workers:
-                worker = _Worker()
-                busy.append(worker)
-                number = waiting.pop(0)
-                worker.give(function, number, tasks[number])
+                busy.append(_Worker())
+                busy[-1].give(function, *waiting.popleft())
             ready: list[Any] = wait([worker.pipe for worker in busy], timeout=0.5)
             for worker in list(busy):
-                row: Row | None = None
-                if worker.pipe in ready:
-                    try:
-                        row = worker.pipe.recv()
-                    except (EOFError, OSError):
-                        row = None
-                    if row == _BEGUN:
-                        worker.started, worker.begun = time.monotonic(), True
-                        continue
-                elif time.monotonic() - worker.started < (hang if worker.begun else HANG):
+                row = worker.answer() if worker.pipe in ready else None
+                if row == _BEGUN:
+                    worker.deadline = time.monotonic() + hang
+                    continue
+                if worker.pipe not in ready and time.monotonic() < worker.deadline:
                     continue
                 yield worker.number, row
                 if row is not None and waiting:
-                    number = waiting.pop(0)
-                    worker.give(function, number, tasks[number])
-                    continue
-                busy.remove(worker)
-                worker.stop()
+                    worker.give(function, *waiting.popleft())
+                else:
+                    busy.remove(worker)
+                    worker.stop()
     finally:
         for worker in busy:
             worker.stop()
@@ -157,11 +149,10 @@ def _pool(
 def _serve(pipe: Connection) -> None:
     """Answer tasks until the other end closes; an interrupt is the other process's business."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    answer: Callable[[str, Task], Row] = run_task
     while True:
         try:
             function, task = pipe.recv()
         except EOFError:
             return
         pipe.send(_BEGUN)
-        pipe.send(answer(function, task))
+        pipe.send(run_task(function, task))
