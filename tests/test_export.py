@@ -19,7 +19,7 @@ from vgtm_qp.cli import main
 from vgtm_qp.cli.export import FormatName
 from vgtm_qp.export import FORMATS, export_maneuver
 from vgtm_qp.export.mjcf import mjcf, node_masses
-from vgtm_qp.export.trajectory import actuator_names, step_rates, through_rates
+from vgtm_qp.export.trajectory import step_rates, through_rates
 from vgtm_qp.verify.arm import RecordedArm
 
 MOVING = {
@@ -64,7 +64,7 @@ def test_the_command_line_names_the_formats_that_there_are():
 def test_csv_holds_lengths_and_rates_to_the_last_digit(maneuver: vq.Maneuver, tmp_path: Path):
     with export_maneuver(maneuver, tmp_path / "t.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
-    names = actuator_names(maneuver)
+    names = list(maneuver.actuator_names)
     assert header == ["time [s]", *(f"{n} [m]" for n in names), *(f"d {n}/dt [m/s]" for n in names)]
     table = np.array(rows, dtype=float)
     lengths = maneuver.member_lengths[:, maneuver.member_actuated]
@@ -94,7 +94,7 @@ def test_rates_through_the_states_are_exact_for_a_parabola():
 
 def test_a_ros_trajectory_holds_the_lengths(maneuver: vq.Maneuver, tmp_path: Path):
     message = yaml.safe_load(export_maneuver(maneuver, tmp_path / "t.yaml").read_text())
-    assert message["joint_names"] == actuator_names(maneuver)
+    assert message["joint_names"] == list(maneuver.actuator_names)
     times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
     assert np.allclose(times, maneuver.time, atol=1e-9)
     positions = [point["positions"] for point in message["points"]]
@@ -119,11 +119,11 @@ def test_a_bag_is_read_back_by_rosbags(maneuver: vq.Maneuver, tmp_path: Path):
                 trajectories.append(message)
     lengths = maneuver.member_lengths[:, maneuver.member_actuated]
     assert np.allclose([stamp for stamp, _ in states], maneuver.time, atol=1e-9)
-    assert all(list(message.name) == actuator_names(maneuver) for _, message in states)
+    assert all(list(message.name) == list(maneuver.actuator_names) for _, message in states)
     assert np.array_equal([message.position for _, message in states], lengths)
     assert np.array_equal([message.velocity for _, message in states], through_rates(maneuver))
     assert len(trajectories) == 1
-    assert list(trajectories[0].joint_names) == actuator_names(maneuver)
+    assert list(trajectories[0].joint_names) == list(maneuver.actuator_names)
     assert np.array_equal([point.positions for point in trajectories[0].points], lengths)
 
 
@@ -241,7 +241,7 @@ def test_a_missing_extra_is_named_with_the_pip_line(
     }.items():
         with pytest.raises(vq.MissingExtraError, match=re.escape(f"pip install 'vgtm-qp[{extra}]'")):
             export_maneuver(still, tmp_path / f"x{FORMATS[name].suffix}")
-    from vgtm_qp.replay import replay
+    from vgtm_qp.export.replay import replay
 
     with pytest.raises(vq.MissingExtraError, match=re.escape("pip install 'vgtm-qp[mujoco]'")):
         replay(still)
@@ -255,6 +255,26 @@ def test_wrong_formats_and_places_are_named(maneuver: vq.Maneuver, tmp_path: Pat
     (tmp_path / "file").write_text("")
     with pytest.raises(vq.ExportError, match="cannot be written"):
         export_maneuver(maneuver, tmp_path / "file" / "x.csv")
+
+
+def test_an_export_that_fails_leaves_the_old_file(
+    maneuver: vq.Maneuver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def full(maneuver: vq.Maneuver) -> str:
+        raise OSError(28, "No space left on device")
+
+    path = export_maneuver(maneuver, tmp_path / "t.csv")
+    before = path.read_bytes()
+    monkeypatch.setattr("vgtm_qp.export.trajectory.csv_text", full)
+    with pytest.raises(vq.ExportError, match="cannot be written: No space left"):
+        export_maneuver(maneuver, path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_picture_has_the_suffix_of_its_kind(maneuver: vq.Maneuver, tmp_path: Path):
+    with pytest.raises(vq.ExportError, match=r'a gif cannot be "\.jpg"; choices: \.gif'):
+        export_maneuver(maneuver, tmp_path / "x.jpg", to="gif")
 
 
 def test_the_command_exports_beside_the_result(

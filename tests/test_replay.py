@@ -11,8 +11,8 @@ from synthetic import maneuver_of, place, tripod
 
 import vgtm_qp as vq
 from vgtm_qp.cli import main
+from vgtm_qp.export.replay import Replay, replay
 from vgtm_qp.maneuver.maneuver import Maneuver
-from vgtm_qp.replay import Replay, replay
 
 
 @pytest.fixture(scope="module")

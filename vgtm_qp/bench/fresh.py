@@ -12,7 +12,7 @@ import resource
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -25,31 +25,6 @@ _REPEATS = 3
 _HELP = "from vgtm_qp.cli import main; main(['--help'])"
 
 
-@dataclass(frozen=True)
-class Fresh:
-    """Measures of a process that sets up a problem and takes a few steps.
-
-    Attributes
-    ----------
-    imports : float
-        Seconds to import what a resolver needs.
-    setup, setup_cpu : float
-        Seconds from the problem to a resolver that can take its first step, kernels included: by the clock, and of
-        the processor, the C compiler's included.
-    first_step : float
-        Seconds.
-    peak_memory, imported_memory : int
-        Greatest resident memory after some steps, and after the imports alone, bytes.
-    """
-
-    imports: float
-    setup: float
-    setup_cpu: float
-    first_step: float
-    peak_memory: int
-    imported_memory: int
-
-
 def measure_start() -> dict[str, float]:
     """Return CPU seconds of a bare interpreter, of one that imports the package, and of ``vgtm --help``.
 
@@ -59,12 +34,16 @@ def measure_start() -> dict[str, float]:
     return {name: min(_cpu_seconds_of(script) for _ in range(_REPEATS)) for name, script in scripts.items()}
 
 
-def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> Fresh:
-    """Return what a fresh process takes for a problem in the form of ``Problem.to_dict``.
+def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> dict[str, float]:
+    """Return what a fresh process takes to set up a problem in the form of ``Problem.to_dict`` and take a few steps.
+
+    Keys: ``imports``, s, of what a resolver needs; ``setup`` and ``setup_cpu``, s from the problem to a resolver that
+    can take its first step, kernels included, by the clock and of the processor, the C compiler's included;
+    ``first_step``, s; ``peak_memory`` and ``imported_memory``, the greatest resident memory after some steps and after
+    the imports alone, bytes.
 
     Parameters
     ----------
-    problem
     cold
         With an empty cache of kernels, in a temporary folder, in the place of the user's.
 
@@ -85,7 +64,7 @@ def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> Fresh:
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         raise SolverError(f"set-up in a fresh process failed: {lines[-1]}")
-    return Fresh(**json.loads(done.stdout))
+    return dict(json.loads(done.stdout))
 
 
 def _measured(problem: dict[str, Any]) -> dict[str, float]:
@@ -101,12 +80,11 @@ def _measured(problem: dict[str, Any]) -> dict[str, float]:
     resolver = Resolver(loaded)
     plan = make_plan(loaded, *resolver.tip())
     setup, setup_cpu = perf_counter() - clock, _cpu_seconds() - cpu
-    first_step, value = 0.0, plan.path.start
-    for mark in plan.marks[:_STEPS]:
+    first_step = 0.0
+    for start, end in pairwise([plan.path.start, *plan.marks[:_STEPS].tolist()]):
         clock = perf_counter()
-        resolver.follow(plan.path, value, float(mark))
+        resolver.follow(plan.path, start, end)
         first_step = first_step or perf_counter() - clock
-        value = float(mark)
     return {
         "imports": imports,
         "setup": setup,

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.bench.contestants import BASELINES, Name, make_baseline
-from vgtm_qp.bench.fresh import Fresh, measure_fresh, measure_start
+from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.measure import Breakdown, Timing, run_alone, run_in_turn
 from vgtm_qp.bench.scenes import BenchScene
+from vgtm_qp.comparison.statistics import exponent
 from vgtm_qp.errors import ResultError, VgtmError
 from vgtm_qp.machine import commit, machine_record, versions
 from vgtm_qp.maneuver.plan import Plan, make_plan
@@ -28,68 +28,16 @@ LEAST_BAYS = 50
 """Growth with the bays is fitted from here on: below, what every step costs hides it."""
 
 
-@dataclass(frozen=True)
-class Against:
-    """A baseline on a scene.
-
-    Attributes
-    ----------
-    step : Timing or None
-        Its own steps.
-    ours : float or None
-        Median CPU time of the resolver over the same steps, s.
-    ratio : float or None
-        Its median CPU time over that.
-    failed : int
-        Steps that it found no answer to; they are not in the times.
-    skipped : str
-        Why it was not measured, empty where it was.
-    """
-
-    step: Timing | None = None
-    ours: float | None = None
-    ratio: float | None = None
-    failed: int = 0
-    skipped: str = ""
-
-
-@dataclass(frozen=True)
-class SceneReport:
-    """What was measured on a scene; seconds, bytes.
-
-    Attributes
-    ----------
-    covered : float
-        Share of the maneuver that the measured steps covered, 0 to 1.
-    stopped_by : str
-        What blocked the arm, empty where nothing did.
-    qps : float
-        QPs a step.
-    warm, cold : Fresh
-        Measures of a fresh process; `cold` where it was asked for.
-    """
-
-    name: str
-    kind: str
-    bays: int
-    tracking: str
-    members: int
-    actuators: int
-    obstacles: int
-    covered: float
-    stopped_by: str
-    step: Timing
-    breakdown: Breakdown
-    qps: float
-    warm: Fresh
-    cold: Fresh | None
-    baselines: dict[str, Against]
-
-
 def measure_scene(
     scene: BenchScene, names: Sequence[Name], *, seconds: float, steps: int, cold: bool = False
-) -> SceneReport:
-    """Measure one scene: alone, in turn with each of the baselines, and in fresh processes.
+) -> dict[str, Any]:
+    """Measure one scene: alone, in turn with each of the baselines, and in fresh processes; seconds and bytes.
+
+    Keys of what is returned: ``name``, ``kind``, ``bays`` and ``tracking`` of the scene; the numbers of ``members``,
+    ``actuators`` and ``obstacles``; ``covered``, the share of the maneuver that the measured steps covered, 0 to 1;
+    ``stopped_by``, what blocked the arm, empty where nothing did; ``step``, a `Timing`; ``breakdown``, a `Breakdown`;
+    ``qps``, QPs a step; ``warm`` and ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
+    ``baselines``, what `_against` returns, by name.
 
     Parameters
     ----------
@@ -102,41 +50,46 @@ def measure_scene(
     resolver = Resolver(problem)
     plan = make_plan(problem, *resolver.tip())
     alone = run_alone(resolver, plan, seconds=seconds, steps=steps)
-    against: dict[str, Against] = {
-        name: _against(scene, name, resolver, plan, seconds=seconds, steps=steps) for name in names
-    }
+    baselines = {name: _against(scene, name, resolver, plan, seconds=seconds, steps=steps) for name in names}
     data = problem.to_dict()
     truss = resolver.setup.truss
-    return SceneReport(
-        name=scene.name,
-        kind=scene.kind,
-        bays=scene.bays,
-        tracking=scene.tracking,
-        members=truss.member_count,
-        actuators=len(truss.actuators),
-        obstacles=len(problem.obstacle),
-        covered=alone.covered,
-        stopped_by=alone.stopped_by,
-        step=Timing.of(alone.spent),
-        breakdown=Breakdown.of([spent.wall for spent in alone.spent], alone.phases),
-        qps=float(np.mean(alone.qps)),
-        warm=measure_fresh(data),
-        cold=measure_fresh(data, cold=True) if cold else None,
-        baselines=against,
-    )
+    return {
+        "name": scene.name,
+        "kind": scene.kind,
+        "bays": scene.bays,
+        "tracking": scene.tracking,
+        "members": truss.member_count,
+        "actuators": len(truss.actuators),
+        "obstacles": len(problem.obstacle),
+        "covered": alone.covered,
+        "stopped_by": alone.stopped_by,
+        "step": asdict(Timing.of(alone.spent)),
+        "breakdown": asdict(Breakdown.of([spent.wall for spent in alone.spent], alone.phases)),
+        "qps": float(np.mean(alone.qps)),
+        "warm": measure_fresh(data),
+        "cold": measure_fresh(data, cold=True) if cold else None,
+        "baselines": baselines,
+    }
 
 
 def _against(
     scene: BenchScene, name: Name, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
-) -> Against:
+) -> dict[str, Any]:
+    """Return a baseline's ``step``, a `Timing`, and its ``ratio`` to ``ours``, median CPU times of the same steps, s.
+
+    These are None where it was not measured, and ``skipped`` says why; ``failed`` counts steps that it found no answer
+    to, which are not in the times.
+    """
+    missing = {"step": None, "ours": None, "ratio": None, "failed": 0, "skipped": ""}
     try:
         baseline = make_baseline(name, scene.problem, scene.bays)
     except VgtmError as error:
-        return Against(skipped=str(error).splitlines()[0])
+        return missing | {"skipped": str(error).splitlines()[0]}
     pairs = run_in_turn(resolver, baseline, plan, seconds=seconds, steps=steps)
     if not pairs.theirs:
-        return Against(failed=pairs.failed, skipped="found no answer to any step")
-    return Against(Timing.of(pairs.theirs), Timing.of(pairs.ours).cpu, pairs.ratio, pairs.failed)
+        return missing | {"failed": pairs.failed, "skipped": "found no answer to any step"}
+    theirs, ours = asdict(Timing.of(pairs.theirs)), Timing.of(pairs.ours).cpu
+    return missing | {"step": theirs, "ours": ours, "ratio": pairs.ratio, "failed": pairs.failed}
 
 
 def measure(
@@ -176,8 +129,8 @@ def measure(
     for scene in scenes:
         if progress is not None:
             progress(scene)
-        report = measure_scene(scene, names, seconds=seconds, steps=steps, cold=cold)
-        document["scenes"].append(asdict(report))
+        found = measure_scene(scene, names, seconds=seconds, steps=steps, cold=cold)
+        document["scenes"].append(found)
     document["growth"] = growth(document["scenes"])
     return document
 
@@ -187,7 +140,7 @@ def growth(scenes: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
     Fitted by least squares of the logarithms over arms of 50 bays and more, where there are two at least.
     """
-    points: dict[tuple[str, str], list[tuple[int, float]]] = {}
+    points: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for scene in scenes:
         if scene["kind"] != "cubes" or scene["bays"] < LEAST_BAYS:
             continue
@@ -200,17 +153,11 @@ def growth(scenes: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
             "method": method,
             "tracking": tracking,
             "bays": [bays for bays, _ in found],
-            "exponent": _exponent(np.array(found, dtype=float)),
+            "exponent": exponent(*zip(*found, strict=True)),
         }
         for (method, tracking), found in points.items()
         if len({bays for bays, _ in found}) > 1
     ]
-
-
-def _exponent(points: NDArray[np.float64]) -> float:
-    """Return the slope of the second column over the first (P, 2), both taken as logarithms."""
-    x, y = (np.log(points) - np.log(points).mean(axis=0)).T
-    return float(x @ y / (x @ x))
 
 
 def load_document(path: Path) -> dict[str, Any]:

@@ -5,48 +5,38 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from rich import box
-from rich.console import Console, Group, RenderableType
-from rich.markup import escape
-from rich.table import Table
+from vgtm_qp.comparison.tables import markdown_table
 
-_WIDTH = 240
 _PHASES = ("distance", "qp", "correction", "acceptance", "other")
 
 
-def render(document: dict[str, Any], *, width: int = _WIDTH) -> str:
+def render(document: dict[str, Any]) -> str:
     """Return the tables of a document as text."""
-    console = Console(width=width, color_system=None)
-    with console.capture() as captured:
-        console.print(Group(*_parts(document)))
-    lines = captured.get().splitlines()
-    return "\n".join(line.rstrip() for line in lines).strip("\n")
+    return "\n\n".join(_parts(document))
 
 
-def _parts(document: dict[str, Any]) -> Iterator[RenderableType]:
+def _parts(document: dict[str, Any]) -> Iterator[str]:
     machine, start, settings = document["machine"], document["start"], document["settings"]
     load = machine["load"][0]
     threads = "one BLAS thread" if settings["one_blas_thread"] else "BLAS THREADS NOT PINNED"
-    cores = f"{machine['cores']} cores, load {load}"
-    yield f"{machine['processor']}, {cores}, Python {machine['python']}, {threads}"
-    yield escape(", ".join(f"{name} {version}" for name, version in document["versions"].items() if version))
+    versions = ", ".join(f"{name} {version}" for name, version in document["versions"].items() if version)
     yield (
+        f"{machine['processor']}, {machine['cores']} cores, load {load}, Python {machine['python']}, {threads}\n"
+        f"{versions}\n"
         f"CPU to start: python {start['python']:.3f} s, import vgtm_qp {start['import']:.3f} s, "
-        f"vgtm --help {start['help']:.3f} s\n"
+        f"vgtm --help {start['help']:.3f} s"
     )
     yield _steps(document["scenes"])
     if document["baselines"]:
-        yield ""
         yield _baselines(document)
+        yield "\n".join(f"{name}: {title}" for name, title in document["baselines"].items())
     if document["growth"]:
-        yield ""
         yield _growth(document["growth"])
     if "compared" in document:
-        yield ""
         yield _compared(document["compared"])
 
 
-def _steps(scenes: Sequence[dict[str, Any]]) -> Table:
+def _steps(scenes: Sequence[dict[str, Any]]) -> str:
     known = [name for scene in scenes for name in scene["breakdown"]["phases"]]
     phases = sorted(dict.fromkeys(known), key=lambda name: _PHASES.index(name) if name in _PHASES else -1)
     heads = ("steps", "QPs", "median", "p95", "p99", "CPU", *phases, "set-up", "cold", "memory", "covered")
@@ -67,18 +57,16 @@ def _steps(scenes: Sequence[dict[str, Any]]) -> Table:
                 + (f", {scene['stopped_by']}" if scene["stopped_by"] else ""),
             )
         )
-    return _table(("one step", *heads), rows)
+    return markdown_table(("one step", *heads), rows, right=True)
 
 
-def _baselines(document: dict[str, Any]) -> RenderableType:
+def _baselines(document: dict[str, Any]) -> str:
     names = list(document["baselines"])
     rows = []
     for scene in document["scenes"]:
         cells = [_against(scene["baselines"][name]) for name in names]
         rows.append((scene["name"], _time(scene["step"]["cpu"]), *cells))
-    titles = "\n".join(f"{name}: {title}" for name, title in document["baselines"].items())
-    table = _table(("CPU, and ratio to ours in turn", "ours", *names), rows)
-    return Group(table, "", escape(titles))
+    return markdown_table(("CPU, and ratio to ours in turn", "ours", *names), rows, right=True)
 
 
 def _setup(fresh: dict[str, Any] | None) -> str:
@@ -92,15 +80,15 @@ def _against(found: dict[str, Any]) -> str:
     return f"{_time(found['step']['cpu'])}, x {found['ratio']:.3g}{failed}"
 
 
-def _growth(rows: Iterable[dict[str, Any]]) -> Table:
+def _growth(rows: Iterable[dict[str, Any]]) -> str:
     cells = [
         (row["method"], row["tracking"], ", ".join(map(str, row["bays"])), f"{row['exponent']:.2f}")
         for row in rows
     ]
-    return _table(("method", "tracking", "bays", "growth exponent"), cells)
+    return markdown_table(("method", "tracking", "bays", "growth exponent"), cells, right=True)
 
 
-def _compared(found: dict[str, Any]) -> Table:
+def _compared(found: dict[str, Any]) -> str:
     rows = [
         (
             row["name"],
@@ -113,16 +101,8 @@ def _compared(found: dict[str, Any]) -> Table:
         for row in found["scenes"]
     ]
     since = f"new / old, {(found['commit'] or found['time'])[:10]}"
-    return _table((since, "old CPU", "new CPU", "ratio", "corrected", "p99", "set-up", "memory"), rows)
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    table = Table(box=box.MARKDOWN)
-    for k, head in enumerate(heads):
-        table.add_column(head, justify="right" if k else "left", no_wrap=True)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table
+    heads = (since, "old CPU", "new CPU", "ratio", "corrected", "p99", "set-up", "memory")
+    return markdown_table(heads, rows, right=True)
 
 
 def _time(seconds: float | None) -> str:

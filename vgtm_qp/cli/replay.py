@@ -14,8 +14,8 @@ def replay(
     result: Annotated[Path, Parameter(name="RESULT", help="result file, .npz")], /, *, json: Json = False
 ) -> int:
     """Replay a result in MuJoCo, exactly and under gravity, and compare it with the certificate."""
+    from vgtm_qp.export.replay import replay as run
     from vgtm_qp.maneuver.maneuver import load_result
-    from vgtm_qp.replay import replay as run
 
     replayed = run(load_result(result))
     if json:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import secrets
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from vgtm_qp.errors import ExportError, nearest
 
@@ -14,48 +13,39 @@ if TYPE_CHECKING:
     from vgtm_qp.result.result import Result
 
 
-@dataclass(frozen=True)
-class Format:
-    """One form of a maneuver.
+class Format(NamedTuple):
+    """One form of a maneuver: the suffix of its files, and the function, of a module here, that returns their content.
 
-    Attributes
-    ----------
-    suffix : str
-        What its files end in.
-    description : str
-        What is in them.
-    module, function : str
-        Where the function ``(maneuver, path) -> path`` is; imported when it is used.
+    The module is imported when the format is written.
     """
 
     suffix: str
-    description: str
     module: str
     function: str
 
-    @property
-    def write(self) -> Callable[[Result, str | Path], Path]:
-        """The function that writes it."""
-        write: Callable[[Result, str | Path], Path] = getattr(import_module(self.module), self.function)
-        return write
+    def content(self, maneuver: Result) -> bytes:
+        """Return what a file of a maneuver holds."""
+        function = getattr(import_module(f"vgtm_qp.export.{self.module}"), self.function)
+        content: bytes | str = function(maneuver)
+        return content.encode() if isinstance(content, str) else content
 
 
 FORMATS = {
-    "html": Format(".html", "one offline page with a play bar", "vgtm_qp.export.html", "write_html"),
-    "gif": Format(".gif", "an animation", "vgtm_qp.export.pictures", "write_animation"),
-    "mp4": Format(".mp4", "an animation", "vgtm_qp.export.pictures", "write_animation"),
-    "pdf": Format(".pdf", "a figure for print", "vgtm_qp.export.pictures", "write_figure"),
-    "png": Format(".png", "a figure", "vgtm_qp.export.pictures", "write_figure"),
-    "csv": Format(".csv", "actuator lengths and rates", "vgtm_qp.export.trajectory", "write_csv"),
-    "mcap": Format(".mcap", "a ROS 2 bag", "vgtm_qp.export.trajectory", "write_mcap"),
-    "ros": Format(".yaml", "a ROS 2 JointTrajectory", "vgtm_qp.export.trajectory", "write_ros"),
-    "mjcf": Format(".xml", "a MuJoCo model", "vgtm_qp.export.mjcf", "write_mjcf"),
+    "html": Format(".html", "html", "html_text"),
+    "gif": Format(".gif", "pictures", "gif"),
+    "mp4": Format(".mp4", "pictures", "mp4"),
+    "pdf": Format(".pdf", "pictures", "pdf"),
+    "png": Format(".png", "pictures", "png"),
+    "csv": Format(".csv", "trajectory", "csv_text"),
+    "mcap": Format(".mcap", "trajectory", "mcap_bytes"),
+    "ros": Format(".yaml", "trajectory", "ros_text"),
+    "mjcf": Format(".xml", "mjcf", "mjcf"),
 }
 """Every format by the name that ``vgtm export --to`` takes."""
 
 
 def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None) -> Path:
-    """Write a maneuver in another form and return the path of the file.
+    """Write a maneuver in another form and return the path of the file: the old one or the whole new one.
 
     Parameters
     ----------
@@ -82,8 +72,17 @@ def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None
         to = named[0]
     if to not in FORMATS:
         raise ExportError(f'no format is called "{to}"{nearest(to, FORMATS)}; choices: {", ".join(FORMATS)}')
+    form = FORMATS[to]
+    if form.module == "pictures" and path.suffix.lower() != form.suffix:
+        raise ExportError(f'{path}: a {to} cannot be "{path.suffix}"; choices: {form.suffix}')
+    scratch = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        return FORMATS[to].write(maneuver, path)
+        try:
+            scratch.write_bytes(form.content(maneuver))
+            scratch.replace(path)
+        finally:
+            scratch.unlink(missing_ok=True)
     except OSError as error:
         raise ExportError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return path

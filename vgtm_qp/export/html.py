@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from html import escape
-from pathlib import Path
 
 import numpy as np
 
@@ -12,19 +11,13 @@ from vgtm_qp.view.drawing import camera_for, drawing_of_maneuver, resampled
 from vgtm_qp.view.scene import ArmScene, viser_server
 
 _LONGEST = 20.0
+_FRAMES = 200
 
 
-def write_html(maneuver: Result, path: str | Path, *, frames: int = 200) -> Path:
-    """Write the maneuver as one file that needs neither a network nor a server, and return its path.
+def html_text(maneuver: Result) -> str:
+    """Return a page that needs neither a network nor a server, played in its own time, or in 20 s where it is longer.
 
-    Parameters
-    ----------
-    maneuver
-        Played in its own time, or in 20 s where it is longer.
-    path
-        File to write.
-    frames
-        Number of pictures; between the states the nodes move on straight lines, as the certificate has it.
+    Between the states the nodes move on straight lines, as the certificate has it.
 
     Raises
     ------
@@ -33,7 +26,7 @@ def write_html(maneuver: Result, path: str | Path, *, frames: int = 200) -> Path
     """
     drawing = drawing_of_maneuver(maneuver)
     time, nodes, vertices = maneuver.time, maneuver.nodes, maneuver.control_vertices
-    at = np.linspace(time[0], time[-1], frames) if len(time) > 1 else time
+    at = np.linspace(time[0], time[-1], _FRAMES) if len(time) > 1 else time
     moving, curves = resampled(time, nodes, at), resampled(time, vertices, at)
     clearance = resampled(time, np.where(np.isfinite(maneuver.clearance), maneuver.clearance, -1.0), at)
     tip = maneuver.tip_position
@@ -53,11 +46,9 @@ def write_html(maneuver: Result, path: str | Path, *, frames: int = 200) -> Path
             scene.move(moving[k], curves[k], float(moment), coarse=True)
             read_out.text = _read_out(maneuver, float(moment), float(clearance[k]))
             recording.insert_sleep(pause)
-        page = recording.as_html()
+        page: str = recording.as_html()
     title = escape(f"{drawing.name or 'maneuver'} ({maneuver.status})")
-    path = Path(path)
-    path.write_text(page.replace("<title>Viser</title>", f"<title>{title}</title>", 1), encoding="utf-8")
-    return path
+    return page.replace("<title>Viser</title>", f"<title>{title}</title>", 1)
 
 
 def _read_out(maneuver: Result, time: float, clearance: float) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import ExportError
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import RecordedArm
-from vgtm_qp.view.drawing import FIXED_COLOUR, OBSTACLE_COLOUR, obstacle_meshes, stroke_colours
+from vgtm_qp.view.drawing import (
+    FIXED_COLOUR,
+    OBSTACLE_COLOUR,
+    ObstacleMesh,
+    drawing_of_maneuver,
+    stroke_colours,
+)
 
 Array = NDArray[np.float64]
 Element = ElementTree.Element
@@ -27,21 +33,8 @@ ACTUATOR_GROUP = 1
 _STIFFNESS = 2.0e5
 
 
-def write_mjcf(maneuver: Result, path: str | Path) -> Path:
-    """Write the MuJoCo model of a maneuver and return its path; opens in MuJoCo's own viewer.
-
-    Raises
-    ------
-    ExportError
-        The truss has offset joints.
-    """
-    path = Path(path)
-    path.write_text(mjcf(maneuver), encoding="utf-8")
-    return path
-
-
 def mjcf(maneuver: Result) -> str:
-    """Return the MuJoCo model of a maneuver as XML.
+    """Return the MuJoCo model of a maneuver as XML, which opens in MuJoCo's own viewer.
 
     Free nodes are bodies with three slide joints, so ``qpos`` is their displacement from the home pose; base
     nodes and moving obstacles are mocap bodies. Each member is a tendon called by its name with an equality
@@ -70,9 +63,12 @@ def mjcf(maneuver: Result) -> str:
     _add(world, "light", pos=(0.0, 0.0, 3.0 * extent), dir=(0.2, 0.3, -1.0), directional="true")
     names = [str(node) for node in record["node_names"]]
     _add_nodes(world, arm, names)
-    _add_obstacles(asset, world, maneuver)
+    obstacles = drawing_of_maneuver(maneuver).obstacles
+    tables = {entry["name"]: entry for entry in maneuver.manifest["problem"].get("obstacle") or ()}
+    for mesh in obstacles:
+        _add_obstacle(asset, world, mesh, tables[mesh.name], float(maneuver.time[0]))
     _add_members(root, arm, names)
-    _add_keyframes(root, maneuver, arm)
+    _add_keyframes(root, maneuver, arm, [mesh for mesh in obstacles if mesh.velocity.any()])
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -85,63 +81,48 @@ def node_masses(arm: RecordedArm) -> Array:
 
 def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
     masses, radius = node_masses(arm), float(np.median(arm.radius))
-    base = set(arm.base.tolist())
     for k, name in enumerate(names):
         body = _add(world, "body", name=name, pos=arm.home[k])
-        if k in base:
+        if k in arm.base:
             body.set("mocap", "true")
-            _add(
-                body,
-                "geom",
-                type="sphere",
-                size=1.5 * radius,
-                rgba="0.25 0.26 0.28 1",
-                contype=0,
-                conaffinity=0,
-            )
+            look = {"size": 1.5 * radius, "rgba": "0.25 0.26 0.28 1", "contype": 0, "conaffinity": 0}
         else:
             for axis, direction in zip("xyz", np.eye(3), strict=True):
                 _add(body, "joint", name=f"{name} {axis}", type="slide", axis=direction)
-            _add(
-                body,
-                "geom",
-                type="sphere",
-                size=radius,
-                mass=masses[k],
-                rgba="0.4 0.41 0.43 1",
-                contype=1,
-                conaffinity=2,
-            )
+            look = {
+                "size": radius,
+                "mass": masses[k],
+                "rgba": "0.4 0.41 0.43 1",
+                "contype": 1,
+                "conaffinity": 2,
+            }
+        _add(body, "geom", type="sphere", **look)
         _add(body, "site", name=name, size=0.5 * radius)
 
 
-def _add_obstacles(asset: Element, world: Element, maneuver: Result) -> None:
-    directory = Path(maneuver.manifest.get("directory") or ".")
-    entries = {str(entry["name"]): entry for entry in maneuver.manifest["problem"].get("obstacle") or ()}
-    for mesh in obstacle_meshes(list(entries.values()), directory):
-        entry = entries[mesh.name]
-        body = _add(world, "body", name=f"obstacle {mesh.name}", pos=mesh.position(float(maneuver.time[0])))
-        if mesh.velocity.any():
-            body.set("mocap", "true")
-        geom = _add(body, "geom", name=f"obstacle {mesh.name}", contype=2, conaffinity=1)
-        geom.set("rgba", _text((*OBSTACLE_COLOUR, 0.45)))
-        turn = np.asarray(entry.get("rotation_vector") or (0.0, 0.0, 0.0), dtype=float)
-        angle = float(np.linalg.norm(turn))
-        if angle > 0.0 and entry["shape"] != "mesh":
-            geom.set("axisangle", _text((*(turn / angle), angle)))
-        if entry["shape"] == "box":
-            size = 0.5 * np.broadcast_to(np.asarray(entry["size"], dtype=float), 3)
-        elif entry["shape"] == "sphere":
-            size = np.array([entry["radius"]], dtype=float)
-        elif entry["shape"] == "cylinder":
-            size = np.array([entry["radius"], 0.5 * entry["height"]], dtype=float)
-        else:
-            _add(asset, "mesh", name=mesh.name, vertex=mesh.vertices, face=mesh.faces)
-            geom.set("type", "mesh")
-            geom.set("mesh", mesh.name)
-            continue
-        geom.set("type", str(entry["shape"]))
-        geom.set("size", _text(size))
+def _add_obstacle(
+    asset: Element, world: Element, mesh: ObstacleMesh, table: Mapping[str, Any], time: float
+) -> None:
+    """Add an obstacle by its ``[[obstacle]]`` table, where it is at `time`, s."""
+    name, shape = f"obstacle {mesh.name}", str(table["shape"])
+    body = _add(world, "body", name=name, pos=mesh.position(time))
+    if mesh.velocity.any():
+        body.set("mocap", "true")
+    geom = _add(body, "geom", name=name, contype=2, conaffinity=1, rgba=(*OBSTACLE_COLOUR, 0.45), type=shape)
+    if shape == "mesh":
+        _add(asset, "mesh", name=mesh.name, vertex=mesh.vertices, face=mesh.faces)
+        geom.set("mesh", mesh.name)
+        return
+    if shape == "box":
+        size = 0.5 * np.broadcast_to(np.asarray(table["size"], dtype=float), 3)
+    else:
+        height = [0.5 * float(table["height"])] if shape == "cylinder" else []
+        size = np.array([float(table["radius"]), *height])
+    geom.set("size", _text(size))
+    turn = np.asarray(table.get("rotation_vector") or (0.0, 0.0, 0.0), dtype=float)
+    angle = float(np.linalg.norm(turn))
+    if angle > 0.0:
+        geom.set("axisangle", _text((*(turn / angle), angle)))
 
 
 def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
@@ -155,37 +136,19 @@ def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
         active = "false" if arm.actuated[k] else "true"
         _add(equalities, "tendon", name=member, tendon1=member, active=active, **stiff)
         if arm.actuated[k]:
-            _add(
-                actuators,
-                "position",
-                name=member,
-                tendon=member,
-                kp=_STIFFNESS,
-                dampratio=1.0,
-                ctrlrange=arm.stroke[k],
-                group=ACTUATOR_GROUP,
-            )
+            drive = {"kp": _STIFFNESS, "dampratio": 1.0, "ctrlrange": arm.stroke[k], "group": ACTUATOR_GROUP}
+            _add(actuators, "position", name=member, tendon=member, **drive)
 
 
-def _add_keyframes(root: Element, maneuver: Result, arm: RecordedArm) -> None:
+def _add_keyframes(root: Element, maneuver: Result, arm: RecordedArm, moving: Sequence[ObstacleMesh]) -> None:
     keyframes = _add(root, "keyframe")
-    moving = [
-        mesh
-        for mesh in obstacle_meshes(
-            maneuver.manifest["problem"].get("obstacle") or (),
-            Path(maneuver.manifest.get("directory") or "."),
-        )
-        if mesh.velocity.any()
-    ]
-    free = np.setdiff1d(np.arange(len(arm.home)), arm.base)
     lengths = maneuver.member_lengths[:, arm.actuated]
     for k, time in enumerate(maneuver.time):
         mocap = [*maneuver.nodes[k, np.sort(arm.base)], *(mesh.position(float(time)) for mesh in moving)]
-        key = _add(keyframes, "key", name=f"state {k}", time=float(time))
-        key.set("qpos", _text((maneuver.nodes[k] - arm.home)[free]))
-        key.set("ctrl", _text(lengths[k]))
+        displacement = (maneuver.nodes[k] - arm.home)[arm.free]
+        key = _add(keyframes, "key", name=f"state {k}", time=time, qpos=displacement, ctrl=lengths[k])
         if mocap:
-            key.set("mpos", _text(np.array(mocap)))
+            key.set("mpos", _text(mocap))
 
 
 def _add(parent: Element, tag: str, **attributes: object) -> Element:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from pathlib import Path
+from io import BytesIO, StringIO
 from typing import Any
 
 import numpy as np
@@ -47,21 +47,10 @@ uint32 nanosec"""
 )
 
 
-def actuator_names(maneuver: Result) -> list[str]:
-    """Return the names of the actuated members or joints: the joints of every trajectory here."""
-    return list(maneuver.actuator_names)
-
-
-def actuator_lengths(maneuver: Result) -> Array:
-    """Return (T, n_a) lengths of the actuated members, m, or values of the actuated joints, rad or m."""
-    return maneuver.actuator_values
-
-
 def step_rates(maneuver: Result) -> Array:
     """Return (T, n_a) mean rates over the step that led to each state, m/s, as the rate limit has them."""
-    lengths = actuator_lengths(maneuver)
-    rates = np.zeros_like(lengths)
-    rates[1:] = np.diff(lengths, axis=0) / np.diff(maneuver.time)[:, None]
+    rates = np.zeros_like(maneuver.actuator_values)
+    rates[1:] = np.diff(maneuver.actuator_values, axis=0) / np.diff(maneuver.time)[:, None]
     return rates
 
 
@@ -70,28 +59,24 @@ def through_rates(maneuver: Result) -> Array:
 
     A central rate lies between the mean rates of its two steps, so it keeps the limits that they keep.
     """
-    rates = np.zeros_like(actuator_lengths(maneuver))
+    rates = np.zeros_like(maneuver.actuator_values)
     steps, durations = step_rates(maneuver)[1:], np.diff(maneuver.time)[:, None]
     rates[1:-1] = (durations[1:] * steps[:-1] + durations[:-1] * steps[1:]) / (durations[1:] + durations[:-1])
     return rates
 
 
-def write_csv(maneuver: Result, path: str | Path) -> Path:
-    """Write one row a state: time, value of each actuator, rate of each over the step before; m or rad, and s."""
-    names = list(zip(actuator_names(maneuver), maneuver.actuator_units, strict=True))
-    path = Path(path)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(
-            [
-                "time [s]",
-                *(f"{name} [{unit}]" for name, unit in names),
-                *(f"d {name}/dt [{unit}/s]" for name, unit in names),
-            ]
-        )
-        for row in np.column_stack([maneuver.time, actuator_lengths(maneuver), step_rates(maneuver)]):
-            writer.writerow([repr(float(value)) for value in row])
-    return path
+def csv_text(maneuver: Result) -> str:
+    """Return a CSV row a state: time, value of each actuator, rate of each over the step before; m or rad, and s."""
+    names = list(zip(maneuver.actuator_names, maneuver.actuator_units, strict=True))
+    values = [f"{name} [{unit}]" for name, unit in names]
+    rates = [f"d {name}/dt [{unit}/s]" for name, unit in names]
+    file = StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(["time [s]", *values, *rates])
+    writer.writerows(
+        np.column_stack([maneuver.time, maneuver.actuator_values, step_rates(maneuver)]).tolist()
+    )
+    return file.getvalue()
 
 
 def joint_trajectory(maneuver: Result) -> dict[str, Any]:
@@ -99,25 +84,25 @@ def joint_trajectory(maneuver: Result) -> dict[str, Any]:
     start = float(maneuver.time[0])
     points = [
         {
-            "positions": [float(value) for value in lengths],
-            "velocities": [float(value) for value in rates],
+            "positions": values,
+            "velocities": rates,
             "accelerations": [],
             "effort": [],
             "time_from_start": _split(float(time) - start),
         }
-        for time, lengths, rates in zip(
-            maneuver.time, actuator_lengths(maneuver), through_rates(maneuver), strict=True
+        for time, values, rates in zip(
+            maneuver.time, maneuver.actuator_values.tolist(), through_rates(maneuver).tolist(), strict=True
         )
     ]
     return {
         "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "base"},
-        "joint_names": actuator_names(maneuver),
+        "joint_names": list(maneuver.actuator_names),
         "points": points,
     }
 
 
-def write_ros(maneuver: Result, path: str | Path) -> Path:
-    """Write a JointTrajectory as YAML, in the form that ``ros2 topic pub`` takes.
+def ros_text(maneuver: Result) -> str:
+    """Return a JointTrajectory as YAML, in the form that ``ros2 topic pub`` takes.
 
     Raises
     ------
@@ -128,14 +113,13 @@ def write_ros(maneuver: Result, path: str | Path) -> Path:
         import yaml
     except ImportError:
         raise MissingExtraError("export", "pyyaml") from None
-    path = Path(path)
-    text = yaml.safe_dump(joint_trajectory(maneuver), sort_keys=False, default_flow_style=None, width=10_000)
-    path.write_text(text, encoding="utf-8")
-    return path
+    return str(
+        yaml.safe_dump(joint_trajectory(maneuver), sort_keys=False, default_flow_style=None, width=10_000)
+    )
 
 
-def write_mcap(maneuver: Result, path: str | Path) -> Path:
-    """Write a ROS 2 bag: one JointState a state, and the whole JointTrajectory at its start.
+def mcap_bytes(maneuver: Result) -> bytes:
+    """Return a ROS 2 bag: one JointState a state, and the whole JointTrajectory at its start.
 
     Raises
     ------
@@ -146,9 +130,9 @@ def write_mcap(maneuver: Result, path: str | Path) -> Path:
         from mcap_ros2.writer import Writer
     except ImportError:
         raise MissingExtraError("export", "mcap-ros2-support") from None
-    names, lengths, rates = actuator_names(maneuver), actuator_lengths(maneuver), through_rates(maneuver)
-    path = Path(path)
-    with path.open("wb") as file, Writer(file) as writer:
+    names, values = list(maneuver.actuator_names), maneuver.actuator_values.tolist()
+    rates, file = through_rates(maneuver).tolist(), BytesIO()
+    with Writer(file) as writer:
         state_schema = writer.register_msgdef("sensor_msgs/msg/JointState", _JOINT_STATE)
         trajectory_schema = writer.register_msgdef("trajectory_msgs/msg/JointTrajectory", _JOINT_TRAJECTORY)
         first = _nanoseconds(float(maneuver.time[0]))
@@ -157,13 +141,13 @@ def write_mcap(maneuver: Result, path: str | Path) -> Path:
             message = {
                 "header": {"stamp": _split(float(time)), "frame_id": "base"},
                 "name": names,
-                "position": lengths[k].tolist(),
-                "velocity": rates[k].tolist(),
+                "position": values[k],
+                "velocity": rates[k],
                 "effort": [],
             }
             stamp = _nanoseconds(float(time))
             writer.write_message(STATES_TOPIC, state_schema, message, stamp, stamp, sequence=k)
-    return path
+    return file.getvalue()
 
 
 def _nanoseconds(seconds: float) -> int:

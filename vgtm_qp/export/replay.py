@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,6 @@ from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.clearance import AgainstBody, MemberMotion
 from vgtm_qp.verify.obstacles import read_obstacles
-from vgtm_qp.view.drawing import obstacle_meshes
 
 Array = NDArray[np.float64]
 
@@ -85,24 +85,19 @@ class Replay:
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return the table: quantity, certificate, kinematic replay, physics replay."""
-        exact, real = self.kinematic, self.physics
-        expected = self.certified_tip_error_per_millimetre * real.actuator_error
+        runs = self.kinematic, self.physics
+        expected = self.certified_tip_error_per_millimetre * self.physics.actuator_error
+
+        def row(name: str, certified: str, value: Callable[[ReplayRun], float]) -> tuple[str, str, str, str]:
+            exact, real = (_mm(value(run)) for run in runs)
+            return name, certified, exact, real
+
         return [
-            ("greatest length error [mm]", "0", _mm(exact.length_error.max()), _mm(real.length_error.max())),
-            (
-                "greatest tip error [mm]",
-                f"at most {_mm(expected.max())}",
-                _mm(exact.tip_error.max()),
-                _mm(real.tip_error.max()),
-            ),
-            (
-                "tip error at the end [mm]",
-                f"at most {_mm(expected[-1])}",
-                _mm(exact.tip_error[-1]),
-                _mm(real.tip_error[-1]),
-            ),
-            ("least clearance [mm]", "-", _mm(exact.clearance.min()), _mm(real.clearance.min())),
-            ("steps with a node in contact", "0", str(exact.contacts), str(real.contacts)),
+            row("greatest length error [mm]", "0", lambda run: run.length_error.max()),
+            row("greatest tip error [mm]", f"at most {_mm(expected.max())}", lambda run: run.tip_error.max()),
+            row("tip error at the end [mm]", f"at most {_mm(expected[-1])}", lambda run: run.tip_error[-1]),
+            row("least clearance [mm]", "-", lambda run: run.clearance.min()),
+            ("steps with a node in contact", "0", str(runs[0].contacts), str(runs[1].contacts)),
             (
                 "tip error per mm of actuator error [mm]",
                 f"{self.certified_tip_error_per_millimetre:.4g}",
@@ -151,26 +146,22 @@ class _Simulation:
         except ImportError:
             raise MissingExtraError("mujoco", "mujoco") from None
         self._mujoco, self._maneuver = mujoco, maneuver
-        self._arm = arm = RecordedArm(maneuver.manifest["arm"], maneuver.members)
+        self._arm = RecordedArm(maneuver.manifest["arm"], maneuver.members)
         self._model: Any = mujoco.MjModel.from_xml_string(mjcf(maneuver))
         self._data: Any = mujoco.MjData(self._model)
-        self._free = np.setdiff1d(np.arange(len(arm.home)), arm.base)
-        self._base = np.sort(arm.base)
         manifest = maneuver.manifest
         directory = Path(manifest.get("directory") or ".")
-        meshes = obstacle_meshes(manifest["problem"].get("obstacle") or (), directory)
-        self._moving = [mesh for mesh in meshes if mesh.velocity.any()]
         self._bodies = read_obstacles(manifest["problem"], manifest.get("meshes") or {}, directory)[0]
         self._home_lengths = np.array(self._model.tendon_length0)
+        self._mocap = np.array(self._model.key_mpos).reshape(len(maneuver.time), -1, 3)
         self._tip = maneuver.tip_position
 
     def kinematic(self) -> ReplayRun:
         """Put the nodes where they should be and read the lengths that MuJoCo finds."""
-        count = len(self._maneuver.time)
         nodes, lengths = np.empty_like(self._maneuver.nodes), np.empty_like(self._maneuver.member_lengths)
         contacts = 0
-        for k in range(count):
-            self._place(k)
+        for k in range(len(nodes)):
+            self._mujoco.mj_resetDataKeyframe(self._model, self._data, k)
             self._mujoco.mj_forward(self._model, self._data)
             nodes[k], lengths[k] = self._data.site_xpos, self._data.ten_length
             contacts += bool(self._data.ncon)
@@ -229,33 +220,18 @@ class _Simulation:
 
     def _hold(self, state: int) -> None:
         """Rest at a state with every length a constraint."""
-        self._mujoco.mj_resetData(self._model, self._data)
+        self._mujoco.mj_resetDataKeyframe(self._model, self._data, state)
         self._model.opt.disableactuator |= 1 << ACTUATOR_GROUP
         self._data.eq_active[:] = 1
-        self._place(state)
         self._command(state, 0.0)
 
-    def _place(self, state: int) -> None:
-        maneuver, data = self._maneuver, self._data
-        data.qpos[:] = (maneuver.nodes[state] - self._arm.home)[self._free].ravel()
-        self._place_mocap(maneuver.nodes[state], float(maneuver.time[state]))
-
-    def _place_mocap(self, nodes: Array, time: float) -> None:
-        count = len(self._base)
-        self._data.mocap_pos[:count] = nodes[self._base]
-        for k, mesh in enumerate(self._moving):
-            self._data.mocap_pos[count + k] = mesh.position(time)
-
     def _command(self, state: int, share: float) -> None:
-        """Ask for the lengths at a `share` of the motion from `state` to the next."""
-        maneuver = self._maneuver
-        after = min(state + 1, len(maneuver.time) - 1)
-
-        def between(values: Array) -> Array:
-            return np.asarray((1.0 - share) * values[state] + share * values[after])
-
-        self._model.eq_data[:, 0] = between(maneuver.member_lengths) - self._home_lengths
-        self._place_mocap(between(maneuver.nodes), float(between(maneuver.time)))
+        """Ask for the lengths at a `share` of the motion from `state` to the next, and move what is given."""
+        after = min(state + 1, len(self._mocap) - 1)
+        lengths = self._maneuver.member_lengths
+        wanted = (1.0 - share) * lengths[state] + share * lengths[after]
+        self._model.eq_data[:, 0] = wanted - self._home_lengths
+        self._data.mocap_pos[:] = (1.0 - share) * self._mocap[state] + share * self._mocap[after]
 
     def _settle(self) -> None:
         for _ in range(_SETTLING_STEPS):
