@@ -7,9 +7,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-TITLE = "A study of nothing"
-TIMED = False
-
 
 def double(value: int, **_: Any) -> dict[str, Any]:
     return {"double": 2 * value}

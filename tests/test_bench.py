@@ -18,7 +18,7 @@ from vgtm_qp.bench import contestants, measure, report, scenes
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.ipopt import NonlinearStep
-from vgtm_qp.bench.measure import Breakdown, Pairs, Spent, Timing, run_alone, run_in_turn
+from vgtm_qp.bench.measure import Pairs, Spent, breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.tables import render
 from vgtm_qp.cli import bench as command
 from vgtm_qp.cli import main
@@ -89,17 +89,17 @@ def resolver_and_plan(problem: vq.Problem) -> tuple[vq.Resolver, Plan]:
 
 
 def test_percentiles_are_of_the_clock_and_of_the_processor_apart() -> None:
-    timing = Timing.of([Spent(k, 200.0 - k) for k in range(1, 101)])
-    assert (timing.median, timing.cpu, timing.steps) == (50.5, 149.5, 100)
-    assert timing.median < timing.p95 < timing.p99 < 100.0
+    found = timing([Spent(k, 200.0 - k) for k in range(1, 101)])
+    assert (found["median"], found["cpu"], found["steps"]) == (50.5, 149.5, 100)
+    assert found["median"] < found["p95"] < found["p99"] < 100.0
 
 
 def test_phases_sum_to_the_total_and_an_interrupted_step_does_not_decide() -> None:
     seconds = [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1000.0]
-    found = Breakdown.of(seconds, {"qp": [0.5] * 7 + [999.0], "distance": [0.25] * 8})
-    assert found.total == 1.0
-    assert found.phases == {"qp": 0.5, "distance": 0.25, "other": 0.25}
-    assert Breakdown.of([3.0], {"qp": [1.0]}).phases == {"qp": 1.0, "other": 2.0}
+    found = breakdown(seconds, {"qp": [0.5] * 7 + [999.0], "distance": [0.25] * 8})
+    assert found["total"] == 1.0
+    assert found["phases"] == {"qp": 0.5, "distance": 0.25, "other": 0.25}
+    assert breakdown([3.0], {"qp": [1.0]})["phases"] == {"qp": 1.0, "other": 2.0}
 
 
 def test_a_run_alone_covers_the_maneuver_and_its_phases_are_parts_of_its_steps(free: vq.Problem) -> None:
@@ -114,8 +114,8 @@ def test_a_run_alone_covers_the_maneuver_and_its_phases_are_parts_of_its_steps(f
     wall = np.array([spent.wall for spent in steps.spent])
     assert np.all(within > 0.0)
     assert np.all(within <= wall + 1e-9)
-    found = Breakdown.of(wall, steps.phases)
-    assert sum(found.phases.values()) == pytest.approx(found.total, rel=1e-12)
+    found = breakdown(wall, steps.phases)
+    assert sum(found["phases"].values()) == pytest.approx(found["total"], rel=1e-12)
 
 
 def test_a_blocked_arm_is_reported_and_does_not_run_for_ever() -> None:

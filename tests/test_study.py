@@ -13,7 +13,7 @@ import study_tasks
 
 from vgtm_qp.comparison.statistics import exponent, wilson_interval
 from vgtm_qp.errors import GoalError
-from vgtm_qp.study import STUDIES, clutter, run_study
+from vgtm_qp.study import STUDIES, Study, clutter, run_study
 from vgtm_qp.study import study as study_module
 from vgtm_qp.study.workers import run_dask, run_here, run_processes
 
@@ -65,14 +65,12 @@ def test_an_interrupted_study_goes_on_where_it_stopped(
     from matplotlib.figure import Figure
 
     fake = SimpleNamespace(
-        TITLE="A study of nothing",
-        TIMED=False,
         tasks=lambda short: [{"value": k} for k in range(2 if short else 4)],
         run=run,
         draw=lambda rows: Figure(),
         text=lambda rows: f"{len(rows)} rows",
     )
-    monkeypatch.setitem(STUDIES, "nothing", "study_tasks")
+    monkeypatch.setitem(STUDIES, "nothing", Study("study_tasks", "A study of nothing"))
     monkeypatch.setattr(study_module, "import_module", lambda name: fake)
     monkeypatch.setattr(study_tasks, "run", run, raising=False)
     with pytest.raises(KeyboardInterrupt):

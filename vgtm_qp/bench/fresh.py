@@ -113,15 +113,14 @@ def _peak_memory() -> int:
 
 def _cpu_seconds() -> float:
     """Return the CPU time of this process and of the children that it waited for, s."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    both = (resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in both)
 
 
 def _cpu_seconds_of(script: str) -> float:
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = _cpu_seconds()
     subprocess.run([sys.executable, "-P", "-c", script], check=True, capture_output=True, env=_environment())
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return _cpu_seconds() - before
 
 
 def _environment() -> dict[str, str]:

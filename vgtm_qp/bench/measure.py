@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter, process_time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,46 +39,25 @@ class Spent(NamedTuple):
     cpu: float
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Seconds a step: median, 95th and 99th percentile by the clock, median CPU time, over so many steps."""
-
-    median: float
-    p95: float
-    p99: float
-    cpu: float
-    steps: int
-
-    @classmethod
-    def of(cls, spent: Sequence[Spent]) -> Timing:
-        """Return the timing of one or more steps."""
-        wall, cpu = np.array(spent, dtype=float).T
-        median, p95, p99 = (float(value) for value in np.percentile(wall, (50, 95, 99)))
-        return cls(median, p95, p99, float(np.median(cpu)), len(wall))
+def timing(spent: Sequence[Spent]) -> dict[str, float]:
+    """Return seconds of one or more steps: ``median``, ``p95`` and ``p99`` by the clock, median ``cpu``; ``steps``."""
+    wall, cpu = np.array(spent, dtype=float).T
+    median, p95, p99 = (float(value) for value in np.percentile(wall, (50, 95, 99)))
+    return {"median": median, "p95": p95, "p99": p99, "cpu": float(np.median(cpu)), "steps": len(wall)}
 
 
-@dataclass(frozen=True)
-class Breakdown:
-    """Where the time of a step goes: mean seconds in each phase, which sum to `total`.
+def breakdown(seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> dict[str, Any]:
+    """Return where the time of steps (S,) goes: mean seconds in each of the ``phases``, which sum to the ``total``.
 
     The mean is that of the middle half of the steps in the order of their time, so that one which the system
-    interrupted does not decide. ``other`` is what the resolver does outside its phases.
+    interrupted does not decide. Phase ``other`` is what the resolver does outside its phases.
     """
-
-    total: float
-    phases: dict[str, float]
-
-    @classmethod
-    def of(cls, seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> Breakdown:
-        """Return the breakdown of steps (S,), with the seconds of each in every phase."""
-        times = np.asarray(seconds, dtype=float)
-        count = len(times)
-        middle = np.argsort(times, kind="stable")[count // 4 : max(count - count // 4, count // 4 + 1)]
-        total = float(times[middle].mean())
-        means = {
-            name: float(np.asarray(values, dtype=float)[middle].mean()) for name, values in phases.items()
-        }
-        return cls(total, means | {"other": total - sum(means.values())})
+    times = np.asarray(seconds, dtype=float)
+    count = len(times)
+    middle = np.argsort(times, kind="stable")[count // 4 : max(count - count // 4, count // 4 + 1)]
+    total = float(times[middle].mean())
+    means = {name: float(np.asarray(values, dtype=float)[middle].mean()) for name, values in phases.items()}
+    return {"total": total, "phases": means | {"other": total - sum(means.values())}}
 
 
 @dataclass
@@ -116,11 +95,10 @@ class Pairs:
     @property
     def ratio(self) -> float:
         """Median CPU time of the baseline over that of the resolver, of the same steps."""
-        return Timing.of(self.theirs).cpu / Timing.of(self.ours).cpu
+        return timing(self.theirs)["cpu"] / timing(self.ours)["cpu"]
 
 
-@dataclass(frozen=True)
-class _Place:
+class _Place(NamedTuple):
     """Where a step begins: the state, its piece of the path, and its duration, s."""
 
     state: State

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from vgtm_qp.bench.contestants import BASELINES, Name, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
-from vgtm_qp.bench.measure import Breakdown, Timing, run_alone, run_in_turn
+from vgtm_qp.bench.measure import breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.scenes import BenchScene
 from vgtm_qp.comparison.statistics import exponent
 from vgtm_qp.errors import ResultError, VgtmError
@@ -35,7 +34,7 @@ def measure_scene(
 
     Keys of what is returned: ``name``, ``kind``, ``bays`` and ``tracking`` of the scene; the numbers of ``members``,
     ``actuators`` and ``obstacles``; ``covered``, the share of the maneuver that the measured steps covered, 0 to 1;
-    ``stopped_by``, what blocked the arm, empty where nothing did; ``step``, a `Timing`; ``breakdown``, a `Breakdown`;
+    ``stopped_by``, what blocked the arm, empty where nothing did; ``step`` and ``breakdown``, see `measure.py`;
     ``qps``, QPs a step; ``warm`` and ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
     ``baselines``, what `_against` returns, by name.
 
@@ -63,8 +62,8 @@ def measure_scene(
         "obstacles": len(problem.obstacle),
         "covered": alone.covered,
         "stopped_by": alone.stopped_by,
-        "step": asdict(Timing.of(alone.spent)),
-        "breakdown": asdict(Breakdown.of([spent.wall for spent in alone.spent], alone.phases)),
+        "step": timing(alone.spent),
+        "breakdown": breakdown([spent.wall for spent in alone.spent], alone.phases),
         "qps": float(np.mean(alone.qps)),
         "warm": measure_fresh(data),
         "cold": measure_fresh(data, cold=True) if cold else None,
@@ -75,7 +74,7 @@ def measure_scene(
 def _against(
     scene: BenchScene, name: Name, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
 ) -> dict[str, Any]:
-    """Return a baseline's ``step``, a `Timing`, and its ``ratio`` to ``ours``, median CPU times of the same steps, s.
+    """Return a baseline's ``step``, see `timing`, and its ``ratio`` to ``ours``, median CPU times of the same steps, s.
 
     These are None where it was not measured, and ``skipped`` says why; ``failed`` counts steps that it found no answer
     to, which are not in the times.
@@ -88,8 +87,8 @@ def _against(
     pairs = run_in_turn(resolver, baseline, plan, seconds=seconds, steps=steps)
     if not pairs.theirs:
         return missing | {"failed": pairs.failed, "skipped": "found no answer to any step"}
-    theirs, ours = asdict(Timing.of(pairs.theirs)), Timing.of(pairs.ours).cpu
-    return missing | {"step": theirs, "ours": ours, "ratio": pairs.ratio, "failed": pairs.failed}
+    step, ours = timing(pairs.theirs), timing(pairs.ours)["cpu"]
+    return missing | {"step": step, "ours": ours, "ratio": pairs.ratio, "failed": pairs.failed}
 
 
 def measure(

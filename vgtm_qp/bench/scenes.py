@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from vgtm_qp.problem import Problem, load_problem
 
@@ -27,20 +26,8 @@ _EDGE = 0.9
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
-@dataclass(frozen=True)
-class BenchScene:
-    """A problem to be measured.
-
-    Attributes
-    ----------
-    name : str
-        Kind, bays, and "hard" where the faces stay on the curve exactly.
-    kind : str
-    bays : int
-    tracking : str
-        "elastic", "hard", or "none" where there is no curve.
-    problem : Problem
-    """
+class BenchScene(NamedTuple):
+    """A problem to be measured; `tracking` is "elastic", "hard", or "none" where there is no curve."""
 
     name: str
     kind: Kind

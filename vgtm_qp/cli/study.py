@@ -45,7 +45,7 @@ def study(
     from vgtm_qp.study import STUDIES, find_study, run_study, study_tasks
 
     wanted = list(STUDIES) if names == ["all"] else names
-    titles = {name: find_study(name).TITLE for name in wanted}
+    titles = {name: find_study(name).title for name in wanted}
     if workers < 1:
         raise GoalError(f"--workers must be 1 or more, not {workers}")
     if scenes is not None and scenes < 1:

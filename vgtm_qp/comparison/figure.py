@@ -85,11 +85,8 @@ def _draw_curves(
         maneuver = maneuvers.get((row.problem, row.method))
         if maneuver is None:
             continue
-        style: dict[str, Any] = {
-            "color": f"C{k % 10}",
-            "linestyle": ("-", "--", ":")[k // 10 % 3],
-            "linewidth": 1.1,
-        }
+        dashes = ("-", "--", ":")[k // 10 % 3]
+        style: dict[str, Any] = {"color": f"C{k % 10}", "linestyle": dashes, "linewidth": 1.1}
         fixed = ~maneuver.member_actuated
         off = np.abs(maneuver.member_lengths - maneuver.member_lengths[0])[:, fixed].max(axis=1, initial=0.0)
         near = np.where(np.isfinite(maneuver.clearance), maneuver.clearance, np.nan)
@@ -127,5 +124,5 @@ def _limits(maneuvers: list[Maneuver]) -> tuple[Array, Array]:
     return low - margin, high + margin
 
 
-def _folded(text: str, width: int = 36) -> str:
-    return "\n".join(textwrap.wrap(text, width)[:3])
+def _folded(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, 36)[:3])

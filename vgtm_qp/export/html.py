@@ -18,11 +18,6 @@ def html_text(maneuver: Result) -> str:
     """Return a page that needs neither a network nor a server, played in its own time, or in 20 s where it is longer.
 
     Between the states the nodes move on straight lines, as the certificate has it.
-
-    Raises
-    ------
-    MissingExtraError
-        viser is not installed.
     """
     drawing = drawing_of_maneuver(maneuver)
     time, nodes, vertices = maneuver.time, maneuver.nodes, maneuver.control_vertices

@@ -32,13 +32,7 @@ def png(maneuver: Result) -> bytes:
 
 
 def gif(maneuver: Result) -> bytes:
-    """Return the maneuver as an animation, in its own time, or in 12 s where it is longer.
-
-    Raises
-    ------
-    MissingExtraError
-        Pillow is not installed.
-    """
+    """Return the maneuver as an animation, in its own time, or in 12 s where it is longer."""
     try:
         from PIL import Image
     except ImportError:
@@ -60,13 +54,7 @@ def gif(maneuver: Result) -> bytes:
 
 
 def mp4(maneuver: Result) -> bytes:
-    """Return the same as a video.
-
-    Raises
-    ------
-    MissingExtraError
-        imageio-ffmpeg is not installed.
-    """
+    """Return the same as a video."""
     try:
         import imageio_ffmpeg
     except ImportError:

@@ -30,8 +30,6 @@ class ReplayRun:
 
     Attributes
     ----------
-    nodes : (T, N, 3)
-        Where the nodes were, m.
     length_error, tip_error : (T,)
         Greatest error of a member length, and distance of the tip from where it should be, m.
     actuator_error : (T,)
@@ -42,7 +40,6 @@ class ReplayRun:
         Time steps in which MuJoCo found a node in contact with an obstacle.
     """
 
-    nodes: Array
     length_error: Array
     tip_error: Array
     actuator_error: Array
@@ -85,25 +82,19 @@ class Replay:
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return the table: quantity, certificate, kinematic replay, physics replay."""
-        runs = self.kinematic, self.physics
+        exact, real = self.kinematic.to_dict(), self.physics.to_dict()
         expected = self.certified_tip_error_per_millimetre * self.physics.actuator_error
-
-        def row(name: str, certified: str, value: Callable[[ReplayRun], float]) -> tuple[str, str, str, str]:
-            exact, real = (_mm(value(run)) for run in runs)
-            return name, certified, exact, real
-
+        lengths = (
+            ("greatest length error [mm]", "0", "max_length_error"),
+            ("greatest tip error [mm]", f"at most {_mm(expected.max())}", "max_tip_error"),
+            ("tip error at the end [mm]", f"at most {_mm(expected[-1])}", "last_tip_error"),
+            ("least clearance [mm]", "-", "min_clearance"),
+        )
+        measured, certified = self.tip_error_per_millimetre, self.certified_tip_error_per_millimetre
         return [
-            row("greatest length error [mm]", "0", lambda run: run.length_error.max()),
-            row("greatest tip error [mm]", f"at most {_mm(expected.max())}", lambda run: run.tip_error.max()),
-            row("tip error at the end [mm]", f"at most {_mm(expected[-1])}", lambda run: run.tip_error[-1]),
-            row("least clearance [mm]", "-", lambda run: run.clearance.min()),
-            ("steps with a node in contact", "0", str(runs[0].contacts), str(runs[1].contacts)),
-            (
-                "tip error per mm of actuator error [mm]",
-                f"{self.certified_tip_error_per_millimetre:.4g}",
-                "-",
-                f"{self.tip_error_per_millimetre:.4g}",
-            ),
+            *((name, wanted, _mm(exact[key]), _mm(real[key])) for name, wanted, key in lengths),
+            ("steps with a node in contact", "0", str(exact["contacts"]), str(real["contacts"])),
+            ("tip error per mm of actuator error [mm]", f"{certified:.4g}", "-", f"{measured:.4g}"),
         ]
 
     def to_dict(self) -> dict[str, Any]:
@@ -131,8 +122,7 @@ def replay(maneuver: Result) -> Replay:
         The truss has offset joints.
     """
     simulation = _Simulation(maneuver)
-    kinematic = simulation.kinematic()
-    physics = simulation.physics()
+    kinematic, physics = (simulation.recorded(move) for move in (simulation.place, simulation.drive))
     state, certified = simulation.most_sensitive_state()
     return Replay(kinematic, physics, simulation.measured_sensitivity(state, certified), state, certified)
 
@@ -154,41 +144,51 @@ class _Simulation:
         self._bodies = read_obstacles(manifest["problem"], manifest.get("meshes") or {}, directory)[0]
         self._home_lengths = np.array(self._model.tendon_length0)
         self._mocap = np.array(self._model.key_mpos).reshape(len(maneuver.time), -1, 3)
-        self._tip = maneuver.tip_position
 
-    def kinematic(self) -> ReplayRun:
-        """Put the nodes where they should be and read the lengths that MuJoCo finds."""
-        nodes, lengths = np.empty_like(self._maneuver.nodes), np.empty_like(self._maneuver.member_lengths)
+    def recorded(self, move: Callable[[int], int]) -> ReplayRun:
+        """Return how the arm followed where `move` takes it to each state, and counts the time steps with a contact."""
+        maneuver, arm = self._maneuver, self._arm
+        nodes, lengths = np.empty_like(maneuver.nodes), np.empty_like(maneuver.member_lengths)
         contacts = 0
         for k in range(len(nodes)):
-            self._mujoco.mj_resetDataKeyframe(self._model, self._data, k)
-            self._mujoco.mj_forward(self._model, self._data)
+            contacts += move(k)
             nodes[k], lengths[k] = self._data.site_xpos, self._data.ten_length
-            contacts += bool(self._data.ncon)
-        return self._run_of(nodes, lengths, contacts)
+        errors = lengths - maneuver.member_lengths
+        motion = MemberMotion(arm, maneuver.time, nodes)
+        pairs = [AgainstBody(motion, body) for body in self._bodies]
+        least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(nodes))]
+        return ReplayRun(
+            length_error=np.abs(errors).max(axis=1),
+            tip_error=np.linalg.norm(arm.tip_position(nodes) - maneuver.tip_position, axis=1),
+            actuator_error=np.linalg.norm(errors[:, arm.actuated], axis=1),
+            clearance=np.array(least),
+            contacts=contacts,
+        )
 
-    def physics(self) -> ReplayRun:
-        """Let the lengths be constraints that move from state to state, and gravity pull."""
-        maneuver, model, data = self._maneuver, self._model, self._data
-        nodes, lengths = np.empty_like(maneuver.nodes), np.empty_like(maneuver.member_lengths)
-        self._hold(0)
-        self._settle()
-        nodes[0], lengths[0] = data.site_xpos, data.ten_length
-        contacts = 0
-        for k in range(1, len(maneuver.time)):
-            duration = float(maneuver.time[k] - maneuver.time[k - 1])
-            steps = max(1, round(duration / model.opt.timestep))
-            for share in np.arange(1, steps + 1) / steps:
-                self._command(k - 1, float(share))
-                self._mujoco.mj_step(model, data)
-                contacts += bool(data.ncon)
-            self._mujoco.mj_fwdPosition(model, data)
-            nodes[k], lengths[k] = data.site_xpos, data.ten_length
-        return self._run_of(nodes, lengths, contacts)
+    def place(self, state: int) -> int:
+        """Put the nodes where they should be."""
+        self._mujoco.mj_resetDataKeyframe(self._model, self._data, state)
+        self._mujoco.mj_forward(self._model, self._data)
+        return int(self._data.ncon > 0)
+
+    def drive(self, state: int) -> int:
+        """Let the lengths be constraints that move from the state before, and gravity pull."""
+        if state == 0:
+            self._hold(0)
+            self._settle()
+            return 0
+        contacts, time = 0, self._maneuver.time
+        steps = max(1, round(float(time[state] - time[state - 1]) / self._model.opt.timestep))
+        for share in np.arange(1, steps + 1) / steps:
+            self._command(state - 1, float(share))
+            self._mujoco.mj_step(self._model, self._data)
+            contacts += self._data.ncon > 0
+        self._mujoco.mj_fwdPosition(self._model, self._data)
+        return contacts
 
     def most_sensitive_state(self) -> tuple[int, float]:
         """Return the state where actuator errors move the tip most, and how far by the Jacobian, mm/mm."""
-        states = np.unique(np.linspace(0, len(self._tip) - 1, _PROBED_STATES).round().astype(int))
+        states = np.unique(np.linspace(0, len(self._mocap) - 1, _PROBED_STATES).round().astype(int))
         values = [
             found[2] if (found := self._arm.singular_values(self._maneuver.nodes[k])) else 0.0 for k in states
         ]
@@ -241,20 +241,6 @@ class _Simulation:
     def _tip_now(self) -> Array:
         return self._arm.tip_position(np.asarray(self._data.site_xpos))
 
-    def _run_of(self, nodes: Array, lengths: Array, contacts: int) -> ReplayRun:
-        errors = lengths - self._maneuver.member_lengths
-        motion = MemberMotion(self._arm, self._maneuver.time, nodes)
-        pairs = [AgainstBody(motion, body) for body in self._bodies]
-        least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(nodes))]
-        return ReplayRun(
-            nodes=nodes,
-            length_error=np.abs(errors).max(axis=1),
-            tip_error=np.linalg.norm(self._arm.tip_position(nodes) - self._tip, axis=1),
-            actuator_error=np.linalg.norm(errors[:, self._arm.actuated], axis=1),
-            clearance=np.array(least),
-            contacts=contacts,
-        )
 
-
-def _mm(value: float) -> str:
-    return f"{1000.0 * value:.4g}"
+def _mm(metres: float | None) -> str:
+    return f"{1000.0 * metres:.4g}" if metres is not None else "inf"

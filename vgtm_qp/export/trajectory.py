@@ -102,13 +102,7 @@ def joint_trajectory(maneuver: Result) -> dict[str, Any]:
 
 
 def ros_text(maneuver: Result) -> str:
-    """Return a JointTrajectory as YAML, in the form that ``ros2 topic pub`` takes.
-
-    Raises
-    ------
-    MissingExtraError
-        pyyaml is not installed.
-    """
+    """Return a JointTrajectory as YAML, in the form that ``ros2 topic pub`` takes."""
     try:
         import yaml
     except ImportError:
@@ -119,13 +113,7 @@ def ros_text(maneuver: Result) -> str:
 
 
 def mcap_bytes(maneuver: Result) -> bytes:
-    """Return a ROS 2 bag: one JointState a state, and the whole JointTrajectory at its start.
-
-    Raises
-    ------
-    MissingExtraError
-        mcap-ros2-support is not installed.
-    """
+    """Return a ROS 2 bag: one JointState a state, and the whole JointTrajectory at its start."""
     try:
         from mcap_ros2.writer import Writer
     except ImportError:

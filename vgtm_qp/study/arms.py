@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,9 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.build import build_truss
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.errors import SolverError
+from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.setup import Setup
 
@@ -58,6 +63,33 @@ def built_truss(problem: Problem) -> Truss:
     """Return the truss of a problem that has one."""
     assert problem.truss is not None, "a serial arm"
     return build_truss(problem.truss)
+
+
+def moving_curve(problem: Problem) -> Iterator[CurveFirstResolver]:
+    """Yield a resolver that moves its curve first, at home and after each step, its kinematics evaluated.
+
+    Raises
+    ------
+    SolverError
+        A step was refused; the message is the reason.
+    """
+    resolver = CurveFirstResolver(problem)
+    plan = make_plan(problem, *resolver.tip())
+    yield resolver
+    for start, end in pairwise([plan.path.start, *plan.marks.tolist()]):
+        if reason := resolver.follow(plan.path, start, end).reason:
+            raise SolverError(reason)
+        resolver.setup.kinematics.evaluate(resolver.state.nodes)
+        yield resolver
+
+
+def furthest(points: Array, line: Array) -> float:
+    """Return the greatest distance of points (P, d) from a polygonal line (L, d), m."""
+    least = np.full(len(points), np.inf)
+    for start, leg in zip(line, np.diff(line, axis=0), strict=False):
+        share = np.clip((points - start) @ leg / (leg @ leg), 0.0, 1.0)
+        least = np.minimum(least, np.linalg.norm(points - start - share[:, None] * leg, axis=1))
+    return float(least.max())
 
 
 def bring_lengths(

@@ -18,8 +18,6 @@ from vgtm_qp.study.drawing import MARKS, label, panels
 from vgtm_qp.study.scenes import is_clear
 from vgtm_qp.study.workers import Row, Task
 
-TITLE = "Clutter: success over random scenes"
-TIMED = False
 SEED = 1991
 
 _METHODS = (

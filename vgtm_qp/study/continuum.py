@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from vgtm_qp.comparison.figure import draw_members
 from vgtm_qp.comparison.statistics import exponent
 from vgtm_qp.comparison.tables import crossed_table
-from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.presets import with_method
-from vgtm_qp.study.arms import bending_problem
+from vgtm_qp.study.arms import bending_problem, furthest, moving_curve
 from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels
 from vgtm_qp.study.workers import Row, Task
-
-Array = NDArray[np.float64]
-
-TITLE = "Figure 3: trusses approach the continuum"
-TIMED = False
 
 _HEIGHT = 4.0
 _EXACT = 1e-9
@@ -52,13 +42,8 @@ def run(module: str, bays: int, steps: int) -> Row:
         "member_radius": 0.0,
     }
     problem = bending_problem(bays, steps=steps, goal=(0.3, 0.1, -0.1), module=module, vertices=5, **sizes)
-    resolver = CurveFirstResolver(with_method(problem, "curve-pseudoinverse-obstacles"))
-    plan = make_plan(problem, *resolver.tip())
-    for start, end in pairwise([plan.path.start, *plan.marks.tolist()]):
-        if reason := resolver.follow(plan.path, start, end).reason:
-            return {"failed": reason}
+    *_, resolver = moving_curve(with_method(problem, "curve-pseudoinverse-obstacles"))
     nodes, truss, curve = resolver.state.nodes, resolver.setup.truss, resolver.curve
-    resolver.setup.kinematics.evaluate(nodes)
     points = curve.position(np.linspace(0.0, 1.0, 4001))
     centres = resolver.setup.arm.stations.centres(nodes)
     middle = np.linspace(0.0, 1.0, 9)[None, :, None]
@@ -68,25 +53,12 @@ def run(module: str, bays: int, steps: int) -> Row:
     sine = np.linalg.norm(np.cross(normals, tangents), axis=1)
     frame = {"nodes": nodes.tolist(), "members": truss.members.tolist(), "actuated": truss.actuated.tolist()}
     return {
-        "axis": _furthest(axis, points),
-        "radius": _furthest(nodes, points),
+        "axis": furthest(axis, points),
+        "radius": furthest(nodes, points),
         "angle": float(np.arctan2(sine, np.einsum("kc,kc->k", normals, tangents)).max()),
         "curve": points[::100].tolist(),
         **(frame if bays <= 16 else {}),
     }
-
-
-def _furthest(points: Array, curve: Array) -> float:
-    """Return the greatest distance of `points` from a finely sampled curve, m."""
-    nearest = KDTree(curve).query(points)[1]
-    least = np.full(len(points), np.inf)
-    for before in (nearest - 1, nearest):
-        first = np.clip(before, 0, len(curve) - 2)
-        leg = curve[first + 1] - curve[first]
-        share = np.einsum("pc,pc->p", points - curve[first], leg) / np.einsum("pc,pc->p", leg, leg)
-        foot = curve[first] + np.clip(share, 0.0, 1.0)[:, None] * leg
-        least = np.minimum(least, np.linalg.norm(points - foot, axis=1))
-    return float(least.max())
 
 
 def draw(rows: Sequence[Row]) -> Figure:

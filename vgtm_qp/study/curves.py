@@ -10,11 +10,9 @@ from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.curve import make_family
+from vgtm_qp.study.arms import furthest
 from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.workers import Row, Task
-
-TITLE = "Figure 4: space curves and their control polygons"
-TIMED = False
 
 _POLYGON = ((0.0, 0.0), (0.0, 1.0), (0.9, 1.8), (0.3, 2.9), (1.5, 3.3), (2.4, 2.6))
 _FAMILIES: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -36,11 +34,8 @@ def run(family: str, options: dict[str, Any], samples: int) -> Row:
     polygon = np.array(_POLYGON)
     made = make_family(family, len(polygon), **options)
     points = made.weights(np.linspace(0.0, 1.0, samples)) @ polygon
-    start, leg = polygon[:-1], np.diff(polygon, axis=0)
-    share = np.einsum("plc,lc->pl", points[:, None] - start, leg) / (leg**2).sum(axis=1)
-    nearest = start + np.clip(share, 0.0, 1.0)[..., None] * leg
-    gap = np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1)
-    return {"greatest_gap": float(gap.max()), "points": points.tolist(), "degree": made.degree}
+    gap = furthest(points, polygon)
+    return {"greatest_gap": gap, "points": points.tolist(), "degree": made.degree}
 
 
 def draw(rows: Sequence[Row]) -> Figure:

@@ -16,9 +16,6 @@ from vgtm_qp.problem import load_problem
 from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.workers import Row, Task
 
-TITLE = "Figure 8: a five-bay arm between two cubes"
-TIMED = False
-
 _FRAMES = 5
 _METHODS = ("qp", "pseudoinverse-obstacles", "curve-pseudoinverse-corrected", "curve-pseudoinverse-obstacles")
 

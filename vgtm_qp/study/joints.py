@@ -15,9 +15,6 @@ from vgtm_qp.study.arms import bring_lengths
 from vgtm_qp.study.drawing import draw_line, label, panels
 from vgtm_qp.study.workers import Row, Task
 
-TITLE = "Offset joints: what ignoring them costs"
-TIMED = False
-
 _PROBLEMS = ("five_bay_free", "five_bay_two_cubes", "ten_bay_round_a_cube")
 
 

@@ -13,9 +13,6 @@ from vgtm_qp.problem import load_problem
 from vgtm_qp.study.drawing import draw_line, label, panels
 from vgtm_qp.study.workers import Row, Task
 
-TITLE = "Variable degree of redundancy: the number of control vertices"
-TIMED = True
-
 _CASES = (
     ("five_bay_two_cubes", "qp"),
     ("ten_bay_round_a_cube", "qp"),

@@ -16,9 +16,6 @@ from vgtm_qp.study.arms import bending_problem
 from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels
 from vgtm_qp.study.workers import Row, Task
 
-TITLE = "Figure 9: run time against the number of bays"
-TIMED = True
-
 _STEPS = 50
 _REACH = 1.2
 _NAMES = {

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +26,11 @@ _SHARES = 20
 _LEAST_SINGULAR_VALUE = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class RandomScene:
+class RandomScene(NamedTuple):
     """A random problem.
 
     Attributes
     ----------
-    number : int
-        Its number under the seed.
     reachable : bool
         Whether the goal is the tip pose of a shape that keeps every limit and clearance. That there is such a shape
         does not mean that it can be reached along the straight path.
@@ -43,7 +39,6 @@ class RandomScene:
         That shape, m.
     """
 
-    number: int
     reachable: bool
     problem: Problem
     shape: Array | None
@@ -84,7 +79,7 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
         if directed:
             waypoint["pointing"] = (kinematics.tip_rotation[:, 2] + 0.5 * random.normal(size=3)).tolist()
     problem["obstacle"] = _cubes(setup, random, shape if reachable else None, int(random.integers(1, 9)))
-    return RandomScene(number, reachable, Problem.from_dict(problem), shape if reachable else None)
+    return RandomScene(reachable, Problem.from_dict(problem), shape if reachable else None)
 
 
 def _truss(random: np.random.Generator) -> dict[str, Any]:

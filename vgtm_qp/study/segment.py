@@ -9,15 +9,10 @@ from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.figure import draw_members
 from vgtm_qp.comparison.tables import markdown_table
-from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.presets import with_method
-from vgtm_qp.study.arms import bending_problem
+from vgtm_qp.study.arms import bending_problem, built_truss, moving_curve
 from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.workers import Row, Task
-
-TITLE = "Figure 7: a segment tracks a moving curve"
-TIMED = False
 
 _FRAMES = 4
 _FACES = (3, 6)
@@ -34,18 +29,12 @@ def run(module: str, steps: int) -> Row:
     problem = with_method(
         bending_problem(8, steps=steps, module=module, stroke=[0.3, 2.0]), "curve-pseudoinverse-corrected"
     )
-    resolver = CurveFirstResolver(problem)
-    truss = resolver.setup.truss
-    plan = make_plan(problem, *resolver.tip())
+    truss = built_truss(problem)
     inside = set(truss.faces[_FACES[0] : _FACES[1] + 1].ravel().tolist())
     members = [k for k, (a, b) in enumerate(truss.members.tolist()) if a in inside and b in inside]
     wanted = {round(k * steps / (_FRAMES - 1)) for k in range(_FRAMES)}
-    marks = [plan.path.start, *plan.marks.tolist()]
     frames, gap, angle = [], 0.0, 0.0
-    for step, mark in enumerate(marks):
-        if step and (reason := resolver.follow(plan.path, marks[step - 1], mark).reason):
-            return {"failed": reason}
-        resolver.setup.kinematics.evaluate(resolver.state.nodes)
+    for step, resolver in enumerate(moving_curve(problem)):
         faces = np.array([segment.face for segment in resolver.tracker.segments])
         s = resolver.motion.s[faces]
         centres = resolver.setup.arm.stations.centres(resolver.state.nodes)[faces]

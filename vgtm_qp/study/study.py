@@ -9,51 +9,41 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import Any, NamedTuple
 
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.machine import machine, sentence
 from vgtm_qp.study.workers import Row, Task, run_dask, run_here, run_processes
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
-STUDIES = {
-    "figure3": "vgtm_qp.study.continuum",
-    "figure4": "vgtm_qp.study.curves",
-    "figure7": "vgtm_qp.study.segment",
-    "figure8": "vgtm_qp.study.example",
-    "figure9": "vgtm_qp.study.run_time",
-    "redundancy": "vgtm_qp.study.redundancy",
-    "joints": "vgtm_qp.study.joints",
-    "clutter": "vgtm_qp.study.clutter",
-    "robustness": "vgtm_qp.study.robustness",
-}
-"""The module of each study."""
+class Study(NamedTuple):
+    """A study: what is in its module, its title, and whether its rows hold times that tasks beside it would falsify.
 
-
-class Study(Protocol):
-    """What the module of a study has.
-
-    Attributes
-    ----------
-    TITLE : str
-    TIMED : bool
-        Its rows hold times that tasks beside it would falsify, so that its tasks run one at a time.
-    tasks
-        Return the keyword arguments of each run, as JSON data: fewer and smaller ones for a `short` look.
-    run
-        Return the row of one task, as JSON data.
-    draw, text
-        Return the figure of the rows, and what they say, in a paragraph and tables.
+    The module's functions are ``tasks(short, **options)``, the keyword arguments of each run, fewer and smaller ones
+    for a `short` look; ``run(**task)``, the row of a task; ``draw(rows)``, the figure; ``text(rows)``, what the rows
+    say, in a paragraph and tables. Tasks and rows are JSON data.
     """
 
-    TITLE: str
-    TIMED: bool
-    tasks: Callable[..., list[Task]]
-    run: Callable[..., Row]
-    draw: Callable[[Sequence[Row]], Figure]
-    text: Callable[[Sequence[Row]], str]
+    module: str
+    title: str
+    timed: bool = False
+
+
+STUDIES = {
+    "figure3": Study("vgtm_qp.study.continuum", "Figure 3: trusses approach the continuum"),
+    "figure4": Study("vgtm_qp.study.curves", "Figure 4: space curves and their control polygons"),
+    "figure7": Study("vgtm_qp.study.segment", "Figure 7: a segment tracks a moving curve"),
+    "figure8": Study("vgtm_qp.study.example", "Figure 8: a five-bay arm between two cubes"),
+    "figure9": Study("vgtm_qp.study.run_time", "Figure 9: run time against the number of bays", timed=True),
+    "redundancy": Study(
+        "vgtm_qp.study.redundancy",
+        "Variable degree of redundancy: the number of control vertices",
+        timed=True,
+    ),
+    "joints": Study("vgtm_qp.study.joints", "Offset joints: what ignoring them costs"),
+    "clutter": Study("vgtm_qp.study.clutter", "Clutter: success over random scenes"),
+    "robustness": Study("vgtm_qp.study.robustness", "Robustness: random scenes of every module"),
+}
 
 
 def find_study(name: str) -> Study:
@@ -66,7 +56,7 @@ def find_study(name: str) -> Study:
     """
     if name not in STUDIES:
         raise GoalError(f'no study "{name}"{nearest(name, STUDIES)}; choices: {", ".join(STUDIES)}, all')
-    return cast(Study, import_module(STUDIES[name]))
+    return STUDIES[name]
 
 
 def study_tasks(name: str, *, short: bool = False, **options: Any) -> list[Task]:
@@ -77,13 +67,14 @@ def study_tasks(name: str, *, short: bool = False, **options: Any) -> list[Task]
     GoalError
         There is no such study, or it has no such option.
     """
-    study = find_study(name)
-    known = list(signature(study.tasks).parameters)[1:]
+    tasks = import_module(find_study(name).module).tasks
+    known = list(signature(tasks).parameters)[1:]
     for option in options:
         if option not in known:
             choices = ", ".join(known) or "none"
             raise GoalError(f'study "{name}" has no option "{option}"; it has {choices}')
-    return study.tasks(short, **options)
+    found: list[Task] = tasks(short, **options)
+    return found
 
 
 def run_study(
@@ -132,11 +123,11 @@ def run_study(
     done = len(tasks) - len(left)
     report = progress or (lambda _done, _total: None)
     report(done, len(tasks))
-    function, waiting = f"{STUDIES[name]}:run", [tasks[k] for k in left]
+    function, waiting = f"{study.module}:run", [tasks[k] for k in left]
     if dask is not None:
         answers = run_dask(function, waiting, dask)
     elif workers > 1:
-        answers = run_processes(function, waiting, 1 if study.TIMED else workers)
+        answers = run_processes(function, waiting, 1 if study.timed else workers)
     else:
         answers = run_here(function, waiting)
     with log.open("a") as file:
@@ -170,8 +161,8 @@ def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None
     """Write rows, figure and text into the folder of a study; failed rows are in the data and named in the text."""
     from vgtm_qp.view.figure import save_figure
 
-    name, found = place.name, machine()
-    data = {"study": name, "title": study.TITLE, "machine": found, "rows": rows}
+    name, module, found = place.name, import_module(study.module), machine()
+    data = {"study": name, "title": study.title, "machine": found, "rows": rows}
     (place / f"{name}.json").write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
     flat = [{key: value for key, value in row.items() if not isinstance(value, list | dict)} for row in rows]
     with (place / f"{name}.csv").open("w", newline="") as file:
@@ -179,8 +170,8 @@ def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None
         writer.writeheader()
         writer.writerows(flat)
     counted = [row for row in rows if "failed" not in row]
-    save_figure(study.draw(counted), place / f"{name}.pdf")
-    lines = [f"## {study.TITLE}", "", study.text(counted).strip(), ""]
+    save_figure(module.draw(counted), place / f"{name}.pdf")
+    lines = [f"## {study.title}", "", module.text(counted).strip(), ""]
     lines += [f"Not counted: a run that failed, {row['failed']}" for row in rows if "failed" in row]
     lines += [f"Measured on: {sentence(found)}. Made again by `{command}`.", ""]
     (place / f"{name}.md").write_text("\n".join(lines))
