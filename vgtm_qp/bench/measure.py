@@ -9,7 +9,7 @@ as it is for every user.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter, process_time
 from typing import Any, NamedTuple
@@ -157,33 +157,29 @@ class _Walk:
             self._index += 1
         return spent, step.qps
 
+    def repeat(self, seconds: float, steps: int) -> Iterator[int]:
+        """Count steps to take, from home again where the plan ends, until there are so many or `seconds` have passed.
 
-class _Clock:
-    """Limits a run to its seconds and steps, with a few steps at least unless they are too slow."""
-
-    def __init__(self, seconds: float, steps: int) -> None:
-        self._seconds, self._steps, self._started = seconds, steps, perf_counter()
-
-    def goes_on(self, count: int) -> bool:
-        """Whether to make another step after `count` steps; the first is always made."""
-        if count == 0 or count >= self._steps:
-            return count == 0
-        limit = self._seconds * (_OVERRUN if count < _LEAST_STEPS else 1.0)
-        return perf_counter() - self._started < limit
+        A few are counted at least, unless they are too slow; an arm that is stuck at home takes no other.
+        """
+        started = perf_counter()
+        for count in range(steps):
+            limit = seconds * (_OVERRUN if count < _LEAST_STEPS else 1.0)
+            if count and perf_counter() - started >= limit:
+                return
+            yield count
+            if self.ended and not self.restart():
+                return
 
 
 def run_alone(resolver: Resolver, plan: Plan, *, seconds: float, steps: int) -> Steps:
     """Return up to `steps` steps of whole maneuvers, as many as `seconds` suffice for, after a warm-up."""
-    walk = _Walk(resolver, plan)
-    warm_up = _Clock(seconds, _WARM_UP)
-    for count in range(_WARM_UP):
-        if walk.ended or not warm_up.goes_on(count):
-            break
+    walk, found = _Walk(resolver, plan), Steps()
+    for _ in walk.repeat(seconds, _WARM_UP):
         walk.step()
     walk.restart()
-    found, clock = Steps(), _Clock(seconds, steps)
     before = dict(resolver.phases)
-    while clock.goes_on(len(found.spent)):
+    for _ in walk.repeat(seconds, steps):
         spent, qps = walk.step()
         found.spent.append(spent)
         found.qps.append(qps)
@@ -192,10 +188,7 @@ def run_alone(resolver: Resolver, plan: Plan, *, seconds: float, steps: int) -> 
             found.phases.setdefault(name, []).append(total - before[name])
         before = now
         found.covered = max(found.covered, walk.covered)
-        if walk.ended:
-            found.stopped_by = found.stopped_by or walk.stuck
-            if not walk.restart():
-                break
+        found.stopped_by = found.stopped_by or walk.stuck
     return found
 
 
@@ -203,8 +196,7 @@ def run_in_turn(resolver: Resolver, baseline: Contestant, plan: Plan, *, seconds
     """Return the times of a baseline and of the resolver over the same steps, in alternation."""
     walk, found = _Walk(resolver, plan), Pairs()
     _take(baseline, walk.place, plan)
-    clock, count = _Clock(seconds, steps), 0
-    while clock.goes_on(count):
+    for count in walk.repeat(seconds, steps):
         place = walk.place
         if count % 2:
             ours, _ = walk.step()
@@ -212,14 +204,11 @@ def run_in_turn(resolver: Resolver, baseline: Contestant, plan: Plan, *, seconds
         else:
             theirs, answered = _take(baseline, place, plan)
             ours, _ = walk.step()
-        count += 1
         if answered:
             found.theirs.append(theirs)
             found.ours.append(ours)
         else:
             found.failed += 1
-        if walk.ended and not walk.restart():
-            break
     return found
 
 

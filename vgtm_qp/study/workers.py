@@ -75,16 +75,10 @@ def run_dask(function: str, tasks: Sequence[Task], address: str) -> Iterator[tup
         raise MissingExtraError("cluster", "distributed") from None
     with Client(address) as client:
         futures = {client.submit(run_task, function, task, pure=False): k for k, task in enumerate(tasks)}
-        again = []
         for future in as_completed(futures):
-            if future.status == "finished":
-                yield futures[future], future.result()
-            else:
-                again.append(futures[future])
-        for k in again:
-            future = client.submit(run_task, function, tasks[k], pure=False)
+            # Where a worker dies, Dask itself gives its task to another one, three times by default.
             failed = future.exception()
-            yield k, {"failed": f"its worker died twice: {failed}"} if failed else future.result()
+            yield futures[future], {"failed": f"its worker died: {failed}"} if failed else future.result()
 
 
 class _Worker:
