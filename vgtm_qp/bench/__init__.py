@@ -1,1 +1,7 @@
 """The measuring instrument: the time of a step by phase, beside baselines that take the same steps."""
+
+from typing import Literal
+
+SceneKind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral"]
+TrackingName = Literal["elastic", "hard"]
+BaselineName = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp"]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, Protocol, get_args
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods import make_resolver
@@ -20,7 +21,6 @@ from vgtm_qp.step.resolver import StepStatus
 from vgtm_qp.step.state import State
 
 Array = NDArray[np.float64]
-Name = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp"]
 
 
 class Contestant(Protocol):
@@ -99,7 +99,7 @@ def _changed(**changes: Any) -> Callable[[Problem], Contestant]:
     return lambda problem: ResolverStep(problem, named)
 
 
-BASELINES: dict[Name, Baseline] = {
+BASELINES: dict[BaselineName, Baseline] = {
     "eq28": Baseline("eq. (28), dense pseudoinverse alone", 100, BarePseudoinverse),
     "eq28-sparse": Baseline(
         "eq. (28), banded",
@@ -115,10 +115,9 @@ BASELINES: dict[Name, Baseline] = {
     "osqp": Baseline("the same QPs, sparse, OSQP", 200, _changed(solver="osqp")),
     "piqp": Baseline("the same QPs, sparse, PIQP", 200, _changed(solver="piqp")),
 }
-NAMES: tuple[Name, ...] = get_args(Name)
 
 
-def make_baseline(name: Name, problem: Problem, bays: int) -> Contestant:
+def make_baseline(name: BaselineName, problem: Problem, bays: int) -> Contestant:
     """Return a baseline for a problem.
 
     Raises

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.bench.contestants import BASELINES, Name, make_baseline
+from vgtm_qp.bench import BaselineName
+from vgtm_qp.bench.contestants import BASELINES, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.measure import breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.scenes import BenchScene
@@ -28,7 +29,7 @@ LEAST_BAYS = 50
 
 
 def measure_scene(
-    scene: BenchScene, names: Sequence[Name], *, seconds: float, steps: int, cold: bool = False
+    scene: BenchScene, names: Sequence[BaselineName], *, seconds: float, steps: int, cold: bool = False
 ) -> dict[str, Any]:
     """Measure one scene: alone, in turn with each of the baselines, and in fresh processes; seconds and bytes.
 
@@ -72,7 +73,7 @@ def measure_scene(
 
 
 def _against(
-    scene: BenchScene, name: Name, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
+    scene: BenchScene, name: BaselineName, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
 ) -> dict[str, Any]:
     """Return a baseline's ``step``, see `timing`, and its ``ratio`` to ``ours``, median CPU times of the same steps, s.
 
@@ -93,7 +94,7 @@ def _against(
 
 def measure(
     scenes: Iterable[BenchScene],
-    names: Sequence[Name],
+    names: Sequence[BaselineName],
     *,
     seconds: float,
     steps: int,

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
+from vgtm_qp.bench import SceneKind, TrackingName
 from vgtm_qp.problem import Problem, load_problem
 
-Kind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral"]
-Tracking = Literal["elastic", "hard"]
-
-KINDS: tuple[Kind, ...] = get_args(Kind)
-TRACKINGS: tuple[Tracking, ...] = get_args(Tracking)
+KINDS: tuple[SceneKind, ...] = get_args(SceneKind)
+TRACKINGS: tuple[TrackingName, ...] = get_args(TrackingName)
 BAYS = (5, 10, 20, 50, 100, 200, 500, 1000)
 CLUTTERED_BAYS = 50
 CLUTTER = 100
@@ -30,14 +28,16 @@ class BenchScene(NamedTuple):
     """A problem to be measured; `tracking` is "elastic", "hard", or "none" where there is no curve."""
 
     name: str
-    kind: Kind
+    kind: SceneKind
     bays: int
     tracking: str
     problem: Problem
 
 
 def make_scenes(
-    kinds: Iterable[Kind] = KINDS, bays: Sequence[int] = BAYS, trackings: Sequence[Tracking] = TRACKINGS
+    kinds: Iterable[SceneKind] = KINDS,
+    bays: Sequence[int] = BAYS,
+    trackings: Sequence[TrackingName] = TRACKINGS,
 ) -> list[BenchScene]:
     """Return the scenes of these kinds; `bays` are those of the arms between two cubes.
 
@@ -60,13 +60,13 @@ def make_scenes(
     return scenes
 
 
-def _bays_of(kind: Kind, bays: Sequence[int]) -> Iterable[int]:
+def _bays_of(kind: SceneKind, bays: Sequence[int]) -> Iterable[int]:
     if kind == "cubes":
         return dict.fromkeys(bays)
     return (CLUTTERED_BAYS,) if kind == "clutter" else (_BUNDLED_BAYS,)
 
 
-def _problem(kind: Kind, bays: int) -> Problem:
+def _problem(kind: SceneKind, bays: int) -> Problem:
     if kind == "free":
         return load_problem("five_bay_free")
     if kind == "pointing":

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from vgtm_qp.bench import BaselineName, SceneKind, TrackingName
 from vgtm_qp.cli.output import ExitCode, Json, document, note, say
-
-SceneKind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral"]
-TrackingName = Literal["elastic", "hard"]
-BaselineName = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp"]
 
 
 def bench(
@@ -60,7 +57,7 @@ def bench(
     from vgtm_qp.machine import pin_threads
 
     pinned = pin_threads()
-    from vgtm_qp.bench.contestants import NAMES
+    from vgtm_qp.bench.contestants import BASELINES
     from vgtm_qp.bench.report import compare as compared
     from vgtm_qp.bench.report import load_document, measure
     from vgtm_qp.bench.scenes import BAYS, KINDS, TRACKINGS, BenchScene, make_scenes
@@ -77,7 +74,7 @@ def bench(
 
     found = measure(
         scenes,
-        NAMES if baselines is None else tuple(dict.fromkeys(baselines)),
+        tuple(BASELINES) if baselines is None else tuple(dict.fromkeys(baselines)),
         seconds=seconds,
         steps=steps,
         cold=cold,
