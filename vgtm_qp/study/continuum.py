@@ -75,7 +75,7 @@ def draw(rows: Sequence[Row]) -> Figure:
         for k, module in enumerate(_MODULES):
             mine = [row for row in rows if row["module"] == module]
             if mine and max(row[key] for row in mine) > _EXACT:
-                draw_line(panel, k, module, [row["bays"] for row in mine], [row[key] for row in mine])
+                draw_line(panel, k, module, mine, "bays", key)
         label(panel, "bays", name, log="xy")
         mark_bays(panel, [row["bays"] for row in rows])
     return figure

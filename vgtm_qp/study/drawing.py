@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from numpy.typing import ArrayLike
+
+from vgtm_qp.study.workers import Row
 
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
@@ -22,9 +23,21 @@ def panels(rows: int, columns: int, *, width: float, height: float) -> tuple[Fig
     return figure, axes
 
 
-def draw_line(axes: Axes, k: int, name: str, x: ArrayLike, y: ArrayLike, style: str = "--") -> None:
-    """Draw the k-th line of a panel, with a mark and colour of its own."""
-    axes.plot(x, y, style, color=f"C{k}", marker=MARKS[k], markersize=4, label=name)
+def draw_line(
+    axes: Axes,
+    k: int,
+    name: str,
+    rows: Sequence[Row],
+    x: str,
+    y: str,
+    *,
+    style: str = "--",
+    factor: float = 1.0,
+) -> None:
+    """Draw the k-th line of a panel, with a mark and colour of its own: `y` of rows, times `factor`, over their `x`."""
+    if rows:
+        xs, ys = [row[x] for row in rows], [factor * row[y] for row in rows]
+        axes.plot(xs, ys, style, color=f"C{k}", marker=MARKS[k], markersize=4, label=name)
 
 
 def label(axes: Axes, x: str, y: str, title: str = "", *, legend: bool = True, log: str = "") -> None:

@@ -46,9 +46,7 @@ def draw(rows: Sequence[Row]) -> Figure:
     figure, axes = panels(1, 1, width=4.2, height=3.2)
     for k, problem in enumerate(_PROBLEMS):
         mine = [row for row in rows if row["problem"] == problem and row["posed"] == row["steps"]]
-        if mine:
-            offsets, errors = [row["offset"] for row in mine], [row["tip_error"] for row in mine]
-            draw_line(axes[0], k, problem, offsets, errors)
+        draw_line(axes[0], k, problem, mine, "offset", "tip_error")
     label(axes[0], "joint offset [m]", "greatest tip error [m]", log="xy")
     return figure
 

@@ -47,17 +47,10 @@ def draw(rows: Sequence[Row]) -> Figure:
     figure, axes = panels(1, 3, width=3.4, height=3.1)
     for k, case in enumerate(_CASES):
         mine = _of(rows, case)
-        if not mine:
-            continue
-        done = [row for row in mine if row["solved"]]
-        timed = [row for row in mine if row["step_time"] is not None]
-        for panel, some, key, factor in (
-            (axes[0], mine, "reached", 1.0),
-            (axes[1], done, "travel", 1.0),
-            (axes[2], timed, "step_time", 1e3),
-        ):
-            vertices, values = [row["vertices"] for row in some], [factor * row[key] for row in some]
-            draw_line(panel, k, ": ".join(case), vertices, values)
+        name, timed = ": ".join(case), [row for row in mine if row["step_time"] is not None]
+        draw_line(axes[0], k, name, mine, "vertices", "reached")
+        draw_line(axes[1], k, name, [row for row in mine if row["solved"]], "vertices", "travel")
+        draw_line(axes[2], k, name, timed, "vertices", "step_time", factor=1e3)
     label(axes[0], "control vertices", "part of the path", "how far")
     label(axes[1], "control vertices", "actuator travel [m]", "solved maneuvers", legend=False)
     label(axes[2], "control vertices", "median step [ms]", "time", legend=False, log="y")

@@ -87,9 +87,8 @@ def draw(rows: Sequence[Row]) -> Figure:
     figure, axes = panels(1, 2, width=4.2, height=3.6)
     for panel, cubes, names in zip(axes, (False, True), (_NAMES, _WITH_CUBES), strict=True):
         for k, (method, name) in enumerate(names.items()):
-            mine = _of(rows, method, cubes)
             style = "-" if method == "qp" else "--" if method.startswith("curve") else ":"
-            draw_line(panel, k, name, [r["bays"] for r in mine], [r["time"] for r in mine], style)
+            draw_line(panel, k, name, _of(rows, method, cubes), "bays", "time", style=style)
         title = "two cubes, clearance watched" if cubes else "no obstacles"
         label(panel, "bays", f"processor time of {_STEPS} steps [s]", title, log="xy")
         mark_bays(panel, [row["bays"] for row in rows if row["cubes"] is cubes])
