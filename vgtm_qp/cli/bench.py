@@ -2,42 +2,39 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from vgtm_qp.cli.output import ExitCode, Json, document, note, say
+from vgtm_qp.cli.output import Json, answer, note
 
 SceneKind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral"]
 TrackingName = Literal["elastic", "hard"]
 BaselineName = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp"]
+
+_several = partial(Parameter, consume_multiple=True, negative="")
 
 
 def bench(
     *,
     scene: Annotated[
         list[SceneKind] | None,
-        Parameter(consume_multiple=True, negative="", help="all of them, or cubes where --bays is given"),
+        _several(help="all of them, or cubes where --bays is given"),
     ] = None,
     bays: Annotated[
         list[int] | None,
-        Parameter(
-            consume_multiple=True,
-            negative="",
+        _several(
             validator=Number(gte=5, lte=10_000),
             help="of the arms between two cubes, 5 or more; 5 to 1000 by default",
         ),
     ] = None,
-    tracking: Annotated[
-        list[TrackingName] | None, Parameter(consume_multiple=True, negative="", help="both by default")
-    ] = None,
+    tracking: Annotated[list[TrackingName] | None, _several(help="both by default")] = None,
     baselines: Annotated[
         list[BaselineName] | None,
-        Parameter(
-            consume_multiple=True, negative="--no-baselines", help="what else takes the steps; all by default"
-        ),
+        _several(negative="--no-baselines", help="what else takes the steps; all by default"),
     ] = None,
     seconds: Annotated[
         float, Parameter(validator=Number(gt=0), help="duration of each run of a scene, at most")
@@ -50,7 +47,7 @@ def bench(
         Path | None, Parameter(help="what --json printed before: give the ratios to it")
     ] = None,
     json: Json = False,
-) -> int:
+) -> None:
     """Measure how long a step takes, where that time goes, and what other methods take for the same steps.
 
     BLAS is held to one thread. Each scene is run by itself, for its median, percentiles and phases, then in
@@ -86,8 +83,4 @@ def bench(
     )
     if older is not None:
         found["compared"] = compared(found, older)
-    if json:
-        document(found)
-    else:
-        say(render(found))
-    return ExitCode.SOLVED
+    answer(found, render(found), as_json=json)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import ExitCode, Json, document, note, say
+from vgtm_qp.cli.output import Json, answer, note
 
 if TYPE_CHECKING:
     from vgtm_qp.step.resolver import Step
@@ -27,7 +27,7 @@ def compare(
         Path | None, Parameter(name=["--output", "-o"], help="folder for compare.md, .json and .pdf")
     ] = None,
     json: Json = False,
-) -> int:
+) -> None:
     """Solve problems by several methods and show what each of them keeps; a method that fails is shown as failed.
 
     Exit code 0 says that the comparison was made, whatever the methods did.
@@ -58,9 +58,5 @@ def compare(
     (folder / "compare.md").write_text(report.markdown())
     (folder / "compare.json").write_text(report.json() + "\n")
     save_figure(report.figure(), folder / "compare.pdf")
-    if json:
-        document(report.to_dict())
-    else:
-        say(report.markdown())
+    answer(report.to_dict(), report.markdown(), as_json=json)
     note(f"written: {folder / 'compare.md'}, compare.json, compare.pdf")
-    return ExitCode.SOLVED

@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-from vgtm_qp.cli.output import ExitCode, Json, document, say, table
+from vgtm_qp.cli.output import ExitCode, Json, answer, table, why_not_writable
 
 _CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
 _EXTRAS = {
@@ -41,12 +40,17 @@ def doctor(*, json: Json = False) -> int:
     from vgtm_qp.machine import versions
 
     cache = cache_directory()
+    hindrance = why_not_writable(cache)
     found: dict[str, Any] = {
         "versions": {"python": platform.python_version(), "system": platform.platform()}
         | versions(("vgtm-qp", *_CORE)),
         "solvers": _tried(_solvers),
         "compiler": compiler(),
-        "cache": {"folder": str(cache), "kernels": _kernels_in(cache), "hindrance": _hindrance(cache)},
+        "cache": {
+            "folder": str(cache),
+            "kernels": len(list(cache.glob("*.so"))),
+            "hindrance": f"; CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else "",
+        },
         "kernels": _tried(_kernels),
         "fcl": _tried(_fcl),
         "extras": {
@@ -58,11 +62,8 @@ def doctor(*, json: Json = False) -> int:
     broken = [name for name in needed if not found[name]["ok"]]
     broken += [name for name in _CORE if not found["versions"][name]]
     found["ok"] = not broken
-    if json:
-        document(found)
-    else:
-        say(_report(found))
-        say(f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order")
+    verdict = f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order"
+    answer(found, f"{_report(found)}\n{verdict}", as_json=json)
     return ExitCode.INTERNAL if broken else ExitCode.SOLVED
 
 
@@ -82,7 +83,7 @@ def _report(found: dict[str, Any]) -> str:
     for extra, missing in found["extras"].items():
         state = f"missing {', '.join(missing)}: pip install 'vgtm-qp[{extra}]'" if missing else "installed"
         rows.append((f"extra [{extra}]", state))
-    return table(rows, indent="")
+    return table(rows)
 
 
 def _tried(trial: Callable[[], str]) -> dict[str, Any]:
@@ -97,17 +98,6 @@ def _solvers() -> str:
     from vgtm_qp.qp.solvers import available_solvers
 
     return ", ".join(available_solvers())
-
-
-def _kernels_in(folder: Path) -> int:
-    return len(list(folder.glob("*.so"))) if folder.is_dir() else 0
-
-
-def _hindrance(folder: Path) -> str:
-    from vgtm_qp.cli.files import why_not_writable
-
-    hindrance = why_not_writable(folder)
-    return f"; CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else ""
 
 
 def _kernels() -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import ExitCode, Json, document, note, say
+from vgtm_qp.cli.output import Json, document, note, say
+from vgtm_qp.cli.progress import bar
 
 
 def study(
@@ -34,7 +33,7 @@ def study(
         "studies"
     ),
     json: Json = False,
-) -> int:
+) -> None:
     """Run studies and write rows (CSV, JSON), a figure (PDF) and a text (Markdown) for each.
 
     An interrupted study goes on where it stopped: the rows of finished runs are on disk. A run that crashes or
@@ -49,17 +48,16 @@ def study(
 
     wanted = list(STUDIES) if names == ["all"] else names
     titles = {name: Study.named(name).title for name in wanted}
-    if workers < 1:
-        raise GoalError(f"--workers must be 1 or more, not {workers}")
-    if scenes is not None and scenes < 1:
-        raise GoalError(f"--scenes must be 1 or more, not {scenes}")
+    for option, value in (("--workers", workers), ("--scenes", scenes)):
+        if value is not None and value < 1:
+            raise GoalError(f"{option} must be 1 or more, not {value}")
     given = {"scenes": scenes, "seed": seed, "ipopt": ipopt or None}
     options = {key: value for key, value in given.items() if value is not None}
     for name in titles:
         Study.named(name).tasks(short=short, **options)
     written = []
     for name, title in titles.items():
-        with _bar(title, shown=not json) as progress:
+        with bar(title, shown=not json, counted=True) as progress:
             place = run_study(
                 name, output, short=short, workers=workers, dask=dask, progress=progress, options=options
             )
@@ -70,22 +68,3 @@ def study(
         document({"studies": written})
     else:
         note("written: " + ", ".join(entry["folder"] for entry in written))
-    return ExitCode.SOLVED
-
-
-@contextmanager
-def _bar(title: str, *, shown: bool) -> Iterator[Any]:
-    """Give what moves a bar on stderr, where that is a terminal."""
-    import sys
-
-    if not shown or not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(escape(title), total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
