@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,8 @@ _CURVE_POINTS = 49
 _SURROUNDINGS = 0.25
 _FIELD_OF_VIEW, _ELEVATION = float(np.radians(32.0)), float(np.radians(14.0))
 _SIDES = np.radians([-62.0, -118.0, 62.0, 118.0])
+_STRAIGHT = 1e-6
+"""A tip that goes no farther aside than this, m, has no heading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +79,9 @@ class Drawing:
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
 
-    def ends(self, nodes: Array) -> Array:
-        """Return (M, 2, 3) the two ends of each member at `nodes` (N, 3), m."""
-        return self.arm.ends(nodes)
+    def surfaces(self) -> list[Array]:
+        """Return (K, 3) the vertices of each obstacle at time 0, m."""
+        return [mesh.vertices + mesh.center for mesh in self.obstacles]
 
     def curve(self, control_vertices: Array) -> Array:
         """Return (K, 3) points along the curve with `control_vertices` (V, 3), m; K = 0 without a curve."""
@@ -98,7 +100,7 @@ class Drawing:
 
     def colours(self, lengths: Array) -> Array:
         """Return (M, 3) colours, 0 to 1: blue for short to red for long, grey for fixed members and links."""
-        if isinstance(self.arm, RecordedChain):
+        if not self.arm.stretches.any():
             return np.tile(FIXED_COLOUR, (len(lengths), 1))
         share = self.stroke_share(lengths)
         colours = stroke_colours(np.nan_to_num(share, nan=0.5))
@@ -203,23 +205,32 @@ def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
     Of four sides it is the one from which obstacles hide least of the arm.
     """
     points = nodes.reshape(-1, 3)
-    low, high = points.min(axis=0), points.max(axis=0)
-    reach = float(np.linalg.norm(high - low))
-    corners = [
-        np.clip(mesh.vertices + mesh.center, low - _SURROUNDINGS * reach, high + _SURROUNDINGS * reach)
-        for mesh in drawing.obstacles
-    ]
-    seen = np.concatenate([points, *corners])
-    target = (seen.min(axis=0) + seen.max(axis=0)) / 2
-    distance = 0.6 * float(np.linalg.norm(np.ptp(seen, axis=0))) / np.tan(_FIELD_OF_VIEW / 2)
-    away = tip[int(np.argmax(np.linalg.norm((tip - tip[0])[:, :2], axis=1)))] - tip[0]
-    heading = np.arctan2(away[1], away[0]) if np.linalg.norm(away[:2]) > 1e-6 * reach else 0.0
-    positions = [target + distance * _direction(heading + side, _ELEVATION) for side in _SIDES]
+    reach = float(np.linalg.norm(np.ptp(points, axis=0)))
+    low, high = with_surroundings(points, drawing.surfaces(), _SURROUNDINGS * reach)
+    target = (low + high) / 2
+    distance = 0.6 * float(np.linalg.norm(high - low)) / np.tan(_FIELD_OF_VIEW / 2)
+    positions = [target + distance * direction(heading(tip) + side, _ELEVATION) for side in _SIDES]
     hidden = [_hidden(drawing.obstacles, position, nodes[[0, -1]].reshape(-1, 3)) for position in positions]
     return Camera(positions[int(np.argmin(hidden))], target, _FIELD_OF_VIEW)
 
 
-def _direction(azimuth: float, elevation: float) -> Array:
+def with_surroundings(points: Array, surroundings: Iterable[Array], room: float) -> Array:
+    """Return least and greatest coordinates (2, D) of points (K, D) and of what is within `room` of their box, m."""
+    box = np.stack([points.min(axis=0), points.max(axis=0)])
+    near = [np.clip(others, box[0] - room, box[1] + room) for others in surroundings]
+    seen = np.concatenate([box, *near])
+    return np.stack([seen.min(axis=0), seen.max(axis=0)])
+
+
+def heading(tip: Array) -> float:
+    """Return the azimuth, rad, of the way to where a tip (T, 3) is farthest aside from its first place; 0 if never."""
+    aside = (tip - tip[0])[:, :2]
+    x, y = aside[int(np.argmax(np.linalg.norm(aside, axis=1)))]
+    return float(np.arctan2(y, x)) if np.hypot(x, y) > _STRAIGHT else 0.0
+
+
+def direction(azimuth: float, elevation: float) -> Array:
+    """Return (3,) the unit vector at `azimuth` about +z and `elevation` above the x-y plane, rad."""
     flat = np.cos(elevation)
     return np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)])
 

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.view.drawing import ObstacleMesh
+from vgtm_qp.view.drawing import ObstacleMesh, direction
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -32,13 +32,7 @@ class Projection:
     @classmethod
     def looking(cls, azimuth: float, elevation: float) -> Projection:
         """Return the view from `azimuth` about +z and `elevation` above the x-y plane, rad; +z is up."""
-        toward = np.array(
-            [
-                np.cos(azimuth) * np.cos(elevation),
-                np.sin(azimuth) * np.cos(elevation),
-                np.sin(elevation),
-            ]
-        )
+        toward = direction(azimuth, elevation)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         return cls(np.stack([right, np.cross(toward, right), toward]))
 
@@ -58,7 +52,7 @@ class ProjectedMesh:
         import trimesh
 
         self.mesh, self.projection = mesh, projection
-        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+        self._solid = solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
         self.vertices = np.asarray(solid.vertices, dtype=float)
         self.faces = np.asarray(solid.faces)
         self.normals = np.asarray(solid.face_normals, dtype=float)
@@ -70,11 +64,7 @@ class ProjectedMesh:
     @cached_property
     def is_convex(self) -> bool:
         """Whether every vertex is on the inner side of every face; a large mesh counts as not convex."""
-        if len(self.faces) > _MANY_FACES:
-            return False
-        heights = self.normals @ self.vertices.T
-        planes = np.einsum("fc,fc->f", self.normals, self.vertices[self.faces[:, 0]])
-        return bool(np.all(heights <= planes[:, None] + 1e-6 * float(np.ptp(self.vertices))))
+        return len(self.faces) <= _MANY_FACES and bool(self._solid.is_convex)
 
     def depth(self, time: float) -> float:
         """Return how near to the viewer its middle is at `time`, m."""
