@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     )
     from vgtm_qp.export import export_maneuver
     from vgtm_qp.maneuver.maneuver import Maneuver, load_result
-    from vgtm_qp.maneuver.many import solve_many
-    from vgtm_qp.maneuver.solve import solve
+    from vgtm_qp.maneuver.solve import solve, solve_many
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
     from vgtm_qp.result.certificate import Certificate, Measure
     from vgtm_qp.step.resolver import Resolver, Step, StepStatus
@@ -50,8 +49,7 @@ _HOMES = {
     "vgtm_qp.export": ("export_maneuver",),
     "vgtm_qp.result.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),
-    "vgtm_qp.maneuver.many": ("solve_many",),
-    "vgtm_qp.maneuver.solve": ("solve",),
+    "vgtm_qp.maneuver.solve": ("solve", "solve_many"),
     "vgtm_qp.comparison.compare": ("compare",),
     "vgtm_qp.comparison.report": ("Report",),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),

@@ -55,6 +55,7 @@ class DeadEnd:
 
 
 Changes = dict[str, Any]
+Change = Callable[[Problem, DeadEnd], Changes]
 
 
 def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]]:
@@ -71,25 +72,24 @@ def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]
             continue
 
 
-def _drawn_home(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    return {"method.weights.stroke_centring": 10.0 * max(problem.method.weights.stroke_centring, 0.02)}
+def _raised(weight: str, factor: float) -> Change:
+    """Return the change that multiplies a weight of the null space."""
+    return lambda problem, _: {
+        f"method.weights.{weight}": factor * max(getattr(problem.method.weights, weight), 0.02)
+    }
 
 
-def _at_full_speed(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+def _at_full_speed(problem: Problem, _: DeadEnd) -> Changes:
     slows = problem.method.slow_approach and problem.end_effector.mode == "scaled"
     return {"method.slow_approach": False} if slows else {}
 
 
-def _shorter_steps(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+def _shorter_steps(problem: Problem, _: DeadEnd) -> Changes:
     maneuver = problem.maneuver
     return {"maneuver.steps": 3 * maneuver.steps} if isinstance(maneuver, WaypointManeuver) else {}
 
 
-def _actuator_rates(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    return {"method.weights.actuator_rate": 50.0 * max(problem.method.weights.actuator_rate, 0.02)}
-
-
-def _no_curve(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+def _no_curve(problem: Problem, _: DeadEnd) -> Changes:
     # Hard tracking asks for the curve, so there is no retry without it.
     if problem.method.tracking == "none" or problem.method.hard_tracking:
         return {}
@@ -102,7 +102,7 @@ def _more_vertices(problem: Problem, dead_end: DeadEnd) -> Changes:
     return {"curve.control_vertices": problem.curve.control_vertices + _MORE_VERTICES}
 
 
-def _bulged(quarter: int, size: float = _BULGE) -> Callable[[Problem, DeadEnd], Changes]:
+def _bulged(quarter: int, size: float = _BULGE) -> Change:
     """Return the change that bulges the curve to one of its four sides."""
 
     def change(problem: Problem, dead_end: DeadEnd) -> Changes:
@@ -145,13 +145,13 @@ def _across(axis: Array, *wanted: Array) -> Array:
     raise AssertionError("no axis is along all of x, y and z")
 
 
-_CHANGES: dict[str, Callable[[Problem, DeadEnd], Changes]] = {
-    "actuators drawn to their home lengths": _drawn_home,
+_CHANGES: dict[str, Change] = {
+    "actuators drawn to their home lengths": _raised("stroke_centring", 10.0),
     **{f"curve bulged {side}": _bulged(quarter) for side, quarter in _SIDES.items()},
     "curve bulged a little away from what blocks it": _bulged(0, _SLIGHT_BULGE),
     "no slowing down before contacts": _at_full_speed,
     "shorter steps": _shorter_steps,
-    "actuator rates as the metric": _actuator_rates,
+    "actuator rates as the metric": _raised("actuator_rate", 50.0),
     "no curve": _no_curve,
     "more control vertices": _more_vertices,
 }
