@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from threading import Event
 from time import perf_counter
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.live.read_out import read_out
-from vgtm_qp.live.session import METHODS, Session
+from vgtm_qp.live.session import Session
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
+from vgtm_qp.problem.method import Method
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled
 from vgtm_qp.view.scene import ArmScene, viser_server
 
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 _PERIOD = 1.0 / 30.0
 _READ_OUT_PERIOD = 0.1
 _LEAST_EXPONENT = -4.0
+_METHODS = get_args(Method.model_fields["name"].annotation)
 _HINT = "Drag the red ball: the tip follows. Hold a green one: the curve is drawn there, the tip stays."
 _TARGET_COLOUR = (214, 39, 40)
 _SLIDERS = (
@@ -121,26 +123,20 @@ class _Page:
             stop.wait(max(0.0, _PERIOD - (perf_counter() - started)))
 
     def _read_inbox(self) -> bool:
-        found = False
-        while True:
-            try:
-                note = self._inbox.get_nowait()
-            except Empty:
-                break
-            note()
-            found = True
+        found = not self._inbox.empty()
+        while not self._inbox.empty():
+            self._inbox.get()()
         if self._settings:
             settings, self._settings = self._settings, {}
             self._try(lambda: self._session.change(settings))
         return found
 
     def _try(self, action: Callable[[], None]) -> None:
+        self._message = ""
         try:
             action()
         except VgtmError as error:
             self._message = str(error)
-        else:
-            self._message = ""
 
     def _draw(self) -> None:
         session = self._session
@@ -190,7 +186,7 @@ class _Page:
         with gui.add_folder("By hand"):
             gui.add_markdown(_HINT)
             home = gui.add_button("Home")
-            method = gui.add_dropdown("method", METHODS, initial_value=session.problem.method.name)
+            method = gui.add_dropdown("method", _METHODS, initial_value=session.problem.method.name)
             safe = gui.add_slider(
                 "safe [m]",
                 min=0.0,
@@ -202,7 +198,7 @@ class _Page:
             for name in _SLIDERS:
                 self._add_weight(name)
         self._on(self._play_button.on_click, lambda _: self._toggle())
-        self._on(self._slider.on_update, lambda event: self._scrub(event))
+        self._on(self._slider.on_update, self._scrub)
         self._on(again.on_click, lambda _: self._solve())
         self._on(home.on_click, lambda _: self._go_home())
         self._on(method.on_update, lambda _: self._settings.update({"method.name": method.value}))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,29 +21,24 @@ from vgtm_qp.view.drawing import Drawing, drawing_of_problem
 
 Array = NDArray[np.float64]
 
-METHODS = ("qp", "pseudoinverse", "curve-pseudoinverse")
+OUTCOMES = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatus.BLOCKED: "blocked"}
 
 _REACHED = 1e-4
 _STRIDE = 0.06
 _RETRY_AFTER = 10
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(NamedTuple):
     """Outcome, active constraints, clearances and step time, as the page shows them.
 
     Attributes
     ----------
     outcome : str
-        ``"at rest"``, ``"moving"``, ``"slowed"`` or ``"blocked"``.
-    stopped_by : tuple of str
-        The obstacles, members and limits that hold the arm back, most decisive first.
-    active : tuple of str
-        Names of all active rows of the last QP.
-    clearance, self_clearance : float
-        Least distance to obstacles, and between members that share no node, m.
-    nearest : str
-        The pair at that distance to an obstacle.
+        One of `OUTCOMES`, or ``"at rest"``.
+    stopped_by, active : tuple of str
+        What holds the arm back, most decisive first, and the names of all active rows of the last QP.
+    clearance, self_clearance, nearest : float, float, str
+        Least distance to obstacles, and between members that share no node, m; the pair nearest to an obstacle.
     step_time : float
         Computing time of the last step, s.
     """
@@ -117,17 +112,16 @@ class Session:
 
     def put_at(self, time: float, q: Array, control_vertices: Array) -> None:
         """Put the arm at rest in configuration `q` and at `control_vertices` (V, 3), m; want nothing else."""
-        arm, home = self._resolver.setup.arm, self._resolver.setup.home_state()
-        self._put(
-            replace(
-                home,
-                time=float(time),
-                q=frozen(q),
-                nodes=frozen(arm.nodes(q)),
-                control_vertices=frozen(control_vertices),
-                quantities=frozen(arm.measured(q)),
-            )
+        arm = self._resolver.setup.arm
+        state = replace(
+            self._resolver.setup.home_state(),
+            time=float(time),
+            q=frozen(q),
+            nodes=frozen(arm.nodes(q)),
+            control_vertices=frozen(control_vertices),
+            quantities=frozen(arm.measured(q)),
         )
+        self._put(state)
 
     def _put(self, state: State) -> None:
         self._resolver.state = state
@@ -163,11 +157,9 @@ class Session:
             return False
         if self.vertices_can_be_wanted:
             self._resolver.control_vertex_goals = dict(self.vertex_goals)
-        position, rotation = self._resolver.tip()
-        stride = away * min(1.0, _STRIDE / max(distance, _REACHED))
-        path = Path(
-            np.array([0.0, 1.0]), np.stack([position, position + stride]), np.stack([rotation, rotation])
-        )
+        position, rotation = self.pose()
+        ends = np.stack([position, position + away * min(1.0, _STRIDE / max(distance, _REACHED))])
+        path = Path(np.array([0.0, 1.0]), ends, np.stack([rotation, rotation]))
         started, before = perf_counter(), self.state.nodes
         step = self._resolver.follow(path, 0.0, 1.0, dt=dt)
         self._step_time = perf_counter() - started
@@ -179,8 +171,7 @@ class Session:
         if step.status is StepStatus.BLOCKED:
             self._waiting = _RETRY_AFTER
             return False
-        moved = float(np.max(np.abs(self.state.nodes - before)))
-        return moved > 1e-9
+        return bool(np.max(np.abs(self.state.nodes - before)) > 1e-9)
 
     def reading(self) -> Reading:
         """Return the readings of the present state."""
@@ -188,14 +179,10 @@ class Session:
         monitor, points = setup.monitor, setup.arm.points(state.q)
         clearance, pair = monitor.least(points, state.time, among="obstacles")
         last = self._last
-        outcome = "at rest"
-        if last is not None:
-            words = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatus.BLOCKED: "blocked"}
-            outcome = words[last.status]
         return Reading(
-            outcome=outcome,
+            outcome="at rest" if last is None else OUTCOMES[last.status],
             stopped_by=self._held_by,
-            active=last.active if last is not None else (),
+            active=() if last is None else last.active,
             clearance=clearance,
             self_clearance=monitor.least(points, state.time, among="members")[0],
             nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),
