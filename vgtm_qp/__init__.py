@@ -7,24 +7,25 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from vgtm_qp.errors import (
+    CurveError,
+    ExportError,
+    GoalError,
+    MissingExtraError,
+    Mistake,
+    ProblemError,
+    ResultError,
+    SolverError,
+    TrussError,
+    VgtmError,
+)
+
 if TYPE_CHECKING:
     from vgtm_qp.arm.truss.build import build_truss
     from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.arm.truss.truss import Truss
     from vgtm_qp.comparison.compare import compare
     from vgtm_qp.comparison.report import Report
-    from vgtm_qp.errors import (
-        CurveError,
-        ExportError,
-        GoalError,
-        MissingExtraError,
-        Mistake,
-        ProblemError,
-        ResultError,
-        SolverError,
-        TrussError,
-        VgtmError,
-    )
     from vgtm_qp.export import export_maneuver
     from vgtm_qp.maneuver.maneuver import Maneuver, load_result
     from vgtm_qp.maneuver.solve import solve, solve_many
@@ -34,18 +35,6 @@ if TYPE_CHECKING:
     from vgtm_qp.verify import verify, verify_file
 
 _HOMES = {
-    "vgtm_qp.errors": (
-        "CurveError",
-        "ExportError",
-        "GoalError",
-        "MissingExtraError",
-        "Mistake",
-        "ProblemError",
-        "ResultError",
-        "SolverError",
-        "TrussError",
-        "VgtmError",
-    ),
     "vgtm_qp.export": ("export_maneuver",),
     "vgtm_qp.result.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),

@@ -56,17 +56,10 @@ def bar(title: str, *, shown: bool, counted: bool = False) -> Iterator[Callable[
         return
     from rich.console import Console
     from rich.markup import escape
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import MofNCompleteColumn, Progress
 
-    number = MofNCompleteColumn() if counted else TaskProgressColumn()
-    columns = (TextColumn("{task.description}"), BarColumn(), number, TimeRemainingColumn())
+    description, line, percentage, remaining = Progress.get_default_columns()
+    columns = (description, line, MofNCompleteColumn() if counted else percentage, remaining)
     with Progress(*columns, console=Console(stderr=True), transient=True) as shown_bar:
         task = shown_bar.add_task(escape(title), total=None if counted else 1.0)
         yield lambda done, total: shown_bar.update(task, completed=done, total=total)

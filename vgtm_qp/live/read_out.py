@@ -17,15 +17,12 @@ def read_out(session: Session, message: str) -> str:
     """Return the instruments of `session` as HTML, under `message` where there is one."""
     reading = session.reading()
     safe = session.problem.clearance.safe
+    step_time = f"{1000 * reading.step_time:.2f} ms" if reading.step_time else "-"
     rows = [
         ("clearance", _distance(reading.clearance, safe), reading.nearest),
         (f"{session.drawing.arm.body}s apart", _distance(reading.self_clearance, -np.inf), ""),
         ("tip to target", f"{1000 * float(np.linalg.norm(session.target - session.tip)):.1f} mm", ""),
-        (
-            "step",
-            f"{1000 * reading.step_time:.2f} ms" if reading.step_time else "-",
-            session.problem.method.name,
-        ),
+        ("step", step_time, session.problem.method.name),
     ]
     cells = "".join(
         f"<tr><td style='color:#6b7280;padding-right:0.8em'>{name}</td>"
@@ -60,17 +57,14 @@ def _distance(distance: float, least: float) -> str:
 def _strokes(session: Session) -> str:
     """Return a bar for each actuator: how much of its stroke is out."""
     share = session.drawing.stroke_share(session.state.quantities)
-    names = [
-        name
-        for name, moving in zip(session.drawing.arm.quantity_names, ~np.isnan(share), strict=True)
-        if moving
-    ]
-    share = share[~np.isnan(share)]
-    colours = np.round(255 * stroke_colours(share)).astype(int)
+    colours = np.round(255 * stroke_colours(np.nan_to_num(share))).astype(int)
     bars = "".join(
         f"<div title='{escape(name)}' style='flex:1;height:{max(2.0, 100.0 * part):.1f}%;"
         f"background:rgb({red},{green},{blue})'></div>"
-        for name, part, (red, green, blue) in zip(names, share.tolist(), colours.tolist(), strict=True)
+        for name, part, (red, green, blue) in zip(
+            session.drawing.arm.quantity_names, share.tolist(), colours.tolist(), strict=True
+        )
+        if not np.isnan(part)
     )
     return (
         "<div style='display:flex;align-items:flex-end;gap:1px;height:2.6em;"

@@ -17,7 +17,8 @@ from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.view.drawing import Drawing, drawing_of_problem
+from vgtm_qp.verify.arm import recorded_arm
+from vgtm_qp.view.drawing import make_drawing
 
 Array = NDArray[np.float64]
 
@@ -59,9 +60,10 @@ class Session:
         self.problem = problem
         self._resolver = _make_resolver(problem)
         arm = self._resolver.setup.arm
-        self.drawing: Drawing = drawing_of_problem(
-            problem, arm.record(), arm.bodies.joints, len(self.state.control_vertices)
-        )
+        directory = problem.source.parent if problem.source else "."
+        recorded = recorded_arm(arm.record(), arm.bodies.joints)
+        vertices = len(self.state.control_vertices)
+        self.drawing = make_drawing(problem.to_dict(), recorded, vertices, directory)
         self.target: Array = self.tip
         self.vertex_goals: dict[int, Array] = {}
         self._waiting = 0

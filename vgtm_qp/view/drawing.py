@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.curve.families import make_family
-from vgtm_qp.problem import Problem
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
@@ -40,13 +39,8 @@ _STRAIGHT = 1e-6
 class ObstacleMesh:
     """The surface of an obstacle.
 
-    Attributes
-    ----------
-    name : str
-    vertices, faces : (K, 3), (F, 3) int
-        Triangles about the obstacle's own origin, turned into the base frame, m.
-    center, velocity : (3,)
-        Position of that origin at time 0, m, and its velocity, m/s.
+    Its triangles, `vertices` (K, 3), m, and `faces` (F, 3), are about its own origin and turned into the base frame.
+    That origin is at `center` (3,), m, at time 0 and has the `velocity` (3,), m/s.
     """
 
     name: str
@@ -64,14 +58,7 @@ class ObstacleMesh:
 class Drawing:
     """An arm and its surroundings, ready to be drawn at any configuration.
 
-    Attributes
-    ----------
-    name : str
-    arm : RecordedArm
-        Member ends, radii and strokes.
-    curve_weights : (K, V)
-        Weights of points along the curve; V = 0 where there is no curve.
-    obstacles : tuple of ObstacleMesh
+    `curve_weights` (K, V) are those of points along the curve; K = 0 where there is no curve.
     """
 
     name: str
@@ -123,30 +110,22 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
         The arm record in the manifest is malformed.
     """
     manifest = maneuver.manifest
-    return _drawing(
-        manifest["problem"],
-        recorded_arm(manifest["arm"], maneuver.members),
-        maneuver.control_vertices.shape[1],
-        Path(manifest.get("directory") or "."),
-    )
+    arm = recorded_arm(manifest["arm"], maneuver.members)
+    vertices = maneuver.control_vertices.shape[1]
+    return make_drawing(manifest["problem"], arm, vertices, manifest.get("directory") or ".")
 
 
-def drawing_of_problem(problem: Problem, record: Mapping[str, Any], members: Index, vertices: int) -> Drawing:
-    """Return the drawing of a problem from the record of its arm and number of control vertices."""
-    directory = problem.source.parent if problem.source else Path.cwd()
-    return _drawing(problem.to_dict(), recorded_arm(record, members), vertices, directory)
-
-
-def _drawing(
-    problem: Mapping[str, Any], arm: RecordedArm | RecordedChain, vertices: int, directory: Path
+def make_drawing(
+    problem: Mapping[str, Any], arm: RecordedArm | RecordedChain, vertices: int, directory: str | Path
 ) -> Drawing:
+    """Return the drawing of an arm with so many control vertices among the obstacles of a problem, as plain data."""
     weights = np.zeros((0, vertices))
     spec = problem.get("curve")
     if vertices and spec:
         options = {key: spec[key] for key in ("degree", "bias", "tension") if key in spec}
         family = make_family(spec.get("family", "bezier"), vertices, **options)
         weights = family.weights(np.linspace(0.0, 1.0, _CURVE_POINTS))
-    obstacles = obstacle_meshes(problem.get("obstacle") or (), directory)
+    obstacles = obstacle_meshes(problem.get("obstacle") or (), Path(directory))
     return Drawing(str(problem.get("name", "")), arm, weights, obstacles)
 
 
@@ -179,9 +158,8 @@ def _surface(entry: Mapping[str, Any], directory: Path) -> Any:
     if shape == "sphere":
         return trimesh.creation.icosphere(subdivisions=3, radius=float(entry["radius"]))
     if shape == "cylinder":
-        return trimesh.creation.cylinder(
-            radius=float(entry["radius"]), height=float(entry["height"]), sections=48
-        )
+        radius, height = float(entry["radius"]), float(entry["height"])
+        return trimesh.creation.cylinder(radius=radius, height=height, sections=48)
     path = directory / str(entry["file"])
     if not path.is_file():
         return None
@@ -190,8 +168,7 @@ def _surface(entry: Mapping[str, Any], directory: Path) -> Any:
     return surface
 
 
-@dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(NamedTuple):
     """Where to look from: `position` and `target` (3,), m, and the vertical field of view, rad."""
 
     position: Array
