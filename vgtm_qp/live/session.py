@@ -8,7 +8,6 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
@@ -18,9 +17,7 @@ from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.verify.arm import recorded_arm
-from vgtm_qp.view.drawing import make_drawing
-
-Array = NDArray[np.float64]
+from vgtm_qp.view.drawing import Array, make_drawing
 
 OUTCOMES = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatus.BLOCKED: "blocked"}
 
