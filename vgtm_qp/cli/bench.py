@@ -9,13 +9,13 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from vgtm_qp.cli.output import Json, answer, note
+from vgtm_qp.cli.output import Json, Switch, answer, note
 
 SceneKind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral"]
 TrackingName = Literal["elastic", "hard"]
 BaselineName = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp"]
 
-_several = partial(Parameter, consume_multiple=True, negative="")
+_several = partial(Switch, consume_multiple=True)
 
 
 def bench(
@@ -40,9 +40,7 @@ def bench(
         float, Parameter(validator=Number(gt=0), help="duration of each run of a scene, at most")
     ] = 2.0,
     steps: Annotated[int, Parameter(validator=Number(gte=1), help="steps of each run, at most")] = 1000,
-    cold: Annotated[
-        bool, Parameter(negative="", help="set up with an empty cache of compiled kernels too")
-    ] = False,
+    cold: Annotated[bool, Switch(help="set up with an empty cache of compiled kernels too")] = False,
     compare: Annotated[
         Path | None, Parameter(help="what --json printed before: give the ratios to it")
     ] = None,

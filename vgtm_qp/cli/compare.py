@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import Json, answer, note
+from vgtm_qp.cli.output import Json, Output, answer, note
 
 if TYPE_CHECKING:
     from vgtm_qp.step.resolver import Step
@@ -23,9 +23,7 @@ def compare(
         list[str] | None,
         Parameter(help="methods by name, all of them with all; nine by default", consume_multiple=True),
     ] = None,
-    output: Annotated[
-        Path | None, Parameter(name=["--output", "-o"], help="folder for compare.md, .json and .pdf")
-    ] = None,
+    output: Annotated[Path | None, Output(help="folder for compare.md, .json and .pdf")] = None,
     json: Json = False,
 ) -> None:
     """Solve problems by several methods and show what each of them keeps; a method that fails is shown as failed.
@@ -43,7 +41,7 @@ def compare(
     names = list(PRESETS) if names == ["all"] else names
     check_methods(names)
     loaded = [load_problem(problem) for problem in problems]
-    folder = Path("compare") if output is None else output
+    folder = output or Path("compare")
     folder.mkdir(parents=True, exist_ok=True)
     reports = []
     total = len(loaded) * len(names)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from vgtm_qp.cli.output import ExitCode, Json, answer, table, why_not_writable
 
 _CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
+_SLOWER = "4 to 10 times slower"
 _EXTRAS = {
     "view": ("viser",),
     "export": ("viser", "mcap", "mcap-ros2-support", "imageio-ffmpeg", "pillow", "pyyaml"),
@@ -58,8 +58,7 @@ def doctor(*, json: Json = False) -> int:
             for extra, names in _EXTRAS.items()
         },
     }
-    needed = ("solvers", "kernels", "fcl")
-    broken = [name for name in needed if not found[name]["ok"]]
+    broken = [name for name in ("solvers", "kernels", "fcl") if not found[name]["ok"]]
     broken += [name for name in _CORE if not found["versions"][name]]
     found["ok"] = not broken
     verdict = f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order"
@@ -72,10 +71,7 @@ def _report(found: dict[str, Any]) -> str:
     rows = [(name, version or "NOT INSTALLED") for name, version in found["versions"].items()]
     rows += [
         ("QP solvers", found["solvers"]["says"]),
-        (
-            "C compiler",
-            found["compiler"] or "none found: CasADi interprets the kernels, 4 to 10 times slower",
-        ),
+        ("C compiler", found["compiler"] or f"none found: CasADi interprets the kernels, {_SLOWER}"),
         ("kernel cache", f"{cache['folder']}, {cache['kernels']} kernels" + cache["hindrance"]),
         ("kernels", found["kernels"]["says"]),
         ("FCL", found["fcl"]["says"]),
@@ -105,19 +101,12 @@ def _kernels() -> str:
     import casadi as ca
 
     from vgtm_qp.compiled import Kernel, compiler
+    from vgtm_qp.machine import environment
 
     x = ca.SX.sym("x", 2)
-    before = os.environ.get("VGTM_CACHE")
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["VGTM_CACHE"] = folder
-        try:
-            kernel = Kernel(ca.Function("doctor", [x], [ca.sqrt(ca.dot(x, x))]))
-            compiled = kernel.is_compiled
-        finally:
-            if before is None:
-                del os.environ["VGTM_CACHE"]
-            else:
-                os.environ["VGTM_CACHE"] = before
+    with tempfile.TemporaryDirectory() as folder, environment({"VGTM_CACHE": folder}):
+        kernel = Kernel(ca.Function("doctor", [x], [ca.sqrt(ca.dot(x, x))]))
+        compiled = kernel.is_compiled
         kernel.inputs[0][:] = 3.0, 4.0
         kernel()
     if abs(float(kernel.outputs[0][0]) - 5.0) > 1e-12:
@@ -125,7 +114,7 @@ def _kernels() -> str:
     if compiled:
         return "compile, load and give the right value"
     reason = "no C compiler" if compiler() is None else "the C compiler fails"
-    return f"interpreted by CasADi, 4 to 10 times slower: {reason}"
+    return f"interpreted by CasADi, {_SLOWER}: {reason}"
 
 
 def _fcl() -> str:

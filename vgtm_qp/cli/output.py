@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -15,9 +16,10 @@ from cyclopts import Parameter
 
 from vgtm_qp.errors import Mistake, ProblemError
 
-Json = Annotated[
-    bool, Parameter(negative="", show_default=False, help="print exactly one JSON document on stdout")
-]
+Output = partial(Parameter, name=["--output", "-o"])
+Switch = partial(Parameter, negative="")
+"""An option that is given or not: it has no opposite."""
+Json = Annotated[bool, Switch(show_default=False, help="print exactly one JSON document on stdout")]
 ProblemName = Annotated[str, Parameter(help="problem file, or the name of a bundled problem (vgtm list)")]
 ResultFile = Annotated[Path, Parameter(name="RESULT", help="result file, .npz")]
 

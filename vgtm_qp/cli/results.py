@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import ExitCode, Json, ResultFile, answer, check_writable, document, note, say, table
+from vgtm_qp.cli.output import (
+    ExitCode,
+    Json,
+    Output,
+    ResultFile,
+    answer,
+    check_writable,
+    document,
+    note,
+    say,
+    table,
+)
 
 if TYPE_CHECKING:
     from vgtm_qp.maneuver.maneuver import Maneuver
@@ -106,9 +117,7 @@ def export(
     /,
     *,
     to: Annotated[FormatName, Parameter(help="form to write")],
-    output: Annotated[
-        Path | None, Parameter(name=["--output", "-o"], help="file to write; beside the result by default")
-    ] = None,
+    output: Annotated[Path | None, Output(help="file to write; beside the result by default")] = None,
     json: Json = False,
 ) -> None:
     """Write a result as an offline page, animation, figure, table, ROS 2 bag or message, or MuJoCo model."""

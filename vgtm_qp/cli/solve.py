@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import ExitCode, Json, ProblemName, answer, check_writable, note, table
+from vgtm_qp.cli.output import ExitCode, Json, Output, ProblemName, answer, check_writable, note, table
 from vgtm_qp.cli.progress import following
 from vgtm_qp.cli.results import outcome_code
 
@@ -23,10 +23,7 @@ def solve(
     problem: ProblemName,
     /,
     *,
-    output: Annotated[
-        Path | None,
-        Parameter(name=["--output", "-o"], help="result file; NAME.npz in this folder by default"),
-    ] = None,
+    output: Annotated[Path | None, Output(help="result file; NAME.npz in this folder by default")] = None,
     method: Annotated[MethodName | None, Parameter(help="in the place of the problem's method")] = None,
     solver: Annotated[str | None, Parameter(help="QP solver, in the place of the problem's")] = None,
     steps: Annotated[int | None, Parameter(help="number of steps, in the place of the problem's")] = None,
@@ -42,7 +39,10 @@ def solve(
 
     A maneuver that is blocked or interrupted is written as far as it came, and says so.
     """
+    from vgtm_qp.export import export_maneuver
+    from vgtm_qp.maneuver.solve import solve as run
     from vgtm_qp.problem import load_problem
+    from vgtm_qp.verify import verify as certify
 
     loaded = _changed(
         load_problem(problem), {"method.name": method, "method.solver": solver, "maneuver.steps": steps}
@@ -58,9 +58,6 @@ def solve(
 
         import_viser()
 
-    from vgtm_qp.maneuver.solve import solve as run
-    from vgtm_qp.verify import verify as certify
-
     with following(loaded.name, shown=not json) as progress:
         maneuver = run(loaded, progress=progress, verify=False)
     # Written before it is verified, so that an interrupt of the verification loses nothing.
@@ -68,12 +65,10 @@ def solve(
     maneuver = maneuver.with_certificate(certify(maneuver))
     maneuver.save(result)
     if figure is not None:
-        from vgtm_qp.view.figure import plot_frames, save_figure
+        from vgtm_qp.view.figure import save_figure
 
-        save_figure(plot_frames(maneuver), figure)
+        save_figure(maneuver.plot(), figure)
     if html is not None:
-        from vgtm_qp.export import export_maneuver
-
         export_maneuver(maneuver, html, to="html")
 
     files = {"result": result, "figure": figure, "html": html}

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import Json, document, note, say
+from vgtm_qp.cli.output import Json, Output, Switch, document, note, say
 from vgtm_qp.cli.progress import bar
 
 
@@ -23,15 +23,11 @@ def study(
     *,
     workers: Annotated[int, Parameter(help="processes; studies of run time use one, alone")] = 1,
     dask: Annotated[str | None, Parameter(help="address of a dask.distributed scheduler")] = None,
-    short: Annotated[bool, Parameter(negative="", help="a quick look: fewer and smaller runs")] = False,
+    short: Annotated[bool, Switch(help="a quick look: fewer and smaller runs")] = False,
     scenes: Annotated[int | None, Parameter(help="number of random scenes, of robustness")] = None,
     seed: Annotated[int | None, Parameter(help="seed of the random scenes, of robustness")] = None,
-    ipopt: Annotated[
-        bool, Parameter(negative="", help="solve them by IPOPT too, step by step, of robustness")
-    ] = False,
-    output: Annotated[Path, Parameter(name=["--output", "-o"], help="folder of the results")] = Path(
-        "studies"
-    ),
+    ipopt: Annotated[bool, Switch(help="solve them by IPOPT too, step by step, of robustness")] = False,
+    output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
     json: Json = False,
 ) -> None:
     """Run studies and write rows (CSV, JSON), a figure (PDF) and a text (Markdown) for each.

@@ -35,23 +35,15 @@ _SIDES = {"to its left": 1, "to its right": 3, "away from what blocks it": 0, "t
 
 @dataclass(frozen=True, eq=False)
 class DeadEnd:
-    """Where an arm stopped.
-
-    Attributes
-    ----------
-    stop : Stop
-    control_vertices : (V, 3)
-        The curve there, m; V = 0 without one.
-    height : float
-        Of the arm at home, m.
-    heading : (3,)
-        Direction of the path from there on.
-    """
+    """Where an arm stopped."""
 
     stop: Stop
     control_vertices: Array
+    """(V, 3) those of the curve there, m; V = 0 without one."""
     height: float
+    """Of the arm at home, m."""
     heading: Array
+    """(3,) direction of the path from there on."""
 
 
 Changes = dict[str, Any]

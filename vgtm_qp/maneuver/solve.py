@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -12,9 +11,9 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
+from vgtm_qp.machine import THREADS, environment
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.retries import DeadEnd, retries
@@ -29,11 +28,8 @@ from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.verify import verify as check
 
-Array = NDArray[np.float64]
-
 _STALLED_PROGRESS = 1e-3
 _STALLED_STEPS = 10
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Progress = Callable[[float, Step], None]
 
@@ -100,24 +96,18 @@ def solve_many(
     concurrent.futures.process.BrokenProcessPool
         A process was killed from outside.
     """
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            tasks = [pool.submit(solve, problem, verify=verify) for problem in problems]
-            try:
-                for task in tasks:
-                    yield task.result()
-            finally:
-                for task in tasks:
-                    task.cancel()
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    context = multiprocessing.get_context("spawn")
+    with (
+        environment(dict.fromkeys(THREADS, "1")),
+        ProcessPoolExecutor(workers, mp_context=context) as pool,
+    ):
+        tasks = [pool.submit(solve, problem, verify=verify) for problem in problems]
+        try:
+            for task in tasks:
+                yield task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
 
 
 class _Attempt:
