@@ -158,7 +158,8 @@ class _Workers:
         """Begin to compile `text` into the object `target`, unless that is done or being done."""
         with self._lock:
             if target not in self._objects or (self._objects[target].done() and not target.exists()):
-                self._objects[target] = self._compilers.submit(_compile, cc, text, target, flags)
+                command = [*shlex.split(cc), *_FLAGS, *flags, "-x", "c", "-c", "-"]
+                self._objects[target] = self._compilers.submit(_make, target, command, text)
             return self._objects[target]
 
 
@@ -175,14 +176,9 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_start_anew)
 
 
-def _compile(cc: str, text: str, target: Path, flags: tuple[str, ...]) -> bool:
-    """Compile `text` into the object `target` if that is not there; return whether it is."""
-    return target.exists() or _make(target, [*shlex.split(cc), *_FLAGS, *flags, "-x", "c", "-c", "-"], text)
-
-
 def _link(cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | None:
     """Return the shared library, made of `objects` if it is not there; None where it cannot be made."""
-    if not library.exists() and all(made.result() for made in objects.values()):
+    if all(made.result() for made in objects.values()):
         _make(library, [*shlex.split(cc), "-shared", *map(str, objects), "-lm"])
         library.with_suffix(".o").unlink(missing_ok=True)
     # Another process may have made the library meanwhile, and cleared up.
@@ -190,18 +186,16 @@ def _link(cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | N
 
 
 def _make(target: Path, command: list[str], text: str = "") -> bool:
-    """Run a compiler that reads `text` and writes `target`, all of it or nothing; return whether it did."""
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-            made = Path(scratch) / target.name
-            subprocess.run(
-                [*command, "-o", str(made)], input=text.encode(), check=True, capture_output=True, timeout=300
-            )
-            made.replace(target)
-    except (OSError, subprocess.SubprocessError):
-        return False
-    return True
+    """Have a compiler read `text` and write all of `target`, or nothing; return whether it is there."""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
+                made = Path(scratch) / target.name
+                whole = [*command, "-o", str(made)]
+                subprocess.run(whole, input=text.encode(), check=True, capture_output=True, timeout=300)
+                made.replace(target)
+    return target.exists()
 
 
 def _begin(function: ca.Function, cc: str) -> Future[Path | None]:

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
-from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError, VgtmError
 from vgtm_qp.result.result import Result
@@ -26,14 +25,13 @@ from vgtm_qp.view.drawing import (
     OBSTACLE_COLOUR,
     PATH_COLOUR,
     POLYGON_COLOUR,
+    Array,
     drawing_of_maneuver,
     heading,
     stroke_colours,
     with_surroundings,
 )
 from vgtm_qp.view.projection import ProjectedMesh, Projection, layers, pieces
-
-Array = NDArray[np.float64]
 
 SUFFIXES = (".pdf", ".png", ".svg")
 _RC: Any = {"font.size": 8.0, "font.family": "sans-serif", "pdf.fonttype": 42, "svg.fonttype": "none"}
@@ -141,18 +139,10 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
 
 
 class _View:
-    """What a panel shows: the arm in the states `seen` and, of the obstacles, what is near it.
+    """What panels show, m: the arm in the states `seen` and, of the obstacles, what is near it.
 
-    Attributes
-    ----------
-    low, high : (2,)
-        Corners of the paper, m.
-    floor : (2, 2)
-        Corners of the floor, in x and y, m.
-    ground, top : float
-        Height of the floor, and of the highest tick, m.
-    step : float
-        Distance of the floor's lines and of the ticks, m.
+    The paper goes from `low` to `high` (2,). The `floor` (2, 2), least and greatest x and y, is at the height `ground`
+    and has lines every `step`, as there are ticks up to `top`.
     """
 
     def __init__(
@@ -336,9 +326,8 @@ def _rows(maneuver: Result, frames: int | Sequence[int]) -> list[int]:
 def _round_step(size: float) -> float:
     """Return the least of 1, 2, 5 times a power of ten that is not less than `size`."""
     power = 10.0 ** np.floor(np.log10(size))
-    return float(
-        next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= size * (1 - 1e-9))
-    )
+    steps = (factor * power for factor in (1.0, 2.0, 5.0, 10.0))
+    return float(next(step for step in steps if step >= size * (1 - 1e-9)))
 
 
 def _label(axes: Axes, name: str, values: Array, places: Array, scale: float) -> None:
@@ -351,23 +340,17 @@ def _label(axes: Axes, name: str, values: Array, places: Array, scale: float) ->
     first = 1 if name == "y" else 0
     for value, place in list(zip(values, places, strict=True))[first::every]:
         axes.annotate(f"{value:g}", place, shift, fontsize=6.5, **text)
-    axes.annotate(
-        f"{name} (m)", places.mean(axis=0), name_shift, fontsize=7.0, rotation=90.0 * (name == "z"), **text
-    )
+    text |= {"fontsize": 7.0, "rotation": 90.0 * (name == "z")}
+    axes.annotate(f"{name} (m)", places.mean(axis=0), name_shift, **text)
 
 
 def _draw_surface(axes: Axes, surface: ProjectedMesh, time: float, zorder: float) -> None:
     polygons = surface.polygons(time)
-    axes.add_collection(
-        PolyCollection(polygons, facecolors=[OBSTACLE_COLOUR], alpha=0.30, linewidths=0.0, zorder=zorder)
-    )
-    for seen, width, style in ((False, 0.5, (0, (1.5, 2.0))), (True, 0.8, "solid")):
-        edges = list(surface.edges(time, seen=seen))
-        axes.add_collection(
-            LineCollection(edges, colors=[_EDGE], linewidths=width, linestyles=[style], zorder=zorder + 0.1)
-        )
+    styles: list[Any] = [{"facecolors": [OBSTACLE_COLOUR], "alpha": 0.30, "linewidths": 0.0}]
     if surface.is_convex:
-        outline = PolyCollection(
-            polygons, facecolors="none", edgecolors=[_EDGE], linewidths=0.8, zorder=zorder
-        )
-        axes.add_collection(outline)
+        styles.append({"facecolors": "none", "edgecolors": [_EDGE], "linewidths": 0.8})
+    for style in styles:
+        axes.add_collection(PolyCollection(polygons, zorder=zorder, **style))
+    for seen, width, dashes in ((False, 0.5, (0, (1.5, 2.0))), (True, 0.8, "solid")):
+        line: Any = {"colors": [_EDGE], "linewidths": width, "linestyles": [dashes], "zorder": zorder + 0.1}
+        axes.add_collection(LineCollection(list(surface.edges(time, seen=seen)), **line))

@@ -9,14 +9,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import recorded_arm
 from vgtm_qp.verify.check import TIP_TOLERANCE
 from vgtm_qp.verify.path import check_path
-
-Array = NDArray[np.float64]
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Distinct in every common form of colour blindness (Okabe and Ito, 2008)."""

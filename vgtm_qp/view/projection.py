@@ -8,10 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.view.drawing import ObstacleMesh, direction
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from vgtm_qp.view.drawing import Array, Index, ObstacleMesh, direction
 
 _MANY_FACES = 4000
 _SHARP = np.radians(20.0)
@@ -19,15 +16,10 @@ _SHARP = np.radians(20.0)
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A parallel projection.
-
-    Attributes
-    ----------
-    axes : (3, 3)
-        Rows: to the right on paper, up on paper, and towards the viewer.
-    """
+    """A parallel projection."""
 
     axes: Array
+    """(3, 3), rows: to the right on paper, up on paper, and towards the viewer."""
 
     @classmethod
     def looking(cls, azimuth: float, elevation: float) -> Projection:
@@ -91,12 +83,11 @@ class ProjectedMesh:
         A point whose line of sight meets a convex body is before it just if it is outside one of the planes
         of the faces that the viewer sees.
         """
-        shifted = points - self.mesh.position(time)
         if not self.is_convex:
             return self.projection.depth(points) > self.depth(time)
-        corners = self.vertices[self.faces[self.facing, 0]]
-        normals = self.normals[self.facing]
-        return np.asarray((shifted @ normals.T > np.einsum("fc,fc->f", normals, corners)).any(axis=1))
+        corners, normals = self.vertices[self.faces[self.facing, 0]], self.normals[self.facing]
+        heights = (points - self.mesh.position(time)) @ normals.T
+        return np.asarray((heights > np.einsum("fc,fc->f", normals, corners)).any(axis=1))
 
 
 def layers(points: Array, surfaces: list[ProjectedMesh], time: float) -> Index:

@@ -17,12 +17,11 @@ from vgtm_qp.view.drawing import (
     OBSTACLE_COLOUR,
     PATH_COLOUR,
     POLYGON_COLOUR,
+    Array,
     Camera,
     Drawing,
     ObstacleMesh,
 )
-
-Array = NDArray[np.float64]
 
 _FIXED_POINT = 2.0**-12
 """Resolution of recorded coordinates, m: a quarter of a millimetre, so that a recording compresses."""
