@@ -19,7 +19,7 @@ from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baselin
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.measure import Breakdown, Pairs, Spent, Timing, run_alone, run_in_turn
 from vgtm_qp.bench.tables import render
-from vgtm_qp.cli import bench as command
+from vgtm_qp.cli import experiments as command
 from vgtm_qp.cli import main
 from vgtm_qp.ipopt.linearised import NonlinearStep
 from vgtm_qp.maneuver.plan import Plan, make_plan

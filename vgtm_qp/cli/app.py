@@ -11,14 +11,12 @@ from typing import Any
 
 from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError, UnusedCliTokensError
 
-from vgtm_qp.cli.bench import bench
-from vgtm_qp.cli.compare import compare
 from vgtm_qp.cli.doctor import doctor
+from vgtm_qp.cli.experiments import bench, compare, study
 from vgtm_qp.cli.output import ExitCode, document, note
 from vgtm_qp.cli.problems import check, list_problems, schema
 from vgtm_qp.cli.results import export, replay, verify, view
 from vgtm_qp.cli.solve import solve
-from vgtm_qp.cli.study import study
 from vgtm_qp.errors import ProblemError, VgtmError, nearest
 
 _EPILOGUE = (
