@@ -178,9 +178,10 @@ if hasattr(os, "register_at_fork"):
 
 def _link(cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | None:
     """Return the shared library, made of `objects` if it is not there; None where it cannot be made."""
-    if all(made.result() for made in objects.values()):
+    if not library.exists() and all(made.result() for made in objects.values()):
         _make(library, [*shlex.split(cc), "-shared", *map(str, objects), "-lm"])
-        library.with_suffix(".o").unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            library.with_suffix(".o").unlink()
     # Another process may have made the library meanwhile, and cleared up.
     return library if library.exists() else None
 

@@ -7,6 +7,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import Any
 
 from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError, UnusedCliTokensError
@@ -70,7 +71,9 @@ def main(tokens: Sequence[str] | None = None) -> int:
         return ExitCode.SOLVED if code is None else int(code)
     except (Exception, KeyboardInterrupt) as error:
         code, message = _told(error)
-        mistakes = _mistakes(error) if isinstance(error, ProblemError) else []
+        mistakes = []
+        if isinstance(error, ProblemError):
+            mistakes = [{"file": error.source, **asdict(mistake)} for mistake in error.mistakes]
         # Each line of a ProblemError begins with the file that it is about.
         note(message if mistakes else f"vgtm: {message}")
         if "--json" in given:
@@ -133,10 +136,3 @@ def _usage(command: str) -> str:
     given = [f" {entry.name}" for entry in arguments if not entry.name.startswith("-")]
     required = [f" {entry.name} ..." for entry in arguments if entry.required and entry.name.startswith("-")]
     return "".join([*given, *required, " [OPTIONS]"])
-
-
-def _mistakes(error: ProblemError) -> list[dict[str, str]]:
-    return [
-        {"file": error.source, "key": mistake.key, "value": mistake.value, "expected": mistake.expected}
-        for mistake in error.mistakes
-    ]
