@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 FormatName = Literal["html", "gif", "mp4", "pdf", "png", "csv", "mcap", "ros", "mjcf"]
 
+_SHOWN = "problem file, name of a bundled problem, or result file, .npz"
+
 # With several results the first of these that any of them earned is the exit code.
 _WORST_FIRST = (ExitCode.USAGE, ExitCode.UNVERIFIED, ExitCode.BLOCKED, ExitCode.SOLVED)
 
@@ -84,12 +86,7 @@ def outcome_code(maneuver: Maneuver) -> ExitCode:
 
 
 def view(
-    shown: Annotated[
-        str,
-        Parameter(
-            name="PROBLEM_OR_RESULT", help="problem file, name of a bundled problem, or result file, .npz"
-        ),
-    ],
+    shown: Annotated[str, Parameter(name="PROBLEM_OR_RESULT", help=_SHOWN)],
     /,
     *,
     port: Annotated[int, Parameter(help="port on 127.0.0.1; the next free one from here on")] = 8080,

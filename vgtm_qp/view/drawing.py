@@ -102,13 +102,7 @@ def stroke_colours(share: Array) -> Array:
 
 
 def drawing_of_maneuver(maneuver: Result) -> Drawing:
-    """Return the drawing of a result, from its manifest.
-
-    Raises
-    ------
-    ResultError
-        The arm record in the manifest is malformed.
-    """
+    """Return the drawing of a result, from its manifest; raise ResultError where its record of the arm is wrong."""
     manifest = maneuver.manifest
     arm = recorded_arm(manifest["arm"], maneuver.members)
     vertices = maneuver.control_vertices.shape[1]

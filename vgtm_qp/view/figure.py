@@ -101,13 +101,7 @@ def plot_frames(
 
 
 def each_frame(maneuver: Result, rows: Sequence[int]) -> Iterator[Figure]:
-    """Yield one figure for each of the states `rows`, all in the view that holds the whole maneuver.
-
-    Raises
-    ------
-    VgtmError
-        There is no such state.
-    """
+    """Yield one figure for each of the states `rows`, all in the view that holds the whole maneuver."""
     view = _View(maneuver, list(range(len(maneuver.time))))
     for row in _rows(maneuver, rows):
         yield view.figure([row], [f"{maneuver.time[row]:.2f} s"])

@@ -28,13 +28,7 @@ _FIXED_POINT = 2.0**-12
 
 
 def import_viser() -> Any:
-    """Return the module ``viser``.
-
-    Raises
-    ------
-    MissingExtraError
-        It is not installed.
-    """
+    """Return the module ``viser``; raise MissingExtraError where it is not installed."""
     try:
         import viser
     except ImportError:
@@ -44,13 +38,7 @@ def import_viser() -> Any:
 
 @contextmanager
 def viser_server(port: int = 0) -> Iterator[Any]:
-    """Run a viser server that this machine alone can reach; its own messages do not reach stdout.
-
-    Raises
-    ------
-    MissingExtraError
-        viser is not installed.
-    """
+    """Run a viser server that this machine alone can reach; its own messages do not reach stdout."""
     viser = import_viser()
     with redirect_stdout(StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
@@ -88,8 +76,10 @@ class ArmScene:
         self._nodes = self._add_many("/nodes", ball, nodes, unturned, dark)
         self._curve = self._polygon = self._vertices = None
         if drawing.curve_weights.size:
-            self._curve = self._add_line("/curve", drawing.curve(control_vertices), CURVE_COLOUR, 0.028)
-            self._polygon = self._add_line("/control polygon", control_vertices, POLYGON_COLOUR, 0.01)
+            points = drawing.curve(control_vertices)
+            self._curve = self.add_path("/curve", points, colour=CURVE_COLOUR, thickness=0.028)
+            style: Any = {"colour": POLYGON_COLOUR, "thickness": 0.01}
+            self._polygon = self.add_path("/control polygon", control_vertices, **style)
             self._vertices = self._scene.add_point_cloud(
                 "/control vertices",
                 control_vertices.astype(np.float32),
@@ -130,9 +120,12 @@ class ArmScene:
                 if mesh.velocity.any():
                     handle.position = mesh.position(time)
 
-    def add_path(self, name: str, points: Array, *, thickness: float = 0.012) -> Any:
+    def add_path(
+        self, name: str, points: Array, *, colour: Any = PATH_COLOUR, thickness: float = 0.012
+    ) -> Any:
         """Draw a line through `points` (K, 3), m, and return its handle."""
-        return self._add_line(name, points, PATH_COLOUR, thickness)
+        segments = _segments(points).astype(np.float32)
+        return self._scene.add_line_segments(name, segments, _rgb(colour), thickness=thickness)
 
     def look(self, camera: Camera) -> None:
         """Let every new page begin with `camera`."""
@@ -152,13 +145,6 @@ class ArmScene:
             batched_colors=_instance_rgb(colours),
             lod="off",
             **more,
-        )
-
-    def _add_line(
-        self, name: str, points: Array, colour: tuple[float, float, float], thickness: float
-    ) -> Any:
-        return self._scene.add_line_segments(
-            name, _segments(points).astype(np.float32), _rgb(colour), thickness=thickness
         )
 
     def _add_obstacle(self, mesh: ObstacleMesh) -> Any:
