@@ -18,7 +18,6 @@ import contextlib
 import hashlib
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import tempfile
@@ -158,7 +157,7 @@ class _Workers:
         """Begin to compile `text` into the object `target`, unless that is done or being done."""
         with self._lock:
             if target not in self._objects or (self._objects[target].done() and not target.exists()):
-                command = [*shlex.split(cc), *_FLAGS, *flags, "-x", "c", "-c", "-"]
+                command = [cc, *_FLAGS, *flags, "-x", "c", "-c", "-"]
                 self._objects[target] = self._compilers.submit(_make, target, command, text)
             return self._objects[target]
 
@@ -179,7 +178,7 @@ if hasattr(os, "register_at_fork"):
 def _link(cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | None:
     """Return the shared library, made of `objects` if it is not there; None where it cannot be made."""
     if not library.exists() and all(made.result() for made in objects.values()):
-        _make(library, [*shlex.split(cc), "-shared", *map(str, objects), "-lm"])
+        _make(library, [cc, "-shared", *map(str, objects), "-lm"])
         with contextlib.suppress(OSError):
             library.with_suffix(".o").unlink()
     # Another process may have made the library meanwhile, and cleared up.
