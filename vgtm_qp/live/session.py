@@ -61,12 +61,8 @@ class Session:
         recorded = recorded_arm(arm.record(), arm.bodies.joints)
         vertices = len(self.state.control_vertices)
         self.drawing = make_drawing(problem.to_dict(), recorded, vertices, directory)
-        self.target: Array = self.tip
-        self.vertex_goals: dict[int, Array] = {}
-        self._waiting = 0
         self._step_time = 0.0
-        self._held_by: tuple[str, ...] = ()
-        self._last: Step | None = None
+        self._put(self.state)
 
     @property
     def nodes(self) -> Array:
@@ -124,8 +120,11 @@ class Session:
 
     def _put(self, state: State) -> None:
         self._resolver.state = state
-        self.target, self.vertex_goals = self.tip, {}
-        self._waiting, self._held_by, self._last = 0, (), None
+        self.target = self.tip
+        self.vertex_goals: dict[int, Array] = {}
+        self._waiting = 0
+        self._held_by: tuple[str, ...] = ()
+        self._last: Step | None = None
 
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change values of the problem, by key path, and go on from the same state.
