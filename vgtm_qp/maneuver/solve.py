@@ -97,10 +97,8 @@ def solve_many(
         A process was killed from outside.
     """
     context = multiprocessing.get_context("spawn")
-    with (
-        environment(dict.fromkeys(THREADS, "1")),
-        ProcessPoolExecutor(workers, mp_context=context) as pool,
-    ):
+    one = environment(dict.fromkeys(THREADS, "1"))
+    with one, ProcessPoolExecutor(workers, mp_context=context) as pool:
         tasks = [pool.submit(solve, problem, verify=verify) for problem in problems]
         try:
             for task in tasks:
@@ -244,7 +242,8 @@ def _assemble(
         problem.to_dict(),
         setup.arm.record(),
         status="solved" if stop is None else "blocked",
-        reached=attempt.progress,
+        # That of the last whole row: an interrupt may have come before the next.
+        reached=float(attempt.rows["progress"][-1]),
         blocked_by=() if stop is None else stop.names,
         stop=None if stop is None else stop.to_dict(),
         way_out=way,
