@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from vgtm_qp import compiled as compiled_module
 from vgtm_qp.compiled import Kernel, compiler, finish_compiling
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -74,17 +74,28 @@ def test_what_two_kernels_share_is_compiled_once(tmp_path, monkeypatch):
 @needs_compiler
 def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
-    monkeypatch.setattr(compiled_module, "_LONG", 0)
     a, b = ca.MX.sym("a", 4, 4), ca.MX.sym("b", 4, 4)
-    product = ca.Function("product", [a, b], [a @ b + ca.fmin(a, b)])
-    kernel, rng = Kernel(product), np.random.default_rng(0)
+    product = a
+    for k in range(300):
+        product = 0.25 * product @ b + ca.fmin(a + k, b)
+    function = ca.Function("product", [a, b], [product])
+    kernel, rng = Kernel(function), np.random.default_rng(0)
+    assert len(_source(function)) > 100_000
     assert kernel.is_compiled
     for array in kernel.inputs:
-        array[:] = rng.normal(size=16)
+        array[:] = rng.uniform(-1.0, 1.0, size=16)
     kernel()
     first, second = (array.reshape(4, 4).T for array in kernel.inputs)
-    wanted = first @ second + np.minimum(first, second)
-    np.testing.assert_allclose(kernel.outputs[0].reshape(4, 4).T, wanted, atol=1e-15)
+    wanted = first
+    for k in range(300):
+        wanted = 0.25 * wanted @ second + np.minimum(first + k, second)
+    np.testing.assert_allclose(kernel.outputs[0].reshape(4, 4).T, wanted, rtol=1e-12)
+
+
+def _source(function: ca.Function) -> str:
+    generator = ca.CodeGenerator("product.c")
+    generator.add(function)
+    return str(generator.dump())
 
 
 def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, monkeypatch):
@@ -100,11 +111,14 @@ def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, mo
 
 @needs_compiler
 def test_finishing_leaves_nothing_to_wait_for(tmp_path, monkeypatch):
-    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("VGTM_CACHE", str(cache))
     kernel = Kernel(_long("awaited", 3.0))
     finish_compiling()
-    assert list(tmp_path.glob("awaited-*.so"))
-    monkeypatch.setattr(compiled_module, "_run", None)
+    assert list(cache.glob("awaited-*.so"))
+    # With a file in the place of the cache nothing could be compiled or loaded any more.
+    shutil.rmtree(cache)
+    cache.write_text("in the way")
     assert kernel.is_compiled
 
 

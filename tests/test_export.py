@@ -16,7 +16,7 @@ from synthetic import maneuver_of, place, tripod
 
 import vgtm_qp as vq
 from vgtm_qp.cli import main
-from vgtm_qp.cli.export import FormatName
+from vgtm_qp.cli.results import FormatName
 from vgtm_qp.export import FORMATS, export_maneuver
 from vgtm_qp.export.mjcf import mjcf, node_masses
 from vgtm_qp.export.trajectory import step_rates, through_rates

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import vgtm_qp as vq
-from vgtm_qp.live.page import view
-from vgtm_qp.live.read_out import read_out
+from vgtm_qp.live.page import read_out, view
 from vgtm_qp.live.session import Session
 
 CHROMIUM = Path("/usr/bin/chromium")

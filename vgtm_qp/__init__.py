@@ -7,50 +7,37 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from vgtm_qp.errors import (
+    CurveError,
+    ExportError,
+    GoalError,
+    MissingExtraError,
+    Mistake,
+    ProblemError,
+    ResultError,
+    SolverError,
+    TrussError,
+    VgtmError,
+)
+
 if TYPE_CHECKING:
     from vgtm_qp.arm.truss.build import build_truss
     from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.arm.truss.truss import Truss
     from vgtm_qp.comparison.compare import Report, compare
-    from vgtm_qp.errors import (
-        CurveError,
-        ExportError,
-        GoalError,
-        MissingExtraError,
-        Mistake,
-        ProblemError,
-        ResultError,
-        SolverError,
-        TrussError,
-        VgtmError,
-    )
     from vgtm_qp.export import export_maneuver
     from vgtm_qp.maneuver.maneuver import Maneuver, load_result
-    from vgtm_qp.maneuver.many import solve_many
-    from vgtm_qp.maneuver.solve import solve
+    from vgtm_qp.maneuver.solve import solve, solve_many
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
     from vgtm_qp.result.certificate import Certificate, Measure
     from vgtm_qp.step.resolver import Resolver, Step, StepStatus
     from vgtm_qp.verify import verify, verify_file
 
 _HOMES = {
-    "vgtm_qp.errors": (
-        "CurveError",
-        "ExportError",
-        "GoalError",
-        "MissingExtraError",
-        "Mistake",
-        "ProblemError",
-        "ResultError",
-        "SolverError",
-        "TrussError",
-        "VgtmError",
-    ),
     "vgtm_qp.export": ("export_maneuver",),
     "vgtm_qp.result.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),
-    "vgtm_qp.maneuver.many": ("solve_many",),
-    "vgtm_qp.maneuver.solve": ("solve",),
+    "vgtm_qp.maneuver.solve": ("solve", "solve_many"),
     "vgtm_qp.comparison.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
     "vgtm_qp.step.resolver": ("Resolver", "Step", "StepStatus"),

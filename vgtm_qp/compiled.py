@@ -18,14 +18,13 @@ import contextlib
 import hashlib
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +51,9 @@ _QUICK = ("-O1",)
 _LONG = 100_000
 """Source texts of more characters take the compiler seconds."""
 
-_MOST_COMPILERS = 4
+_MOST_COMPILERS, _MOST_LINKERS = 4, 64
+"""Processes at a time; most linkers only wait for their objects."""
+
 _WORTH_IT = 100
 """Functions of fewer lines are not compiled by themselves."""
 
@@ -86,6 +87,7 @@ def cache_directory() -> Path:
     return (Path(root) if root else Path.home() / ".cache") / "vgtm-qp"
 
 
+@cache
 def _machine() -> str:
     """Return what a ``-march=native`` library depends on beside its source."""
     try:
@@ -141,112 +143,78 @@ def _with_fast_helpers(source: str) -> str:
     )
 
 
-class _Compilers:
-    """Compilers at work for this process."""
+class _Workers:
+    """The threads in which the compilers of this process run, and the objects they make."""
 
     def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self._pool: ThreadPoolExecutor | None = None
-        self._units: dict[Path, Future[Path | None]] = {}
+        self.resolving = threading.RLock()
+        self.linkers = ThreadPoolExecutor(_MOST_LINKERS, "vgtm-linker")
+        self._compilers = ThreadPoolExecutor(min(_MOST_COMPILERS, os.cpu_count() or 1), "vgtm-compiler")
+        self._lock = threading.Lock()
+        self._objects: dict[Path, Future[bool]] = {}
 
-    def compile(self, cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Future[Path | None]:
+    def compile(self, cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Future[bool]:
         """Begin to compile `text` into the object `target`, unless that is done or being done."""
-        with self.lock:
-            if target not in self._units or (self._units[target].done() and not target.exists()):
-                self._units[target] = self._workers().submit(_object, cc, text, target, flags)
-            return self._units[target]
-
-    def link(self, compiling: Compiling) -> None:
-        """Have a library made as soon as its parts are there."""
-        with self.lock:
-            self._workers().submit(compiling.make)
-
-    def _workers(self) -> ThreadPoolExecutor:
-        if self._pool is None:
-            most = max(1, min(_MOST_COMPILERS, os.cpu_count() or 1))
-            self._pool = ThreadPoolExecutor(most, "vgtm-compiler")
-        return self._pool
+        with self._lock:
+            if target not in self._objects or (self._objects[target].done() and not target.exists()):
+                command = [cc, *_FLAGS, *flags, "-x", "c", "-c", "-"]
+                self._objects[target] = self._compilers.submit(_make, target, command, text)
+            return self._objects[target]
 
 
-_compilers = _Compilers()
-_resolving = threading.RLock()
+_workers = _Workers()
 
 
-def _forget() -> None:
-    """Begin anew in a forked process, which has none of the threads."""
-    global _compilers, _resolving
-    _compilers, _resolving = _Compilers(), threading.RLock()
+def _start_anew() -> None:
+    """Begin anew in a forked process, which has none of its parent's threads."""
+    global _workers
+    _workers = _Workers()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget)
+    os.register_at_fork(after_in_child=_start_anew)
 
 
-def _run(command: list[str]) -> None:
-    subprocess.run(command, check=True, capture_output=True, timeout=300)
+def _link(cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | None:
+    """Return the shared library, made of `objects` if it is not there; None where it cannot be made."""
+    if not library.exists() and all(made.result() for made in objects.values()):
+        _make(library, [cc, "-shared", *map(str, objects), "-lm"])
+        with contextlib.suppress(OSError):
+            library.with_suffix(".o").unlink()
+    # Another process may have made the library meanwhile, and cleared up.
+    return library if library.exists() else None
 
 
-def _object(cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Path | None:
-    """Return the object file that `text` was compiled to; None where it cannot be."""
-    if target.exists():
-        return target
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-            c_file, o_file = Path(scratch) / "kernel.c", Path(scratch) / "kernel.o"
-            c_file.write_text(text)
-            _run([*shlex.split(cc), *_FLAGS, *flags, "-c", str(c_file), "-o", str(o_file)])
-            o_file.replace(target)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return target
+def _make(target: Path, command: list[str], text: str = "") -> bool:
+    """Have a compiler read `text` and write all of `target`, or nothing; return whether it is there."""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
+                made = Path(scratch) / target.name
+                whole = [*command, "-o", str(made)]
+                subprocess.run(whole, input=text.encode(), check=True, capture_output=True, timeout=300)
+                made.replace(target)
+    return target.exists()
 
 
-class _Build:
-    """A library that is being compiled."""
-
-    def __init__(self, function: ca.Function, cc: str) -> None:
-        generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
-        generator.add(function)
-        source = generator.dump()
-        folder = cache_directory()
-        key = _hash(source, cc)
-        self._cc, self._target = cc, folder / f"{function.name()}-{key}.so"
-        self._parts: list[Future[Path | None]] = []
-        self.process = os.getpid()
-        self._main = folder / f"{function.name()}-{key}.o"
-        if not self._target.exists():
-            rest, units = _split(source)
-            texts = {folder / f"{name}-{_hash(cc)[:8]}.o": text for name, text in units.items()}
-            quick = _QUICK if len(rest) > _LONG else ()
-            texts[self._main] = _with_fast_helpers(rest) if quick else rest
-            # The longest first: nothing waits for it at the end.
-            longest = sorted(texts, key=lambda path: -len(texts[path]))
-            self._parts = [
-                _compilers.compile(cc, texts[path], path, quick if path == self._main else ())
-                for path in longest
-            ]
-
-    @property
-    def is_made(self) -> bool:
-        """Whether the shared library is there."""
-        return self._target.exists()
-
-    def library(self) -> Path | None:
-        """Return the shared library as soon as it is there; None where it cannot be compiled."""
-        if self._target.exists():
-            return self._target
-        objects = [part.result() for part in self._parts]
-        try:
-            with tempfile.TemporaryDirectory(dir=self._target.parent) as scratch:
-                so_file = Path(scratch) / "kernel.so"
-                _run([*shlex.split(self._cc), "-shared", *map(str, objects), "-o", str(so_file), "-lm"])
-                so_file.replace(self._target)
-            self._main.unlink(missing_ok=True)
-        except (OSError, subprocess.SubprocessError):
-            # Another process may have made the library meanwhile, and cleared up.
-            pass
-        return self._target if self._target.exists() else None
+def _begin(function: ca.Function, cc: str) -> Future[Path | None]:
+    """Begin to compile `function`; return what will be its shared library, None where it cannot be compiled."""
+    generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
+    generator.add(function)
+    source = generator.dump()
+    folder = cache_directory()
+    library = folder / f"{function.name()}-{_hash(source, cc)}.so"
+    objects: dict[Path, Future[bool]] = {}
+    if not library.exists():
+        rest, units = _split(source)
+        texts = {folder / f"{name}-{_hash(cc)[:8]}.o": text for name, text in units.items()}
+        main, quick = library.with_suffix(".o"), _QUICK if len(rest) > _LONG else ()
+        texts[main] = _with_fast_helpers(rest) if quick else rest
+        # The longest first: nothing waits for it at the end.
+        for path in sorted(texts, key=lambda path: -len(texts[path])):
+            objects[path] = _workers.compile(cc, texts[path], path, quick if path == main else ())
+    return _workers.linkers.submit(_link, cc, objects, library)
 
 
 class Compiling:
@@ -254,35 +222,25 @@ class Compiling:
 
     def __init__(self, function: ca.Function) -> None:
         self._function, self._cc = function, compiler()
-        self._build = None if self._cc is None else _Build(function, self._cc)
-        self._done: ca.Function | None = None
+        self._found: ca.Function | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._begun_by = _workers
+        self._library = None if self._cc is None else _begin(self._function, self._cc)
 
     def result(self) -> ca.Function:
         """Return the compiled function when it is there, or the one it comes from where no compiler works."""
-        if self._done is None:
-            self._done = self._wait()
-            self._build = None
-        return self._done
+        if self._found is None:
+            self._found = self._load() or self._function
+        return self._found
 
-    @property
-    def is_made(self) -> bool:
-        """Whether nothing has to be waited for."""
-        return self._build is None or self._build.is_made
-
-    def make(self) -> None:
-        """Wait until the library is there, if it can be; any thread may."""
-        build = self._build
-        if build is not None and build.process == os.getpid():
-            build.library()
-
-    def _wait(self) -> ca.Function:
-        if self._build is None or self._cc is None:
-            return self._function
-        if self._build.process != os.getpid():
+    def _load(self) -> ca.Function | None:
+        if self._begun_by is not _workers:
             # The compilers were at work for the process that this one was forked from.
-            self._build = _Build(self._function, self._cc)
+            self._begin()
         for _ in range(2):
-            library = self._build.library()
+            library = None if self._library is None else self._library.result()
             if library is None:
                 break
             try:
@@ -291,8 +249,8 @@ class Compiling:
                 # Cut short by a full disk, or from a machine with another C library: compiled once more.
                 with contextlib.suppress(OSError):
                     library.unlink(missing_ok=True)
-                self._build = _Build(self._function, self._cc)
-        return self._function
+                self._begin()
+        return None
 
 
 _waiting: weakref.WeakSet[Kernel] = weakref.WeakSet()
@@ -303,17 +261,7 @@ def finish_compiling() -> None:
 
     Those that were begun for later go on being compiled.
     """
-    kernels = list(_waiting)
-    unmade = {
-        kernel.compiling
-        for kernel in kernels
-        if kernel.compiling is not None and not kernel.compiling.is_made
-    }
-    if unmade:
-        # Each is linked as soon as its parts are there, while others are still being compiled.
-        with ThreadPoolExecutor(len(unmade), "vgtm-linker") as pool:
-            list(pool.map(Compiling.make, unmade))
-    for kernel in kernels:
+    for kernel in list(_waiting):
         _ = kernel.is_compiled
 
 
@@ -331,62 +279,30 @@ class Kernel:
         self, function: ca.Function, *, compiled: bool | Compiling = True, for_later: bool = False
     ) -> None:
         self._given = function
-        self._compiling: Compiling | None
-        if isinstance(compiled, Compiling):
-            self._compiling = compiled
-        else:
-            self._compiling = Compiling(function) if compiled else None
+        self._compiling = Compiling(function) if compiled is True else compiled or None
         self._found: ca.Function | None = None
         self._buffer: Any = None
         self.inputs: list[Array] = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
         self.outputs: list[Array] = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
-        # Until it is called first, when this is replaced by the evaluation itself.
-        self._evaluate: Callable[[], None] = self._evaluate_first
-        self._code: Callable[[], int] = self._code_of_none
-        if not compiled:
+        if self._compiling is None:
             self._resolve()
         elif not for_later:
             _waiting.add(self)
-        elif self._compiling is not None and not self._compiling.is_made:
-            # Its parts stand before it in the queue, so that they never wait for it.
-            _compilers.link(self._compiling)
 
     def _resolve(self) -> ca.Function:
-        with _resolving:
+        """Return the function that is evaluated, bound to the arrays; waits for the compiler."""
+        with _workers.resolving:
             if self._found is None:
-                self._found = self._given if self._compiling is None else self._compiling.result()
-                self._compiling = None
-                _waiting.discard(self)
-                self._buffer, self._evaluate = self._found.buffer()
+                found = self._given if self._compiling is None else self._compiling.result()
+                self._buffer, self._evaluate = found.buffer()
                 self._code = self._buffer.ret
                 for i, array in enumerate(self.inputs):
                     self._buffer.set_arg(i, array.reshape(-1).data)
                 for i, array in enumerate(self.outputs):
                     self._buffer.set_res(i, array.reshape(-1).data)
+                self._found, self._compiling = found, None
+                _waiting.discard(self)
             return self._found
-
-    def _evaluate_first(self) -> None:
-        self._resolve()
-        self._evaluate()
-
-    def _code_of_none(self) -> int:
-        raise AssertionError("a kernel that was never evaluated has no return code")
-
-    def _refuse(self) -> None:
-        """Leave nothing in the outputs that could be read as an answer, and raise."""
-        for array in self.outputs:
-            array.fill(np.nan)
-        raise EvaluationError(f'the function "{self._given.name()}" has no value at its arguments')
-
-    @property
-    def compiling(self) -> Compiling | None:
-        """What it waits for when it is called first; None once it was."""
-        return self._compiling
-
-    @property
-    def function(self) -> ca.Function:
-        """The function that is evaluated, compiled where it can be; waits for the compiler."""
-        return self._resolve()
 
     @property
     def is_compiled(self) -> bool:
@@ -401,30 +317,33 @@ class Kernel:
         EvaluationError
             The function could not be evaluated, at a singular matrix say; all outputs are NaN.
         """
+        if self._found is None:
+            self._resolve()
         self._evaluate()
         if self._code():
-            self._refuse()
+            # Nothing that is left in the outputs could be read as an answer.
+            for array in self.outputs:
+                array.fill(np.nan)
+            raise EvaluationError(f'the function "{self._given.name()}" has no value at its arguments')
 
     def bind_input(self, index: int, array: Array) -> None:
         """Let argument `index` be read from `array` (C-contiguous float64, of its size), which the kernel keeps."""
-        if array.size != self.inputs[index].size or not array.flags.c_contiguous or array.dtype != np.float64:
-            raise ValueError(f"argument {index} takes {self.inputs[index].size} contiguous float64 numbers")
-        self.inputs[index] = array
+        self.inputs[index] = _bindable(array, self.inputs[index].size, f"argument {index} takes")
         if self._buffer is not None:
             self._buffer.set_arg(index, array.reshape(-1).data)
 
     def bind_output(self, index: int, array: Array) -> None:
         """Let result `index` be written to `array` (C-contiguous float64, of its size), which the kernel keeps."""
-        if (
-            array.size != self.outputs[index].size
-            or not array.flags.c_contiguous
-            or array.dtype != np.float64
-        ):
-            raise ValueError(f"result {index} gives {self.outputs[index].size} contiguous float64 numbers")
-        self.outputs[index] = array
+        self.outputs[index] = _bindable(array, self.outputs[index].size, f"result {index} gives")
         if self._buffer is not None:
             self._buffer.set_res(index, array.reshape(-1).data)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Refuse to pickle: a kernel holds addresses; build it in the worker."""
         raise TypeError("a Kernel holds addresses and cannot be pickled; build it where it is used")
+
+
+def _bindable(array: Array, size: int, what: str) -> Array:
+    if array.size != size or not array.flags.c_contiguous or array.dtype != np.float64:
+        raise ValueError(f"{what} {size} contiguous float64 numbers")
+    return array

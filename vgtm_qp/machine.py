@@ -9,12 +9,13 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-_THREADS = (
+THREADS = (
     "OPENBLAS_NUM_THREADS",
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -30,9 +31,24 @@ def pin_threads() -> bool:
     The matrices of a step are small: with a second thread a pseudoinverse of ten bays takes a hundred times
     as long.
     """
-    late = "numpy" in sys.modules and any(os.environ.get(name) != "1" for name in _THREADS[:2])
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    late = "numpy" in sys.modules and any(os.environ.get(name) != "1" for name in THREADS[:2])
+    os.environ.update(dict.fromkeys(THREADS, "1"))
     return not late
+
+
+@contextmanager
+def environment(changes: Mapping[str, str]) -> Iterator[None]:
+    """Change variables of the environment, of processes started meanwhile too, and put them back."""
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 def machine_record() -> dict[str, Any]:

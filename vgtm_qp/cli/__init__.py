@@ -1,4 +1,4 @@
-"""The command ``vgtm``: one file a command; what a command imports is imported when it runs."""
+"""The command ``vgtm``; what one of its commands needs is imported when it runs."""
 
 from vgtm_qp.cli.app import main
 

@@ -7,23 +7,17 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import Any
 
 from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError, UnusedCliTokensError
 
-from vgtm_qp.cli.bench import bench
-from vgtm_qp.cli.check import check
-from vgtm_qp.cli.compare import compare
 from vgtm_qp.cli.doctor import doctor
-from vgtm_qp.cli.export import export
-from vgtm_qp.cli.list import list_problems
+from vgtm_qp.cli.experiments import bench, compare, study
 from vgtm_qp.cli.output import ExitCode, document, note
-from vgtm_qp.cli.replay import replay
-from vgtm_qp.cli.schema import schema
+from vgtm_qp.cli.problems import check, list_problems, schema
+from vgtm_qp.cli.results import export, replay, verify, view
 from vgtm_qp.cli.solve import solve
-from vgtm_qp.cli.study import study
-from vgtm_qp.cli.verify import verify
-from vgtm_qp.cli.view import view
 from vgtm_qp.errors import ProblemError, VgtmError, nearest
 
 _EPILOGUE = (
@@ -71,25 +65,36 @@ for order, (name, command) in enumerate(_COMMANDS.items()):
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run one command line, that of the process by default, and return its exit code."""
     given = list(sys.argv[1:] if tokens is None else tokens)
-    as_json = "--json" in given
     try:
         with _plain_warnings():
             code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
         return ExitCode.SOLVED if code is None else int(code)
-    except CycloptsError as error:
-        return _failed(_explained(error), ExitCode.USAGE, as_json)
-    except ProblemError as error:
-        return _failed(str(error), ExitCode.USAGE, as_json, mistakes=_mistakes(error))
-    except VgtmError as error:
-        return _failed(str(error), ExitCode.USAGE, as_json)
-    except KeyboardInterrupt:
-        return _failed("interrupted before there was anything to keep", ExitCode.INTERRUPTED, as_json)
-    except OSError as error:
-        return _failed(f"the system refuses: {error}", ExitCode.INTERNAL, as_json)
-    except Exception as error:
-        note(traceback.format_exc().rstrip())
-        message = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
-        return _failed(message, ExitCode.INTERNAL, as_json)
+    except (Exception, KeyboardInterrupt) as error:
+        code, message = _told(error)
+        mistakes = []
+        if isinstance(error, ProblemError):
+            mistakes = [{"file": error.source, **asdict(mistake)} for mistake in error.mistakes]
+        # Each line of a ProblemError begins with the file that it is about.
+        note(message if mistakes else f"vgtm: {message}")
+        if "--json" in given:
+            document({"error": message, "mistakes": mistakes})
+        return code
+
+
+def _told(error: BaseException) -> tuple[ExitCode, str]:
+    """Return the exit code and what is said of an error; the traceback of an internal one is printed."""
+    match error:
+        case CycloptsError():
+            return ExitCode.USAGE, _explained(error)
+        case VgtmError():
+            return ExitCode.USAGE, str(error)
+        case KeyboardInterrupt():
+            return ExitCode.INTERRUPTED, "interrupted before there was anything to keep"
+        case OSError():
+            return ExitCode.INTERNAL, f"the system refuses: {error}"
+    note("".join(traceback.format_exception(error)).rstrip())
+    said = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
+    return ExitCode.INTERNAL, said
 
 
 @contextmanager
@@ -106,16 +111,6 @@ def _plain_warnings() -> Iterator[None]:
 
         warnings.showwarning = line
         yield
-
-
-def _failed(
-    message: str, code: ExitCode, as_json: bool, *, mistakes: Sequence[dict[str, str]] = ()
-) -> ExitCode:
-    # Each line of a ProblemError begins with the file that it is about.
-    note(message if mistakes else f"vgtm: {message}")
-    if as_json:
-        document({"error": message, "mistakes": list(mistakes)})
-    return code
 
 
 def _explained(error: CycloptsError) -> str:
@@ -141,10 +136,3 @@ def _usage(command: str) -> str:
     given = [f" {entry.name}" for entry in arguments if not entry.name.startswith("-")]
     required = [f" {entry.name} ..." for entry in arguments if entry.required and entry.name.startswith("-")]
     return "".join([*given, *required, " [OPTIONS]"])
-
-
-def _mistakes(error: ProblemError) -> list[dict[str, str]]:
-    return [
-        {"file": error.source, "key": mistake.key, "value": mistake.value, "expected": mistake.expected}
-        for mistake in error.mistakes
-    ]

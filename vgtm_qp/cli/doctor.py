@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-from vgtm_qp.cli.output import ExitCode, Json, document, say, table
+from vgtm_qp.cli.output import ExitCode, Json, answer, table, why_not_writable
 
 _CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
+_SLOWER = "4 to 10 times slower"
 _EXTRAS = {
     "view": ("viser",),
     "export": ("viser", "mcap", "mcap-ros2-support", "imageio-ffmpeg", "pillow", "pyyaml"),
@@ -41,12 +40,17 @@ def doctor(*, json: Json = False) -> int:
     from vgtm_qp.machine import versions
 
     cache = cache_directory()
+    hindrance = why_not_writable(cache)
     found: dict[str, Any] = {
         "versions": {"python": platform.python_version(), "system": platform.platform()}
         | versions(("vgtm-qp", *_CORE)),
         "solvers": _tried(_solvers),
         "compiler": compiler(),
-        "cache": {"folder": str(cache), "kernels": _kernels_in(cache), "hindrance": _hindrance(cache)},
+        "cache": {
+            "folder": str(cache),
+            "kernels": len(list(cache.glob("*.so"))),
+            "hindrance": f"; CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else "",
+        },
         "kernels": _tried(_kernels),
         "fcl": _tried(_fcl),
         "extras": {
@@ -54,15 +58,11 @@ def doctor(*, json: Json = False) -> int:
             for extra, names in _EXTRAS.items()
         },
     }
-    needed = ("solvers", "kernels", "fcl")
-    broken = [name for name in needed if not found[name]["ok"]]
+    broken = [name for name in ("solvers", "kernels", "fcl") if not found[name]["ok"]]
     broken += [name for name in _CORE if not found["versions"][name]]
     found["ok"] = not broken
-    if json:
-        document(found)
-    else:
-        say(_report(found))
-        say(f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order")
+    verdict = f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order"
+    answer(found, f"{_report(found)}\n{verdict}", as_json=json)
     return ExitCode.INTERNAL if broken else ExitCode.SOLVED
 
 
@@ -71,10 +71,7 @@ def _report(found: dict[str, Any]) -> str:
     rows = [(name, version or "NOT INSTALLED") for name, version in found["versions"].items()]
     rows += [
         ("QP solvers", found["solvers"]["says"]),
-        (
-            "C compiler",
-            found["compiler"] or "none found: CasADi interprets the kernels, 4 to 10 times slower",
-        ),
+        ("C compiler", found["compiler"] or f"none found: CasADi interprets the kernels, {_SLOWER}"),
         ("kernel cache", f"{cache['folder']}, {cache['kernels']} kernels" + cache["hindrance"]),
         ("kernels", found["kernels"]["says"]),
         ("FCL", found["fcl"]["says"]),
@@ -82,7 +79,7 @@ def _report(found: dict[str, Any]) -> str:
     for extra, missing in found["extras"].items():
         state = f"missing {', '.join(missing)}: pip install 'vgtm-qp[{extra}]'" if missing else "installed"
         rows.append((f"extra [{extra}]", state))
-    return table(rows, indent="")
+    return table(rows)
 
 
 def _tried(trial: Callable[[], str]) -> dict[str, Any]:
@@ -99,35 +96,17 @@ def _solvers() -> str:
     return ", ".join(available_solvers())
 
 
-def _kernels_in(folder: Path) -> int:
-    return len(list(folder.glob("*.so"))) if folder.is_dir() else 0
-
-
-def _hindrance(folder: Path) -> str:
-    from vgtm_qp.cli.files import why_not_writable
-
-    hindrance = why_not_writable(folder)
-    return f"; CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else ""
-
-
 def _kernels() -> str:
     """Compile a kernel in an empty cache and compare its value."""
     import casadi as ca
 
     from vgtm_qp.compiled import Kernel, compiler
+    from vgtm_qp.machine import environment
 
     x = ca.SX.sym("x", 2)
-    before = os.environ.get("VGTM_CACHE")
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["VGTM_CACHE"] = folder
-        try:
-            kernel = Kernel(ca.Function("doctor", [x], [ca.sqrt(ca.dot(x, x))]))
-            compiled = kernel.is_compiled
-        finally:
-            if before is None:
-                del os.environ["VGTM_CACHE"]
-            else:
-                os.environ["VGTM_CACHE"] = before
+    with tempfile.TemporaryDirectory() as folder, environment({"VGTM_CACHE": folder}):
+        kernel = Kernel(ca.Function("doctor", [x], [ca.sqrt(ca.dot(x, x))]))
+        compiled = kernel.is_compiled
         kernel.inputs[0][:] = 3.0, 4.0
         kernel()
     if abs(float(kernel.outputs[0][0]) - 5.0) > 1e-12:
@@ -135,7 +114,7 @@ def _kernels() -> str:
     if compiled:
         return "compile, load and give the right value"
     reason = "no C compiler" if compiler() is None else "the C compiler fails"
-    return f"interpreted by CasADi, 4 to 10 times slower: {reason}"
+    return f"interpreted by CasADi, {_SLOWER}: {reason}"
 
 
 def _fcl() -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -33,11 +33,11 @@ def following(title: str, *, shown: bool) -> Iterator[Progress]:
         nonlocal before
         if before is None and threading.current_thread() is threading.main_thread():
             before = signal.signal(signal.SIGINT, interrupt)
-        advance(fraction)
+        advance(fraction, 1.0)
         if interrupted.is_set():
             raise KeyboardInterrupt
 
-    with _bar(title) if shown and sys.stderr.isatty() else nullcontext(_nothing) as advance:
+    with bar(title, shown=shown) as advance:
         try:
             yield after_step
         finally:
@@ -45,17 +45,21 @@ def following(title: str, *, shown: bool) -> Iterator[Progress]:
                 signal.signal(signal.SIGINT, before)
 
 
-def _nothing(_fraction: float) -> None:
-    """Show nothing."""
-
-
 @contextmanager
-def _bar(title: str) -> Iterator[Any]:
+def bar(title: str, *, shown: bool, counted: bool = False) -> Iterator[Callable[[float, float], None]]:
+    """Give what moves a bar on stderr to what is done of the total, if that is a terminal.
+
+    The bar has a percentage beside it, or where things are `counted` their number.
+    """
+    if not shown or not sys.stderr.isatty():
+        yield lambda _done, _total: None
+        return
     from rich.console import Console
     from rich.markup import escape
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import MofNCompleteColumn, Progress
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(escape(title), total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)
+    description, line, percentage, remaining = Progress.get_default_columns()
+    columns = (description, line, MofNCompleteColumn() if counted else percentage, remaining)
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown_bar:
+        task = shown_bar.add_task(escape(title), total=None if counted else 1.0)
+        yield lambda done, total: shown_bar.update(task, completed=done, total=total)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import ExitCode, Json, document, note, say, table
-from vgtm_qp.cli.verify import outcome_code
+from vgtm_qp.cli.output import ExitCode, Json, Output, ProblemName, answer, check_writable, note, table
+from vgtm_qp.cli.progress import following
+from vgtm_qp.cli.results import outcome_code
 
 if TYPE_CHECKING:
     from vgtm_qp.problem import Problem
@@ -19,13 +20,10 @@ _KEYS = {"method.name": "--method", "method.solver": "--solver", "maneuver.steps
 
 
 def solve(
-    problem: Annotated[str, Parameter(help="problem file, or the name of a bundled problem (vgtm list)")],
+    problem: ProblemName,
     /,
     *,
-    output: Annotated[
-        Path | None,
-        Parameter(name=["--output", "-o"], help="result file; NAME.npz in this folder by default"),
-    ] = None,
+    output: Annotated[Path | None, Output(help="result file; NAME.npz in this folder by default")] = None,
     method: Annotated[MethodName | None, Parameter(help="in the place of the problem's method")] = None,
     solver: Annotated[str | None, Parameter(help="QP solver, in the place of the problem's")] = None,
     steps: Annotated[int | None, Parameter(help="number of steps, in the place of the problem's")] = None,
@@ -41,9 +39,10 @@ def solve(
 
     A maneuver that is blocked or interrupted is written as far as it came, and says so.
     """
-    from vgtm_qp.cli.files import check_writable
-    from vgtm_qp.cli.progress import following
+    from vgtm_qp.export import export_maneuver
+    from vgtm_qp.maneuver.solve import solve as run
     from vgtm_qp.problem import load_problem
+    from vgtm_qp.verify import verify as certify
 
     loaded = _changed(
         load_problem(problem), {"method.name": method, "method.solver": solver, "maneuver.steps": steps}
@@ -54,13 +53,10 @@ def solve(
     if figure is not None:
         check_writable(figure, "--figure", (".pdf", ".png", ".svg"))
     if html is not None:
+        check_writable(html, "--html", (".html",))
         from vgtm_qp.view.scene import import_viser
 
-        check_writable(html, "--html", (".html",))
         import_viser()
-
-    from vgtm_qp.maneuver.solve import solve as run
-    from vgtm_qp.verify import verify as certify
 
     with following(loaded.name, shown=not json) as progress:
         maneuver = run(loaded, progress=progress, verify=False)
@@ -69,22 +65,18 @@ def solve(
     maneuver = maneuver.with_certificate(certify(maneuver))
     maneuver.save(result)
     if figure is not None:
-        from vgtm_qp.view.figure import plot_frames, save_figure
+        from vgtm_qp.view.figure import save_figure
 
-        save_figure(plot_frames(maneuver), figure)
+        save_figure(maneuver.plot(), figure)
     if html is not None:
-        from vgtm_qp.export import export_maneuver
-
         export_maneuver(maneuver, html, to="html")
 
-    summary = maneuver.summary(result)
-    files = {"figure": figure, "html": html}
+    files = {"result": result, "figure": figure, "html": html}
     written = {name: str(path) for name, path in files.items() if path is not None}
-    if json:
-        document(summary | written)
-    else:
-        say(_report(summary, serial=maneuver.joints is not None))
-        say("\n".join(f"{name}: {path}" for name, path in {"result": str(result), **written}.items()))
+    summary = maneuver.summary(result) | written
+    report = _report(summary, serial=maneuver.joints is not None)
+    lines = [f"{name}: {path}" for name, path in written.items()]
+    answer(summary, "\n".join([report, *lines]), as_json=json)
     if "interrupted" in maneuver.blocked_by:
         note(f"vgtm: interrupted; what was solved is in {result}")
         return ExitCode.INTERRUPTED
@@ -98,10 +90,8 @@ def _changed(problem: Problem, changes: dict[str, Any]) -> Problem:
     from vgtm_qp.errors import ProblemError
 
     wanted = {key: value for key, value in changes.items() if value is not None}
-    if not wanted:
-        return problem
     try:
-        changed = problem.replace(wanted)
+        changed = problem.replace(wanted) if wanted else problem
         if "method.solver" in wanted:
             from vgtm_qp.step.build import check_solver
 
@@ -141,7 +131,7 @@ def _report(summary: dict[str, Any], *, serial: bool) -> str:
         ("set-up", _milliseconds(summary["setup_time"])),
         ("method and solver", ", ".join(filter(None, (summary["method"], summary["solver"])))),
     ]
-    return "\n".join([*lines, table(rows)])
+    return "\n".join([*lines, table(rows, indent="  ")])
 
 
 def _number(value: float | None, unit: str, absent: str = "-") -> str:

@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from queue import Empty, SimpleQueue
+from functools import partial
+from html import escape
+from queue import SimpleQueue
 from threading import Event
 from time import perf_counter
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.errors import VgtmError
-from vgtm_qp.live.read_out import read_out
-from vgtm_qp.live.session import METHODS, Session
+from vgtm_qp.live.session import Session
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
-from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled
+from vgtm_qp.problem.method import Method
+from vgtm_qp.view.drawing import CURVE_COLOUR, Array, camera_for, resampled, stroke_colours
 from vgtm_qp.view.scene import ArmScene, viser_server
-
-Array = NDArray[np.float64]
 
 _PERIOD = 1.0 / 30.0
 _READ_OUT_PERIOD = 0.1
 _LEAST_EXPONENT = -4.0
+_METHODS = get_args(Method.model_fields["name"].annotation)
 _HINT = "Drag the red ball: the tip follows. Hold a green one: the curve is drawn there, the tip stays."
 _TARGET_COLOUR = (214, 39, 40)
 _SLIDERS = (
@@ -37,6 +37,8 @@ _SLIDERS = (
     "tangent",
     "smoothness",
 )
+_COLOURS = {"at rest": "#6b7280", "moving": "#0b7a5b", "slowed": "#b45309", "blocked": "#b91c1c"}
+_MOST_ACTIVE = 6
 
 
 def view(
@@ -48,23 +50,13 @@ def view(
 ) -> None:
     """Serve the live page of a problem or a result, to this machine alone, until interrupted.
 
-    Parameters
-    ----------
-    shown
-        A problem, or a maneuver to play back first.
-    port
-        The next free one from here on; 0 for any.
-    ready
-        Called with the page's address once it can be opened.
-    stop
-        Ends the page when set.
+    The `port` is the next free one from there on, 0 for any; `ready` is called with the page's address once it can be
+    opened; `stop` ends the page when it is set.
 
     Raises
     ------
-    MissingExtraError
-        viser is not installed.
-    ProblemError
-        The problem cannot be set up.
+    MissingExtraError, ProblemError
+        viser is not installed; the problem cannot be set up.
     """
     maneuver = shown if isinstance(shown, Maneuver) else None
     problem = Problem.from_dict(maneuver.manifest["problem"]) if maneuver else shown
@@ -90,15 +82,17 @@ class _Page:
         self._scene.add_path("/path", path)
         nodes = maneuver.nodes if maneuver else session.nodes[None]
         self._scene.look(camera_for(session.drawing, nodes, path))
-        self._target = self._add_handle("/tip target", session.target, 0.085, _TARGET_COLOUR, self._drag_tip)
+        self._target = self._add_handle(
+            "/tip target", session.target, 0.085, _TARGET_COLOUR, lambda place, _: session.want_tip(place)
+        )
         colour = tuple(round(255 * channel) for channel in CURVE_COLOUR)
         # The first vertex belongs to the base, and the tip has a ball of its own at the last.
+        inner = range(1, len(state.control_vertices) - 1) if session.vertices_can_be_wanted else ()
         self._vertices = {
             i: self._add_handle(
-                f"/control vertex {i}", state.control_vertices[i], 0.06, colour, self._drag_vertex(i)
+                f"/control vertex {i}", state.control_vertices[i], 0.06, colour, partial(self._drag_vertex, i)
             )
-            for i in range(1, len(state.control_vertices) - 1)
-            if session.vertices_can_be_wanted
+            for i in inner
         }
         self._add_widgets()
         if maneuver:
@@ -121,26 +115,20 @@ class _Page:
             stop.wait(max(0.0, _PERIOD - (perf_counter() - started)))
 
     def _read_inbox(self) -> bool:
-        found = False
-        while True:
-            try:
-                note = self._inbox.get_nowait()
-            except Empty:
-                break
-            note()
-            found = True
+        found = not self._inbox.empty()
+        while not self._inbox.empty():
+            self._inbox.get()()
         if self._settings:
             settings, self._settings = self._settings, {}
             self._try(lambda: self._session.change(settings))
         return found
 
     def _try(self, action: Callable[[], None]) -> None:
+        self._message = ""
         try:
             action()
         except VgtmError as error:
             self._message = str(error)
-        else:
-            self._message = ""
 
     def _draw(self) -> None:
         session = self._session
@@ -150,30 +138,22 @@ class _Page:
             handle.position = session.vertex_goals.get(i, session.state.control_vertices[i])
 
     def _add_handle(self, name: str, position: Array, radius: float, colour: Any, moved: Any) -> Any:
+        """Draw a ball; where it is dragged to, and whether it was let go there, is told to `moved`."""
         handle = self._server.scene.add_icosphere(name, radius=radius, color=colour, position=position)
 
-        @handle.on_drag("left")  # type: ignore[untyped-decorator]
-        async def _(event: Any) -> None:
-            place = np.array(event.end_position)
-            self._inbox.put(lambda: moved(place, event.phase == "end"))
+        def dragged(event: Any) -> None:
+            self._pause()
+            moved(np.array(event.end_position), event.phase == "end")
 
+        self._on(handle.on_drag("left"), dragged)
         return handle
 
-    def _drag_tip(self, position: Array, _: bool) -> None:
-        self._pause()
-        self._session.want_tip(position)
-
-    def _drag_vertex(self, index: int) -> Callable[[Array, bool], None]:
-        def moved(position: Array, released: bool) -> None:
-            self._pause()
-            if self._session.vertices_can_be_wanted:
-                self._session.want_vertex(index, None if released else position)
-            else:
-                self._message = (
-                    f"the method {self._session.problem.method.name} takes no goals of control vertices"
-                )
-
-        return moved
+    def _drag_vertex(self, index: int, position: Array, released: bool) -> None:
+        if self._session.vertices_can_be_wanted:
+            self._session.want_vertex(index, None if released else position)
+        else:
+            method = self._session.problem.method.name
+            self._message = f"the method {method} takes no goals of control vertices"
 
     def _add_widgets(self) -> None:
         gui, session = self._server.gui, self._session
@@ -190,42 +170,35 @@ class _Page:
         with gui.add_folder("By hand"):
             gui.add_markdown(_HINT)
             home = gui.add_button("Home")
-            method = gui.add_dropdown("method", METHODS, initial_value=session.problem.method.name)
-            safe = gui.add_slider(
-                "safe [m]",
-                min=0.0,
-                max=0.3,
-                step=0.005,
-                initial_value=min(0.3, session.problem.clearance.safe),
-            )
+            method = gui.add_dropdown("method", _METHODS, initial_value=session.problem.method.name)
+            least = min(0.3, session.problem.clearance.safe)
+            safe = gui.add_slider("safe [m]", min=0.0, max=0.3, step=0.005, initial_value=least)
         with gui.add_folder("Weights, powers of ten", expand_by_default=False):
             for name in _SLIDERS:
                 self._add_weight(name)
         self._on(self._play_button.on_click, lambda _: self._toggle())
-        self._on(self._slider.on_update, lambda event: self._scrub(event))
+        self._on(self._slider.on_update, self._scrub)
         self._on(again.on_click, lambda _: self._solve())
         self._on(home.on_click, lambda _: self._go_home())
-        self._on(method.on_update, lambda _: self._settings.update({"method.name": method.value}))
-        self._on(safe.on_update, lambda _: self._settings.update({"clearance.safe": float(safe.value)}))
+        self._set_by(method, "method.name", str)
+        self._set_by(safe, "clearance.safe", float)
 
     def _add_weight(self, name: str) -> None:
         weights = self._session.problem.method.weights
-        value = float(getattr(weights, name))
+        exponent = max(_LEAST_EXPONENT, np.log10(max(float(getattr(weights, name)), 1e-12)))
         slider = self._server.gui.add_slider(
             name.replace("_", " "),
             min=_LEAST_EXPONENT,
             max=2.0,
             step=0.1,
-            initial_value=round(max(_LEAST_EXPONENT, np.log10(max(value, 1e-12))), 1),
+            initial_value=round(exponent, 1),
             hint=f"{type(weights).model_fields[name].description}; the least value switches it off",
         )
+        self._set_by(slider, f"method.weights.{name}", lambda x: 10.0**x if x > _LEAST_EXPONENT else 0.0)
 
-        def changed(_: Any) -> None:
-            exponent = float(slider.value)
-            weight = 0.0 if exponent <= _LEAST_EXPONENT else float(10.0**exponent)
-            self._settings[f"method.weights.{name}"] = weight
-
-        self._on(slider.on_update, changed)
+    def _set_by(self, widget: Any, key: str, meaning: Callable[[Any], Any]) -> None:
+        """Let a key of the problem be what the value of a widget means."""
+        self._on(widget.on_update, lambda _: self._settings.update({key: meaning(widget.value)}))
 
     def _on(self, register: Any, act: Callable[[Any], Any]) -> None:
         """Let `act` run in the loop whenever the event comes."""
@@ -248,12 +221,13 @@ class _Page:
         self._read_out.content = read_out(self._session, self._message)
 
         def run() -> None:
-            self._show(solve(self._session.problem))
+            maneuver = solve(self._session.problem)
+            self._show(maneuver)
             self._toggle()
+            if maneuver.status != "solved":
+                self._message = f"{maneuver.status} at {100 * maneuver.reached:.0f} % of the path"
 
         self._try(run)
-        if self._maneuver is not None and self._maneuver.status != "solved":
-            self._message = f"{self._maneuver.status} at {100 * self._maneuver.reached:.0f} % of the path"
 
     def _toggle(self) -> None:
         if self._playing:
@@ -273,27 +247,84 @@ class _Page:
         self._playing, self._play_button.label = False, "Play"
 
     def _play(self, duration: float) -> None:
-        assert self._maneuver is not None
-        self._moment = min(self._moment + duration, float(self._maneuver.time[-1]))
-        self._put(self._moment)
+        self._put(self._moment + duration)
         self._slider.value = round(self._moment, 2)
-        if self._moment >= self._maneuver.time[-1]:
+        if self._maneuver is None or self._moment >= self._maneuver.time[-1]:
             self._pause()
 
     def _scrub(self, event: Any) -> None:
         """Follow the hand on the slider; what the page itself sets there has no client."""
-        if event.client is None or self._maneuver is None:
-            return
-        self._pause()
-        self._moment = float(self._slider.value)
-        self._put(self._moment)
+        if event.client is not None:
+            self._pause()
+            self._put(float(self._slider.value))
 
     def _put(self, moment: float) -> None:
         """Show the arm at `moment` on the straight line between two states, from where it can be dragged."""
         maneuver = self._maneuver
-        assert maneuver is not None
-        at = np.array([moment])
+        if maneuver is None:
+            return
+        self._moment = min(moment, float(maneuver.time[-1]))
+        at = np.array([self._moment])
         q = resampled(maneuver.time, maneuver.configurations, at)[0]
         vertices = resampled(maneuver.time, maneuver.control_vertices, at)[0]
-        self._session.put_at(moment, q, vertices)
+        self._session.put_at(self._moment, q, vertices)
         self._draw()
+
+
+def read_out(session: Session, message: str) -> str:
+    """Return the instruments of `session` as HTML, under `message` where there is one."""
+    reading = session.reading()
+    safe = session.problem.clearance.safe
+    step_time = f"{1000 * reading.step_time:.2f} ms" if reading.step_time else "-"
+    rows = [
+        ("clearance", _distance(reading.clearance, safe), reading.nearest),
+        (f"{session.drawing.arm.body}s apart", _distance(reading.self_clearance, -np.inf), ""),
+        ("tip to target", f"{1000 * float(np.linalg.norm(session.target - session.tip)):.1f} mm", ""),
+        ("step", step_time, session.problem.method.name),
+    ]
+    cells = "".join(
+        f"<tr><td style='color:#6b7280;padding-right:0.8em'>{name}</td>"
+        f"<td style='text-align:right;white-space:nowrap'><b>{value}</b></td>"
+        f"<td style='color:#6b7280;padding-left:0.8em'>{escape(more)}</td></tr>"
+        for name, value, more in rows
+    )
+    stopped = ", ".join(reading.stopped_by[:3]) if reading.outcome in ("slowed", "blocked") else ""
+    outcome = f"<b style='color:{_COLOURS[reading.outcome]}'>{reading.outcome}</b>"
+    if stopped:
+        outcome += f" <span id='stopped-by'>by {escape(stopped)}</span>"
+    active = "".join(f"<li>{escape(name)}</li>" for name in reading.active[:_MOST_ACTIVE]) or "<li>none</li>"
+    if len(reading.active) > _MOST_ACTIVE:
+        active += f"<li>and {len(reading.active) - _MOST_ACTIVE} more</li>"
+    notice = f"<div style='color:#b91c1c'>{escape(message)}</div>" if message else ""
+    return (
+        "<div style='font-size:0.8rem;line-height:1.35;padding:0.2em 0.8em'>"
+        f"{notice}<div style='min-height:2.7em'>{outcome}</div><table>{cells}</table>"
+        f"<div style='color:#6b7280;margin-top:0.4em'>strokes, least to greatest</div>{_strokes(session)}"
+        f"<div style='color:#6b7280;margin-top:0.4em'>active constraints</div>"
+        f"<ul style='margin:0;padding-left:1.2em;min-height:5.4em'>{active}</ul></div>"
+    )
+
+
+def _distance(distance: float, least: float) -> str:
+    if not np.isfinite(distance):
+        return "-"
+    colour = "#b91c1c" if distance < least - 1e-6 else "inherit"
+    return f"<span style='color:{colour}'>{1000 * distance:.1f} mm</span>"
+
+
+def _strokes(session: Session) -> str:
+    """Return a bar for each actuator: how much of its stroke is out."""
+    share = session.drawing.stroke_share(session.state.quantities)
+    colours = np.round(255 * stroke_colours(np.nan_to_num(share))).astype(int)
+    bars = "".join(
+        f"<div title='{escape(name)}' style='flex:1;height:{max(2.0, 100.0 * part):.1f}%;"
+        f"background:rgb({red},{green},{blue})'></div>"
+        for name, part, (red, green, blue) in zip(
+            session.drawing.arm.quantity_names, share.tolist(), colours.tolist(), strict=True
+        )
+        if not np.isnan(part)
+    )
+    return (
+        "<div style='display:flex;align-items:flex-end;gap:1px;height:2.6em;"
+        f"border-top:1px dashed #9ca3af;border-bottom:1px solid #9ca3af'>{bars}</div>"
+    )

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
@@ -17,33 +16,27 @@ from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.view.drawing import Drawing, drawing_of_problem
+from vgtm_qp.verify.arm import recorded_arm
+from vgtm_qp.view.drawing import Array, make_drawing
 
-Array = NDArray[np.float64]
-
-METHODS = ("qp", "pseudoinverse", "curve-pseudoinverse")
+OUTCOMES = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatus.BLOCKED: "blocked"}
 
 _REACHED = 1e-4
 _STRIDE = 0.06
 _RETRY_AFTER = 10
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(NamedTuple):
     """Outcome, active constraints, clearances and step time, as the page shows them.
 
     Attributes
     ----------
     outcome : str
-        ``"at rest"``, ``"moving"``, ``"slowed"`` or ``"blocked"``.
-    stopped_by : tuple of str
-        The obstacles, members and limits that hold the arm back, most decisive first.
-    active : tuple of str
-        Names of all active rows of the last QP.
-    clearance, self_clearance : float
-        Least distance to obstacles, and between members that share no node, m.
-    nearest : str
-        The pair at that distance to an obstacle.
+        One of `OUTCOMES`, or ``"at rest"``.
+    stopped_by, active : tuple of str
+        What holds the arm back, most decisive first, and the names of all active rows of the last QP.
+    clearance, self_clearance, nearest : float, float, str
+        Least distance to obstacles, and between members that share no node, m; the pair nearest to an obstacle.
     step_time : float
         Computing time of the last step, s.
     """
@@ -64,15 +57,12 @@ class Session:
         self.problem = problem
         self._resolver = _make_resolver(problem)
         arm = self._resolver.setup.arm
-        self.drawing: Drawing = drawing_of_problem(
-            problem, arm.record(), arm.bodies.joints, len(self.state.control_vertices)
-        )
-        self.target: Array = self.tip
-        self.vertex_goals: dict[int, Array] = {}
-        self._waiting = 0
+        directory = problem.source.parent if problem.source else "."
+        recorded = recorded_arm(arm.record(), arm.bodies.joints)
+        vertices = len(self.state.control_vertices)
+        self.drawing = make_drawing(problem.to_dict(), recorded, vertices, directory)
         self._step_time = 0.0
-        self._held_by: tuple[str, ...] = ()
-        self._last: Step | None = None
+        self._put(self.state)
 
     @property
     def nodes(self) -> Array:
@@ -117,22 +107,24 @@ class Session:
 
     def put_at(self, time: float, q: Array, control_vertices: Array) -> None:
         """Put the arm at rest in configuration `q` and at `control_vertices` (V, 3), m; want nothing else."""
-        arm, home = self._resolver.setup.arm, self._resolver.setup.home_state()
-        self._put(
-            replace(
-                home,
-                time=float(time),
-                q=frozen(q),
-                nodes=frozen(arm.nodes(q)),
-                control_vertices=frozen(control_vertices),
-                quantities=frozen(arm.measured(q)),
-            )
+        arm = self._resolver.setup.arm
+        state = replace(
+            self._resolver.setup.home_state(),
+            time=float(time),
+            q=frozen(q),
+            nodes=frozen(arm.nodes(q)),
+            control_vertices=frozen(control_vertices),
+            quantities=frozen(arm.measured(q)),
         )
+        self._put(state)
 
     def _put(self, state: State) -> None:
         self._resolver.state = state
-        self.target, self.vertex_goals = self.tip, {}
-        self._waiting, self._held_by, self._last = 0, (), None
+        self.target = self.tip
+        self.vertex_goals: dict[int, Array] = {}
+        self._waiting = 0
+        self._held_by: tuple[str, ...] = ()
+        self._last: Step | None = None
 
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change values of the problem, by key path, and go on from the same state.
@@ -163,11 +155,9 @@ class Session:
             return False
         if self.vertices_can_be_wanted:
             self._resolver.control_vertex_goals = dict(self.vertex_goals)
-        position, rotation = self._resolver.tip()
-        stride = away * min(1.0, _STRIDE / max(distance, _REACHED))
-        path = Path(
-            np.array([0.0, 1.0]), np.stack([position, position + stride]), np.stack([rotation, rotation])
-        )
+        position, rotation = self.pose()
+        ends = np.stack([position, position + away * min(1.0, _STRIDE / max(distance, _REACHED))])
+        path = Path(np.array([0.0, 1.0]), ends, np.stack([rotation, rotation]))
         started, before = perf_counter(), self.state.nodes
         step = self._resolver.follow(path, 0.0, 1.0, dt=dt)
         self._step_time = perf_counter() - started
@@ -179,8 +169,7 @@ class Session:
         if step.status is StepStatus.BLOCKED:
             self._waiting = _RETRY_AFTER
             return False
-        moved = float(np.max(np.abs(self.state.nodes - before)))
-        return moved > 1e-9
+        return bool(np.max(np.abs(self.state.nodes - before)) > 1e-9)
 
     def reading(self) -> Reading:
         """Return the readings of the present state."""
@@ -188,14 +177,10 @@ class Session:
         monitor, points = setup.monitor, setup.arm.points(state.q)
         clearance, pair = monitor.least(points, state.time, among="obstacles")
         last = self._last
-        outcome = "at rest"
-        if last is not None:
-            words = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatus.BLOCKED: "blocked"}
-            outcome = words[last.status]
         return Reading(
-            outcome=outcome,
+            outcome="at rest" if last is None else OUTCOMES[last.status],
             stopped_by=self._held_by,
-            active=last.active if last is not None else (),
+            active=() if last is None else last.active,
             clearance=clearance,
             self_clearance=monitor.least(points, state.time, among="members")[0],
             nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),

@@ -23,27 +23,24 @@ class Maneuver(Result):
 
     def plot_clearance(self, *, axes: Axes | None = None) -> Figure:
         """Plot the least distances to obstacles and between members over time."""
-        from vgtm_qp.view.plots import plot_clearance
-
-        return plot_clearance(self, axes=axes)
+        return self._plot("clearance", axes)
 
     def plot_strokes(self, *, axes: Axes | None = None) -> Figure:
         """Plot the lengths of the actuated members over time, between their limits."""
-        from vgtm_qp.view.plots import plot_strokes
-
-        return plot_strokes(self, axes=axes)
+        return self._plot("strokes", axes)
 
     def plot_tip_error(self, *, axes: Axes | None = None) -> Figure:
         """Plot the distance of the tip from its target over time."""
-        from vgtm_qp.view.plots import plot_tip_error
-
-        return plot_tip_error(self, axes=axes)
+        return self._plot("tip error", axes)
 
     def plot_step_time(self, *, axes: Axes | None = None) -> Figure:
         """Plot the computing time of each step by phase."""
-        from vgtm_qp.view.plots import plot_step_time
+        return self._plot("step time", axes)
 
-        return plot_step_time(self, axes=axes)
+    def _plot(self, quantity: str, axes: Axes | None) -> Figure:
+        from vgtm_qp.view.plots import plot
+
+        return plot(quantity, self, axes)
 
 
 def load_result(path: str | Path) -> Maneuver:

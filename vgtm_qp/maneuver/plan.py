@@ -21,18 +21,12 @@ _SMALL_REST = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Where the tip goes, in steps.
-
-    Attributes
-    ----------
-    path : Path
-        Poses over time, from the home pose at time 0, s.
-    marks : (S,)
-        Times at which the steps end if nothing slows them, s.
-    """
+    """Where the tip goes, in steps."""
 
     path: Path
+    """Poses over time, from the home pose at time 0, s."""
     marks: Array
+    """(S,) times at which the steps end if nothing slows them, s."""
 
     def next_mark(self, value: float, *, keeps_moving: bool = False) -> tuple[float, float]:
         """Return where the step from `value` of the path aims, and how long it takes, s.
@@ -71,19 +65,17 @@ def make_plan(problem: Problem, position: Array, rotation: Array) -> Plan:
 def _through_waypoints(maneuver: WaypointManeuver, position: Array, rotation: Array) -> Plan:
     times, positions, rotations = [0.0], [position], [rotation]
     for waypoint in maneuver.waypoint:
-        times.append(waypoint.time)
-        positions.append(
-            positions[-1] if waypoint.position is None else np.asarray(waypoint.position, dtype=float)
-        )
-        turned = rotations[-1]
+        if waypoint.position is not None:
+            position = np.asarray(waypoint.position, dtype=float)
         if waypoint.pointing is not None:
             wanted = np.asarray(waypoint.pointing, dtype=float)
-            turned = (
-                rotation_from_vector(turn_between(turned[:, 2], wanted / np.linalg.norm(wanted))) @ turned
-            )
+            turn = turn_between(rotation[:, 2], wanted / np.linalg.norm(wanted))
+            rotation = rotation_from_vector(turn) @ rotation
         elif waypoint.rotation_vector is not None:
-            turned = rotation_from_vector(waypoint.rotation_vector)
-        rotations.append(turned)
+            rotation = rotation_from_vector(waypoint.rotation_vector)
+        times.append(waypoint.time)
+        positions.append(position)
+        rotations.append(rotation)
     marks = np.linspace(0.0, times[-1], maneuver.steps + 1)[1:]
     return Plan(Path(np.array(times), np.stack(positions), np.stack(rotations)), marks)
 

@@ -7,7 +7,8 @@ Robustness).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,101 +24,64 @@ Array = NDArray[np.float64]
 
 _HOPELESS = (StopKind.INTERRUPTED, StopKind.SINGULAR, StopKind.OUT_OF_REACH, StopKind.LOCKED)
 
-_BULGE, _SLIGHT_BULGE = 0.3, 0.1
+_BULGE = 0.3
 """Sideways displacement of the middle of a bulged curve, as a share of the arm's height."""
+_BULGES = (
+    ("curve bulged to its left", 1, _BULGE),
+    ("curve bulged to its right", 3, _BULGE),
+    ("curve bulged away from what blocks it", 0, _BULGE),
+    ("curve bulged towards it", 2, _BULGE),
+    ("curve bulged a little away from what blocks it", 0, 0.1),
+)
+"""Name, side and size: sides in quarters of a turn about the arm, from the direction away from what blocks it."""
 _FIRM_TRACKING = 1.0
 """Least weight of tracking in a retry with a bulged curve."""
 _MORE_VERTICES = 3
 
-_SIDES = {"to its left": 1, "to its right": 3, "away from what blocks it": 0, "towards it": 2}
-"""Quarters of a turn about the arm, as seen along it, from the direction away from what blocks it."""
-
 
 @dataclass(frozen=True, eq=False)
 class DeadEnd:
-    """Where an arm stopped.
-
-    Attributes
-    ----------
-    stop : Stop
-    control_vertices : (V, 3)
-        The curve there, m; V = 0 without one.
-    height : float
-        Of the arm at home, m.
-    heading : (3,)
-        Direction of the path from there on.
-    """
+    """Where an arm stopped."""
 
     stop: Stop
     control_vertices: Array
+    """(V, 3) those of the curve there, m; V = 0 without one."""
     height: float
+    """Of the arm at home, m."""
     heading: Array
-
-
-Changes = dict[str, Any]
+    """(3,) direction of the path from there on."""
 
 
 def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]]:
     """Yield name and changed problem of each retry that applies; nothing if retries are off."""
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
-    for name, change in _CHANGES.items():
-        changes = change(problem, dead_end)
-        if not changes:
-            continue
-        try:
+    for name, changes in _changes(problem, dead_end):
+        with suppress(ProblemError):
             yield name, problem.replace(changes)
-        except ProblemError:
-            continue
 
 
-def _drawn_home(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    return {"method.weights.stroke_centring": 10.0 * max(problem.method.weights.stroke_centring, 0.02)}
-
-
-def _at_full_speed(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    slows = problem.method.slow_approach and problem.end_effector.mode == "scaled"
-    return {"method.slow_approach": False} if slows else {}
-
-
-def _shorter_steps(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    maneuver = problem.maneuver
-    return {"maneuver.steps": 3 * maneuver.steps} if isinstance(maneuver, WaypointManeuver) else {}
-
-
-def _actuator_rates(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
-    return {"method.weights.actuator_rate": 50.0 * max(problem.method.weights.actuator_rate, 0.02)}
-
-
-def _no_curve(problem: Problem, dead_end: DeadEnd) -> Changes:  # noqa: ARG001
+def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[str, Any]]]:
+    method, weights, curve = problem.method, problem.method.weights, problem.curve
+    vertices = len(dead_end.control_vertices)
+    centring, rate = 10.0 * max(weights.stroke_centring, 0.02), 50.0 * max(weights.actuator_rate, 0.02)
+    yield "actuators drawn to their home lengths", {"method.weights.stroke_centring": centring}
+    if curve is not None and not curve.control_vertex_goals and vertices >= 4:
+        firm = {"method.weights.tracking": max(weights.tracking, _FIRM_TRACKING)}
+        for name, quarter, size in _BULGES:
+            bulged = bulge(dead_end, quarter, size)
+            goals = [{"index": i, "position": bulged[i].tolist()} for i in range(2, vertices - 1)]
+            yield name, {"curve.control_vertex_goals": goals, **firm}
+    if method.slow_approach and problem.end_effector.mode == "scaled":
+        yield "no slowing down before contacts", {"method.slow_approach": False}
+    if isinstance(problem.maneuver, WaypointManeuver):
+        yield "shorter steps", {"maneuver.steps": 3 * problem.maneuver.steps}
+    yield "actuator rates as the metric", {"method.weights.actuator_rate": rate}
     # Hard tracking asks for the curve, so there is no retry without it.
-    if problem.method.tracking == "none" or problem.method.hard_tracking:
-        return {}
-    return {"method.tracking": "none"}
-
-
-def _more_vertices(problem: Problem, dead_end: DeadEnd) -> Changes:
-    if problem.curve is None or not len(dead_end.control_vertices):
-        return {}
-    return {"curve.control_vertices": problem.curve.control_vertices + _MORE_VERTICES}
-
-
-def _bulged(quarter: int, size: float = _BULGE) -> Callable[[Problem, DeadEnd], Changes]:
-    """Return the change that bulges the curve to one of its four sides."""
-
-    def change(problem: Problem, dead_end: DeadEnd) -> Changes:
-        vertices = len(dead_end.control_vertices)
-        if problem.curve is None or problem.curve.control_vertex_goals or vertices < 4:
-            return {}
-        goals = bulge(dead_end, quarter, size)
-        return {
-            "curve.control_vertex_goals": [
-                {"index": i, "position": goals[i].tolist()} for i in range(2, vertices - 1)
-            ],
-            "method.weights.tracking": max(problem.method.weights.tracking, _FIRM_TRACKING),
-        }
-
-    return change
+    if method.tracking != "none" and not method.hard_tracking:
+        yield "no curve", {"method.tracking": "none"}
+    if curve is not None and vertices:
+        yield "more control vertices", {"curve.control_vertices": curve.control_vertices + _MORE_VERTICES}
 
 
 def bulge(dead_end: DeadEnd, quarter: int, size: float = _BULGE) -> Array:
@@ -143,15 +107,3 @@ def _across(axis: Array, *wanted: Array) -> Array:
         if length > 1e-6 * max(float(np.linalg.norm(direction)), 1e-6):
             return np.asarray(across / length)
     raise AssertionError("no axis is along all of x, y and z")
-
-
-_CHANGES: dict[str, Callable[[Problem, DeadEnd], Changes]] = {
-    "actuators drawn to their home lengths": _drawn_home,
-    **{f"curve bulged {side}": _bulged(quarter) for side, quarter in _SIDES.items()},
-    "curve bulged a little away from what blocks it": _bulged(0, _SLIGHT_BULGE),
-    "no slowing down before contacts": _at_full_speed,
-    "shorter steps": _shorter_steps,
-    "actuator rates as the metric": _actuator_rates,
-    "no curve": _no_curve,
-    "more control vertices": _more_vertices,
-}

@@ -1,19 +1,21 @@
-"""The maneuver loop: step after step along the plan until it is done or no safe step is left."""
+"""The maneuver loop: step after step along the plan until it is done or no safe step is left; of many at once too."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
+from vgtm_qp.machine import THREADS, environment
 from vgtm_qp.maneuver.maneuver import Maneuver
-from vgtm_qp.maneuver.plan import Plan, make_plan
+from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.retries import DeadEnd, retries
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
@@ -26,26 +28,10 @@ from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.verify import verify as check
 
-Array = NDArray[np.float64]
-
 _STALLED_PROGRESS = 1e-3
 _STALLED_STEPS = 10
 
 Progress = Callable[[float, Step], None]
-
-
-@dataclass
-class _Record:
-    """The rows of the result, grown step by step."""
-
-    rows: dict[str, list[Any]] = field(default_factory=dict)
-
-    def add(self, **values: Any) -> None:
-        for name, value in values.items():
-            self.rows.setdefault(name, []).append(value)
-
-    def array(self, name: str) -> Array:
-        return np.asarray(self.rows[name], dtype=float)
 
 
 def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = True) -> Maneuver:
@@ -72,151 +58,192 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     mistakes = check_problem(problem, resolver.setup)
     if mistakes:
         raise ProblemError(str(problem.source or problem.name), mistakes)
-    plan = make_plan(problem, *resolver.tip())
-    record = _Record()
-    _add_state(record, resolver, plan, 0.0, 0.0, dict.fromkeys(resolver.phases, 0.0))
+    attempt = _Attempt(problem, resolver)
     setup_time = perf_counter() - started
 
     way = ""
     try:
-        stop = _run(resolver, plan, record, progress)
+        stop = attempt.run(progress)
         if stop is not None:
-            value = plan.path.start + record.rows["progress"][-1] * (plan.path.end - plan.path.start)
-            dead_end = DeadEnd(
-                stop,
-                resolver.state.control_vertices,
-                resolver.setup.arm.height,
-                plan.path.at(value).velocity,
-            )
-            way, record, stop = _retry(problem, resolver, record, dead_end, progress)
+            way, attempt, stop = _retry(problem, attempt, stop, progress)
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
-    maneuver = _assemble(problem, resolver, record, stop, setup_time, way)
+    maneuver = _assemble(problem, resolver, attempt, stop, setup_time, way)
     return maneuver.with_certificate(check(maneuver)) if verify else maneuver
 
 
+def solve_many(
+    problems: Iterable[Problem], *, workers: int | None = None, verify: bool = True
+) -> Iterator[Maneuver]:
+    """Solve problems in processes of their own and yield their maneuvers in order.
+
+    Each process solves one problem after another with a resolver of its own and one BLAS thread. Kernels are compiled
+    once for all of them, into the cache that they share.
+
+    Parameters
+    ----------
+    problems
+        What `load_problem` returns.
+    workers
+        Number of processes; that of the processors by default.
+    verify
+        Check each result again from its nodes alone.
+
+    Raises
+    ------
+    VgtmError
+        What `solve` raises for a problem, when its turn comes; the maneuvers before it were yielded.
+    concurrent.futures.process.BrokenProcessPool
+        A process was killed from outside.
+    """
+    context = multiprocessing.get_context("spawn")
+    one = environment(dict.fromkeys(THREADS, "1"))
+    with one, ProcessPoolExecutor(workers, mp_context=context) as pool:
+        tasks = [pool.submit(solve, problem, verify=verify) for problem in problems]
+        try:
+            for task in tasks:
+                yield task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+
+
+class _Attempt:
+    """A resolver on its way along the path of a problem, and the rows of the result, grown step by step."""
+
+    def __init__(self, problem: Problem, resolver: Mover) -> None:
+        self.resolver, self.plan = resolver, make_plan(problem, *resolver.tip())
+        self.value = self.plan.path.start
+        self.rows: dict[str, list[Any]] = {}
+        self._seconds, self._phases = 0.0, [0.0] * len(resolver.phases)
+        self._add_row()
+
+    @property
+    def progress(self) -> float:
+        """Share of the path covered, 0 to 1."""
+        path = self.plan.path
+        return (self.value - path.start) / (path.end - path.start)
+
+    def run(self, progress: Progress | None) -> Stop | None:
+        """Step along the plan; return why the arm stopped for good, or None if it reached the end."""
+        resolver, plan, arm = self.resolver, self.plan, self.resolver.setup.arm
+        stalled, last = 0, float(plan.marks[-1])
+        keeps_moving = bool(np.isfinite(arm.acceleration[arm.actuators]).any())
+        while self.value < last:
+            aim, dt = plan.next_mark(self.value, keeps_moving=keeps_moving)
+            before = resolver.state
+            with self._clock():
+                step = resolver.follow(plan.path, self.value, aim, dt=dt)
+            if step.status is StepStatus.BLOCKED:
+                return self._explain(aim, dt, step)
+            stop = self._explain(aim, dt, step, before) if self._gives_up(step) else None
+            if stop is not None and step.left_path:
+                # From here on the arm would brake off the path; those states do not belong to the maneuver.
+                return stop
+            self._advance(aim, step)
+            if stop is not None:
+                self._come_to_rest()
+                return stop
+            stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
+            if stalled >= _STALLED_STEPS:
+                return self._explain(aim, dt, step)
+            if progress is not None:
+                progress(self.progress, step)
+        return None
+
+    def _explain(self, aim: float, dt: float, step: Step, state: State | None = None) -> Stop:
+        return self.resolver.explain(self.plan.path, self.value, aim, dt=dt, last=step, state=state)
+
+    def _gives_up(self, step: Step) -> bool:
+        """Return whether the maneuver ends with a step, since the arm braked in it.
+
+        A hard tip may not be late, so braking ends it; any tip but an elastic one ends when it leaves the path.
+        """
+        mode = self.resolver.setup.tip_mode
+        return step.braked and (mode == "hard" or (mode != "elastic" and step.left_path))
+
+    def _come_to_rest(self) -> None:
+        """Take the steps in which the arm comes to rest on its path."""
+        path = self.plan.path
+        while self.value < path.end:
+            with self._clock():
+                step = self.resolver.brake(path, self.value, path.end)
+            if step is None or step.left_path:
+                return
+            self._advance(path.end, step)
+
+    @contextmanager
+    def _clock(self) -> Iterator[None]:
+        """Note the time of the step that is taken meanwhile, as a whole and by phase."""
+        known, started = dict(self.resolver.phases), perf_counter()
+        yield
+        self._seconds = perf_counter() - started
+        self._phases = [total - known[name] for name, total in self.resolver.phases.items()]
+
+    def _advance(self, aim: float, step: Step) -> None:
+        """Count the step that was taken towards `aim`."""
+        reached = step.status is StepStatus.REACHED
+        self.value = aim if reached else self.value + step.progress * (aim - self.value)
+        self._add_row()
+
+    def _add_row(self) -> None:
+        resolver, state, setup = self.resolver, self.resolver.state, self.resolver.setup
+        position, rotation = resolver.tip()
+        target = self.plan.path.at(self.value)
+        row = {
+            "time": state.time,
+            "configuration": state.q,
+            "quantities": state.quantities,
+            "control_vertices": state.control_vertices,
+            "tip_position": position,
+            "tip_rotation": rotation,
+            "tip_target_position": target.position,
+            "tip_target_rotation": target.rotation,
+            "clearance": setup.least_clearance(state.q, state.time, "obstacles"),
+            "self_clearance": setup.least_clearance(state.q, state.time, "members"),
+            "progress": self.progress,
+            "step_time": self._seconds,
+            "phase_time": self._phases,
+        }
+        for name, value in row.items():
+            self.rows.setdefault(name, []).append(value)
+
+
 def _retry(
-    problem: Problem, first: Mover, record: _Record, dead_end: DeadEnd, progress: Progress | None
-) -> tuple[str, _Record, Stop | None]:
-    """Return name, record and stop of the attempt that comes furthest; the name is empty for the first attempt."""
-    best: tuple[str, _Record, Stop | None] = ("", record, dead_end.stop)
-    for name, other in retries(problem, dead_end):
-        resolver = first.again(other)
+    problem: Problem, first: _Attempt, stop: Stop, progress: Progress | None
+) -> tuple[str, _Attempt, Stop | None]:
+    """Return name, attempt and stop of the one that comes furthest; the name is empty for the first attempt."""
+    arm, state = first.resolver.setup.arm, first.resolver.state
+    heading = first.plan.path.at(first.value).velocity
+    best: tuple[str, _Attempt, Stop | None] = ("", first, stop)
+    for name, other in retries(problem, DeadEnd(stop, state.control_vertices, arm.height, heading)):
+        resolver = first.resolver.again(other)
         if resolver is None:
             break
-        plan = make_plan(other, *resolver.tip())
-        tried = _Record()
-        _add_state(tried, resolver, plan, 0.0, 0.0, dict.fromkeys(resolver.phases, 0.0))
-        found = _run(resolver, plan, tried, progress)
+        attempt = _Attempt(other, resolver)
+        found = attempt.run(progress)
         if found is None:
-            return name, tried, None
-        if tried.rows["progress"][-1] > best[1].rows["progress"][-1] + _STALLED_PROGRESS:
-            best = (name, tried, found)
+            return name, attempt, None
+        if attempt.progress > best[1].progress + _STALLED_PROGRESS:
+            best = (name, attempt, found)
     return best
 
 
-def _run(resolver: Mover, plan: Plan, record: _Record, progress: Progress | None) -> Stop | None:
-    """Step along the plan; return why the arm stopped for good, or None if it reached the end."""
-    value, start, end = plan.path.start, plan.path.start, plan.path.end
-    stalled, last = 0, float(plan.marks[-1])
-    keeps_moving = bool(np.isfinite(resolver.setup.arm.acceleration[resolver.setup.arm.actuators]).any())
-    while value < last:
-        aim, dt = plan.next_mark(value, keeps_moving=keeps_moving)
-        before, known, clock = resolver.state, dict(resolver.phases), perf_counter()
-        step = resolver.follow(plan.path, value, aim, dt=dt)
-        seconds = perf_counter() - clock
-        if step.status is StepStatus.BLOCKED:
-            return resolver.explain(plan.path, value, aim, dt=dt, last=step)
-        stop = _given_up(resolver, plan, value, aim, dt, step, before)
-        if stop is not None and step.left_path:
-            # From here on the arm would brake off the path; those states do not belong to the maneuver.
-            return stop
-        value = aim if step.status is StepStatus.REACHED else value + step.progress * (aim - value)
-        phases = {name: total - known[name] for name, total in resolver.phases.items()}
-        _add_state(record, resolver, plan, value, seconds, phases)
-        if stop is not None:
-            _come_to_rest(resolver, plan, record, value)
-            return stop
-        stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
-        if stalled >= _STALLED_STEPS:
-            return resolver.explain(plan.path, value, aim, dt=dt, last=step)
-        if progress is not None:
-            progress((value - start) / (end - start), step)
-    return None
-
-
-def _given_up(
-    resolver: Mover, plan: Plan, value: float, mark: float, dt: float, step: Step, before: State
-) -> Stop | None:
-    """Return why the maneuver ends with a step in which the arm braked; None if it goes on afterwards.
-
-    A hard tip may not be late, so braking ends it; any tip but an elastic one ends when it leaves the path.
-    """
-    mode = resolver.setup.tip_mode
-    if not step.braked or mode == "elastic":
-        return None
-    if mode != "hard" and not step.left_path:
-        return None
-    return resolver.explain(plan.path, value, mark, dt=dt, last=step, state=before)
-
-
-def _come_to_rest(resolver: Mover, plan: Plan, record: _Record, value: float) -> None:
-    """Record the steps in which the arm comes to rest on its path."""
-    end = plan.path.end
-    while value < end:
-        known, clock = dict(resolver.phases), perf_counter()
-        step = resolver.brake(plan.path, value, end)
-        if step is None or step.left_path:
-            return
-        value += step.progress * (end - value)
-        phases = {name: total - known[name] for name, total in resolver.phases.items()}
-        _add_state(record, resolver, plan, value, perf_counter() - clock, phases)
-
-
-def _add_state(
-    record: _Record, resolver: Mover, plan: Plan, value: float, seconds: float, phases: dict[str, float]
-) -> None:
-    state, setup = resolver.state, resolver.setup
-    position, rotation = resolver.tip()
-    target = plan.path.at(value)
-    record.add(
-        time=state.time,
-        configuration=state.q,
-        quantities=state.quantities,
-        control_vertices=state.control_vertices,
-        tip_position=position,
-        tip_rotation=rotation,
-        tip_target_position=target.position,
-        tip_target_rotation=target.rotation,
-        clearance=setup.least_clearance(state.q, state.time, "obstacles"),
-        self_clearance=setup.least_clearance(state.q, state.time, "members"),
-        progress=(value - plan.path.start) / (plan.path.end - plan.path.start),
-        step_time=seconds,
-        phase_time=list(phases.values()),
-    )
-
-
 def _assemble(
-    problem: Problem,
-    resolver: Mover,
-    record: _Record,
-    stop: Stop | None,
-    setup_time: float,
-    way: str,
+    problem: Problem, resolver: Mover, attempt: _Attempt, stop: Stop | None, setup_time: float, way: str
 ) -> Maneuver:
     setup = resolver.setup
-    task = setup.task
     meshes = {
         obstacle.name: mesh_record(obstacle.file, len(pieces.pieces))
         for obstacle, pieces in zip(problem.obstacle, setup.monitor.obstacles, strict=True)
         if obstacle.shape == "mesh"
     }
-    reached = float(record.rows["progress"][-1])
     manifest = make_manifest(
         problem.to_dict(),
         setup.arm.record(),
         status="solved" if stop is None else "blocked",
-        reached=reached,
+        # That of the last whole row: an interrupt may have come before the next.
+        reached=float(attempt.rows["progress"][-1]),
         blocked_by=() if stop is None else stop.names,
         stop=None if stop is None else stop.to_dict(),
         way_out=way,
@@ -229,24 +256,16 @@ def _assemble(
     )
     # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank only.
     manifest["jacobian_rank"] = resolver.rank
-    rotation = record.array("tip_target_rotation")
-    count = len(record.rows["time"])
+    arrays: dict[str, Any] = {name: np.asarray(rows, dtype=float) for name, rows in attempt.rows.items()}
+    rotation = arrays.pop("tip_target_rotation")
+    arrays |= setup.arm.recorded(arrays.pop("configuration"), arrays.pop("quantities"))
+    arrays["control_vertices"] = arrays["control_vertices"].reshape(len(rotation), -1, 3)
     return Maneuver(
-        time=record.array("time"),
-        control_vertices=record.array("control_vertices").reshape(count, -1, 3),
-        tip_position=record.array("tip_position"),
-        tip_rotation=record.array("tip_rotation"),
-        tip_target_position=record.array("tip_target_position"),
-        clearance=record.array("clearance"),
-        self_clearance=record.array("self_clearance"),
-        progress=record.array("progress"),
-        step_time=record.array("step_time"),
+        **arrays,
         phase_names=np.array(list(resolver.phases)),
-        phase_time=record.array("phase_time"),
         manifest=manifest,
-        tip_target_rotation=rotation if task.turns == "orientation" else None,
-        tip_target_pointing=rotation[:, :, 2] if task.turns == "pointing" else None,
-        **setup.arm.recorded(record.array("configuration"), record.array("quantities")),
+        tip_target_rotation=rotation if setup.task.turns == "orientation" else None,
+        tip_target_pointing=rotation[:, :, 2] if setup.task.turns == "pointing" else None,
     )
 
 

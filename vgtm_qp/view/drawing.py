@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.curve.families import make_family
-from vgtm_qp.problem import Problem
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
@@ -32,19 +31,16 @@ _CURVE_POINTS = 49
 _SURROUNDINGS = 0.25
 _FIELD_OF_VIEW, _ELEVATION = float(np.radians(32.0)), float(np.radians(14.0))
 _SIDES = np.radians([-62.0, -118.0, 62.0, 118.0])
+_STRAIGHT = 1e-6
+"""A tip that goes no farther aside than this, m, has no heading."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObstacleMesh:
     """The surface of an obstacle.
 
-    Attributes
-    ----------
-    name : str
-    vertices, faces : (K, 3), (F, 3) int
-        Triangles about the obstacle's own origin, turned into the base frame, m.
-    center, velocity : (3,)
-        Position of that origin at time 0, m, and its velocity, m/s.
+    Its triangles, `vertices` (K, 3), m, and `faces` (F, 3), are about its own origin and turned into the base frame.
+    That origin is at `center` (3,), m, at time 0 and has the `velocity` (3,), m/s.
     """
 
     name: str
@@ -62,14 +58,7 @@ class ObstacleMesh:
 class Drawing:
     """An arm and its surroundings, ready to be drawn at any configuration.
 
-    Attributes
-    ----------
-    name : str
-    arm : RecordedArm
-        Member ends, radii and strokes.
-    curve_weights : (K, V)
-        Weights of points along the curve; V = 0 where there is no curve.
-    obstacles : tuple of ObstacleMesh
+    `curve_weights` (K, V) are those of points along the curve; K = 0 where there is no curve.
     """
 
     name: str
@@ -77,9 +66,9 @@ class Drawing:
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
 
-    def ends(self, nodes: Array) -> Array:
-        """Return (M, 2, 3) the two ends of each member at `nodes` (N, 3), m."""
-        return self.arm.ends(nodes)
+    def surfaces(self) -> list[Array]:
+        """Return (K, 3) the vertices of each obstacle at time 0, m."""
+        return [mesh.vertices + mesh.center for mesh in self.obstacles]
 
     def curve(self, control_vertices: Array) -> Array:
         """Return (K, 3) points along the curve with `control_vertices` (V, 3), m; K = 0 without a curve."""
@@ -98,7 +87,7 @@ class Drawing:
 
     def colours(self, lengths: Array) -> Array:
         """Return (M, 3) colours, 0 to 1: blue for short to red for long, grey for fixed members and links."""
-        if isinstance(self.arm, RecordedChain):
+        if not self.arm.stretches.any():
             return np.tile(FIXED_COLOUR, (len(lengths), 1))
         share = self.stroke_share(lengths)
         colours = stroke_colours(np.nan_to_num(share, nan=0.5))
@@ -113,38 +102,24 @@ def stroke_colours(share: Array) -> Array:
 
 
 def drawing_of_maneuver(maneuver: Result) -> Drawing:
-    """Return the drawing of a result, from its manifest.
-
-    Raises
-    ------
-    ResultError
-        The arm record in the manifest is malformed.
-    """
+    """Return the drawing of a result, from its manifest; raise ResultError where its record of the arm is wrong."""
     manifest = maneuver.manifest
-    return _drawing(
-        manifest["problem"],
-        recorded_arm(manifest["arm"], maneuver.members),
-        maneuver.control_vertices.shape[1],
-        Path(manifest.get("directory") or "."),
-    )
+    arm = recorded_arm(manifest["arm"], maneuver.members)
+    vertices = maneuver.control_vertices.shape[1]
+    return make_drawing(manifest["problem"], arm, vertices, manifest.get("directory") or ".")
 
 
-def drawing_of_problem(problem: Problem, record: Mapping[str, Any], members: Index, vertices: int) -> Drawing:
-    """Return the drawing of a problem from the record of its arm and number of control vertices."""
-    directory = problem.source.parent if problem.source else Path.cwd()
-    return _drawing(problem.to_dict(), recorded_arm(record, members), vertices, directory)
-
-
-def _drawing(
-    problem: Mapping[str, Any], arm: RecordedArm | RecordedChain, vertices: int, directory: Path
+def make_drawing(
+    problem: Mapping[str, Any], arm: RecordedArm | RecordedChain, vertices: int, directory: str | Path
 ) -> Drawing:
+    """Return the drawing of an arm with so many control vertices among the obstacles of a problem, as plain data."""
     weights = np.zeros((0, vertices))
     spec = problem.get("curve")
     if vertices and spec:
         options = {key: spec[key] for key in ("degree", "bias", "tension") if key in spec}
         family = make_family(spec.get("family", "bezier"), vertices, **options)
         weights = family.weights(np.linspace(0.0, 1.0, _CURVE_POINTS))
-    obstacles = obstacle_meshes(problem.get("obstacle") or (), directory)
+    obstacles = obstacle_meshes(problem.get("obstacle") or (), Path(directory))
     return Drawing(str(problem.get("name", "")), arm, weights, obstacles)
 
 
@@ -177,9 +152,8 @@ def _surface(entry: Mapping[str, Any], directory: Path) -> Any:
     if shape == "sphere":
         return trimesh.creation.icosphere(subdivisions=3, radius=float(entry["radius"]))
     if shape == "cylinder":
-        return trimesh.creation.cylinder(
-            radius=float(entry["radius"]), height=float(entry["height"]), sections=48
-        )
+        radius, height = float(entry["radius"]), float(entry["height"])
+        return trimesh.creation.cylinder(radius=radius, height=height, sections=48)
     path = directory / str(entry["file"])
     if not path.is_file():
         return None
@@ -188,8 +162,7 @@ def _surface(entry: Mapping[str, Any], directory: Path) -> Any:
     return surface
 
 
-@dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(NamedTuple):
     """Where to look from: `position` and `target` (3,), m, and the vertical field of view, rad."""
 
     position: Array
@@ -203,23 +176,32 @@ def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
     Of four sides it is the one from which obstacles hide least of the arm.
     """
     points = nodes.reshape(-1, 3)
-    low, high = points.min(axis=0), points.max(axis=0)
-    reach = float(np.linalg.norm(high - low))
-    corners = [
-        np.clip(mesh.vertices + mesh.center, low - _SURROUNDINGS * reach, high + _SURROUNDINGS * reach)
-        for mesh in drawing.obstacles
-    ]
-    seen = np.concatenate([points, *corners])
-    target = (seen.min(axis=0) + seen.max(axis=0)) / 2
-    distance = 0.6 * float(np.linalg.norm(np.ptp(seen, axis=0))) / np.tan(_FIELD_OF_VIEW / 2)
-    away = tip[int(np.argmax(np.linalg.norm((tip - tip[0])[:, :2], axis=1)))] - tip[0]
-    heading = np.arctan2(away[1], away[0]) if np.linalg.norm(away[:2]) > 1e-6 * reach else 0.0
-    positions = [target + distance * _direction(heading + side, _ELEVATION) for side in _SIDES]
+    reach = float(np.linalg.norm(np.ptp(points, axis=0)))
+    low, high = with_surroundings(points, drawing.surfaces(), _SURROUNDINGS * reach)
+    target = (low + high) / 2
+    distance = 0.6 * float(np.linalg.norm(high - low)) / np.tan(_FIELD_OF_VIEW / 2)
+    positions = [target + distance * direction(heading(tip) + side, _ELEVATION) for side in _SIDES]
     hidden = [_hidden(drawing.obstacles, position, nodes[[0, -1]].reshape(-1, 3)) for position in positions]
     return Camera(positions[int(np.argmin(hidden))], target, _FIELD_OF_VIEW)
 
 
-def _direction(azimuth: float, elevation: float) -> Array:
+def with_surroundings(points: Array, surroundings: Iterable[Array], room: float) -> Array:
+    """Return least and greatest coordinates (2, D) of points (K, D) and of what is within `room` of their box, m."""
+    box = np.stack([points.min(axis=0), points.max(axis=0)])
+    near = [np.clip(others, box[0] - room, box[1] + room) for others in surroundings]
+    seen = np.concatenate([box, *near])
+    return np.stack([seen.min(axis=0), seen.max(axis=0)])
+
+
+def heading(tip: Array) -> float:
+    """Return the azimuth, rad, of the way to where a tip (T, 3) is farthest aside from its first place; 0 if never."""
+    aside = (tip - tip[0])[:, :2]
+    x, y = aside[int(np.argmax(np.linalg.norm(aside, axis=1)))]
+    return float(np.arctan2(y, x)) if np.hypot(x, y) > _STRAIGHT else 0.0
+
+
+def direction(azimuth: float, elevation: float) -> Array:
+    """Return (3,) the unit vector at `azimuth` about +z and `elevation` above the x-y plane, rad."""
     flat = np.cos(elevation)
     return np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)])
 

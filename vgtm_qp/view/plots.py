@@ -1,26 +1,19 @@
-"""Quantities of a maneuver over time: clearance, strokes, tip error and step time.
-
-Each function draws into `axes`, or into those of a new figure, and returns the figure.
-"""
+"""Quantities of a maneuver over time: clearance, strokes, tip error and step time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import recorded_arm
 from vgtm_qp.verify.check import TIP_TOLERANCE
 from vgtm_qp.verify.path import check_path
-
-Array = NDArray[np.float64]
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Distinct in every common form of colour blindness (Okabe and Ito, 2008)."""
@@ -38,34 +31,23 @@ _NAMED = 5
 _SMALLEST = 1e-17
 
 
-@contextmanager
-def _on(axes: Axes | None) -> Iterator[Axes]:
-    """Give `axes`, or those of a new figure that is not kept by pyplot, in the style of all plots here."""
-    with mpl.rc_context(_STYLE):
-        if axes is None:
-            axes = Figure(figsize=_SIZE, layout="constrained").add_subplot()
-        yield axes
-
-
-def plot_clearance(maneuver: Result, *, axes: Axes | None = None) -> Figure:
-    """Plot the least distances to obstacles and between members over time, mm."""
+def _draw_clearance(axes: Axes, maneuver: Result) -> None:
+    """Draw the least distances to obstacles and between members over time, mm."""
     safe = 1000.0 * float(maneuver.manifest["problem"]["clearance"]["safe"])
-    with _on(axes) as axes:
-        both = {"to obstacles": maneuver.clearance, "between members": maneuver.self_clearance}
-        shown = [(name, values) for name, values in both.items() if np.isfinite(values).any()]
-        for (name, values), colour, dash in zip(shown, _COLOURS, _DASHES, strict=False):
-            axes.plot(maneuver.time, 1000.0 * values, color=colour, linestyle=dash, label=name)
-        floor = min(0.0, *(1100.0 * float(values.min()) for _, values in shown)) if shown else 0.0
-        axes.axhspan(floor, safe, label=f"below {safe:g} mm", **_FORBIDDEN)
-        axes.set_ylim(bottom=floor)
-        axes.set(xlabel="time (s)", ylabel="least clearance (mm)")
-        _set_time(axes, maneuver)
-        axes.legend(frameon=False)
-    return _figure(axes)
+    both = {"to obstacles": maneuver.clearance, "between members": maneuver.self_clearance}
+    shown = [(name, values) for name, values in both.items() if np.isfinite(values).any()]
+    for (name, values), colour, dash in zip(shown, _COLOURS, _DASHES, strict=False):
+        axes.plot(maneuver.time, 1000.0 * values, color=colour, linestyle=dash, label=name)
+    floor = min(0.0, *(1100.0 * float(values.min()) for _, values in shown)) if shown else 0.0
+    axes.axhspan(floor, safe, label=f"below {safe:g} mm", **_FORBIDDEN)
+    axes.set_ylim(bottom=floor)
+    axes.set(xlabel="time (s)", ylabel="least clearance (mm)")
+    _set_time(axes, maneuver)
+    axes.legend(frameon=False)
 
 
-def plot_strokes(maneuver: Result, *, axes: Axes | None = None) -> Figure:
-    """Plot the lengths of the actuated members over time, between their limits.
+def _draw_strokes(axes: Axes, maneuver: Result) -> None:
+    """Draw the lengths of the actuated members over time, between their limits.
 
     In m where all have the same stroke, as parts of it, %, where not. The members that come nearest to a limit
     are named; the others are grey.
@@ -79,73 +61,71 @@ def plot_strokes(maneuver: Result, *, axes: Axes | None = None) -> Figure:
     alike = bool(len(actuators)) and np.ptp(low) == 0.0 and np.ptp(high) == 0.0
     values, bottom, top = (lengths, low[0], high[0]) if alike else (100.0 * share, 0.0, 100.0)
     order = np.argsort(np.minimum(share, 1.0 - share).min(axis=0), kind="stable")
-    with _on(axes) as axes:
-        for k in order[_NAMED:][::-1]:
-            axes.plot(maneuver.time, values[:, k], color="0.78", linewidth=0.8)
-        for k, colour, dash in zip(order[:_NAMED], _COLOURS, _DASHES, strict=False):
-            name = arm.quantity_names[actuators[k]]
-            axes.plot(maneuver.time, values[:, k], color=colour, linestyle=dash, label=name)
-        room = 0.08 * (top - bottom)
-        axes.axhspan(bottom - room, bottom, **_FORBIDDEN)
-        axes.axhspan(top, top + room, **_FORBIDDEN)
-        axes.set_ylim(bottom - room, top + room)
-        axes.set(
-            xlabel="time (s)",
-            ylabel=f"actuator {'length (m)' if maneuver.joints is None else 'value (rad or m)'}"
-            if alike
-            else "part of the stroke (%)",
-        )
-        _set_time(axes, maneuver)
-        axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), title="nearest a limit")
-    return _figure(axes)
+    for k in order[_NAMED:][::-1]:
+        axes.plot(maneuver.time, values[:, k], color="0.78", linewidth=0.8)
+    for k, colour, dash in zip(order[:_NAMED], _COLOURS, _DASHES, strict=False):
+        name = arm.quantity_names[actuators[k]]
+        axes.plot(maneuver.time, values[:, k], color=colour, linestyle=dash, label=name)
+    room = 0.08 * (top - bottom)
+    axes.axhspan(bottom - room, bottom, **_FORBIDDEN)
+    axes.axhspan(top, top + room, **_FORBIDDEN)
+    axes.set_ylim(bottom - room, top + room)
+    unit = "length (m)" if maneuver.joints is None else "value (rad or m)"
+    axes.set(xlabel="time (s)", ylabel=f"actuator {unit}" if alike else "part of the stroke (%)")
+    _set_time(axes, maneuver)
+    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), title="nearest a limit")
 
 
-def plot_tip_error(maneuver: Result, *, axes: Axes | None = None) -> Figure:
-    """Plot the distance of the tip from its target over the tracked axes, m."""
+def _draw_tip_error(axes: Axes, maneuver: Result) -> None:
+    """Draw the distance of the tip from its target over the tracked axes, m."""
     error = check_path(maneuver, maneuver.tip_position).tip_error(maneuver.tip_position)
-    with _on(axes) as axes:
-        if error is not None:
-            axes.semilogy(
-                maneuver.time, np.maximum(error, _SMALLEST), color=_COLOURS[0], marker=".", markersize=3.0
-            )
-        axes.axhline(TIP_TOLERANCE, color="#b91c1c", linestyle="--", linewidth=0.9, label="tolerance")
-        axes.set(xlabel="time (s)", ylabel="tip error (m)", ylim=(_SMALLEST / 2.0, None))
-        _set_time(axes, maneuver)
-        axes.legend(frameon=False)
-    return _figure(axes)
+    if error is not None:
+        shown = np.maximum(error, _SMALLEST)
+        axes.semilogy(maneuver.time, shown, color=_COLOURS[0], marker=".", markersize=3.0)
+    axes.axhline(TIP_TOLERANCE, color="#b91c1c", linestyle="--", linewidth=0.9, label="tolerance")
+    axes.set(xlabel="time (s)", ylabel="tip error (m)", ylim=(_SMALLEST / 2.0, None))
+    _set_time(axes, maneuver)
+    axes.legend(frameon=False)
 
 
-def plot_step_time(maneuver: Result, *, axes: Axes | None = None) -> Figure:
-    """Plot the computing time of each step by phase, ms, and median and 99th percentile of the whole."""
-    with _on(axes) as axes:
-        steps = np.arange(1, len(maneuver.time))
-        phases = 1000.0 * maneuver.phase_time[1:]
-        total = 1000.0 * maneuver.step_time[1:]
-        below = np.zeros(len(steps))
-        for values, name, colour in zip(phases.T, maneuver.phase_names, _COLOURS, strict=False):
-            axes.bar(steps, values, bottom=below, width=1.0, color=colour, label=str(name))
-            below += values
-        axes.bar(
-            steps, np.maximum(total - below, 0.0), bottom=below, width=1.0, color="0.8", label="the rest"
-        )
-        if len(steps):
-            for quantile, name, dash in ((50, "median", "-"), (99, "99 %", ":")):
-                value = float(np.percentile(total, quantile))
-                axes.axhline(
-                    value, color="0.15", linestyle=dash, linewidth=0.9, label=f"{name}: {value:.2g} ms"
-                )
-            axes.set_xlim(0.5, len(steps) + 0.5)
-        axes.set(xlabel="step", ylabel="computing time (ms)")
-        axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return _figure(axes)
-
-
-def _figure(axes: Axes) -> Figure:
-    figure = axes.get_figure(root=True)
-    assert figure is not None
-    return figure
+def _draw_step_time(axes: Axes, maneuver: Result) -> None:
+    """Draw the computing time of each step by phase, ms, and median and 99th percentile of the whole."""
+    steps = np.arange(1, len(maneuver.time))
+    phases = 1000.0 * maneuver.phase_time[1:]
+    total = 1000.0 * maneuver.step_time[1:]
+    below = np.zeros(len(steps))
+    for values, name, colour in zip(phases.T, maneuver.phase_names, _COLOURS, strict=False):
+        axes.bar(steps, values, bottom=below, width=1.0, color=colour, label=str(name))
+        below += values
+    axes.bar(steps, np.maximum(total - below, 0.0), bottom=below, width=1.0, color="0.8", label="the rest")
+    if len(steps):
+        for quantile, name, dash in ((50, "median", "-"), (99, "99 %", ":")):
+            value = float(np.percentile(total, quantile))
+            axes.axhline(value, color="0.15", linestyle=dash, linewidth=0.9, label=f"{name}: {value:.2g} ms")
+        axes.set_xlim(0.5, len(steps) + 0.5)
+    axes.set(xlabel="step", ylabel="computing time (ms)")
+    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def _set_time(axes: Axes, maneuver: Result) -> None:
     if len(maneuver.time) > 1:
         axes.set_xlim(maneuver.time[0], maneuver.time[-1])
+
+
+_DRAW: dict[str, Callable[[Axes, Result], None]] = {
+    "clearance": _draw_clearance,
+    "strokes": _draw_strokes,
+    "tip error": _draw_tip_error,
+    "step time": _draw_step_time,
+}
+
+
+def plot(quantity: str, maneuver: Result, axes: Axes | None) -> Figure:
+    """Draw a quantity of a maneuver into `axes`, or those of a new figure unknown to pyplot; return the figure."""
+    with mpl.rc_context(_STYLE):
+        if axes is None:
+            axes = Figure(figsize=_SIZE, layout="constrained").add_subplot()
+        _DRAW[quantity](axes, maneuver)
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    return figure

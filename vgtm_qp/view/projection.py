@@ -8,10 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.view.drawing import ObstacleMesh
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from vgtm_qp.view.drawing import Array, Index, ObstacleMesh, direction
 
 _MANY_FACES = 4000
 _SHARP = np.radians(20.0)
@@ -19,26 +16,15 @@ _SHARP = np.radians(20.0)
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A parallel projection.
-
-    Attributes
-    ----------
-    axes : (3, 3)
-        Rows: to the right on paper, up on paper, and towards the viewer.
-    """
+    """A parallel projection."""
 
     axes: Array
+    """(3, 3), rows: to the right on paper, up on paper, and towards the viewer."""
 
     @classmethod
     def looking(cls, azimuth: float, elevation: float) -> Projection:
         """Return the view from `azimuth` about +z and `elevation` above the x-y plane, rad; +z is up."""
-        toward = np.array(
-            [
-                np.cos(azimuth) * np.cos(elevation),
-                np.sin(azimuth) * np.cos(elevation),
-                np.sin(elevation),
-            ]
-        )
+        toward = direction(azimuth, elevation)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         return cls(np.stack([right, np.cross(toward, right), toward]))
 
@@ -58,7 +44,7 @@ class ProjectedMesh:
         import trimesh
 
         self.mesh, self.projection = mesh, projection
-        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+        self._solid = solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
         self.vertices = np.asarray(solid.vertices, dtype=float)
         self.faces = np.asarray(solid.faces)
         self.normals = np.asarray(solid.face_normals, dtype=float)
@@ -70,11 +56,7 @@ class ProjectedMesh:
     @cached_property
     def is_convex(self) -> bool:
         """Whether every vertex is on the inner side of every face; a large mesh counts as not convex."""
-        if len(self.faces) > _MANY_FACES:
-            return False
-        heights = self.normals @ self.vertices.T
-        planes = np.einsum("fc,fc->f", self.normals, self.vertices[self.faces[:, 0]])
-        return bool(np.all(heights <= planes[:, None] + 1e-6 * float(np.ptp(self.vertices))))
+        return len(self.faces) <= _MANY_FACES and bool(self._solid.is_convex)
 
     def depth(self, time: float) -> float:
         """Return how near to the viewer its middle is at `time`, m."""
@@ -101,12 +83,11 @@ class ProjectedMesh:
         A point whose line of sight meets a convex body is before it just if it is outside one of the planes
         of the faces that the viewer sees.
         """
-        shifted = points - self.mesh.position(time)
         if not self.is_convex:
             return self.projection.depth(points) > self.depth(time)
-        corners = self.vertices[self.faces[self.facing, 0]]
-        normals = self.normals[self.facing]
-        return np.asarray((shifted @ normals.T > np.einsum("fc,fc->f", normals, corners)).any(axis=1))
+        corners, normals = self.vertices[self.faces[self.facing, 0]], self.normals[self.facing]
+        heights = (points - self.mesh.position(time)) @ normals.T
+        return np.asarray((heights > np.einsum("fc,fc->f", normals, corners)).any(axis=1))
 
 
 def layers(points: Array, surfaces: list[ProjectedMesh], time: float) -> Index:

@@ -17,24 +17,18 @@ from vgtm_qp.view.drawing import (
     OBSTACLE_COLOUR,
     PATH_COLOUR,
     POLYGON_COLOUR,
+    Array,
     Camera,
     Drawing,
+    ObstacleMesh,
 )
-
-Array = NDArray[np.float64]
 
 _FIXED_POINT = 2.0**-12
 """Resolution of recorded coordinates, m: a quarter of a millimetre, so that a recording compresses."""
 
 
 def import_viser() -> Any:
-    """Return the module ``viser``.
-
-    Raises
-    ------
-    MissingExtraError
-        It is not installed.
-    """
+    """Return the module ``viser``; raise MissingExtraError where it is not installed."""
     try:
         import viser
     except ImportError:
@@ -44,13 +38,7 @@ def import_viser() -> Any:
 
 @contextmanager
 def viser_server(port: int = 0) -> Iterator[Any]:
-    """Run a viser server that this machine alone can reach; its own messages do not reach stdout.
-
-    Raises
-    ------
-    MissingExtraError
-        viser is not installed.
-    """
+    """Run a viser server that this machine alone can reach; its own messages do not reach stdout."""
     viser = import_viser()
     with redirect_stdout(StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
@@ -65,25 +53,33 @@ class ArmScene:
     """Draws one arm into a viser scene once, and moves it as often as asked."""
 
     def __init__(self, server: Any, drawing: Drawing, nodes: Array, control_vertices: Array) -> None:
+        import trimesh
+
         self._server, self._scene, self._drawing = server, server.scene, drawing
         arm = drawing.arm
         self._scene.set_up_direction("+z")
         self._scene.world_axes.visible = False
         self._add_ground(nodes)
-        ends, lengths = drawing.ends(nodes), arm.lengths(nodes)
-        self._groups = [
-            (index, self._add_members(name, ends[index], arm.radius[index], drawing.colours(lengths)[index]))
-            for name, index in (
-                ("fixed", np.flatnonzero(~arm.stretches)),
-                ("actuated", np.flatnonzero(arm.stretches)),
-            )
-            if len(index)
-        ]
-        self._nodes = self._add_nodes(nodes)
+        tube = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16)
+        position, wxyz, span = _placement(arm.ends(nodes))
+        scales = np.column_stack([arm.radius, arm.radius, span]).astype(np.float32)
+        colours = drawing.colours(arm.lengths(nodes))
+        self._members = []
+        for name, which in (("fixed", ~arm.stretches), ("actuated", arm.stretches)):
+            if which.any():
+                placed = position[which], wxyz[which], colours[which]
+                handle = self._add_many(f"/members/{name}", tube, *placed, batched_scales=scales[which])
+                self._members.append((which, handle))
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=1.35 * float(np.median(arm.radius)))
+        unturned = np.tile([1.0, 0.0, 0.0, 0.0], (len(nodes), 1))
+        dark = tuple(0.55 * channel for channel in FIXED_COLOUR)
+        self._nodes = self._add_many("/nodes", ball, nodes, unturned, dark)
         self._curve = self._polygon = self._vertices = None
         if drawing.curve_weights.size:
-            self._curve = self._add_line("/curve", drawing.curve(control_vertices), CURVE_COLOUR, 0.028)
-            self._polygon = self._add_line("/control polygon", control_vertices, POLYGON_COLOUR, 0.01)
+            points = drawing.curve(control_vertices)
+            self._curve = self.add_path("/curve", points, colour=CURVE_COLOUR, thickness=0.028)
+            style: Any = {"colour": POLYGON_COLOUR, "thickness": 0.01}
+            self._polygon = self.add_path("/control polygon", control_vertices, **style)
             self._vertices = self._scene.add_point_cloud(
                 "/control vertices",
                 control_vertices.astype(np.float32),
@@ -103,18 +99,18 @@ class ArmScene:
             rounded = np.round(array / _FIXED_POINT) * _FIXED_POINT if coarse else array
             return np.asarray(rounded, dtype=np.float32)
 
-        ends, lengths = self._drawing.ends(nodes), self._drawing.arm.lengths(nodes)
-        colours = self._drawing.colours(lengths)
+        arm = self._drawing.arm
+        position, wxyz, span = map(numbers, _placement(arm.ends(nodes)))
+        colours = _instance_rgb(self._drawing.colours(arm.lengths(nodes)))
         with self._server.atomic():
-            for index, handle in self._groups:
-                position, wxyz, span = _placement(ends[index])
-                handle.batched_positions = numbers(position)
-                handle.batched_wxyzs = numbers(wxyz)
-                if self._drawing.arm.stretches[index].any():
+            for which, handle in self._members:
+                handle.batched_positions = position[which]
+                handle.batched_wxyzs = wxyz[which]
+                if arm.stretches[which].any():
                     scales = np.array(handle.batched_scales)
-                    scales[:, 2] = numbers(span)
+                    scales[:, 2] = span[which]
                     handle.batched_scales = scales
-                    handle.batched_colors = _instance_rgb(colours[index])
+                    handle.batched_colors = colours[which]
             self._nodes.batched_positions = numbers(nodes)
             if self._curve is not None and self._polygon is not None and self._vertices is not None:
                 self._curve.points = numbers(_segments(self._drawing.curve(control_vertices)))
@@ -124,56 +120,34 @@ class ArmScene:
                 if mesh.velocity.any():
                     handle.position = mesh.position(time)
 
-    def add_path(self, name: str, points: Array, *, thickness: float = 0.012) -> Any:
+    def add_path(
+        self, name: str, points: Array, *, colour: Any = PATH_COLOUR, thickness: float = 0.012
+    ) -> Any:
         """Draw a line through `points` (K, 3), m, and return its handle."""
-        return self._add_line(name, points, PATH_COLOUR, thickness)
+        segments = _segments(points).astype(np.float32)
+        return self._scene.add_line_segments(name, segments, _rgb(colour), thickness=thickness)
 
     def look(self, camera: Camera) -> None:
         """Let every new page begin with `camera`."""
         first = self._server.initial_camera
         first.position, first.look_at, first.fov = camera.position, camera.target, camera.field_of_view
 
-    def _add_members(self, name: str, ends: Array, radius: Array, colours: Array) -> Any:
-        import trimesh
-
-        tube = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16)
-        position, wxyz, span = _placement(ends)
+    def _add_many(
+        self, name: str, shape: Any, position: Array, wxyz: Array, colours: Any, **more: Any
+    ) -> Any:
+        """Draw the mesh `shape` at each position (K, 3), m, turned by quaternions (K, 4)."""
         return self._scene.add_batched_meshes_simple(
-            f"/members/{name}",
-            tube.vertices,
-            tube.faces,
-            batched_wxyzs=wxyz,
+            name,
+            shape.vertices,
+            shape.faces,
             batched_positions=position,
-            batched_scales=np.column_stack([radius, radius, span]).astype(np.float32),
+            batched_wxyzs=wxyz,
             batched_colors=_instance_rgb(colours),
             lod="off",
-            flat_shading=False,
+            **more,
         )
 
-    def _add_nodes(self, nodes: Array) -> Any:
-        import trimesh
-
-        ball = trimesh.creation.icosphere(
-            subdivisions=2, radius=1.35 * float(np.median(self._drawing.arm.radius))
-        )
-        return self._scene.add_batched_meshes_simple(
-            "/nodes",
-            ball.vertices,
-            ball.faces,
-            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(nodes), 1)),
-            batched_positions=nodes,
-            batched_colors=_instance_rgb(tuple(0.55 * channel for channel in FIXED_COLOUR)),
-            lod="off",
-        )
-
-    def _add_line(
-        self, name: str, points: Array, colour: tuple[float, float, float], thickness: float
-    ) -> Any:
-        return self._scene.add_line_segments(
-            name, _segments(points).astype(np.float32), _rgb(colour), thickness=thickness
-        )
-
-    def _add_obstacle(self, mesh: Any) -> Any:
+    def _add_obstacle(self, mesh: ObstacleMesh) -> Any:
         group = self._scene.add_frame(f"/obstacles/{mesh.name}", show_axes=False, position=mesh.center)
         self._scene.add_mesh_simple(
             f"/obstacles/{mesh.name}/surface",

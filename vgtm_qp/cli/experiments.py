@@ -1,0 +1,185 @@
+"""``vgtm compare``, ``vgtm study``, ``vgtm bench``: methods against each other, over scenes, and by the clock."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from vgtm_qp.bench import BaselineName, SceneKind, TrackingName
+from vgtm_qp.cli.output import Json, Output, Switch, answer, document, note, say
+from vgtm_qp.cli.progress import bar, following
+
+if TYPE_CHECKING:
+    from vgtm_qp.step.resolver import Step
+
+_several = partial(Switch, consume_multiple=True)
+
+
+def compare(
+    problems: Annotated[
+        list[str], Parameter(name="PROBLEM", help="problem files, or names of bundled problems (vgtm list)")
+    ],
+    /,
+    *,
+    methods: Annotated[
+        list[str] | None,
+        Parameter(help="methods by name, all of them with all; nine by default", consume_multiple=True),
+    ] = None,
+    output: Annotated[Path | None, Output(help="folder for compare.md, .json and .pdf")] = None,
+    json: Json = False,
+) -> None:
+    """Solve problems by several methods and show what each of them keeps; a method that fails is shown as failed.
+
+    Exit code 0 says that the comparison was made, whatever the methods did.
+    """
+    from vgtm_qp.comparison.compare import compare as run
+    from vgtm_qp.methods import DEFAULT_METHODS, PRESETS
+    from vgtm_qp.methods.presets import check_methods
+    from vgtm_qp.problem import load_problem
+    from vgtm_qp.view.figure import save_figure
+
+    names = [name for entry in methods or DEFAULT_METHODS for name in entry.split(",")]
+    names = list(PRESETS) if names == ["all"] else names
+    check_methods(names)
+    loaded = [load_problem(problem) for problem in problems]
+    folder = output or Path("compare")
+    folder.mkdir(parents=True, exist_ok=True)
+    reports = []
+    total = len(loaded) * len(names)
+    with following("compare", shown=not json) as advance:
+        for k, problem in enumerate(loaded):
+
+            def show(name: str, part: float, step: Step, done: int = k * len(names)) -> None:
+                advance((done + names.index(name) + part) / total, step)
+
+            reports.append(run(problem, methods=names, progress=show))
+    report = sum(reports[1:], reports[0])
+    (folder / "compare.md").write_text(report.markdown())
+    (folder / "compare.json").write_text(report.json() + "\n")
+    save_figure(report.figure(), folder / "compare.pdf")
+    answer(report.to_dict(), report.markdown(), as_json=json)
+    note(f"written: {folder / 'compare.md'}, compare.json, compare.pdf")
+
+
+def study(
+    names: Annotated[
+        list[str],
+        Parameter(
+            name="NAME",
+            help="figure3, figure4, figure7, figure8, figure9, redundancy, joints, clutter, robustness, or all",
+        ),
+    ],
+    /,
+    *,
+    workers: Annotated[int, Parameter(help="processes; studies of run time use one, alone")] = 1,
+    dask: Annotated[str | None, Parameter(help="address of a dask.distributed scheduler")] = None,
+    short: Annotated[bool, Switch(help="a quick look: fewer and smaller runs")] = False,
+    scenes: Annotated[int | None, Parameter(help="number of random scenes, of robustness")] = None,
+    seed: Annotated[int | None, Parameter(help="seed of the random scenes, of robustness")] = None,
+    output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
+    json: Json = False,
+) -> None:
+    """Run studies and write rows (CSV, JSON), a figure (PDF) and a text (Markdown) for each.
+
+    An interrupted study goes on where it stopped: the rows of finished runs are on disk. A run that crashes or
+    hangs loses only itself; it is tried once more alone, and then reported.
+    """
+    import os
+
+    # Before NumPy is imported: times and processes are for one BLAS thread each.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from vgtm_qp.errors import GoalError
+    from vgtm_qp.study import STUDIES, find_study, run_study, study_tasks
+
+    wanted = list(STUDIES) if names == ["all"] else names
+    titles = {name: find_study(name).title for name in wanted}
+    for option, value in (("--workers", workers), ("--scenes", scenes)):
+        if value is not None and value < 1:
+            raise GoalError(f"{option} must be 1 or more, not {value}")
+    given = {"scenes": scenes, "seed": seed}
+    options = {key: value for key, value in given.items() if value is not None}
+    for name in titles:
+        study_tasks(name, short=short, **options)
+    written = []
+    for name, title in titles.items():
+        with bar(title, shown=not json, counted=True) as progress:
+            place = run_study(
+                name, output, short=short, workers=workers, dask=dask, progress=progress, options=options
+            )
+        written.append({"study": name, "title": title, "folder": str(place)})
+        if not json:
+            say((place / f"{name}.md").read_text())
+    if json:
+        document({"studies": written})
+    else:
+        note("written: " + ", ".join(entry["folder"] for entry in written))
+
+
+def bench(
+    *,
+    scene: Annotated[
+        list[SceneKind] | None,
+        _several(help="all of them, or cubes where --bays is given"),
+    ] = None,
+    bays: Annotated[
+        list[int] | None,
+        _several(
+            validator=Number(gte=5, lte=10_000),
+            help="of the arms between two cubes, 5 or more; 5 to 1000 by default",
+        ),
+    ] = None,
+    tracking: Annotated[list[TrackingName] | None, _several(help="both by default")] = None,
+    baselines: Annotated[
+        list[BaselineName] | None,
+        _several(negative="--no-baselines", help="what else takes the steps; all by default"),
+    ] = None,
+    seconds: Annotated[
+        float, Parameter(validator=Number(gt=0), help="duration of each run of a scene, at most")
+    ] = 2.0,
+    steps: Annotated[int, Parameter(validator=Number(gte=1), help="steps of each run, at most")] = 1000,
+    cold: Annotated[bool, Switch(help="set up with an empty cache of compiled kernels too")] = False,
+    compare: Annotated[
+        Path | None, Parameter(help="what --json printed before: give the ratios to it")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Measure how long a step takes, where that time goes, and what other methods take for the same steps.
+
+    BLAS is held to one thread. Each scene is run by itself, for its median, percentiles and phases, then in
+    turn with each baseline, step by step from the same states, for the ratios. Set-up and memory are those of
+    a fresh process.
+    """
+    from vgtm_qp.machine import pin_threads
+
+    pinned = pin_threads()
+    from vgtm_qp.bench.contestants import BASELINES
+    from vgtm_qp.bench.report import compare as compared
+    from vgtm_qp.bench.report import load_document, measure
+    from vgtm_qp.bench.scenes import BAYS, KINDS, TRACKINGS, BenchScene, make_scenes
+    from vgtm_qp.bench.tables import render
+
+    older = None if compare is None else load_document(compare)
+    kinds = scene or (("cubes",) if bays else KINDS)
+    scenes = make_scenes(kinds, bays or BAYS, tracking or TRACKINGS)
+    if not pinned:
+        note("vgtm bench: BLAS was loaded before its threads could be held to one")
+
+    def follow(under_way: BenchScene) -> None:
+        note(f"{scenes.index(under_way) + 1}/{len(scenes)} {under_way.name}")
+
+    found = measure(
+        scenes,
+        tuple(BASELINES) if baselines is None else tuple(dict.fromkeys(baselines)),
+        seconds=seconds,
+        steps=steps,
+        cold=cold,
+        pinned=pinned,
+        progress=follow,
+    )
+    if older is not None:
+        found["compared"] = compared(found, older)
+    answer(found, render(found), as_json=json)

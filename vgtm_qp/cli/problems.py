@@ -1,0 +1,53 @@
+"""``vgtm check``, ``vgtm list``, ``vgtm schema``: problem files, without solving any."""
+
+from __future__ import annotations
+
+from vgtm_qp.cli.output import Json, ProblemName, answer, document, note, table
+
+
+def check(problem: ProblemName, /, *, json: Json = False) -> None:
+    """Check a problem file: its keys and values, its arm, its obstacles and goals at the home pose."""
+    from dataclasses import asdict
+
+    from vgtm_qp.errors import ProblemError
+    from vgtm_qp.problem import load_problem
+    from vgtm_qp.step.build import build_arm
+    from vgtm_qp.step.checks import check_problem, find_warnings
+
+    loaded = load_problem(problem)
+    source = str(loaded.source or loaded.name)
+    setup = build_arm(loaded)
+    mistakes = check_problem(loaded, setup)
+    if mistakes:
+        raise ProblemError(source, mistakes)
+    warnings = find_warnings(loaded, setup)
+    for warning in warnings:
+        note(f"{source}: warning: {warning}")
+    arm = setup.arm.describe()
+    found = {
+        "file": source,
+        "name": loaded.name,
+        "valid": True,
+        "warnings": [asdict(warning) for warning in warnings],
+        "arm" if loaded.truss is None else "truss": asdict(arm),
+    }
+    answer(found, f"{source}: no mistakes\n{arm}", as_json=json)
+
+
+def list_problems(*, json: Json = False) -> None:
+    """List the bundled problems; `vgtm solve` and `vgtm check` take their names as well as files."""
+    from vgtm_qp.problem import bundled_problems, load_problem
+
+    entries = [
+        {"name": name, "title": load_problem(file).name, "file": str(file)}
+        for name, file in bundled_problems().items()
+    ]
+    titles = table([(entry["name"], entry["title"]) for entry in entries])
+    answer({"problems": entries}, titles, as_json=json)
+
+
+def schema(*, json: Json = False) -> None:  # noqa: ARG001 - the answer is one JSON document either way
+    """Print the JSON Schema of problem files, for editors that complete and check TOML."""
+    from vgtm_qp.problem import problem_schema
+
+    document(problem_schema())

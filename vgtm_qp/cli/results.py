@@ -1,0 +1,139 @@
+"""``vgtm verify``, ``vgtm view``, ``vgtm export``, ``vgtm replay``: what is done with a result."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from vgtm_qp.cli.output import (
+    ExitCode,
+    Json,
+    Output,
+    ResultFile,
+    answer,
+    check_writable,
+    document,
+    note,
+    say,
+    table,
+)
+
+if TYPE_CHECKING:
+    from vgtm_qp.maneuver.maneuver import Maneuver
+
+FormatName = Literal["html", "gif", "mp4", "pdf", "png", "csv", "mcap", "ros", "mjcf"]
+
+_SHOWN = "problem file, name of a bundled problem, or result file, .npz"
+
+# With several results the first of these that any of them earned is the exit code.
+_WORST_FIRST = (ExitCode.USAGE, ExitCode.UNVERIFIED, ExitCode.BLOCKED, ExitCode.SOLVED)
+
+
+def verify(
+    results: Annotated[list[Path], Parameter(name="RESULT", help="result files, .npz")],
+    /,
+    *,
+    json: Json = False,
+) -> int:
+    """Check results again from their nodes alone, with none of the solver's code.
+
+    A file that is no result file is wrong usage (exit code 2); one that is altered or outside a tolerance
+    fails the verification (4); a maneuver that is right as far as it goes, but was blocked, gives 3.
+    """
+    from vgtm_qp.errors import ResultError
+    from vgtm_qp.maneuver.maneuver import load_result
+    from vgtm_qp.verify import verify as certify
+
+    codes: list[ExitCode] = []
+    entries: list[dict[str, Any]] = []
+    for path in results:
+        try:
+            maneuver = load_result(path)
+            certificate = certify(maneuver)
+        except ResultError as error:
+            codes.append(ExitCode.UNVERIFIED if zipfile.is_zipfile(path) else ExitCode.USAGE)
+            entries.append({"result": str(path), "verified": False, "error": str(error)})
+            note(f"vgtm: {error}")
+            continue
+        codes.append(outcome_code(maneuver.with_certificate(certificate)))
+        entries.append(
+            {
+                "result": str(path),
+                "verified": certificate.ok,
+                "status": maneuver.status,
+                "reached": maneuver.reached,
+                "blocked_by": list(maneuver.blocked_by),
+                "certificate": certificate.to_dict(),
+            }
+        )
+        if not json:
+            say(f"{path}: {maneuver.status}, {'verified' if certificate.ok else 'VERIFICATION FAILED'}")
+            say("\n".join(f"  {line}" for line in str(certificate).splitlines()))
+    if json:
+        document({"verified": all(entry["verified"] for entry in entries), "results": entries})
+    return next(code for code in _WORST_FIRST if code in codes)
+
+
+def outcome_code(maneuver: Maneuver) -> ExitCode:
+    """Return the exit code that a maneuver with its certificate deserves."""
+    certificate = maneuver.certificate
+    if certificate is None or not certificate.ok:
+        return ExitCode.UNVERIFIED
+    return ExitCode.SOLVED if maneuver.status == "solved" else ExitCode.BLOCKED
+
+
+def view(
+    shown: Annotated[str, Parameter(name="PROBLEM_OR_RESULT", help=_SHOWN)],
+    /,
+    *,
+    port: Annotated[int, Parameter(help="port on 127.0.0.1; the next free one from here on")] = 8080,
+) -> None:
+    """Show an arm on a live page: play a maneuver back, drag its tip, and see what holds it.
+
+    The page is served to this machine alone, until the command is interrupted.
+    """
+    from vgtm_qp.live.page import view as serve
+    from vgtm_qp.maneuver.maneuver import load_result
+    from vgtm_qp.problem import load_problem
+    from vgtm_qp.view.scene import import_viser
+
+    import_viser()
+    loaded = load_result(shown) if shown.lower().endswith(".npz") else load_problem(shown)
+    note("interrupt (Ctrl-C) to end")
+    try:
+        serve(loaded, port=port, ready=say)
+    except KeyboardInterrupt:
+        note("ended")
+
+
+def export(
+    result: ResultFile,
+    /,
+    *,
+    to: Annotated[FormatName, Parameter(help="form to write")],
+    output: Annotated[Path | None, Output(help="file to write; beside the result by default")] = None,
+    json: Json = False,
+) -> None:
+    """Write a result as an offline page, animation, figure, table, ROS 2 bag or message, or MuJoCo model."""
+    from vgtm_qp.export import FORMATS, export_maneuver
+    from vgtm_qp.maneuver.maneuver import load_result
+
+    suffix = FORMATS[to].suffix
+    path = result.with_suffix(suffix) if output is None else output
+    check_writable(path, "--output", (suffix,))
+    file = export_maneuver(load_result(result), path, to=to)
+    written = {"result": str(result), "format": to, "file": str(file), "bytes": file.stat().st_size}
+    answer(written, f"{to}: {file}", as_json=json)
+
+
+def replay(result: ResultFile, /, *, json: Json = False) -> None:
+    """Replay a result in MuJoCo, exactly and under gravity, and compare it with the certificate."""
+    from vgtm_qp.export.replay import replay as run
+    from vgtm_qp.maneuver.maneuver import load_result
+
+    replayed = run(load_result(result))
+    rows = [("", "certificate", "kinematic", "physics"), *replayed.rows()]
+    answer({"result": str(result), **replayed.to_dict()}, table(rows, indent="  "), as_json=json)
