@@ -4,14 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from modules import double_octahedral, hexapod, longeron, octahedral, plate, tetrahedral
 
+from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.build import build_truss, lock_members
 from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.arm.truss.kinematics import TrussKinematics
 from vgtm_qp.arm.truss.mobility import describe, tip_response, trackable_coordinates
-from vgtm_qp.arm.truss.modules import double_octahedral, hexapod, longeron, octahedral, tetrahedral
-from vgtm_qp.arm.truss.plate import plate
-from vgtm_qp.errors import TrussError
+from vgtm_qp.errors import TrussError, VgtmError
 from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
 
 MODULES = {
@@ -85,7 +84,7 @@ def test_names_are_unique_and_faces_grow_along_z(module):
     np.testing.assert_array_equal(truss.tip, truss.faces[-1])
     np.testing.assert_allclose(truss.tip_weights @ truss.home[truss.tip], centres[-1], atol=1e-12)
     np.testing.assert_array_equal(truss.face_frames, np.tile(np.eye(3), (5, 1, 1)))
-    kinematics = TrussKinematics(truss, compiled=False)
+    kinematics = TrussArm(truss).kinematics(compiled=False)
     kinematics.evaluate(truss.home)
     np.testing.assert_allclose(kinematics.station_rotation, truss.face_frames, atol=1e-12)
     np.testing.assert_allclose(kinematics.tip_rotation, truss.tip_frame, atol=1e-12)
@@ -175,7 +174,7 @@ def test_tip_response_moves_the_tip_as_newton_on_the_lengths_does():
         ends = truss.member_ends(X)
         error = lengths - np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
         X[truss.free] += np.linalg.solve(length_jacobian(truss, X).toarray(), error).reshape(-1, 3)
-    before, after = TrussKinematics(truss, compiled=False), TrussKinematics(truss, compiled=False)
+    before, after = TrussArm(truss).kinematics(compiled=False), TrussArm(truss).kinematics(compiled=False)
     before.evaluate(truss.home)
     after.evaluate(X)
     turn = (after.tip_rotation @ before.tip_rotation.T - np.eye(3)) / step
@@ -233,23 +232,29 @@ def test_plates_are_determinate(columns, nodes, condition):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: octahedral(0), "at least 1"),
-        (lambda: octahedral(2, batten=1.8), "folds flat"),
-        (lambda: octahedral(2, longeron=-1.0), "longeron is -1 m"),
-        (lambda: octahedral(2, longeron=math.nan), "longeron is nan m"),
-        (lambda: octahedral(2, stroke=[1.1, 1.4]), "home length of member B1-1"),
-        (lambda: octahedral(2, stroke=[1.4, 0.7]), "least <= greatest"),
-        (lambda: octahedral(2, rate=0.0), "rate is 0"),
-        (lambda: octahedral(2, member_radius=-0.1), "member_radius"),
+        (lambda: octahedral(0), "bays: found 0; expected an integer from 1"),
+        (lambda: octahedral(2, batten=1.8), "where a bay folds flat"),
+        (lambda: octahedral(2, longeron=-1.0), "longeron: found -1.0"),
+        (lambda: octahedral(2, longeron=math.nan), "longeron: found nan"),
+        (lambda: octahedral(2, stroke=[1.1, 1.4]), "holds the home length, 1 m"),
+        (lambda: octahedral(2, stroke=[1.4, 0.7]), "least length first"),
+        (lambda: octahedral(2, rate=0.0), "rate: found 0"),
+        (lambda: octahedral(2, member_radius=-0.1), "member_radius: found -0.1"),
         (lambda: octahedral(2, joint_offset=0.5), "less than half the shortest member"),
-        (lambda: tetrahedral(2, actuated=()), "one to three"),
-        (lambda: tetrahedral(2, actuated=(1, 4)), "one to three"),
-        (lambda: tetrahedral(2, longeron=1.75), "folds flat"),
-        (lambda: plate(2, 4), "at least 3"),
+        (lambda: tetrahedral(2, actuated=()), "actuated: found"),
+        (lambda: tetrahedral(2, actuated=(1, 1)), "one to three different numbers"),
+        (lambda: tetrahedral(2, actuated=(1, 4)), "an integer from 1 to 3"),
+        (lambda: tetrahedral(2, longeron=1.75), "where the helix folds flat"),
+        (lambda: plate(2, 4), "rows: found 2; expected an integer from 3"),
+        (
+            lambda: plate(4, 4, stroke=[0.8, 1.2]),
+            "home length of member D2-1, 1.41421 m, is outside its stroke",
+        ),
+        (lambda: plate(4, 4, depth=0.1, joint_offset=0.4), "less than half the shortest member, 0.357"),
     ],
 )
 def test_impossible_dimensions_are_refused(build, message):
-    with pytest.raises(TrussError, match=message):
+    with pytest.raises(VgtmError, match=message):
         build()
 
 

@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple
 
 import numpy as np
 
 from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
-from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
+from vgtm_qp.arm.truss.truss import Array, Index, Truss
 from vgtm_qp.errors import TrussError
-
-
-class Limits(TypedDict, total=False):
-    """What every builder takes by keyword besides its dimensions."""
-
-    stroke: Sequence[float] | None
-    """Least and greatest length of an actuated member, m; the module's factors times home if not given."""
-    rate: float | None
-    """Greatest |dl/dt| of an actuated member, m/s; none if not given."""
-    acceleration: float | None
-    """Greatest |d2l/dt2| of an actuated member, m/s^2; none if not given."""
-    member_radius: float
-    """Radius of every member, m; 0.03 if not given."""
-    joint_offset: float
-    """Distance from node to member end, along the member at home, m; 0 (pin joints) if not given."""
+from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
 
 
 class MemberRow(NamedTuple):
@@ -37,12 +22,11 @@ class MemberRow(NamedTuple):
 
 
 def assemble(
-    module: str,
+    spec: ModuleTruss | TetrahedralTruss | PlateTruss,
     node_names: tuple[str, ...],
     home: Array,
     stage: Index,
     members: Sequence[MemberRow],
-    limits: Limits,
     stroke_factors: tuple[float, float],
     *,
     faces: Index,
@@ -53,14 +37,12 @@ def assemble(
     trackable: tuple[str, ...],
     face_stride: int = 1,
 ) -> Truss:
-    """Return the truss whose face and tip frames at home are those of the base.
+    """Return the truss of a table, whose face and tip frames at home are those of the base.
 
     Parameters
     ----------
-    members
-        Rows of name, two nodes, and whether the member is actuated.
-    limits
-        Of actuated members; without a stroke they have `stroke_factors` times their home length.
+    stroke_factors
+        Least and greatest length of an actuated member over its home length, where the table has no stroke.
     weights
         Of the three nodes of every face.
 
@@ -69,34 +51,39 @@ def assemble(
     Raises
     ------
     TrussError
-        A limit is not positive, a home length is outside its stroke, or the joint offsets leave no member.
+        A home length is outside its stroke, or the joint offsets leave no member.
     """
     names = tuple(member.name for member in members)
     pairs = np.array([member.nodes for member in members], dtype=np.int64)
     actuated = np.array([member.actuated for member in members])
     lengths = np.linalg.norm(home[pairs[:, 0]] - home[pairs[:, 1]], axis=1)
-    offset = limits.get("joint_offset", 0.0)
-    if not 0.0 <= 2.0 * offset < lengths.min():
+    offset, joints = spec.joint_offset, None
+    if not 2.0 * offset < lengths.min():
         raise TrussError(
             f"joint_offset is {offset:g} m; expected at least 0 and less than half the shortest member, "
             f"{lengths.min() / 2:g} m"
         )
-    joints = None
     if offset > 0.0:
         triangle = joint_triangles(node_names, home, pairs, stage)
         joints = axial_joints(home, pairs, triangle, np.full((len(members), 2), offset))
+    strokes = np.column_stack([lengths - 2.0 * offset] * 2)
+    strokes[actuated] *= stroke_factors
+    if spec.stroke is not None:
+        for k in np.flatnonzero(actuated):
+            check_stroke(names[k], lengths[k] - 2.0 * offset, spec.stroke)
+        strokes[actuated] = spec.stroke
     return Truss(
-        module=module,
+        module=spec.module,
         node_names=node_names,
         member_names=names,
         home=home,
         base=stage < 0,
         members=pairs,
         actuated=actuated,
-        stroke=_strokes(names, lengths - 2.0 * offset, actuated, limits.get("stroke"), stroke_factors),
-        rate=_greatest(actuated, limits.get("rate"), "rate"),
-        acceleration=_greatest(actuated, limits.get("acceleration"), "acceleration"),
-        radius=np.full(len(members), _radius(limits.get("member_radius", 0.03))),
+        stroke=strokes,
+        rate=np.where(actuated, spec.rate or np.inf, np.inf),
+        acceleration=np.where(actuated, spec.acceleration or np.inf, np.inf),
+        radius=np.full(len(members), spec.member_radius),
         faces=faces,
         face_weights=np.tile(np.asarray(weights, dtype=np.float64), (len(faces), 1)),
         face_frames=np.tile(np.eye(3), (len(faces), 1, 1)),
@@ -111,39 +98,10 @@ def assemble(
     )
 
 
-def _strokes(
-    names: Sequence[str],
-    lengths: Array,
-    actuated: Mask,
-    stroke: Sequence[float] | None,
-    factors: tuple[float, float],
-) -> Array:
-    """(M, 2) least and greatest lengths, m; the home length twice where a member is fixed."""
-    strokes = np.column_stack([lengths, lengths])
-    if stroke is None:
-        strokes[actuated] *= factors
-        return strokes
+def check_stroke(name: str, length: float, stroke: Sequence[float]) -> None:
+    """Refuse a home length, m, outside its stroke."""
     least, greatest = stroke
-    if not 0.0 < least <= greatest:
-        raise TrussError(f"stroke is [{least:g}, {greatest:g}] m; expected 0 < least <= greatest")
-    strokes[actuated] = least, greatest
-    outside = (lengths < strokes[:, 0] - 1e-9) | (lengths > strokes[:, 1] + 1e-9)
-    if outside.any():
-        k = int(np.argmax(outside))
+    if not least - 1e-9 <= length <= greatest + 1e-9:
         raise TrussError(
-            f"the home length of member {names[k]}, {lengths[k]:g} m, is outside its stroke "
-            f"[{least:g}, {greatest:g}] m"
+            f"the home length of member {name}, {length:g} m, is outside its stroke [{least:g}, {greatest:g}] m"
         )
-    return strokes
-
-
-def _greatest(actuated: Mask, limit: float | None, name: str) -> Array:
-    if limit is not None and not limit > 0.0:
-        raise TrussError(f"{name} is {limit:g}; expected a number greater than 0")
-    return np.where(actuated, np.inf if limit is None else limit, np.inf)
-
-
-def _radius(radius: float) -> float:
-    if not (math.isfinite(radius) and radius >= 0.0):
-        raise TrussError(f"member_radius is {radius:g} m; expected a finite radius of at least 0")
-    return radius

@@ -7,20 +7,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from vgtm_qp.arm.truss import modules
-from vgtm_qp.arm.truss.assembly import Limits
 from vgtm_qp.arm.truss.graph import truss_from_graph
+from vgtm_qp.arm.truss.modules import stacked, tetrahedral
 from vgtm_qp.arm.truss.plate import plate
 from vgtm_qp.arm.truss.truss import Array, Truss
 from vgtm_qp.errors import TrussError, nearest
 from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, PlateTruss, TetrahedralTruss
-
-_MODULES = {
-    "octahedral": modules.octahedral,
-    "double-octahedral": modules.double_octahedral,
-    "hexapod": modules.hexapod,
-    "longeron": modules.longeron,
-}
 
 
 class LockError(TrussError):
@@ -84,20 +76,9 @@ def lock_members(truss: Truss, names: Iterable[str], X: Array | None = None) -> 
 def _unlocked(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
     if isinstance(spec, GraphTruss):
         return truss_from_graph(spec)
-    limits = Limits(
-        stroke=spec.stroke,
-        rate=spec.rate,
-        acceleration=spec.acceleration,
-        member_radius=spec.member_radius,
-        joint_offset=spec.joint_offset,
-    )
     if isinstance(spec, PlateTruss):
-        return plate(spec.rows, spec.columns, spacing=spec.spacing, depth=spec.depth, **limits)
-    if isinstance(spec, TetrahedralTruss):
-        return modules.tetrahedral(
-            spec.bays, longeron=spec.longeron, batten=spec.batten, actuated=spec.actuated, **limits
-        )
-    return _MODULES[spec.module](spec.bays, longeron=spec.longeron, batten=spec.batten, **limits)
+        return plate(spec)
+    return tetrahedral(spec) if isinstance(spec, TetrahedralTruss) else stacked(spec)
 
 
 def _check_actuated(truss: Truss, names: Iterable[str]) -> None:

@@ -2,43 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Unpack
-
 import numpy as np
 
-from vgtm_qp.arm.truss.assembly import Limits, MemberRow, assemble
+from vgtm_qp.arm.truss.assembly import MemberRow, assemble
 from vgtm_qp.arm.truss.truss import Truss
-from vgtm_qp.errors import TrussError
+from vgtm_qp.problem.truss import PlateTruss
 
 
-def plate(
-    rows: int, columns: int, *, spacing: float = 1.0, depth: float = 0.5**0.5, **limits: Unpack[Limits]
-) -> Truss:
-    """Plate in the xz plane that grows along +z; its first two rows and the apexes between are the base.
+def plate(spec: PlateTruss) -> Truss:
+    """Return a plate in the xz plane that grows along +z; its first two rows and the apexes between are the base.
 
     Nodes ``n<row>-<column>`` of the surface and ``a<row>-<column>`` over the cells' centres, towards -y. A
     free row is a stage: its surface nodes and the apexes below it. Three fixed legs ``G`` carry each apex;
     longitudinals ``L``, transverses ``T``, one diagonal ``D`` a row, and the apexes' longitudinals ``M`` and
     one transverse ``U`` are actuated. A diagonal in every cell has the right count but leaves a mechanism.
 
-    Parameters
-    ----------
-    rows, columns : int
-        Nodes of the surface along z and along x, at least 3 each.
-    spacing, depth : float
-        Distance of neighbouring surface nodes, and of the apexes from the surface, m.
-    **limits
-        See :class:`vgtm_qp.arm.truss.assembly.Limits`; the stroke is 0.7 to 1.4 times the home length by default.
-
     Raises
     ------
     TrussError
-        Fewer than three rows or columns, a dimension not positive, or a home length outside its stroke.
+        See :func:`assemble`.
     """
-    if rows < 3 or columns < 3:
-        raise TrussError(f"a plate of {rows} rows and {columns} columns; expected at least 3 of each")
-    if not (0.0 < spacing < np.inf and 0.0 < depth < np.inf):
-        raise TrussError(f"spacing is {spacing:g} m and depth {depth:g} m; expected lengths greater than 0")
+    rows, columns, spacing = spec.rows, spec.columns, spec.spacing
     names: list[str] = []
     positions: list[tuple[float, float, float]] = []
     stages: list[int] = []
@@ -47,7 +31,7 @@ def plate(
         if i:
             for j in range(columns - 1):
                 names.append(f"a{i - 1}-{j + 1}")
-                positions.append((left + spacing * (j + 0.5), -depth, spacing * (i - 0.5)))
+                positions.append((left + spacing * (j + 0.5), -spec.depth, spacing * (i - 0.5)))
                 stages.append(max(i - 2, -1))
         for j in range(columns):
             names.append(f"n{i}-{j + 1}")
@@ -60,12 +44,11 @@ def plate(
         for name, first, second in _row(i, columns)
     ]
     return assemble(
-        "plate",
+        spec,
         tuple(names),
         np.array(positions),
         np.array(stages, dtype=np.int64),
         members,
-        limits,
         (0.7, 1.4),
         faces=np.empty((0, 3), dtype=np.int64),
         weights=(1 / 3, 1 / 3, 1 / 3),
