@@ -8,110 +8,39 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
-from vgtm_qp.arm.record import or_none
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, or_none
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.chords import chord_deviation
-from vgtm_qp.arm.truss.kinematics import EndKinematics, TrussKinematics
+from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.arm.truss.lengths import LengthRows
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.reach import hollow, longest_ways
 from vgtm_qp.arm.truss.symbols import TrussSymbols
-from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
+from vgtm_qp.arm.truss.truss import Array, Index, Truss
 from vgtm_qp.errors import TrussError
-from vgtm_qp.geometry.bodies import Bodies, capsules
+from vgtm_qp.geometry.bodies import capsules
 
 
-class TrussArm:
+class TrussArm(Arm):
     """See ``arm.Arm``."""
 
     def __init__(self, truss: Truss) -> None:
-        self.truss = truss
-        self.kind = truss.module
+        self.truss = self.bays = truss
+        self.kind, self.segments = truss.module, truss.bays
         self.leaves_chords = truss.joints is not None
-
-    @property
-    def node_names(self) -> tuple[str, ...]:
-        """Length N."""
-        return self.truss.node_names
-
-    @property
-    def home(self) -> Array:
-        """(N, 3) nodes at home, m."""
-        return self.truss.home
-
-    @property
-    def home_configuration(self) -> Array:
-        """(N, 3) nodes at home, m."""
-        return self.truss.home
-
-    @property
-    def base(self) -> Mask:
-        """(N,) nodes that only the base moves."""
-        return self.truss.base
-
-    @property
-    def free(self) -> Index:
-        """(N - N_c,) the others in stage order."""
-        return self.truss.free
-
-    @property
-    def quantity_names(self) -> tuple[str, ...]:
-        """Names of the members."""
-        return self.truss.member_names
-
-    @property
-    def actuated(self) -> Mask:
-        """(M,) members that change their length."""
-        return self.truss.actuated
-
-    @property
-    def actuators(self) -> Index:
-        """(n_a,) their indices."""
-        return self.truss.actuators
-
-    @property
-    def actuator_units(self) -> tuple[str, ...]:
-        """Metres."""
-        return ("m",) * len(self.truss.actuators)
-
-    @property
-    def stroke(self) -> Array:
-        """(M, 2) least and greatest lengths, m."""
-        return self.truss.stroke
-
-    @property
-    def rate(self) -> Array:
-        """(M,) m/s."""
-        return self.truss.rate
-
-    @property
-    def acceleration(self) -> Array:
-        """(M,) m/s^2."""
-        return self.truss.acceleration
-
-    @property
-    def home_quantities(self) -> Array:
-        """(M,) lengths at home, m."""
-        return self.truss.home_lengths
-
-    @property
-    def height(self) -> float:
-        """Length of the axis at home, m."""
-        return self.truss.height
-
-    @cached_property
-    def stations(self) -> Stations:
-        """The faces."""
-        truss = self.truss
-        return Stations(
+        self.node_names, self.quantity_names = truss.node_names, truss.member_names
+        self.home = self.home_configuration = truss.home
+        self.base, self.free = truss.base, truss.free
+        self.home_quantities, self.height = truss.home_lengths, truss.height
+        self.actuated, self.actuator_units = truss.actuated, ("m",) * len(truss.actuators)
+        self.stroke, self.rate, self.acceleration = truss.stroke, truss.rate, truss.acceleration
+        self.stations = Stations(
             truss.faces, truss.face_weights, truss.face_frames, truss.trackable, truss.face_stride
         )
-
-    @cached_property
-    def end_effector(self) -> Tip:
-        """The tip's nodes."""
-        return Tip(self.truss.tip, self.truss.tip_weights, self.truss.tip_frame)
+        self.end_effector = Tip(truss.tip, truss.tip_weights, truss.tip_frame)
+        # Members end in their nodes or, in offset joints, in points of their own.
+        ends = truss.members if truss.joints is None else np.arange(2 * truss.member_count).reshape(-1, 2)
+        self.bodies = capsules(ends, truss.radius, truss.member_names, joints=truss.members)
 
     @cached_property
     def motion_pattern(self) -> MotionPattern:
@@ -127,11 +56,6 @@ class TrussArm:
         return MotionPattern(
             np.concatenate([scatter.member, truss.actuators]), np.concatenate([scatter.column, own]), labels
         )
-
-    @property
-    def bays(self) -> Truss:
-        """The truss itself."""
-        return self.truss
 
     def nodes(self, q: Array) -> Array:
         """Return the configuration itself."""
@@ -205,22 +129,6 @@ class TrussArm:
     def deviation(self, start: Array, end: Array) -> float:
         """See ``arm.Arm``: offset joints turn on the way."""
         return 2.0 * chord_deviation(self.truss, start, end)
-
-    @property
-    def segments(self) -> int:
-        """Number of bays."""
-        return self.truss.bays
-
-    @cached_property
-    def bodies(self) -> Bodies:
-        """The members, between their nodes or, in offset joints, between ends of their own."""
-        truss = self.truss
-        points = truss.members if truss.joints is None else np.arange(2 * truss.member_count).reshape(-1, 2)
-        return capsules(points, truss.radius, truss.member_names, joints=truss.members)
-
-    def kinematics(self, *, compiled: bool = True) -> TrussKinematics:
-        """See ``arm.Arm``."""
-        return TrussKinematics(self.truss, compiled=compiled)
 
     def symbols(self, constants: Constants) -> TrussSymbols:
         """See ``arm.Arm``."""

@@ -14,6 +14,7 @@ from scipy import sparse
 from scipy.linalg import qr
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
+from vgtm_qp.arm.truss.kinematics import length_gradients
 from vgtm_qp.arm.truss.truss import Array, Truss
 from vgtm_qp.errors import TrussError
 
@@ -59,30 +60,11 @@ def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
     X : (N, 3), optional
         Node positions, m; home if not given.
     """
-    X = truss.home if X is None else np.asarray(X, dtype=np.float64)
-    if truss.joints is None:
-        nodes = truss.members
-        direction = X[nodes[:, 0]] - X[nodes[:, 1]]
-        direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-        gradient = np.stack([direction, -direction], axis=1)
-    else:
-        from vgtm_qp.arm.truss.kinematics import TrussKinematics
-
-        kinematics = TrussKinematics(truss, compiled=False)
-        kinematics.evaluate(X)
-        nodes, gradient = truss.member_nodes, kinematics.gradient
-    column = np.full(truss.node_count, -1, dtype=np.int64)
-    column[truss.free] = np.arange(len(truss.free))
-    rows = np.broadcast_to(np.arange(truss.member_count)[:, None, None], gradient.shape)
-    columns = 3 * column[nodes][:, :, None] + np.arange(3)
-    unknown = np.broadcast_to((column[nodes] >= 0)[:, :, None], gradient.shape)
-    shape = (truss.member_count, 3 * len(truss.free))
-    return sparse.csc_array((gradient[unknown], (rows[unknown], columns[unknown])), shape=shape)
+    X = truss.home if X is None else X
+    return sparse.csc_array(truss.scatter.sparse(length_gradients(truss, X)))
 
 
-def check_determinacy(
-    truss: Truss, X: Array | None = None, J: sparse.sparray | Array | None = None
-) -> DeterminacyReport:
+def check_determinacy(truss: Truss, X: Array | None = None) -> DeterminacyReport:
     """Return the report of a statically determinate truss; refuse any other.
 
     Parameters
@@ -91,8 +73,6 @@ def check_determinacy(
         Its stages need not be set.
     X : (N, 3), optional
         Node positions, m; home if not given.
-    J : (M, 3 (N - N_c)), optional
-        Length Jacobian in the place of :func:`length_jacobian` at `X`.
 
     Raises
     ------
@@ -100,7 +80,7 @@ def check_determinacy(
         The number of members is not 3 (N - N_c) or the length Jacobian is singular. The message names the
         nodes of a free motion with their directions, and the members of a state of self-stress.
     """
-    matrix = sparse.csc_array(length_jacobian(truss, X) if J is None else J)
+    matrix = length_jacobian(truss, X)
     members, coordinates = matrix.shape
     if coordinates == 0:
         raise TrussError("every node is fixed: nothing can move; expected at least one node that is not")

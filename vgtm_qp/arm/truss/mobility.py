@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from vgtm_qp.arm.rank import rank
+from vgtm_qp.arm.arm import rank
+from vgtm_qp.arm.frames import frame_spins
 from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, length_jacobian
-from vgtm_qp.arm.truss.kinematics import TrussKinematics
 from vgtm_qp.arm.truss.truss import Array, Index, Truss
 
 _ROLL_REASON = (
@@ -70,46 +70,40 @@ class TrussDescription:
         return "\n".join(lines)
 
 
-def actuator_response(truss: Truss, rows: Array, X: Array | None = None) -> Array:
-    """Return (R, n_a) rates of R functions of the nodes for unit rates of each actuator, fixed members kept.
+def pose_response(truss: Truss, nodes: Index, weights: Array, rotations: Array, X: Array) -> Array:
+    """Return (F, 6, n_a) twists of F poses for unit rates of each actuator, fixed members kept.
+
+    Three rows for the velocity of each centroid, m/m, and three for its angular velocity, rad/m, both in the base
+    frame; the first three alone where a pose has no frame.
 
     Parameters
     ----------
     truss : Truss
         Statically determinate.
-    rows : (R, N, 3)
-        Derivatives of the functions with respect to all node positions; those of base nodes are left out.
-    X : (N, 3), optional
-        Node positions, m; home if not given.
+    nodes, weights : (F, K)
+        What each pose is made of; three nodes or more have a frame.
+    rotations : (F, 3, 3)
+        At home.
+    X : (N, 3)
+        Node positions, m.
     """
-    J = length_jacobian(truss, X)
-    unknown = np.ascontiguousarray(rows[:, truss.free].reshape(len(rows), -1).T)
-    return np.asarray(splu(J).solve(unknown, trans="T").T[:, truss.actuators])
+    count, corners = nodes.shape
+    rows = np.zeros((count, 6 if corners >= 3 else 3, truss.node_count, 3))
+    every = np.arange(count)[:, None]
+    rows[every, :3, nodes] = weights[:, :, None, None] * np.eye(3)
+    if corners >= 3:
+        spins = frame_spins(X, truss.home, rotations, nodes).reshape(count, 3, corners, 3)
+        rows[every, 3:, nodes] = spins.transpose(0, 2, 1, 3)
+    unknown = np.ascontiguousarray(rows[:, :, truss.free].reshape(-1, 3 * len(truss.free)).T)
+    response = splu(length_jacobian(truss, X)).solve(unknown, trans="T")
+    twists: Array = response.T[:, truss.actuators].reshape(count, rows.shape[1], -1)
+    return twists
 
 
 def tip_response(truss: Truss, X: Array | None = None) -> Array:
-    """Return (6, n_a), or (3, n_a) where the tip has no frame: tip twist for unit rates of the actuators.
-
-    Three rows for the velocity of the tip's centroid, m/m, and three for its angular velocity, rad/m, both
-    in the base frame.
-    """
-    X = truss.home if X is None else X
-    kinematics = TrussKinematics(truss, compiled=False)
-    kinematics.evaluate(X)
-    spin = kinematics.tip_spin if len(truss.tip) >= 3 else None
-    return actuator_response(truss, _pose_rows(truss, truss.tip, truss.tip_weights, spin), X)
-
-
-def face_response(truss: Truss, X: Array | None = None) -> Array:
-    """Return (F - 1, 6, n_a): twists of the faces beyond the base's for unit rates of the actuators."""
-    X = truss.home if X is None else X
-    kinematics = TrussKinematics(truss, compiled=False)
-    kinematics.evaluate(X)
-    rows = [
-        _pose_rows(truss, truss.faces[k], truss.face_weights[k], kinematics.station_spin[k])
-        for k in range(1, len(truss.faces))
-    ]
-    return actuator_response(truss, np.concatenate(rows), X).reshape(len(rows), 6, -1)
+    """Return :func:`pose_response` (6, n_a) or (3, n_a) of the tip alone, at home if `X` (N, 3) is not given."""
+    at = truss.home if X is None else X
+    return pose_response(truss, truss.tip[None], truss.tip_weights[None], truss.tip_frame[None], at)[0]
 
 
 def trackable_coordinates(truss: Truss, *, face_stride: int = 1) -> tuple[str, ...]:
@@ -124,17 +118,18 @@ def trackable_coordinates(truss: Truss, *, face_stride: int = 1) -> tuple[str, .
     """
     if len(truss.faces) <= face_stride:
         return ()
-    taken = slice(face_stride, None, face_stride)
-    response = face_response(truss)[face_stride - 1 :: face_stride]
-    turns = np.swapaxes(truss.face_frames[taken], 1, 2) @ response[:, 3:] * _size(truss)
+    tracked = slice(face_stride, None, face_stride)
+    frames = truss.face_frames[tracked]
+    response = pose_response(truss, truss.faces[tracked], truss.face_weights[tracked], frames, truss.home)
+    turns = np.swapaxes(frames, 1, 2) @ response[:, 3:] * _size(truss)
     local = np.concatenate([response[:, :3], turns], axis=1)
-    tracked: tuple[str, ...] = ()
+    coordinates: tuple[str, ...] = ()
     for coordinate, count in (("position", 3), ("pointing", 5), ("orientation", 6)):
         rows = local[:, :count].reshape(-1, local.shape[-1])
         if rows.shape[0] > rows.shape[1] or rank(np.linalg.svd(rows, compute_uv=False)) < rows.shape[0]:
             break
-        tracked += (coordinate,)
-    return tracked
+        coordinates += (coordinate,)
+    return coordinates
 
 
 def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
@@ -174,15 +169,6 @@ def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
         tip_coordinates=len(response),
         unreachable=tuple(_in_words(twist, truss) for twist in _roll_first(left[:, tip_rank:], truss).T),
     )
-
-
-def _pose_rows(truss: Truss, nodes: Index, weights: Array, spin: Array | None) -> Array:
-    """Return (6, N, 3) rows of a weighted centroid and its frame's spin, or (3, N, 3) without `spin`."""
-    rows = np.zeros((3 if spin is None else 6, truss.node_count, 3))
-    rows[:3, nodes] = weights[None, :, None] * np.eye(3)[:, None, :]
-    if spin is not None:
-        rows[3:, nodes] = spin.reshape(3, len(nodes), 3)
-    return rows
 
 
 def _size(truss: Truss) -> float:

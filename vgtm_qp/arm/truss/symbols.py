@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arm.symbols import ArmSymbols, Constants
 from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.arm.truss.truss import Index, Truss
 
@@ -59,24 +60,34 @@ def stage_faces(truss: Truss, stages: list[PlacedNodes], tracked: Sequence[int])
     return np.array(faces) if three and min(faces) >= 0 and len(faces) == len(tracked) else None
 
 
-class TrussSymbols:
+class TrussSymbols(ArmSymbols):
     """Lengths and gradients of a truss at symbolic positions X (3, N); see ``arm.ArmSymbols``."""
 
     def __init__(self, truss: Truss, constants: Constants) -> None:
+        super().__init__(truss.home_lengths, truss.actuators, constants)
         self._truss = truss
         self.shape = 3, truss.node_count
         self.given: list[int] = np.flatnonzero(truss.base).tolist()
-        self.home = constants.add("home_lengths", truss.home_lengths)
         self._offsets: list[ca.MX] = []
         if truss.joints is not None:
             self._offsets = [constants.add("offsets", truss.joints.offset.reshape(-1, 3))]
         self._member = member_function(truss)
         self._solvers: dict[object, ca.Function] = {}
         self._columns = truss.member_nodes.reshape(-1).tolist()
-        self._stages = elimination_stages(truss)
-        self.can_eliminate = self._stages is not None
-        self._blocks = [self._pattern(stage) for stage in self._stages or ()]
         self._place = {int(node): 3 * k for k, node in enumerate(truss.free)}
+
+    @cached_property
+    def _stages(self) -> list[PlacedNodes] | None:
+        return elimination_stages(self._truss)
+
+    @cached_property
+    def _blocks(self) -> list[tuple[_Layers, _Layers]]:
+        return [self._pattern(stage) for stage in self._stages or ()]
+
+    @property
+    def can_eliminate(self) -> bool:
+        """See ``arm.ArmSymbols``."""
+        return self._stages is not None
 
     def nodes(self, X: ca.MX) -> ca.MX:
         """See ``arm.ArmSymbols``."""
@@ -118,19 +129,10 @@ class TrussSymbols:
         )
         return X + ca.horzcat(*columns)
 
-    def _aims(self, lengths: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        aim, actuators = self.home * 1.0, self._truss.actuators.tolist()
-        aim[actuators] = ca.fmax(lower, ca.fmin(upper, lengths[actuators]))
-        return aim
-
-    def error(self, lengths: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
-        return ca.norm_2(self._aims(lengths, lower, upper) - lengths)
-
     def closed(self, X: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
         """See ``arm.ArmSymbols``."""
         lengths, gradients = self._lengths(X)
-        error = self._aims(lengths, lower, upper) - lengths
+        error = self.aims(lengths, lower, upper) - lengths
         blocks = [self._stage_blocks(k, gradients) for k in range(len(self._blocks))]
         rhs = [error[stage.members.tolist()] for stage in self._stages or ()]
         return X + self._substituted(blocks, rhs)
