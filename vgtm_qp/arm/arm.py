@@ -165,21 +165,7 @@ class LengthRowsLike(Protocol):
 
 
 class Bays(Protocol):
-    """The bays of an arm, for speed alone: how its members hang on one another.
-
-    Attributes
-    ----------
-    node_count, member_count : int
-    base, stage : (N,)
-        Base nodes, and the stage in which each node is placed, -1 for those.
-    free : (N - N_c,) int
-    member_nodes : (M, Q) int
-        Nodes that each member's length depends on.
-    actuated, actuators : (M,) bool, (n_a,) int
-    joints : object or None
-        None for ideal pin joints.
-    scatter : LengthScatter
-    """
+    """The bays of an arm, for speed alone: how its members hang on one another, as in ``truss.Truss``."""
 
     @property
     def joints(self) -> object: ...

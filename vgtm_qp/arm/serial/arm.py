@@ -58,7 +58,6 @@ class ChainRows:
 
     @property
     def values(self) -> Array:
-        """See ``arm.MotionRows``."""
         return np.concatenate([np.ones(len(self.rhs)), -self.jacobian.reshape(-1)])
 
     def response(self) -> tuple[Array, Array]:
@@ -158,7 +157,6 @@ class SerialArm(Arm):
         return MotionPattern(np.concatenate([own, grid[0]]), np.concatenate([own, rows + grid[1]]), labels)
 
     def symbols(self, constants: Constants) -> ChainSymbols:
-        """See ``arm.Arm``."""
         return ChainSymbols(self.chain, self.home_quantities, self.actuators, self.free, constants)
 
     def motion_rows(self, *values: Array) -> ChainRows:
@@ -167,25 +165,20 @@ class SerialArm(Arm):
         return ChainRows(response.reshape(len(self.actuators), len(rhs)).T, rhs)
 
     def measured(self, q: Array) -> Array:
-        """See ``arm.Arm``."""
         return np.array(q[:-6])
 
     def based(self, q: Array, pose: Pose) -> Array:
-        """See ``arm.Arm``."""
         return np.concatenate([q[:-6], pose.position, vector_near(pose.rotation, q[-3:])])
 
     def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``."""
         q = q.copy()
         q[self.actuators] += strokes
         return q
 
     def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``."""
         return np.concatenate([q[:-6] + missing, q[-6:]])
 
     def travel(self, motion: Array) -> float:
-        """See ``arm.Arm``."""
         turn, slide = self._motions(motion)
         return float(turn @ self._reach + slide.sum() + np.abs(motion[-6:-3]).max(initial=0.0))
 
@@ -217,11 +210,9 @@ class SerialArm(Arm):
         return np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
 
     def reach(self) -> Array:
-        """See ``arm.Arm``."""
         return np.full(int(self.base.sum()), self._reach[0])
 
     def describe(self) -> ChainDescription:
-        """See ``arm.Arm``."""
         stations, hard = len(self.stations) - 1, "position" in self.stations.trackable
         return ChainDescription(
             self.segments, len(self.actuators), len(self.bodies), stations, self.height, hard

@@ -23,7 +23,6 @@ class ChainSymbols(ArmSymbols):
         self._constants = [constants.add(name, value) for name, value in chain.constants.items()]
 
     def nodes(self, q: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         return self._chain.nodes(q, *self._constants)
 
     def quantities(self, q: ca.MX) -> ca.MX:
@@ -37,7 +36,6 @@ class ChainSymbols(ArmSymbols):
         return [jacobian[rows, self._actuators], ca.vec(moved[:, self._free])]
 
     def response(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         return ca.horzcat(*self.motion(q, at, moved))
 
     def coordinates(self, nodes: Any, strokes: Any) -> Any:  # noqa: ARG002
@@ -45,12 +43,10 @@ class ChainSymbols(ArmSymbols):
         return strokes
 
     def along(self, q: ca.MX, coordinates: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         q = q * 1.0
         q[self._actuators] = q[self._actuators] + coordinates
         return q
 
     def closed(self, q: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         joints = len(self._chain)
         return ca.vertcat(self.aims(q[:joints], lower, upper), q[joints:])

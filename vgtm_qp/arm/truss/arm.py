@@ -72,19 +72,15 @@ class TrussArm(Arm):
         return np.ascontiguousarray(self.bodies.points.T)
 
     def based(self, q: Array, pose: Pose) -> Array:
-        """See ``arm.Arm``."""
         return np.where(self.truss.base[:, None], self.truss.home @ pose.rotation.T + pose.position, q)
 
     def carried(self, q: Array, before: Pose, after: Pose) -> Array:
-        """See ``arm.Arm``."""
         return before.carry(q, after)
 
     def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``."""
         return q + nodes
 
     def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``."""
         q = q.copy()
         q[self.truss.free] += solve()
         return q
@@ -108,22 +104,18 @@ class TrussArm(Arm):
         return None if self.truss.joints is None else EndKinematics(self.truss)
 
     def travel(self, motion: Array) -> float:
-        """See ``arm.Arm``."""
         return float(np.abs(motion).max())
 
     def reach(self) -> Array:
-        """See ``arm.Arm``."""
         tip = self.end_effector
         return np.asarray(
             longest_ways(self.truss, np.flatnonzero(self.truss.base))[:, tip.nodes] @ np.abs(tip.weights)
         )
 
     def hollow(self) -> float:
-        """See ``arm.Arm``."""
         return hollow(self.truss)
 
     def unreachable(self) -> tuple[str, ...]:
-        """See ``arm.Arm``."""
         return describe(self.truss).unreachable
 
     def deviation(self, start: Array, end: Array) -> float:
@@ -131,11 +123,9 @@ class TrussArm(Arm):
         return 2.0 * chord_deviation(self.truss, start, end)
 
     def symbols(self, constants: Constants) -> TrussSymbols:
-        """See ``arm.Arm``."""
         return TrussSymbols(self.truss, constants)
 
     def describe(self) -> TrussDescription:
-        """See ``arm.Arm``."""
         return describe(self.truss)
 
     def record(self) -> dict[str, Any]:
@@ -174,7 +164,6 @@ class TrussArm(Arm):
         }
 
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
-        """See ``arm.Arm``."""
         return {
             "nodes": q,
             "members": self.truss.members,

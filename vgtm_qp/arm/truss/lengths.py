@@ -30,7 +30,6 @@ class LengthRows:
 
     @property
     def values(self) -> Array:
-        """See ``arm.MotionRows``."""
         truss = self.truss
         gradients = self.gradient.reshape(-1)[truss.scatter.flat]
         return np.concatenate([gradients, np.full(len(truss.actuators), -1.0)])

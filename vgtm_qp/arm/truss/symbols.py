@@ -86,11 +86,9 @@ class TrussSymbols(ArmSymbols):
 
     @property
     def can_eliminate(self) -> bool:
-        """See ``arm.ArmSymbols``."""
         return self._stages is not None
 
     def nodes(self, X: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         return X
 
     def quantities(self, X: ca.MX) -> ca.MX:
@@ -121,7 +119,6 @@ class TrussSymbols(ArmSymbols):
         return nodes
 
     def along(self, X: ca.MX, coordinates: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         zero, place = ca.DM.zeros(3), self._place
         columns = (
             coordinates[place[n] : place[n] + 3] if n in place else zero
@@ -130,7 +127,6 @@ class TrussSymbols(ArmSymbols):
         return X + ca.horzcat(*columns)
 
     def closed(self, X: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         lengths, gradients = self._lengths(X)
         error = self.aims(lengths, lower, upper) - lengths
         blocks = [self._stage_blocks(k, gradients) for k in range(len(self._blocks))]
@@ -162,7 +158,6 @@ class TrussSymbols(ArmSymbols):
         return step
 
     def response(self, X: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         gradients, rhs = self.motion(X, at, moved)
         truss = self._truss
         actuators = truss.actuators.tolist()
