@@ -82,7 +82,11 @@ class TrussSymbols(ArmSymbols):
 
     @cached_property
     def _blocks(self) -> list[tuple[_Layers, _Layers]]:
-        return [self._pattern(stage) for stage in self._stages or ()]
+        """Layers of the blocks D and L of each stage."""
+        return [
+            (self._layers(stage.members, stage.nodes), self._layers(stage.members, stage.earlier))
+            for stage in self._stages or ()
+        ]
 
     @property
     def can_eliminate(self) -> bool:
@@ -190,28 +194,24 @@ class TrussSymbols(ArmSymbols):
                 place[int(node)] = block[3 * j : 3 * j + 3, :]
         return ca.vertcat(*(place[int(node)] for node in truss.free))
 
-    def _pattern(self, stage: PlacedNodes) -> tuple[_Layers, _Layers]:
-        """Return the layers of the blocks D and L."""
-        nodes = self._truss.member_nodes[stage.members]
-        terms = []
-        for targets in (stage.nodes, stage.earlier):
-            found: dict[tuple[int, int], list[int]] = {}
-            place = {int(node): 3 * k for k, node in enumerate(targets)}
-            for row, (member, names) in enumerate(zip(stage.members, nodes, strict=True)):
-                for slot, node in enumerate(names):
-                    if int(node) in place:
-                        for axis in range(3):
-                            flat = (int(member) * nodes.shape[1] + slot) * 3 + axis
-                            found.setdefault((row, place[int(node)] + axis), []).append(flat)
-            layers = []
-            for depth in range(max((len(v) for v in found.values()), default=0)):
-                entries = sorted((c, r, v[depth]) for (r, c), v in found.items() if len(v) > depth)
-                sparsity = ca.Sparsity.triplet(
-                    len(stage.members), 3 * len(targets), [e[1] for e in entries], [e[0] for e in entries]
-                )
-                layers.append((np.array([e[2] for e in entries], dtype=np.int64), sparsity))
-            terms.append(layers)
-        return terms[0], terms[1]
+    def _layers(self, members: Index, nodes: Index) -> _Layers:
+        """Return the layers of the block of `members` (rows) and free `nodes` (three columns each)."""
+        scatter = self._truss.scatter
+        row, column = np.full(scatter.shape[0], -1), np.full(scatter.shape[1], -1)
+        row[members] = np.arange(len(members))
+        for k, node in enumerate(nodes.tolist()):
+            column[self._place[node] : self._place[node] + 3] = 3 * k + np.arange(3)
+        rows, columns = row[scatter.member], column[scatter.column]
+        kept = np.flatnonzero((rows >= 0) & (columns >= 0))
+        kept = kept[np.lexsort((rows[kept], columns[kept]))]
+        place = columns[kept] * len(members) + rows[kept]
+        depth = np.arange(len(kept)) - np.searchsorted(place, place)
+        layers = []
+        for k in range(depth.max(initial=-1) + 1):
+            chosen = kept[depth == k]
+            at = rows[chosen].tolist(), columns[chosen].tolist()
+            layers.append((scatter.flat[chosen], ca.Sparsity.triplet(len(members), 3 * len(nodes), *at)))
+        return layers
 
     def _stage_blocks(self, k: int, gradients: ca.MX) -> tuple[ca.MX, ca.MX]:
         """Return the blocks D and L of stage `k`, sparse."""
