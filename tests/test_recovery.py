@@ -12,7 +12,7 @@ from arms import mast
 from recovery_problems import BASE, box, problem
 
 import vgtm_qp as vq
-from vgtm_qp.arm.truss.chords import chord_deviation
+from vgtm_qp.arm.truss.bounds import chord_deviation
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.separation import Distances, Separation

@@ -421,6 +421,11 @@ def rank(values: NDArray[Any]) -> int:
     return int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
 
 
+def has_full_rank(rows: Array) -> bool:
+    """Whether the functions whose Jacobian this is can be changed one by one."""
+    return 0 < len(rows) <= rows.shape[1] and rank(np.linalg.svd(rows, compute_uv=False)) == len(rows)
+
+
 def or_none(limits: Array) -> list[float | None]:
     """Return limits as JSON data, which has no infinity: None where there is none."""
     return [limit if math.isfinite(limit) else None for limit in limits.tolist()]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, or_none, rank
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, has_full_rank, or_none
 from vgtm_qp.arm.serial.chain import Array, SerialChain
 from vgtm_qp.arm.serial.symbols import ChainSymbols
 from vgtm_qp.arm.symbols import Constants
@@ -104,10 +104,8 @@ class SerialArm(Arm):
         return -(-joints // max(1, len(self.actuators) // 3))
 
     def _can_hold(self, jacobian: Array) -> bool:
-        """Whether nodes whose Jacobian (K, 3, J) this is can be held in place one by one, by rank."""
-        rows = jacobian[:, :, self.actuators].reshape(3 * len(jacobian), len(self.actuators))
-        full = 0 < len(rows) <= len(self.actuators)
-        return full and rank(np.linalg.svd(rows, compute_uv=False)) == len(rows)
+        """Whether nodes whose Jacobian (K, 3, J) this is can be held in place one by one."""
+        return has_full_rank(jacobian[:, :, self.actuators].reshape(3 * len(jacobian), len(self.actuators)))
 
     def _place_stations(self) -> None:
         """Find nodes and stations at home; the stations' z-axes lie along the arm."""

@@ -10,11 +10,10 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, or_none
 from vgtm_qp.arm.symbols import Constants
-from vgtm_qp.arm.truss.chords import chord_deviation
+from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_ways
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.arm.truss.lengths import LengthRows
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
-from vgtm_qp.arm.truss.reach import hollow, longest_ways
 from vgtm_qp.arm.truss.symbols import TrussSymbols
 from vgtm_qp.arm.truss.truss import Array, Index, Truss
 from vgtm_qp.errors import TrussError
@@ -91,9 +90,9 @@ class TrussArm(Arm):
 
     def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:
         """See ``arm.Arm``: an end in an offset joint is moved by the three nodes that orient that."""
-        if self._ends is None:
-            return points, coefficients
         ends, (count, slots) = self._ends, points.shape
+        if ends is None:
+            return points, coefficients
         ends.evaluate(q)
         member, end = points >> 1, points & 1
         by_nodes = np.einsum("rsc,rscn->rsn", coefficients, ends.jacobian[member, end])
@@ -101,7 +100,8 @@ class TrussArm(Arm):
 
     @cached_property
     def _ends(self) -> EndKinematics | None:
-        return None if self.truss.joints is None else EndKinematics(self.truss)
+        truss = self.truss
+        return None if truss.joints is None else EndKinematics(truss.members, truss.joints)
 
     def travel(self, motion: Array) -> float:
         return float(np.abs(motion).max())

@@ -162,13 +162,17 @@ def _localised(basis: Array) -> Array:
 def _name_motion(truss: Truss, motion: Array) -> str:
     size = np.linalg.norm(motion, axis=1)
     order = [int(i) for i in _from_largest(size) if size[i] > 1e-6 * size.max()]
-    names = [f"node {truss.node_names[truss.free[i]]} along {_direction(motion[i])}" for i in order[:_NAMED]]
+    names = [
+        f"node {truss.node_names[truss.free[i]]} along {in_words(motion[i] / size[i])}"
+        for i in order[:_NAMED]
+    ]
     return _listed(names, len(order), "nodes")
 
 
-def _direction(vector: Array) -> str:
-    unit = np.round(vector / np.linalg.norm(vector), 3) + 0.0
-    return f"({unit[0]:g}, {unit[1]:g}, {unit[2]:g})"
+def in_words(vector: Array) -> str:
+    """Return ``"(x, y, z)"`` to three decimals."""
+    x, y, z = np.round(vector, 3) + 0.0
+    return f"({x:g}, {y:g}, {z:g})"
 
 
 def _name_members(truss: Truss, stress: Array) -> str:

@@ -8,10 +8,9 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.truss.joints import Array
+from vgtm_qp.arm.truss.joints import Array, Index, Joints
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.errors import TrussError
 
 
 def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:
@@ -70,16 +69,13 @@ class EndKinematics:
         d end / d (positions of ``nodes``).
     """
 
-    def __init__(self, truss: Truss, *, compiled: bool = True) -> None:
-        if truss.joints is None:
-            raise TrussError("this truss has pin joints: its members end in the nodes")
-        self.nodes = truss.joints.triangle[truss.members]
+    def __init__(self, members: Index, joints: Joints, *, compiled: bool = True) -> None:
+        self.nodes = joints.triangle[members]
         corners, offset = ca.SX.sym("corners", 3, 3), ca.SX.sym("offset", 3)
         end = _end(corners, offset)
         one = ca.Function("end", [corners, offset], [end, ca.densify(ca.jacobian(end, ca.vec(corners)))])
-        count = 2 * truss.member_count
-        self._kernel = Kernel(one.map(count), compiled=compiled)
-        self._kernel.inputs[1][:] = truss.joints.offset.reshape(-1)
+        self._kernel = Kernel(one.map(2 * len(members)), compiled=compiled)
+        self._kernel.inputs[1][:] = joints.offset.reshape(-1)
         self.ends = self._kernel.outputs[0].reshape(-1, 2, 3)
         self.jacobian = self._kernel.outputs[1].reshape(-1, 2, 9, 3).transpose(0, 1, 3, 2)
 

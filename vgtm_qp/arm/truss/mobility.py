@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from vgtm_qp.arm.arm import rank
+from vgtm_qp.arm.arm import has_full_rank, rank
 from vgtm_qp.arm.frames import frame_spins
-from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, length_jacobian
+from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, in_words, length_jacobian
 from vgtm_qp.arm.truss.truss import Array, Index, Truss
 
 _ROLL_REASON = (
@@ -106,27 +106,18 @@ def tip_response(truss: Truss, X: Array | None = None) -> Array:
     return pose_response(truss, truss.tip[None], truss.tip_weights[None], truss.tip_frame[None], at)[0]
 
 
-def trackable_coordinates(truss: Truss, *, face_stride: int = 1) -> tuple[str, ...]:
-    """Return what the faces of a truss can track at home at once, by rank; see ``Truss.trackable``.
-
-    Parameters
-    ----------
-    truss : Truss
-        Statically determinate, with faces.
-    face_stride : int
-        Take every `face_stride`-th face only.
-    """
-    if len(truss.faces) <= face_stride:
+def trackable_coordinates(truss: Truss) -> tuple[str, ...]:
+    """Return what every ``face_stride``-th face of a determinate truss can track at home at once, by rank."""
+    tracked = slice(truss.face_stride, None, truss.face_stride)
+    faces, frames = truss.faces[tracked], truss.face_frames[tracked]
+    if not len(faces):
         return ()
-    tracked = slice(face_stride, None, face_stride)
-    frames = truss.face_frames[tracked]
-    response = pose_response(truss, truss.faces[tracked], truss.face_weights[tracked], frames, truss.home)
+    response = pose_response(truss, faces, truss.face_weights[tracked], frames, truss.home)
     turns = np.swapaxes(frames, 1, 2) @ response[:, 3:] * _size(truss)
     local = np.concatenate([response[:, :3], turns], axis=1)
     coordinates: tuple[str, ...] = ()
     for coordinate, count in (("position", 3), ("pointing", 5), ("orientation", 6)):
-        rows = local[:, :count].reshape(-1, local.shape[-1])
-        if rows.shape[0] > rows.shape[1] or rank(np.linalg.svd(rows, compute_uv=False)) < rows.shape[0]:
+        if not has_full_rank(local[:, :count].reshape(-1, local.shape[-1])):
             break
         coordinates += (coordinate,)
     return coordinates
@@ -167,7 +158,9 @@ def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
         determinacy=report,
         tip_rank=tip_rank,
         tip_coordinates=len(response),
-        unreachable=tuple(_in_words(twist, truss) for twist in _roll_first(left[:, tip_rank:], truss).T),
+        unreachable=tuple(
+            _twist_in_words(twist, truss) for twist in _roll_first(left[:, tip_rank:], truss).T
+        ),
     )
 
 
@@ -191,19 +184,14 @@ def _roll_first(missing: Array, truss: Truss) -> Array:
     return np.column_stack([roll, basis[:, 1 : missing.shape[1]]])
 
 
-def _in_words(twist: Array, truss: Truss) -> str:
+def _twist_in_words(twist: Array, truss: Truss) -> str:
     """Return the words for a `twist` of the tip: velocity, angular velocity times the truss's size."""
     velocity, spin = twist[:3], twist[3:]
     if np.linalg.norm(spin) < 1e-6:
-        return f"motion along {_vector(velocity)}"
-    turn = f"a turn about {_vector(spin / np.linalg.norm(spin))}"
+        return f"motion along {in_words(velocity)}"
+    turn = f"a turn about {in_words(spin / np.linalg.norm(spin))}"
     if np.linalg.norm(velocity) > 1e-6:
-        return f"{turn} with motion along {_vector(velocity / np.linalg.norm(velocity))}"
+        return f"{turn} with motion along {in_words(velocity / np.linalg.norm(velocity))}"
     if abs(spin @ truss.tip_frame[:, 2]) < (1.0 - 1e-6) * np.linalg.norm(spin):
         return turn
     return f"roll, {turn}{_ROLL_REASON if 'octahedral' in truss.module else ''}"
-
-
-def _vector(vector: Array) -> str:
-    rounded = np.round(vector, 3) + 0.0
-    return f"({rounded[0]:g}, {rounded[1]:g}, {rounded[2]:g})"
