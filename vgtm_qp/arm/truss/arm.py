@@ -40,6 +40,7 @@ class TrussArm(Arm):
         # Members end in their nodes or, in offset joints, in points of their own.
         ends = truss.members if truss.joints is None else np.arange(2 * truss.member_count).reshape(-1, 2)
         self.bodies = capsules(ends, truss.radius, truss.member_names, joints=truss.members)
+        self._first, self._last = np.ascontiguousarray(ends.T)
 
     @cached_property
     def motion_pattern(self) -> MotionPattern:
@@ -62,13 +63,9 @@ class TrussArm(Arm):
 
     def measured(self, q: Array) -> Array:
         """See ``arm.Arm``: the distances of the members' ends."""
-        points, (first, last) = self.points(q), self._ends_of_bodies
-        way = points.take(first, axis=0) - points.take(last, axis=0)
+        points = self.points(q)
+        way = points.take(self._first, axis=0) - points.take(self._last, axis=0)
         return np.asarray(np.sqrt(np.einsum("mc,mc->m", way, way)))
-
-    @cached_property
-    def _ends_of_bodies(self) -> Array:
-        return np.ascontiguousarray(self.bodies.points.T)
 
     def based(self, q: Array, pose: Pose) -> Array:
         return np.where(self.truss.base[:, None], self.truss.home @ pose.rotation.T + pose.position, q)

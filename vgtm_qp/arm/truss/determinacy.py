@@ -6,10 +6,10 @@ stress.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import qr
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
@@ -121,10 +121,13 @@ def _refusal(truss: Truss, J: sparse.csc_array) -> str:
         "statically determinate is as many of both and no free motion"
     ]
     if motions.shape[1]:
-        names = _name_motion(truss, _localised(motions).reshape(-1, 3))
+        motion = _localised(motions).reshape(-1, 3)
+        size = np.linalg.norm(motion, axis=1)
+        free = [truss.node_names[i] for i in truss.free]
+        names = _largest(size, "nodes", lambda i: f"node {free[i]} along {in_words(motion[i] / size[i])}")
         parts.append(f"{motions.shape[1]} free motion(s), one of them {names}: a member has to hinder it")
     if stresses.shape[1]:
-        names = _name_members(truss, _localised(stresses))
+        names = _largest(np.abs(_localised(stresses)), "members", truss.member_names.__getitem__)
         parts.append(f"{stresses.shape[1]} redundant member(s), one of them among {names}: it has to go")
     return ". ".join(parts)
 
@@ -159,32 +162,16 @@ def _localised(basis: Array) -> Array:
     return np.asarray(echelon[:, np.argmin(np.count_nonzero(np.abs(echelon) > 1e-6, axis=0))])
 
 
-def _name_motion(truss: Truss, motion: Array) -> str:
-    size = np.linalg.norm(motion, axis=1)
-    order = [int(i) for i in _from_largest(size) if size[i] > 1e-6 * size.max()]
-    names = [
-        f"node {truss.node_names[truss.free[i]]} along {in_words(motion[i] / size[i])}"
-        for i in order[:_NAMED]
-    ]
-    return _listed(names, len(order), "nodes")
+def _largest(size: Array, what: str, name: Callable[[int], str]) -> str:
+    """Return the names of what is greatest in `size` (K,); what differs by rounding alone stays in order."""
+    greatest = float(size.max())
+    order = np.argsort(-np.round(size / greatest, 9), kind="stable")
+    order = order[size[order] > 1e-6 * greatest]
+    more = f" and {len(order) - _NAMED} more {what}" if len(order) > _NAMED else ""
+    return ", ".join(name(k) for k in order[:_NAMED].tolist()) + more
 
 
 def in_words(vector: Array) -> str:
     """Return ``"(x, y, z)"`` to three decimals."""
     x, y, z = np.round(vector, 3) + 0.0
     return f"({x:g}, {y:g}, {z:g})"
-
-
-def _name_members(truss: Truss, stress: Array) -> str:
-    order = [int(k) for k in _from_largest(np.abs(stress)) if abs(stress[k]) > 1e-6]
-    return _listed([truss.member_names[k] for k in order[:_NAMED]], len(order), "members")
-
-
-def _listed(names: list[str], count: int, what: str) -> str:
-    more = f" and {count - len(names)} more {what}" if count > len(names) else ""
-    return ", ".join(names) + more
-
-
-def _from_largest(size: Array) -> NDArray[np.int64]:
-    """Return the indices of `size` (K,) from the largest on; what differs by rounding alone stays in order."""
-    return np.argsort(-np.round(size / max(float(size.max(initial=0.0)), 1e-300), 9), kind="stable")
