@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from steps import MOVED_BASE
 
 from vgtm_qp.arm.truss.build import lock_members
-from vgtm_qp.arm.truss.lengths import LengthRows
+from vgtm_qp.arm.truss.kinematics import LengthRows
 from vgtm_qp.errors import SolverError
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp import lengths as lengths_module

@@ -11,8 +11,7 @@ import numpy as np
 from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, or_none
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_ways
-from vgtm_qp.arm.truss.kinematics import EndKinematics
-from vgtm_qp.arm.truss.lengths import LengthRows
+from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.symbols import TrussSymbols
 from vgtm_qp.arm.truss.truss import Array, Index, Truss
@@ -133,10 +132,7 @@ class TrussArm(Arm):
         ``radius`` (M), ``tip`` (``nodes``, ``weights``, ``frame`` at home) and ``joints`` (``triangle``, ``offset``,
         see ``truss.Joints``; None for pin joints). Lengths in m; None means no limit.
         """
-        truss = self.truss
-        joints = truss.joints
-        ends = truss.home[truss.members]
-        pin_lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+        truss, joints = self.truss, self.truss.joints
         return {
             "module": truss.module,
             "bays": truss.bays,
@@ -145,7 +141,7 @@ class TrussArm(Arm):
             "base": np.flatnonzero(truss.base).tolist(),
             "member_names": list(truss.member_names),
             "actuated": truss.actuated.tolist(),
-            "length": (pin_lengths if joints is None else truss.home_lengths).tolist(),
+            "length": truss.home_lengths.tolist(),
             "stroke": truss.stroke.tolist(),
             "rate": or_none(truss.rate),
             "acceleration": or_none(truss.acceleration),

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from vgtm_qp.arm.truss.graph import truss_from_graph
-from vgtm_qp.arm.truss.modules import stacked, tetrahedral
-from vgtm_qp.arm.truss.plate import plate
+from vgtm_qp.arm.truss.modules import plate, stacked, tetrahedral
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.errors import TrussError, nearest
 from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, PlateTruss, TetrahedralTruss

@@ -10,12 +10,11 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from vgtm_qp.arm.truss.assembly import check_stroke
 from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
 from vgtm_qp.arm.truss.joints import Joints, axial_joints, joint_triangles
 from vgtm_qp.arm.truss.mobility import trackable_coordinates
 from vgtm_qp.arm.truss.stages import placement_stages
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Array, Index, Truss, check_stroke
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import GraphTruss, Member
 

@@ -1,16 +1,20 @@
-"""Kinematics of a truss by CasADi: lengths, face frames, tip pose and their Jacobians (paper, section 3.3).
-
-One member and one face are written as CasADi graphs, differentiated by CasADi, mapped over the truss and compiled.
-"""
+"""Lengths of members and their gradients by CasADi, one member mapped over the truss; how nodes follow."""
 
 from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+from scipy.sparse.linalg import splu
 
 from vgtm_qp.arm.truss.joints import Array, Index, Joints
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.compiled import Kernel
+from vgtm_qp.errors import SolverError
+
+_DENSE = 150
+"""Up to so many node coordinates LAPACK is faster than any use of the structure."""
+
+_SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
 
 def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:
@@ -83,3 +87,45 @@ class EndKinematics:
         """Overwrite ends and Jacobians with those at node positions `X` (N, 3), m."""
         self._kernel.inputs[0][:] = X[self.nodes].reshape(-1)
         self._kernel()
+
+
+class LengthRows:
+    """J d_rho - E d_a = rhs, eqs. (22)-(24) with the actuated members beside the fixed ones; see ``arm.MotionRows``.
+
+    Attributes
+    ----------
+    gradient : (M, Q, 3)
+    rhs : (M,)
+        m.
+    """
+
+    def __init__(self, truss: Truss, gradient: Array, rhs: Array) -> None:
+        self.truss, self.gradient, self.rhs = truss, gradient, rhs
+
+    @property
+    def values(self) -> Array:
+        truss = self.truss
+        gradients = self.gradient.reshape(-1)[truss.scatter.flat]
+        return np.concatenate([gradients, np.full(len(truss.actuators), -1.0)])
+
+    def jacobian(self) -> Array:
+        """Return the dense length Jacobian (M, 3 (N - N_c))."""
+        return self.truss.scatter.dense(self.gradient)
+
+    def response(self) -> tuple[Array, Array]:
+        """Return K and r with J K = E, J r = rhs; see ``arm.MotionRows``."""
+        truss = self.truss
+        members, count = truss.member_count, len(truss.actuators)
+        known = np.zeros((members, count + 1))
+        known[truss.actuators, np.arange(count)] = 1.0
+        known[:, -1] = self.rhs
+        try:
+            if members <= _DENSE:
+                answer = np.linalg.solve(self.jacobian(), known)
+            else:
+                answer = splu(truss.scatter.sparse(self.gradient)).solve(known)
+        except (np.linalg.LinAlgError, RuntimeError) as reason:
+            raise SolverError(_SINGULAR) from reason
+        if not np.isfinite(answer).all():
+            raise SolverError(_SINGULAR)
+        return answer[:, :-1], answer[:, -1]

@@ -1,7 +1,7 @@
-"""The periodic trusses of the paper: each builder stacks one module along +z of the base frame.
+"""The trusses of the paper from their tables: modules that are stacked along +z of the base frame, and plates.
 
-A name is a kind, a layer of nodes (0 is the base) and a place in it (from 1): node ``n0-1``, batten ``B4-1``,
-longeron or leg ``L3-2``, diagonal ``D2-1``. Lengths of a table are distances between nodes.
+In a stack a name is a kind, a layer of nodes (0 is the base) and a place in it (from 1): node ``n0-1``, batten
+``B4-1``, longeron or leg ``L3-2``, diagonal ``D2-1``. Lengths of a table are distances between nodes.
 """
 
 from __future__ import annotations
@@ -12,11 +12,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.arm.truss.assembly import MemberRow, assemble
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
-from vgtm_qp.problem.truss import ModuleTruss, TetrahedralTruss
+from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
+from vgtm_qp.arm.truss.truss import Array, Index, Truss, check_stroke
+from vgtm_qp.errors import TrussError
+from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
 
 _POSE = ("position", "pointing", "orientation")
+
+
+class MemberRow(NamedTuple):
+    """A member before its truss: name, indices of its two nodes, and whether it changes its length."""
+
+    name: str
+    nodes: tuple[int, int]
+    actuated: bool
 
 
 class _Module(NamedTuple):
@@ -59,7 +68,7 @@ def stacked(spec: ModuleTruss) -> Truss:
     Raises
     ------
     TrussError
-        See :func:`assemble`.
+        A home length is outside its stroke, or the joint offsets leave no member.
     """
     module = _MODULES[spec.module]
     per_bay = len(module.battens)
@@ -95,7 +104,7 @@ def tetrahedral(spec: TetrahedralTruss) -> Truss:
     Raises
     ------
     TrussError
-        See :func:`assemble`.
+        A home length is outside its stroke, or the joint offsets leave no member.
     """
     home, cosine = _helix(3 * (spec.bays + 1), spec.longeron, spec.batten)
     members = [
@@ -112,6 +121,56 @@ def tetrahedral(spec: TetrahedralTruss) -> Truss:
         trackable=_POSE if len(spec.actuated) > 1 else ("position",),
         weights=(weight, 1.0 - 2.0 * weight, weight),
         stage=np.maximum(np.arange(len(home)) - 3, -1),
+    )
+
+
+def plate(spec: PlateTruss) -> Truss:
+    """Return a plate in the xz plane that grows along +z; its first two rows and the apexes between are the base.
+
+    Nodes ``n<row>-<column>`` of the surface and ``a<row>-<column>`` over the cells' centres, towards -y. A
+    free row is a stage: its surface nodes and the apexes below it. Three fixed legs ``G`` carry each apex;
+    longitudinals ``L``, transverses ``T``, one diagonal ``D`` a row, and the apexes' longitudinals ``M`` and
+    one transverse ``U`` are actuated. A diagonal in every cell has the right count but leaves a mechanism.
+
+    Raises
+    ------
+    TrussError
+        A home length is outside its stroke, or the joint offsets leave no member.
+    """
+    rows, columns, spacing = spec.rows, spec.columns, spec.spacing
+    names: list[str] = []
+    positions: list[tuple[float, float, float]] = []
+    stages: list[int] = []
+    left = -0.5 * spacing * (columns - 1)
+    for i in range(rows):
+        if i:
+            for j in range(columns - 1):
+                names.append(f"a{i - 1}-{j + 1}")
+                positions.append((left + spacing * (j + 0.5), -spec.depth, spacing * (i - 0.5)))
+                stages.append(max(i - 2, -1))
+        for j in range(columns):
+            names.append(f"n{i}-{j + 1}")
+            positions.append((left + spacing * j, 0.0, spacing * i))
+            stages.append(max(i - 2, -1))
+    index = {name: i for i, name in enumerate(names)}
+    members = [
+        MemberRow(name, (index[first], index[second]), name[0] != "G")
+        for i in range(2, rows)
+        for name, first, second in _row(i, columns)
+    ]
+    return _assemble(
+        spec,
+        tuple(names),
+        np.array(positions),
+        np.array(stages, dtype=np.int64),
+        members,
+        (0.7, 1.4),
+        faces=np.empty((0, 3), dtype=np.int64),
+        weights=(1 / 3, 1 / 3, 1 / 3),
+        tip=np.array([index[f"n{rows - 1}-1"], index[f"n{rows - 1}-{columns}"]]),
+        tip_weights=(0.5, 0.5),
+        bays=rows - 2,
+        trackable=("position",),
     )
 
 
@@ -179,7 +238,7 @@ def _layered(
     """Assemble a truss of layers of three nodes; a face ends each bay."""
     nodes = np.arange(len(home))
     faces = nodes.reshape(-1, 3)[::layers_per_bay]
-    return assemble(
+    return _assemble(
         spec,
         tuple(f"n{i // 3}-{i % 3 + 1}" for i in range(len(home))),
         home,
@@ -193,4 +252,97 @@ def _layered(
         bays=spec.bays,
         trackable=trackable,
         face_stride=face_stride,
+    )
+
+
+def _row(i: int, columns: int) -> list[tuple[str, str, str]]:
+    """Return name and node names of the members that place row `i` and the apexes below it."""
+    members: list[tuple[str, str, str]] = []
+    for j in range(1, columns):
+        apex = f"a{i - 1}-{j}"
+        # With three columns the second apex stands on the mirror image of the first one's legs.
+        mirrored = columns == 3 and j == 2
+        feet = (
+            (f"n{i - 1}-{j + 1}", f"n{i}-{j + 1}", f"n{i}-{j}")
+            if mirrored
+            else (f"n{i - 1}-{j}", f"n{i}-{j}", f"n{i}-{j + 1}")
+        )
+        members += [(f"G{i}-{3 * (j - 1) + k}", apex, foot) for k, foot in enumerate(feet, start=1)]
+    members += [(f"L{i}-{j}", f"n{i - 1}-{j}", f"n{i}-{j}") for j in range(1, columns + 1)]
+    members += [(f"T{i}-{j}", f"n{i}-{j}", f"n{i}-{j + 1}") for j in range(1, columns)]
+    members += [(f"D{i}-1", f"n{i - 1}-1", f"n{i}-2")]
+    members += [(f"M{i}-{j}", f"a{i - 2}-{j}", f"a{i - 1}-{j}") for j in range(1, columns)]
+    members += [(f"U{i}-1", f"a{i - 1}-{columns - 2}", f"a{i - 1}-{columns - 1}")]
+    return members
+
+
+def _assemble(
+    spec: ModuleTruss | TetrahedralTruss | PlateTruss,
+    node_names: tuple[str, ...],
+    home: Array,
+    stage: Index,
+    members: Sequence[MemberRow],
+    stroke_factors: tuple[float, float],
+    *,
+    faces: Index,
+    weights: Sequence[float],
+    tip: Index,
+    tip_weights: Sequence[float],
+    bays: int,
+    trackable: tuple[str, ...],
+    face_stride: int = 1,
+) -> Truss:
+    """Return the truss of a table, whose face and tip frames at home are those of the base.
+
+    Parameters
+    ----------
+    stroke_factors
+        Least and greatest length of an actuated member over its home length, where the table has no stroke.
+    weights
+        Of the three nodes of every face.
+
+    Other parameters are as in :class:`vgtm_qp.arm.truss.truss.Truss`.
+    """
+    names = tuple(member.name for member in members)
+    pairs = np.array([member.nodes for member in members], dtype=np.int64)
+    actuated = np.array([member.actuated for member in members])
+    lengths = np.linalg.norm(home[pairs[:, 0]] - home[pairs[:, 1]], axis=1)
+    offset, joints = spec.joint_offset, None
+    if not 2.0 * offset < lengths.min():
+        raise TrussError(
+            f"joint_offset is {offset:g} m; expected at least 0 and less than half the shortest member, "
+            f"{lengths.min() / 2:g} m"
+        )
+    if offset > 0.0:
+        triangle = joint_triangles(node_names, home, pairs, stage)
+        joints = axial_joints(home, pairs, triangle, np.full((len(members), 2), offset))
+    strokes = np.column_stack([lengths - 2.0 * offset] * 2)
+    strokes[actuated] *= stroke_factors
+    if spec.stroke is not None:
+        for k in np.flatnonzero(actuated):
+            check_stroke(names[k], lengths[k] - 2.0 * offset, spec.stroke)
+        strokes[actuated] = spec.stroke
+    return Truss(
+        module=spec.module,
+        node_names=node_names,
+        member_names=names,
+        home=home,
+        base=stage < 0,
+        members=pairs,
+        actuated=actuated,
+        stroke=strokes,
+        rate=np.where(actuated, spec.rate or np.inf, np.inf),
+        acceleration=np.where(actuated, spec.acceleration or np.inf, np.inf),
+        radius=np.full(len(members), spec.member_radius),
+        faces=faces,
+        face_weights=np.tile(np.asarray(weights, dtype=np.float64), (len(faces), 1)),
+        face_frames=np.tile(np.eye(3), (len(faces), 1, 1)),
+        tip=tip,
+        tip_weights=np.asarray(tip_weights, dtype=np.float64),
+        tip_frame=np.eye(3),
+        stage=stage,
+        bays=bays,
+        trackable=trackable,
+        face_stride=face_stride,
+        joints=joints,
     )

@@ -164,31 +164,24 @@ class TrussSymbols(ArmSymbols):
     def response(self, X: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
         gradients, rhs = self.motion(X, at, moved)
         truss = self._truss
-        actuators = truss.actuators.tolist()
-        count = len(actuators)
         place: dict[int, ca.MX] = {}
+        count = len(truss.actuators)
         for k, stage in enumerate(self._stages or ()):
             D, L = self._stage_blocks(k, gradients)
-            own = [(row, actuators.index(int(m))) for row, m in enumerate(stage.members) if truss.actuated[m]]
-            unit = ca.DM(len(stage.members), len(own))
-            for column, (row, _) in enumerate(own):
-                unit[row, column] = 1.0
-            earlier = len(stage.earlier)
-            arguments: list[ca.MX] = [ca.densify(-L)] if earlier else []
-            arguments += [ca.MX(ca.densify(unit))] if own else []
-            width = 3 * earlier + len(own) + 1
-            solved = self._solver(D.sparsity(), width)(D, ca.horzcat(*arguments, rhs[stage.members.tolist()]))
-            particular = solved[:, -1]
-            columns = ca.MX(len(stage.members), count)
+            own = np.flatnonzero(truss.actuated[stage.members])
+            actuators = np.searchsorted(truss.actuators, stage.members[own])
+            earlier, rows = L.size2(), len(stage.members)
+            unit = ca.MX(ca.DM(np.eye(rows)[:, own]))
+            known = ca.horzcat(ca.densify(-L), unit, rhs[stage.members.tolist()])
+            solved = self._solver(D.sparsity(), known.size2())(D, known)
+            columns, particular = ca.MX(rows, count), solved[:, -1]
             if earlier:
                 before = ca.vertcat(*(place[int(node)] for node in stage.earlier))
-                product = solved[:, : 3 * earlier] @ before
+                product = solved[:, :earlier] @ before
                 columns, particular = product[:, :count], product[:, count] + particular
-            if own:
-                spread = ca.DM(
-                    ca.Sparsity.triplet(len(own), count, list(range(len(own))), [c for _, c in own]), 1.0
-                )
-                columns = columns + solved[:, 3 * earlier : 3 * earlier + len(own)] @ spread
+            if len(own):
+                spread = ca.sparsify(ca.DM(np.eye(count)[actuators]))
+                columns = columns + solved[:, earlier:-1] @ spread
             block = ca.horzcat(ca.densify(columns), particular)
             for j, node in enumerate(stage.nodes):
                 place[int(node)] = block[3 * j : 3 * j + 3, :]
