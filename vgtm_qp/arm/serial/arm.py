@@ -40,7 +40,6 @@ class ChainDescription:
     hard: bool
 
     def __str__(self) -> str:
-        """Return two lines."""
         can = "can" if self.hard else "cannot"
         return (
             f"serial arm of {self.joints} joints, {self.actuated} of them actuated, {self.links} links, "
@@ -68,7 +67,7 @@ class ChainRows:
 class SerialArm(Arm):
     """See ``arm.Arm``; joints of an ``[arm]`` table, of which those that are locked from the start are stuck at home.
 
-    Its nodes are those of ``SerialChain.graph``.
+    Its nodes are those of ``SerialChain.functions``.
     """
 
     kind = "serial"

@@ -66,7 +66,7 @@ class SerialChain:
 
     @property
     def node_count(self) -> int:
-        """Number of nodes N, see :attr:`graph`."""
+        """Number of nodes N, see :attr:`functions`."""
         return len(self) + 2 + 2 * (len(self.tracked) + 2)
 
     @cached_property
@@ -81,7 +81,7 @@ class SerialChain:
 
     @property
     def constants(self) -> dict[str, Array]:
-        """What :attr:`graph` takes beside the configuration, the columns of each as rows: (J, 3), (3 J, 3), (1, 3)."""
+        """What :attr:`functions` takes beside the configuration, the columns of each as rows."""
         return {
             "axes": self.axis,
             "positions": self.position,
@@ -90,8 +90,8 @@ class SerialChain:
         }
 
     @cached_property
-    def graph(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
-        """(q, axes (3, J), positions (3, J), rotations (3, 3 J), tip (3)), nodes (3, N), Jacobian (3 N, J).
+    def functions(self) -> tuple[ca.Function, ca.Function]:
+        """(q, axes (3, J), positions (3, J), rotations (3, 3 J), tip (3)) -> nodes (3, N); the same and their Jacobian.
 
         The configuration q (J + 6) holds the joints' values, then position, m, and rotation vector, rad, of the base. A
         node moves across the axis of each revolute joint before it, and along that of each prismatic one. The nodes are
@@ -132,22 +132,11 @@ class SerialChain:
             )
             for j, (axis, at, turns) in enumerate(joints)
         ]
-        jacobian = ca.densify(ca.horzcat(*columns))
-        return [q, axes, positions, rotations, tip], ca.horzcat(*(node for node, _ in nodes)), jacobian
-
-    @cached_property
-    def nodes(self) -> ca.Function:
-        """Arguments of :attr:`graph` -> nodes."""
-        arguments, nodes, _ = self.graph
-        return ca.Function("chain_nodes", arguments, [nodes])
-
-    @cached_property
-    def moving(self) -> ca.Function:
-        """Arguments of :attr:`graph` -> nodes and their Jacobian."""
-        arguments, nodes, jacobian = self.graph
-        return ca.Function("chain", arguments, [nodes, jacobian])
+        arguments, places = [q, axes, positions, rotations, tip], ca.horzcat(*(node for node, _ in nodes))
+        both = ca.Function("chain", arguments, [places, ca.densify(ca.horzcat(*columns))])
+        return ca.Function("chain_nodes", arguments, [places]), both
 
     def at(self, q: Array) -> tuple[Array, Array]:
         """Return nodes (N, 3), m, and Jacobian (N, 3, J) at a configuration."""
-        nodes, jacobian = self.moving(q, *(value.T for value in self.constants.values()))
+        nodes, jacobian = self.functions[1](q, *(value.T for value in self.constants.values()))
         return np.asarray(nodes, dtype=float).T, np.asarray(jacobian, dtype=float).reshape(-1, 3, len(self))

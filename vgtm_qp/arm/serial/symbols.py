@@ -18,21 +18,22 @@ class ChainSymbols(ArmSymbols):
         self, chain: SerialChain, home: Array, actuators: Index, free: Index, constants: Constants
     ) -> None:
         super().__init__(home, actuators, constants)
-        self._chain, self._free = chain, free.tolist()
+        self._joints, self._free = len(chain), free.tolist()
+        self._nodes, self._moving = chain.functions
         self.shape, self.given = (len(chain) + 6, 1), list(range(chain.node_count))
         self._constants = [constants.add(name, value) for name, value in chain.constants.items()]
 
     def nodes(self, q: ca.MX) -> ca.MX:
-        return self._chain.nodes(q, *self._constants)
+        return self._nodes(q, *self._constants)
 
     def quantities(self, q: ca.MX) -> ca.MX:
         """See ``arm.ArmSymbols``: the joints' values."""
-        return q[: len(self._chain)]
+        return q[: self._joints]
 
     def motion(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> list[ca.MX]:  # noqa: ARG002
         """See ``arm.ArmSymbols``: K and r."""
         rows = [3 * node + axis for node in self._free for axis in range(3)]
-        _, jacobian = self._chain.moving(at, *self._constants)
+        _, jacobian = self._moving(at, *self._constants)
         return [jacobian[rows, self._actuators], ca.vec(moved[:, self._free])]
 
     def response(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
@@ -48,5 +49,4 @@ class ChainSymbols(ArmSymbols):
         return q
 
     def closed(self, q: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        joints = len(self._chain)
-        return ca.vertcat(self.aims(q[:joints], lower, upper), q[joints:])
+        return ca.vertcat(self.aims(self.quantities(q), lower, upper), q[self._joints :])

@@ -103,10 +103,8 @@ class TrussArm(Arm):
         return float(np.abs(motion).max())
 
     def reach(self) -> Array:
-        tip = self.end_effector
-        return np.asarray(
-            longest_ways(self.truss, np.flatnonzero(self.truss.base))[:, tip.nodes] @ np.abs(tip.weights)
-        )
+        ways, tip = longest_ways(self.truss, np.flatnonzero(self.base)), self.end_effector
+        return np.asarray(ways[:, tip.nodes] @ np.abs(tip.weights))
 
     def hollow(self) -> float:
         return hollow(self.truss)

@@ -22,13 +22,13 @@ def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:
 
     z is the triangle's normal, x the outward bisector of the two members that meet at the node.
     """
-    to_first = (first - node) / ca.norm_2(first - node)
-    to_second = (second - node) / ca.norm_2(second - node)
-    z = ca.cross(to_first, to_second)
-    z /= ca.norm_2(z)
-    x = -(to_first + to_second)
-    x /= ca.norm_2(x)
+    to_first, to_second = _unit(first - node), _unit(second - node)
+    z, x = _unit(ca.cross(to_first, to_second)), _unit(-(to_first + to_second))
     return ca.horzcat(x, ca.cross(z, x), z)
+
+
+def _unit(vector: ca.SX) -> ca.SX:
+    return vector / ca.norm_2(vector)
 
 
 def member_function(truss: Truss) -> ca.Function:
@@ -121,7 +121,7 @@ class LengthRows:
         known[:, -1] = self.rhs
         try:
             if members <= _DENSE:
-                answer = np.linalg.solve(self.jacobian(), known)
+                answer = np.asarray(np.linalg.solve(self.jacobian(), known), dtype=float)
             else:
                 answer = splu(truss.scatter.sparse(self.gradient)).solve(known)
         except (np.linalg.LinAlgError, RuntimeError) as reason:

@@ -103,7 +103,8 @@ def pose_response(truss: Truss, nodes: Index, weights: Array, rotations: Array, 
 def tip_response(truss: Truss, X: Array | None = None) -> Array:
     """Return :func:`pose_response` (6, n_a) or (3, n_a) of the tip alone, at home if `X` (N, 3) is not given."""
     at = truss.home if X is None else X
-    return pose_response(truss, truss.tip[None], truss.tip_weights[None], truss.tip_frame[None], at)[0]
+    twist = pose_response(truss, truss.tip[None], truss.tip_weights[None], truss.tip_frame[None], at)
+    return twist.reshape(-1, len(truss.actuators))
 
 
 def trackable_coordinates(truss: Truss) -> tuple[str, ...]:

@@ -33,8 +33,8 @@ class PlacedNodes:
     earlier: Index
 
 
-def elimination_stages(truss: Truss) -> list[PlacedNodes] | None:
-    """Return the stages of the truss in order, or None where a stage does not have three members for each node."""
+def elimination_stages(truss: Truss) -> list[PlacedNodes]:
+    """Return the stages of the truss in order; none where a stage does not have three members for each node."""
     node_stage = np.where(truss.base, -1, truss.stage)
     member_stage = node_stage[truss.member_nodes].max(axis=1)
     stages = []
@@ -42,7 +42,7 @@ def elimination_stages(truss: Truss) -> list[PlacedNodes] | None:
         nodes = truss.free[node_stage[truss.free] == stage]
         members = np.flatnonzero(member_stage == stage)
         if len(members) != 3 * len(nodes):
-            return None
+            return []
         used = np.unique(truss.member_nodes[members])
         earlier = used[(node_stage[used] < stage) & ~truss.base[used]]
         stages.append(PlacedNodes(nodes, members, earlier))
@@ -56,8 +56,10 @@ def stage_faces(truss: Truss, stages: list[PlacedNodes], tracked: Sequence[int])
     """
     nodes_of = {frozenset(truss.faces[face].tolist()): int(face) for face in tracked}
     faces = [nodes_of.get(frozenset(stage.nodes.tolist()), -1) for stage in stages]
+    if not faces or min(faces) < 0 or len(faces) != len(tracked):
+        return None
     three = all(int(truss.actuated[stage.members].sum()) == 3 for stage in stages)
-    return np.array(faces) if three and min(faces) >= 0 and len(faces) == len(tracked) else None
+    return np.array(faces) if three else None
 
 
 class TrussSymbols(ArmSymbols):
@@ -77,20 +79,20 @@ class TrussSymbols(ArmSymbols):
         self._place = {int(node): 3 * k for k, node in enumerate(truss.free)}
 
     @cached_property
-    def _stages(self) -> list[PlacedNodes] | None:
+    def _stages(self) -> list[PlacedNodes]:
         return elimination_stages(self._truss)
 
     @cached_property
-    def _blocks(self) -> list[tuple[_Layers, _Layers]]:
+    def _patterns(self) -> list[tuple[_Layers, _Layers]]:
         """Layers of the blocks D and L of each stage."""
         return [
             (self._layers(stage.members, stage.nodes), self._layers(stage.members, stage.earlier))
-            for stage in self._stages or ()
+            for stage in self._stages
         ]
 
     @property
     def can_eliminate(self) -> bool:
-        return self._stages is not None
+        return bool(self._stages)
 
     def nodes(self, X: ca.MX) -> ca.MX:
         return X
@@ -133,13 +135,12 @@ class TrussSymbols(ArmSymbols):
     def closed(self, X: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
         lengths, gradients = self._lengths(X)
         error = self.aims(lengths, lower, upper) - lengths
-        blocks = [self._stage_blocks(k, gradients) for k in range(len(self._blocks))]
-        rhs = [error[stage.members.tolist()] for stage in self._stages or ()]
-        return X + self._substituted(blocks, rhs)
+        rhs = [error[stage.members.tolist()] for stage in self._stages]
+        return X + self._substituted(self._blocks(gradients), rhs)
 
     def held(self, tracked: Sequence[int]) -> Callable[[ca.MX, ca.MX], ca.MX] | None:
         """See ``arm.ArmSymbols``: actuated members take the lengths that follow."""
-        faces = stage_faces(self._truss, self._stages, tracked) if self._stages else None
+        faces = stage_faces(self._truss, self._stages, tracked)
         if faces is None:
             return None
         truss, order = self._truss, list(tracked)
@@ -149,10 +150,13 @@ class TrussSymbols(ArmSymbols):
             error = self.home - lengths
             centres = (X[:, truss.faces[face].tolist()] @ ca.DM(truss.face_weights[face]) for face in order)
             gaps = points - ca.horzcat(*centres)
-            blocks, rhs = [], []
-            for k, (stage, face) in enumerate(zip(self._stages or (), faces.tolist(), strict=True)):
+            blocks, rhs, placed = (
+                [],
+                [],
+                zip(self._stages, self._blocks(gradients), faces.tolist(), strict=True),
+            )
+            for stage, (D, L), face in placed:
                 fixed = np.flatnonzero(~truss.actuated[stage.members]).tolist()
-                D, L = self._stage_blocks(k, gradients)
                 weight = dict(zip(truss.faces[face].tolist(), truss.face_weights[face], strict=True))
                 centre = ca.sparsify(ca.DM(np.kron([weight[int(n)] for n in stage.nodes], np.eye(3))))
                 blocks.append((ca.vertcat(D[fixed, :], centre), ca.vertcat(L[fixed, :], ca.MX(3, L.size2()))))
@@ -166,8 +170,7 @@ class TrussSymbols(ArmSymbols):
         truss = self._truss
         place: dict[int, ca.MX] = {}
         count = len(truss.actuators)
-        for k, stage in enumerate(self._stages or ()):
-            D, L = self._stage_blocks(k, gradients)
+        for stage, (D, L) in zip(self._stages, self._blocks(gradients), strict=True):
             own = np.flatnonzero(truss.actuated[stage.members])
             actuators = np.searchsorted(truss.actuators, stage.members[own])
             earlier, rows = L.size2(), len(stage.members)
@@ -183,8 +186,7 @@ class TrussSymbols(ArmSymbols):
                 spread = ca.sparsify(ca.DM(np.eye(count)[actuators]))
                 columns = columns + solved[:, earlier:-1] @ spread
             block = ca.horzcat(ca.densify(columns), particular)
-            for j, node in enumerate(stage.nodes):
-                place[int(node)] = block[3 * j : 3 * j + 3, :]
+            place |= zip(stage.nodes.tolist(), ca.vertsplit(block, 3), strict=True)
         return ca.vertcat(*(place[int(node)] for node in truss.free))
 
     def _layers(self, members: Index, nodes: Index) -> _Layers:
@@ -206,13 +208,13 @@ class TrussSymbols(ArmSymbols):
             layers.append((scatter.flat[chosen], ca.Sparsity.triplet(len(members), 3 * len(nodes), *at)))
         return layers
 
-    def _stage_blocks(self, k: int, gradients: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Return the blocks D and L of stage `k`, sparse."""
-        stage = (self._stages or [])[k]
-        rows = len(stage.members)
-        own, earlier = self._blocks[k]
-        columns = 3 * len(stage.earlier)
-        return _block(own, gradients, (rows, rows)), _block(earlier, gradients, (rows, columns))
+    def _blocks(self, gradients: ca.MX) -> _Blocks:
+        """Return the blocks D and L of each stage, sparse."""
+        blocks = []
+        for stage, (own, earlier) in zip(self._stages, self._patterns, strict=True):
+            D = _block(own, gradients, stage.members, stage.nodes)
+            blocks.append((D, _block(earlier, gradients, stage.members, stage.earlier)))
+        return blocks
 
     def _solver(self, D: ca.Sparsity, width: int) -> ca.Function:
         """Return (D, right-hand sides (rows, width)) -> D^-1 rhs by an unrolled sparse QR factorisation."""
@@ -227,18 +229,17 @@ class TrussSymbols(ArmSymbols):
     def _substituted(self, blocks: _Blocks, rhs: list[ca.MX]) -> ca.MX:
         """Return displacements (3, N) of all nodes: each stage's blocks D and L place its nodes after earlier ones."""
         place: dict[int, ca.MX] = {}
-        for stage, (D, L), right in zip(self._stages or (), blocks, rhs, strict=True):
+        for stage, (D, L), right in zip(self._stages, blocks, rhs, strict=True):
             if len(stage.earlier):
                 right = right - L @ ca.vertcat(*(place[int(node)] for node in stage.earlier))
             step = self._solver(D.sparsity(), 1)(D, right)
-            for j, node in enumerate(stage.nodes):
-                place[int(node)] = step[3 * j : 3 * j + 3]
+            place |= zip(stage.nodes.tolist(), ca.vertsplit(step, 3), strict=True)
         zero = ca.DM.zeros(3)
         return ca.horzcat(*(place.get(node, zero) for node in range(self._truss.node_count)))
 
 
-def _block(layers: _Layers, gradients: ca.MX, shape: tuple[int, int]) -> ca.MX:
-    block = ca.MX(*shape)
+def _block(layers: _Layers, gradients: ca.MX, members: Index, nodes: Index) -> ca.MX:
+    block = ca.MX(len(members), 3 * len(nodes))
     for flat, sparsity in layers:
         block = block + ca.MX(sparsity, gradients[flat.tolist()])
     return block
