@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import modules
 import numpy as np
+from modules import graph_truss
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm
-from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.arm import TrussArm
-from vgtm_qp.arm.truss.graph import graph_truss
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.curve.families import bezier
 from vgtm_qp.problem import Problem

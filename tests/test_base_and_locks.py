@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import modules
 import numpy as np
 import pytest
 from arms import arm_problem, central_differences
@@ -9,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
 from vgtm_qp.arm.arm import Pose
-from vgtm_qp.arm.truss import modules
 from vgtm_qp.errors import GoalError, ProblemError
 from vgtm_qp.problem.truss import BasePose
 from vgtm_qp.qp.numbers import ClearanceRows

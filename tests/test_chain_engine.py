@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import modules
 import numpy as np
 import pytest
 from arms import make_layout
 from steps import assert_same_answer, make_step, pressing
 
-from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.build import lock_members
 from vgtm_qp.bench.scenes import make_scenes
 from vgtm_qp.qp.long.chain import find_chain

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vgtm_qp as vq
-from vgtm_qp.arm.truss.reach import longest_ways
+from vgtm_qp.arm.truss.bounds import longest_ways
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from modules import double_octahedral, graph_truss, hexapod, longeron, octahedral
 
 from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.arm.truss.graph import graph_truss
 from vgtm_qp.arm.truss.mobility import describe
-from vgtm_qp.arm.truss.modules import double_octahedral, hexapod, longeron, octahedral
 from vgtm_qp.arm.truss.stages import placement_stages
 from vgtm_qp.errors import ProblemError, TrussError
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import modules
 import numpy as np
 import pytest
 from arms import arm_problem
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from vgtm_qp.arm.truss import modules
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem, load_problem

@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import modules
 import numpy as np
 import pytest
 from arms import mast
 from recovery_problems import BASE, box, problem
 
 import vgtm_qp as vq
-from vgtm_qp.arm.truss import modules
-from vgtm_qp.arm.truss.chords import chord_deviation
+from vgtm_qp.arm.truss.bounds import chord_deviation
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.separation import Distances, Separation

@@ -9,13 +9,13 @@ import sys
 from dataclasses import replace
 
 import casadi as ca
+import modules
 import numpy as np
 import pytest
 from arms import make_layout
 
 import vgtm_qp as vq
-from vgtm_qp.arm.truss import modules
-from vgtm_qp.arm.truss.lengths import LengthRows
+from vgtm_qp.arm.truss.kinematics import LengthRows
 from vgtm_qp.compiled import Kernel, compiler, finish_compiling
 from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.fused import FusedSolver

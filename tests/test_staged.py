@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import casadi as ca
+import modules
 import numpy as np
 import pytest
 from arms import make_layout, mast, random_pose
@@ -14,9 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from steps import MOVED_BASE
 
-from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.build import lock_members
-from vgtm_qp.arm.truss.lengths import LengthRows
+from vgtm_qp.arm.truss.kinematics import LengthRows
 from vgtm_qp.errors import SolverError
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp import lengths as lengths_module

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from modules import octahedral
 from synthetic import LENGTHS, RADIUS, found_clearances, good_maneuver, maneuver_of, place, swing, tripod
 
 from vgtm_qp.arm.truss.joints import Joints
-from vgtm_qp.arm.truss.modules import octahedral
 from vgtm_qp.errors import ResultError
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.verify import check, verify, verify_file

@@ -12,20 +12,31 @@ Nothing outside the folder ``arm`` asks which arm it has.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.scatter import LengthScatter
-from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants, Frames
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+RANK_TOLERANCE = 1e-8
+"""Singular values of a Jacobian below this fraction of the greatest one count as zero."""
+
+_FEW_STATIONS = 20
+"""Another compiled function without the stations does not pay for so few."""
 
 
 class Label(NamedTuple):
@@ -146,98 +157,6 @@ class MotionRows(Protocol):
         ...
 
 
-class Kinematics(Protocol):
-    """An arm at one configuration, in arrays that are overwritten by `evaluate`.
-
-    Attributes
-    ----------
-    quantities : (M,)
-        Fixed and actuated quantities, in their units.
-    gradient : (M, Q, 3)
-        Of the quantities by the nodes they depend on, see ``Bays.member_nodes``; empty without bays.
-    station_rotation, station_spin : (F, 3, 3), (F, 3, 9)
-        Rotations of the stations, and their angular-velocity rows with respect to their nodes.
-    tip_rotation, tip_spin : (3, 3), (3, 3K)
-        The same for the end effector; identity and zeros where it has no frame.
-    """
-
-    quantities: Array
-    gradient: Array
-    station_rotation: Array
-    station_spin: Array
-    tip_rotation: Array
-    tip_spin: Array
-
-    def evaluate(self, q: Array) -> None:
-        """Overwrite every attribute with its value at the configuration `q`."""
-        ...
-
-    def evaluate_quantities(self, q: Array) -> None:
-        """Overwrite quantities and tip alone, at less cost."""
-        ...
-
-    def motion(self) -> MotionRows:
-        """Return how the nodes move at the configuration evaluated last."""
-        ...
-
-
-class ArmSymbols(Protocol):
-    """An arm in CasADi's symbols: functions of a configuration of :attr:`shape`.
-
-    What is constant over a maneuver is an argument that is bound once, so that what is compiled depends on the
-    topology of the arm alone.
-    """
-
-    shape: tuple[int, int]
-    given: list[int]
-    """Nodes whose displacement with the base is given; the others follow by the fixed quantities."""
-
-    home: Any
-    """(M, 1) the quantities at home."""
-
-    can_eliminate: bool
-    """Whether :meth:`response`, :meth:`closed` and :meth:`held` are there: coordinates follow one after another."""
-
-    def nodes(self, q: Any) -> Any:
-        """Return (3, N) the nodes."""
-        ...
-
-    def quantities(self, q: Any) -> Any:
-        """Return (M, 1) the quantities."""
-        ...
-
-    def motion(self, q: Any, at: Any, moved: Any) -> list[Any]:
-        """Return what :meth:`Arm.motion_rows` takes: rows at `at`, residuals at `q`, base moving by `moved` (3, N)."""
-        ...
-
-    def response(self, q: Any, at: Any, moved: Any) -> Any:
-        """Return [K, r] (3 (N - N_c), n_a + 1) with K at `at` and r from the residuals at `q`."""
-        ...
-
-    def coordinates(self, nodes: Any, strokes: Any) -> Any:
-        """Return which of both moves the configuration: those of the nodes (3 (N - N_c), c), or strokes (n_a, c)."""
-        ...
-
-    def along(self, q: Any, coordinates: Any) -> Any:
-        """Return the configuration after a displacement of :meth:`coordinates` (c,)."""
-        ...
-
-    def closed(self, q: Any, lower: Any, upper: Any) -> Any:
-        """Return the configuration after one Newton step to the fixed quantities, actuators in their boxes (n_a,)."""
-        ...
-
-    def error(self, quantities: Any, lower: Any, upper: Any) -> Any:
-        """Return the norm of what quantities (M, 1) are off, boxes (n_a,) included."""
-        ...
-
-    def held(self, tracked: Sequence[int]) -> Callable[[Any, Any], Any] | None:
-        """Return the Newton step of a configuration whose `tracked` stations go to points (3, K) of the curve.
-
-        None where these and the fixed quantities do not determine the configuration, or not stage by stage.
-        """
-        ...
-
-
 class LengthRowsLike(Protocol):
     """Rows of lengths: gradients (M, Q, 3) by the nodes each depends on, and right-hand sides (M,)."""
 
@@ -246,21 +165,7 @@ class LengthRowsLike(Protocol):
 
 
 class Bays(Protocol):
-    """The bays of an arm, for speed alone: how its members hang on one another.
-
-    Attributes
-    ----------
-    node_count, member_count : int
-    base, stage : (N,)
-        Base nodes, and the stage in which each node is placed, -1 for those.
-    free : (N - N_c,) int
-    member_nodes : (M, Q) int
-        Nodes that each member's length depends on.
-    actuated, actuators : (M,) bool, (n_a,) int
-    joints : object or None
-        None for ideal pin joints.
-    scatter : LengthScatter
-    """
+    """The bays of an arm, for speed alone: how its members hang on one another, as in ``truss.Truss``."""
 
     @property
     def joints(self) -> object: ...
@@ -284,13 +189,19 @@ class Bays(Protocol):
     def scatter(self) -> LengthScatter: ...
 
 
-class Arm(Protocol):
+class Arm(ABC):
     """What a step knows of an arm.
 
     Attributes
     ----------
     kind : str
         What the arm is called: the module of a truss, or ``"serial"``.
+    bays : Bays or None
+        What the arm's own structure offers for speed.
+    leaves_chords : bool
+        Whether points do not move on straight lines where the configuration does, see :meth:`deviation`.
+    segments : int
+        Number of bays or joints.
     node_names : tuple of str
         Length N.
     home_configuration : configuration
@@ -302,151 +213,219 @@ class Arm(Protocol):
         The others, eq. (9), in the order in which they can be eliminated.
     quantity_names : tuple of str
         Length M: fixed and actuated quantities.
+    home_quantities : (M,)
     actuated : (M,) bool
-    actuators : (n_a,) int
-        Indices of the actuated quantities.
     actuator_units : (n_a,) str
         ``"m"`` or ``"rad"``.
     stroke, rate, acceleration : (M, 2), (M,), (M,)
         Least and greatest value, and greatest rates; inf where there is no limit.
-    home_quantities : (M,)
     stations : Stations
         Empty where nothing tracks a curve.
     end_effector : Tip
     height : float
         Length of the axis from the base to the tip at home, m.
-    motion_pattern : MotionPattern
-    bays : Bays or None
-        What the arm's own structure offers for speed.
     bodies : Bodies
         Spanned by the points of :meth:`points`.
-    segments : int
-        Number of bays or joints.
-    leaves_chords : bool
-        Whether points do not move on straight lines where the configuration does, see :meth:`deviation`.
     """
 
     kind: str
+    bays: Bays | None
+    leaves_chords: bool
+    segments: int
+    node_names: tuple[str, ...]
+    home_configuration: Array
+    home: Array
+    base: Mask
+    free: Index
+    quantity_names: tuple[str, ...]
+    home_quantities: Array
+    actuated: Mask
+    actuator_units: tuple[str, ...]
+    stroke: Array
+    rate: Array
+    acceleration: Array
+    stations: Stations
+    end_effector: Tip
+    height: float
+    bodies: Bodies
+
+    @cached_property
+    def actuators(self) -> Index:
+        """(n_a,) indices of the actuated quantities."""
+        return np.flatnonzero(self.actuated)
 
     @property
-    def node_names(self) -> tuple[str, ...]: ...
-    @property
-    def home_configuration(self) -> Array: ...
-    @property
-    def home(self) -> Array: ...
-    @property
-    def base(self) -> Mask: ...
-    @property
-    def free(self) -> Index: ...
-    @property
-    def quantity_names(self) -> tuple[str, ...]: ...
-    @property
-    def actuated(self) -> Mask: ...
-    @property
-    def actuators(self) -> Index: ...
-    @property
-    def actuator_units(self) -> tuple[str, ...]: ...
-    @property
-    def stroke(self) -> Array: ...
-    @property
-    def rate(self) -> Array: ...
-    @property
-    def acceleration(self) -> Array: ...
-    @property
-    def home_quantities(self) -> Array: ...
-    @property
-    def stations(self) -> Stations: ...
-    @property
-    def end_effector(self) -> Tip: ...
-    @property
-    def height(self) -> float: ...
-    @property
+    @abstractmethod
     def motion_pattern(self) -> MotionPattern: ...
-    @property
-    def bays(self) -> Bays | None: ...
-    @property
-    def bodies(self) -> Bodies: ...
-    @property
-    def segments(self) -> int: ...
-    @property
-    def leaves_chords(self) -> bool: ...
 
-    def nodes(self, q: Array) -> Array:
-        """Return (N, 3) the nodes at a configuration, m."""
-        ...
+    @abstractmethod
+    def symbols(self, constants: Constants) -> ArmSymbols:
+        """Return the arm in symbols, and add what it keeps constant to `constants`."""
 
+    @abstractmethod
+    def motion_rows(self, *values: Array) -> MotionRows:
+        """Return the rows from the values of ``ArmSymbols.motion``."""
+
+    def kinematics(self, *, compiled: bool = True) -> Kinematics:
+        """Return the arm at one configuration, in arrays."""
+        return Kinematics(self, compiled=compiled)
+
+    @abstractmethod
     def measured(self, q: Array) -> Array:
         """Return (M,) the quantities by plain arithmetic, which shares nothing with :meth:`symbols` and kinematics."""
-        ...
 
+    @abstractmethod
     def based(self, q: Array, pose: Pose) -> Array:
         """Return the configuration with its base at `pose` and all else as it is; eqs. (7)-(8)."""
-        ...
 
-    def carried(self, q: Array, before: Pose, after: Pose) -> Array:
+    def carried(self, q: Array, before: Pose, after: Pose) -> Array:  # noqa: ARG002
         """Return the configuration that moves as a rigid body with its base from one pose to another."""
-        ...
+        return self.based(q, after)
 
+    @abstractmethod
     def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:
         """Return the configuration after displacements of nodes (N, 3) and actuators (n_a,) that belong together."""
-        ...
 
+    @abstractmethod
     def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:
         """Return the configuration after one Newton step that changes the quantities by `missing` (M,).
 
         `solve` returns the displacements (N - N_c, 3) of the free nodes where they have to be solved for.
         """
-        ...
 
-    def kinematics(self, *, compiled: bool = True) -> Kinematics: ...
+    def nodes(self, q: Array) -> Array:
+        """Return (N, 3) the nodes at a configuration, m."""
+        kernel = self._nodes
+        kernel.inputs[0][:] = q.reshape(-1)
+        kernel()
+        return kernel.outputs[0].reshape(-1, 3).copy()
 
-    def symbols(self, constants: Constants) -> ArmSymbols:
-        """Return the arm in symbols, and add what it keeps constant to `constants`."""
-        ...
+    @cached_property
+    def _nodes(self) -> Kernel:
+        constants = Constants()
+        symbols = self.symbols(constants)
+        q = ca.MX.sym("q", *symbols.shape)
+        return constants.bound("nodes", [q], [symbols.nodes(q)]).kernel(compiled=False)
 
     def points(self, q: Array) -> Array:
-        """Return (P, 3) the points that span the bodies, m."""
-        ...
+        """Return (P, 3) the points that span the bodies, m; the nodes as a rule."""
+        return self.nodes(q)
 
-    def deviation(self, start: Array, end: Array) -> float:
-        """Return a bound of how much nearer two points come than their chords do, m, where q moves straight."""
-        ...
-
-    def reach(self) -> Array:
-        """Return (N_c,) a bound of the distance from each base node to the tip in any pose, m."""
-        ...
-
-    def hollow(self) -> float:
-        """Return a bound of the distance from the tip to the nearest point on the axis of a body, m."""
-        ...
-
-    def unreachable(self) -> tuple[str, ...]:
-        """Return in words the tip motions that no actuator can start at home."""
-        ...
-
-    def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:
+    def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:  # noqa: ARG002
         """Return nodes (R, S) and coefficients (R, S, 3) of rows over the displacements of points.
 
         Given are `points` (R, 4) and `coefficients` (R, 4, 3).
         """
-        ...
+        return points, coefficients
 
+    @abstractmethod
+    def deviation(self, start: Array, end: Array) -> float:
+        """Return a bound of how much nearer two points come than their chords do, m, where q moves straight."""
+
+    @abstractmethod
     def travel(self, motion: Array) -> float:
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
-        ...
 
+    @abstractmethod
+    def reach(self) -> Array:
+        """Return (N_c,) a bound of the distance from each base node to the tip in any pose, m."""
+
+    def hollow(self) -> float:
+        """Return a bound of the distance from the tip to the nearest point on the axis of a body, m."""
+        return 0.0
+
+    def unreachable(self) -> tuple[str, ...]:
+        """Return in words the tip motions that no actuator can start at home."""
+        return ()
+
+    @abstractmethod
     def describe(self) -> Description:
         """Return the arm's counts, and what they allow."""
-        ...
 
+    @abstractmethod
     def record(self) -> dict[str, Any]:
         """Return what verification needs to know of the arm, as JSON data."""
-        ...
 
+    @abstractmethod
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
         """Return the arrays of a result file that tell of configurations (T, ...) and quantities (T, M)."""
-        ...
 
-    def motion_rows(self, *values: Array) -> MotionRows:
-        """Return the rows from the values of ``ArmSymbols.motion``."""
-        ...
+
+class Kinematics:
+    """An arm at one configuration, in arrays that are overwritten by `evaluate`: its symbols as one compiled function.
+
+    Attributes
+    ----------
+    quantities : (M,)
+        Fixed and actuated quantities, in their units.
+    gradient : (M, Q, 3)
+        Of the quantities by the nodes they depend on, see ``Bays.member_nodes``; empty without bays.
+    station_rotation, station_spin : (F, 3, 3), (F, 3, 9)
+        Rotations of the stations, and their angular-velocity rows with respect to their nodes.
+    tip_rotation, tip_spin : (3, 3), (3, 3K)
+        The same for the end effector; identity and zeros where it has no frame.
+    """
+
+    def __init__(self, arm: Arm, *, compiled: bool) -> None:
+        self._arm, self._compiled = arm, compiled
+        self._kernel = self._function("arm", arm.stations).kernel(compiled=compiled)
+        self.quantities, self._motion, tip_rotation, tip_spin, *stations = self._kernel.outputs
+        members = 0 if arm.bays is None else arm.bays.member_count
+        self.gradient = self._motion.reshape(members, -1, 3) if members else np.zeros((0, 0, 3))
+        self.tip_rotation, self.tip_spin = tip_rotation.reshape(3, 3).T, tip_spin.reshape(-1, 3).T
+        rotations, spins = stations or (np.zeros(0), np.zeros(0))
+        self.station_rotation = rotations.reshape(-1, 3, 3).transpose(0, 2, 1)
+        self.station_spin = spins.reshape(-1, 9, 3).transpose(0, 2, 1)
+
+    def _function(self, name: str, stations: Stations | None) -> Bound:
+        """Return q -> quantities, motion, the tip's rotation and spin, and the same of `stations` if there are any."""
+        arm, constants = self._arm, Constants()
+        symbols, tip = arm.symbols(constants), arm.end_effector
+        q = ca.MX.sym("q", *symbols.shape)
+        X = symbols.nodes(q)
+        motion, _ = symbols.motion(q, q, ca.MX.zeros(*X.shape))
+        outputs = [symbols.quantities(q), motion, ca.MX.eye(3), ca.MX.zeros(3, 3 * len(tip.nodes))]
+        if tip.has_frame:
+            frame = Frames(arm.home[tip.nodes][None], tip.frame[None], tip.nodes[None], constants, "tip")
+            outputs[2:] = frame.at(X)
+        if stations:
+            at_home = arm.home[stations.nodes]
+            outputs += Frames(at_home, stations.frames, stations.nodes, constants, "station").at(X)
+        return constants.bound(name, [q], ca.cse(outputs))
+
+    def evaluate(self, q: Array) -> None:
+        """Overwrite every attribute with its value at the configuration `q`."""
+        self._kernel.inputs[0][:] = q.reshape(-1)
+        self._kernel()
+
+    @cached_property
+    def _without_stations(self) -> Kernel:
+        kernel = self._function("arm_without_stations", None).kernel(compiled=self._compiled)
+        for k in range(4):
+            kernel.bind_output(k, self._kernel.outputs[k])
+        return kernel
+
+    def evaluate_quantities(self, q: Array) -> None:
+        """Overwrite quantities, gradient and tip alone, at a quarter of the cost for a long arm."""
+        kernel = self._kernel if len(self._arm.stations) <= _FEW_STATIONS else self._without_stations
+        kernel.inputs[0][:] = q.reshape(-1)
+        kernel()
+
+    def motion(self) -> MotionRows:
+        """Return how the nodes move at the configuration evaluated last."""
+        return self._arm.motion_rows(self._motion.copy(), np.zeros(3 * len(self._arm.free)))
+
+
+def rank(values: NDArray[Any]) -> int:
+    """Return the rank that goes with singular values of a Jacobian."""
+    return int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
+
+
+def has_full_rank(rows: Array) -> bool:
+    """Whether the functions whose Jacobian this is can be changed one by one."""
+    return 0 < len(rows) <= rows.shape[1] and rank(np.linalg.svd(rows, compute_uv=False)) == len(rows)
+
+
+def or_none(limits: Array) -> list[float | None]:
+    """Return limits as JSON data, which has no infinity: None where there is none."""
+    return [limit if math.isfinite(limit) else None for limit in limits.tolist()]

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from vgtm_qp.arm.arm import Arm
 from vgtm_qp.arm.serial.arm import SerialArm
-from vgtm_qp.arm.serial.build import build_chain
 from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.build import LockError, build_truss
 from vgtm_qp.errors import Mistake, ProblemError
@@ -29,7 +28,7 @@ def make_arm(problem: Problem) -> Arm:
         mistakes = list(_beyond_serial(problem, problem.arm))
         if mistakes:
             raise ProblemError(str(problem.source or problem.name), mistakes)
-        return SerialArm(build_chain(problem.arm))
+        return SerialArm(problem.arm)
     assert problem.truss is not None
     try:
         return TrussArm(build_truss(problem.truss))

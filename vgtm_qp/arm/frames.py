@@ -66,17 +66,9 @@ def frame_tables(home: Array, rotations: Array) -> tuple[Array, Array, Array]:
     return cosines, sines, alignments.transpose(0, 2, 1).reshape(-1, 3)
 
 
-def frames_at(X: ca.MX, home: Array, rotations: Array, nodes: Index) -> list[ca.MX]:
-    """Return rotations (3, 3F) and spins (3, 3KF) of F frames of K nodes each, from all nodes `X` (3, N).
-
-    Parameters
-    ----------
-    home, rotations : (F, K, 3), (F, 3, 3)
-        Nodes and rotations at home, m.
-    nodes : (F, K) int
-    """
-    if not len(home):
-        return [ca.MX(0, 0), ca.MX(0, 0)]
-    function = frame_function(home.shape[1]).map(len(home))
-    arguments = (ca.DM(table.T) for table in frame_tables(home, rotations))
-    return list(function(X[:, nodes.reshape(-1).tolist()], *arguments))
+def frame_spins(X: Array, home: Array, rotations: Array, nodes: Index) -> Array:
+    """Return the spins (F, 3, 3K) of F frames of nodes (F, K), with `rotations` (F, 3, 3) at `home`; nodes (N, 3)."""
+    function = frame_function(nodes.shape[1]).map(len(nodes))
+    tables = (table.T for table in frame_tables(home[nodes], rotations))
+    _, spins = function(X[nodes].reshape(-1, 3).T, *tables)
+    return np.asarray(spins).reshape(3, len(nodes), -1).transpose(1, 0, 2)

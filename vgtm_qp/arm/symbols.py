@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +32,11 @@ class Constants:
         self.symbols.append(ca.MX.sym(name, *reversed(np.atleast_2d(value).shape)))
         self.values.append(np.ascontiguousarray(value, dtype=float).reshape(-1))
         return self.symbols[-1]
+
+    def bound(self, name: str, inputs: list[ca.MX], results: list[ca.MX]) -> Bound:
+        """Return the function of `inputs` and these constants that gives the `results`, dense."""
+        arguments = [*inputs, *self.symbols]
+        return Bound(ca.Function(name, arguments, [ca.densify(result) for result in results]), self.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +69,81 @@ class Frames:
         """Return rotations (3, 3F) and spins (3, 3KF) at positions (3, N)."""
         rotation, spin = self._function(X[:, self._columns], *self._arguments)
         return rotation, spin
+
+
+class ArmSymbols(ABC):
+    """An arm in CasADi's symbols: functions of a configuration of :attr:`shape`.
+
+    What is constant over a maneuver is an argument that is bound once, so that what is compiled depends on the
+    topology of the arm alone.
+
+    Attributes
+    ----------
+    shape : (int, int)
+    home : (M, 1)
+        Quantities at home.
+    given : list of int
+        Nodes whose displacement with the base is given; the others follow by the fixed quantities.
+    can_eliminate : bool
+        Whether :meth:`response`, :meth:`closed` and :meth:`held` are there: coordinates follow one after another.
+    """
+
+    shape: tuple[int, int]
+    given: list[int]
+
+    def __init__(self, home: Array, actuators: Index, constants: Constants) -> None:
+        self.home = constants.add("home", home)
+        self._actuators: list[int] = actuators.tolist()
+
+    @property
+    def can_eliminate(self) -> bool:
+        """See the class."""
+        return True
+
+    @abstractmethod
+    def nodes(self, q: Any) -> Any:
+        """Return (3, N) the nodes."""
+
+    @abstractmethod
+    def quantities(self, q: Any) -> Any:
+        """Return (M, 1) the quantities."""
+
+    @abstractmethod
+    def motion(self, q: Any, at: Any, moved: Any) -> list[Any]:
+        """Return what ``Arm.motion_rows`` takes: rows at `at`, residuals at `q`, base moving by `moved` (3, N)."""
+
+    @abstractmethod
+    def response(self, q: Any, at: Any, moved: Any) -> Any:
+        """Return [K, r] (3 (N - N_c), n_a + 1) with K at `at` and r from the residuals at `q`."""
+
+    @abstractmethod
+    def coordinates(self, nodes: Any, strokes: Any) -> Any:
+        """Return which of both moves the configuration: those of the nodes (3 (N - N_c), c), or strokes (n_a, c)."""
+
+    @abstractmethod
+    def along(self, q: Any, coordinates: Any) -> Any:
+        """Return the configuration after a displacement of :meth:`coordinates` (c,)."""
+
+    @abstractmethod
+    def closed(self, q: Any, lower: Any, upper: Any) -> Any:
+        """Return the configuration after one Newton step to the fixed quantities, actuators in their boxes (n_a,)."""
+
+    def aims(self, quantities: Any, lower: Any, upper: Any) -> Any:
+        """Return what quantities (M, 1) should be: as at home, or in their boxes (n_a,)."""
+        aims = self.home * 1.0
+        aims[self._actuators] = ca.fmax(lower, ca.fmin(upper, quantities[self._actuators]))
+        return aims
+
+    def error(self, quantities: Any, lower: Any, upper: Any) -> Any:
+        """Return the norm of what quantities (M, 1) are off, boxes (n_a,) included."""
+        return ca.norm_2(self.aims(quantities, lower, upper) - quantities)
+
+    def held(self, tracked: Sequence[int]) -> Callable[[Any, Any], Any] | None:  # noqa: ARG002
+        """Return the Newton step of a configuration whose `tracked` stations go to points (3, K) of the curve.
+
+        None where these and the fixed quantities do not determine the configuration, or not stage by stage.
+        """
+        return None
 
 
 def rotated(vector: Any) -> Any:

@@ -7,8 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.arm import ArmSymbols
-from vgtm_qp.arm.symbols import Bound, Constants, Frames
+from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants, Frames
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.rows import tip as tip_rows

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.rank import rank
+from vgtm_qp.arm.arm import rank
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
 from vgtm_qp.errors import Mistake
 from vgtm_qp.geometry.bodies import capsules

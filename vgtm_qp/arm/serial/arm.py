@@ -2,54 +2,135 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Label, MotionPattern, Pose, Stations, Tip
-from vgtm_qp.arm.record import or_none
-from vgtm_qp.arm.serial.chain import Array, Index, Mask, SerialChain
-from vgtm_qp.arm.serial.description import ChainDescription
-from vgtm_qp.arm.serial.kinematics import ChainKinematics, ChainRows
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, has_full_rank, or_none
+from vgtm_qp.arm.serial.chain import Array, SerialChain
 from vgtm_qp.arm.serial.symbols import ChainSymbols
 from vgtm_qp.arm.symbols import Constants
-from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies, capsules
-from vgtm_qp.rotation import vector_near
+from vgtm_qp.problem.arm import ArmTable
+from vgtm_qp.rotation import rotation_from_vector, turn_between, vector_near
 
 
-class SerialArm:
-    """See ``arm.Arm``; its nodes are the joints' origins, the tip, and two beside each station."""
+@dataclass(frozen=True)
+class ChainDescription:
+    """What `vgtm check` tells of a serial arm.
+
+    Attributes
+    ----------
+    joints, actuated, links, stations : int
+    length : float
+        Of the way from the base over the joints to the tip at home, m.
+    hard : bool
+        Whether all stations can keep their positions on the curve at home.
+    """
+
+    joints: int
+    actuated: int
+    links: int
+    stations: int
+    length: float
+    hard: bool
+
+    def __str__(self) -> str:
+        can = "can" if self.hard else "cannot"
+        return (
+            f"serial arm of {self.joints} joints, {self.actuated} of them actuated, {self.links} links, "
+            f"{self.length:.6g} m long\n"
+            f"{self.stations} stations track the curve; they {can} keep their positions on it exactly"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ChainRows:
+    """d_rho - K d_a = rhs; see ``arm.MotionRows``. `jacobian` is K."""
+
+    jacobian: Array
+    rhs: Array
+
+    @property
+    def values(self) -> Array:
+        return np.concatenate([np.ones(len(self.rhs)), -self.jacobian.reshape(-1)])
+
+    def response(self) -> tuple[Array, Array]:
+        """Return K and r."""
+        return self.jacobian, self.rhs
+
+
+class SerialArm(Arm):
+    """See ``arm.Arm``; joints of an ``[arm]`` table, of which those that are locked from the start are stuck at home.
+
+    Its nodes are those of ``SerialChain.functions``.
+    """
 
     kind = "serial"
     bays = None
     leaves_chords = True
 
-    def __init__(self, chain: SerialChain) -> None:
-        self.chain = chain
-        self.node_names, self.quantity_names = chain.node_names, chain.names
-        self.stroke, self.rate, self.acceleration = chain.limits, chain.rate, chain.acceleration
-        self.home_quantities, self.segments = chain.home, len(chain)
-        self.home_configuration = np.concatenate([chain.home, np.zeros(6)])
-        self.actuated: Mask = ~chain.locked
-        self.actuators, self.base, self.free = chain.actuators, chain.base, chain.free
-        self.actuator_units = tuple("rad" if chain.revolute[j] else "m" for j in self.actuators)
-        self._nodes = Kernel(chain.nodes, compiled=False)
-        for argument, part in enumerate(chain.geometry.values(), start=1):
-            self._nodes.inputs[argument][:] = part.reshape(-1)
-        self.home = chain.home_nodes
-        self.height = float(np.linalg.norm(np.diff(self.home[: len(chain) + 2], axis=0), axis=1).sum())
-        nodes, origin = chain.station_nodes, np.array([1.0, 0.0, 0.0])
-        trackable = ("position",) if chain.holds_origins(nodes[1:, 0]) else ()
-        weights = np.tile(origin, (len(nodes), 1))
-        self.stations = Stations(nodes, weights, chain.station_frames, trackable, word="joint")
-        self.end_effector = Tip(nodes[-1], origin, chain.station_frames[-1])
+    def __init__(self, spec: ArmTable) -> None:
+        joints, stuck = spec.joint, {lock.member for lock in spec.locked if lock.time == 0.0}
+        self.segments, self.quantity_names = len(joints), tuple(joint.name for joint in joints)
+        self.home_quantities = np.array([joint.home for joint in joints], dtype=float)
+        self.home_configuration = np.concatenate([self.home_quantities, np.zeros(6)])
+        self.actuated = np.array([joint.name not in stuck for joint in joints])
+        self.actuator_units = tuple(
+            "rad" if joint.kind == "revolute" else "m" for joint in joints if joint.name not in stuck
+        )
+        self.stroke = np.array([joint.limits or (-np.inf, np.inf) for joint in joints], dtype=float)
+        self.rate = _or_infinite([joint.rate for joint in joints])
+        self.acceleration = _or_infinite([joint.acceleration for joint in joints])
+        chain = SerialChain.of(spec)
+        self.chain = chain if spec.every else replace(chain, every=self._every(chain))
+        self._place_stations()
+        self.bodies = self._links(spec.link_radius)
 
-    @cached_property
-    def bodies(self) -> Bodies:
-        """Links between successive origins; those of joints in one place are joined as if they were one."""
+    def _every(self, chain: SerialChain) -> int:
+        """Return the least distance of stations, in joints, at which all of them can keep to the curve at once at home.
+
+        Where there is none, as at the straight home of a snake, there is a station for every three actuators.
+        """
+        joints, (_, jacobian) = len(chain), chain.at(self.home_configuration)
+        for every in range(1, joints + 1):
+            if self._can_hold(jacobian[[*range(1 + every, joints + 1, every), joints + 1]]):
+                return every
+        return -(-joints // max(1, len(self.actuators) // 3))
+
+    def _can_hold(self, jacobian: Array) -> bool:
+        """Whether nodes whose Jacobian (K, 3, J) this is can be held in place one by one."""
+        return has_full_rank(jacobian[:, :, self.actuators].reshape(3 * len(jacobian), len(self.actuators)))
+
+    def _place_stations(self) -> None:
+        """Find nodes and stations at home; the stations' z-axes lie along the arm."""
+        count, tracked = len(self.chain), self.chain.tracked
+        words = ["base", *(self.quantity_names[j] for j in tracked), "tip"]
+        beside = tuple(f"{word} {axis}" for word in words for axis in "xy")
+        self.node_names = ("base", *self.quantity_names, "tip", *beside)
+        self.home, jacobian = self.chain.at(self.home_configuration)
+        self.height = float(np.linalg.norm(np.diff(self.home[: count + 2], axis=0), axis=1).sum())
+        origins = np.array([0, *(1 + j for j in tracked), count + 1])
+        first = count + 2 + 2 * np.arange(len(origins))
+        nodes = np.column_stack([origins, first, first + 1])
+        self.base = np.isin(np.arange(len(self.home)), [0, 1, *nodes[0]])
+        self.free = np.flatnonzero(~self.base)
+        frames = [np.eye(3)]
+        for before, after in pairwise(self.home[origins]):
+            way = after - before
+            turn = turn_between(frames[-1][:, 2], way / np.linalg.norm(way))
+            frames.append(rotation_from_vector(turn) @ frames[-1])
+        weights = np.tile([1.0, 0.0, 0.0], (len(nodes), 1))
+        trackable = ("position",) if self._can_hold(jacobian[origins[1:]]) else ()
+        self.stations = Stations(nodes, weights, np.stack(frames), trackable, word="joint")
+        self.end_effector = Tip(nodes[-1], weights[-1], frames[-1])
+
+    def _links(self, radius: float) -> Bodies:
+        """Return links between successive origins; those of joints in one place are joined as if they were one."""
         chain, count = self.chain, len(self.chain)
         apart = (chain.lengths[1:] > 0.0) | ~chain.revolute
         place = np.arange(count + 2)
@@ -57,60 +138,44 @@ class SerialArm:
             place[node] = node if apart[node - 1] else place[node + 1]
         kept = np.flatnonzero(apart)
         points = np.stack([kept + 1, kept + 2], axis=1)
-        names = [chain.names[j] for j in kept]
-        return capsules(points, chain.radius, names, joints=place[points], kind="link")
+        names = [self.quantity_names[j] for j in kept]
+        return capsules(points, radius, names, joints=place[points], kind="link")
 
     @cached_property
     def motion_pattern(self) -> MotionPattern:
         """d_rho - K d_a, dense in the actuators."""
         rows, count = 3 * len(self.free), len(self.actuators)
-        grid = np.indices((rows, count)).reshape(2, -1)
+        grid, own = np.indices((rows, count)).reshape(2, -1), np.arange(rows)
         labels = tuple(
             Label(f"node: {self.node_names[n]} {axis}", "kinematics", "m")
             for n in self.free
             for axis in "xyz"
         )
-        every = np.arange(rows)
-        return MotionPattern(
-            np.concatenate([every, grid[0]]), np.concatenate([every, rows + grid[1]]), labels
-        )
+        return MotionPattern(np.concatenate([own, grid[0]]), np.concatenate([own, rows + grid[1]]), labels)
 
-    def nodes(self, q: Array) -> Array:
-        """See ``arm.Arm``."""
-        self._nodes.inputs[0][:] = q
-        self._nodes()
-        return self._nodes.outputs[0].reshape(-1, 3).copy()
+    def symbols(self, constants: Constants) -> ChainSymbols:
+        return ChainSymbols(self.chain, self.home_quantities, self.actuators, self.free, constants)
 
-    points = nodes
-
-    def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:  # noqa: ARG002
-        """See ``arm.Arm``: the points are the nodes."""
-        return points, coefficients
+    def motion_rows(self, *values: Array) -> ChainRows:
+        """See ``arm.Arm``: K column by column, and r."""
+        response, rhs = values
+        return ChainRows(response.reshape(len(self.actuators), len(rhs)).T, rhs)
 
     def measured(self, q: Array) -> Array:
-        """See ``arm.Arm``."""
         return np.array(q[:-6])
 
     def based(self, q: Array, pose: Pose) -> Array:
-        """See ``arm.Arm``."""
         return np.concatenate([q[:-6], pose.position, vector_near(pose.rotation, q[-3:])])
 
-    def carried(self, q: Array, before: Pose, after: Pose) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``: joints keep their values."""
-        return self.based(q, after)
-
     def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``."""
         q = q.copy()
         q[self.actuators] += strokes
         return q
 
     def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``."""
         return np.concatenate([q[:-6] + missing, q[-6:]])
 
     def travel(self, motion: Array) -> float:
-        """See ``arm.Arm``."""
         turn, slide = self._motions(motion)
         return float(turn @ self._reach + slide.sum() + np.abs(motion[-6:-3]).max(initial=0.0))
 
@@ -128,8 +193,11 @@ class SerialArm:
 
     @cached_property
     def _reach(self) -> Array:
-        """(J + 1,) reach beyond the base and beyond each joint, m."""
-        return np.concatenate([[self.chain.reach[0] + self.chain.lengths[0]], self.chain.reach])
+        """(J + 1,) bound of the distance from the base, and from each joint, to any node beyond it in any pose, m."""
+        chain = self.chain
+        slide = np.where(chain.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
+        beyond = np.cumsum((chain.lengths[1:] + slide)[::-1])[::-1] + np.sqrt(2.0) * chain.spread
+        return np.concatenate([[beyond[0] + chain.lengths[0]], beyond])
 
     def _motions(self, motion: Array) -> tuple[Array, Array]:
         """Return turns (J + 1,), rad, the base's first and counted twice, and slides (J + 1,), m."""
@@ -139,31 +207,13 @@ class SerialArm:
         return np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
 
     def reach(self) -> Array:
-        """See ``arm.Arm``."""
         return np.full(int(self.base.sum()), self._reach[0])
 
-    def hollow(self) -> float:
-        """See ``arm.Arm``: the tip is the end of the last link."""
-        return 0.0
-
-    def unreachable(self) -> tuple[str, ...]:
-        """See ``arm.Arm``."""
-        return ()
-
     def describe(self) -> ChainDescription:
-        """See ``arm.Arm``."""
         stations, hard = len(self.stations) - 1, "position" in self.stations.trackable
         return ChainDescription(
-            len(self.chain), len(self.actuators), len(self.bodies), stations, self.height, hard
+            self.segments, len(self.actuators), len(self.bodies), stations, self.height, hard
         )
-
-    def kinematics(self, *, compiled: bool = True) -> ChainKinematics:
-        """See ``arm.Arm``."""
-        return ChainKinematics(self.chain, compiled=compiled)
-
-    def symbols(self, constants: Constants) -> ChainSymbols:
-        """See ``arm.Arm``."""
-        return ChainSymbols(self.chain, constants)
 
     def record(self) -> dict[str, Any]:
         """See ``arm.Arm``.
@@ -176,15 +226,15 @@ class SerialArm:
         chain, bodies = self.chain, self.bodies
         return {
             "kind": self.kind,
-            "joint_names": list(chain.names),
+            "joint_names": list(self.quantity_names),
             "revolute": chain.revolute.tolist(),
             "axis": chain.axis.tolist(),
             "position": chain.position.tolist(),
             "rotation": chain.rotation.tolist(),
-            "home": chain.home.tolist(),
-            "stroke": [or_none(limits) for limits in chain.limits],
-            "rate": or_none(chain.rate),
-            "acceleration": or_none(chain.acceleration),
+            "home": self.home_quantities.tolist(),
+            "stroke": [or_none(limits) for limits in self.stroke],
+            "rate": or_none(self.rate),
+            "acceleration": or_none(self.acceleration),
             "actuated": self.actuated.tolist(),
             "tip": chain.tip.tolist(),
             "tip_frame": self.end_effector.frame.tolist(),
@@ -196,10 +246,9 @@ class SerialArm:
 
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:  # noqa: ARG002
         """See ``arm.Arm``: the base's pose follows from the problem."""
-        names = {"joint_names": np.array(self.chain.names), "body_names": np.array(self.bodies.names)}
+        names = {"joint_names": np.array(self.quantity_names), "body_names": np.array(self.bodies.names)}
         return {"joints": quantities, **names}
 
-    def motion_rows(self, *values: Array) -> ChainRows:
-        """See ``arm.Arm``: K column by column, and r."""
-        response, rhs = values
-        return ChainRows(response.reshape(len(self.actuators), -1).T, rhs)
+
+def _or_infinite(limits: Sequence[float | None]) -> Array:
+    return np.array([np.inf if limit is None else limit for limit in limits])

@@ -8,110 +8,38 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
-from vgtm_qp.arm.record import or_none
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, or_none
 from vgtm_qp.arm.symbols import Constants
-from vgtm_qp.arm.truss.chords import chord_deviation
-from vgtm_qp.arm.truss.kinematics import EndKinematics, TrussKinematics
-from vgtm_qp.arm.truss.lengths import LengthRows
+from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_ways
+from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
-from vgtm_qp.arm.truss.reach import hollow, longest_ways
 from vgtm_qp.arm.truss.symbols import TrussSymbols
-from vgtm_qp.arm.truss.truss import Array, Index, Mask, Truss
+from vgtm_qp.arm.truss.truss import Array, Index, Truss
 from vgtm_qp.errors import TrussError
-from vgtm_qp.geometry.bodies import Bodies, capsules
+from vgtm_qp.geometry.bodies import capsules
 
 
-class TrussArm:
+class TrussArm(Arm):
     """See ``arm.Arm``."""
 
     def __init__(self, truss: Truss) -> None:
-        self.truss = truss
-        self.kind = truss.module
+        self.truss = self.bays = truss
+        self.kind, self.segments = truss.module, truss.bays
         self.leaves_chords = truss.joints is not None
-
-    @property
-    def node_names(self) -> tuple[str, ...]:
-        """Length N."""
-        return self.truss.node_names
-
-    @property
-    def home(self) -> Array:
-        """(N, 3) nodes at home, m."""
-        return self.truss.home
-
-    @property
-    def home_configuration(self) -> Array:
-        """(N, 3) nodes at home, m."""
-        return self.truss.home
-
-    @property
-    def base(self) -> Mask:
-        """(N,) nodes that only the base moves."""
-        return self.truss.base
-
-    @property
-    def free(self) -> Index:
-        """(N - N_c,) the others in stage order."""
-        return self.truss.free
-
-    @property
-    def quantity_names(self) -> tuple[str, ...]:
-        """Names of the members."""
-        return self.truss.member_names
-
-    @property
-    def actuated(self) -> Mask:
-        """(M,) members that change their length."""
-        return self.truss.actuated
-
-    @property
-    def actuators(self) -> Index:
-        """(n_a,) their indices."""
-        return self.truss.actuators
-
-    @property
-    def actuator_units(self) -> tuple[str, ...]:
-        """Metres."""
-        return ("m",) * len(self.truss.actuators)
-
-    @property
-    def stroke(self) -> Array:
-        """(M, 2) least and greatest lengths, m."""
-        return self.truss.stroke
-
-    @property
-    def rate(self) -> Array:
-        """(M,) m/s."""
-        return self.truss.rate
-
-    @property
-    def acceleration(self) -> Array:
-        """(M,) m/s^2."""
-        return self.truss.acceleration
-
-    @property
-    def home_quantities(self) -> Array:
-        """(M,) lengths at home, m."""
-        return self.truss.home_lengths
-
-    @property
-    def height(self) -> float:
-        """Length of the axis at home, m."""
-        return self.truss.height
-
-    @cached_property
-    def stations(self) -> Stations:
-        """The faces."""
-        truss = self.truss
-        return Stations(
+        self.node_names, self.quantity_names = truss.node_names, truss.member_names
+        self.home = self.home_configuration = truss.home
+        self.base, self.free = truss.base, truss.free
+        self.home_quantities, self.height = truss.home_lengths, truss.height
+        self.actuated, self.actuator_units = truss.actuated, ("m",) * len(truss.actuators)
+        self.stroke, self.rate, self.acceleration = truss.stroke, truss.rate, truss.acceleration
+        self.stations = Stations(
             truss.faces, truss.face_weights, truss.face_frames, truss.trackable, truss.face_stride
         )
-
-    @cached_property
-    def end_effector(self) -> Tip:
-        """The tip's nodes."""
-        return Tip(self.truss.tip, self.truss.tip_weights, self.truss.tip_frame)
+        self.end_effector = Tip(truss.tip, truss.tip_weights, truss.tip_frame)
+        # Members end in their nodes or, in offset joints, in points of their own.
+        ends = truss.members if truss.joints is None else np.arange(2 * truss.member_count).reshape(-1, 2)
+        self.bodies = capsules(ends, truss.radius, truss.member_names, joints=truss.members)
+        self._first, self._last = np.ascontiguousarray(ends.T)
 
     @cached_property
     def motion_pattern(self) -> MotionPattern:
@@ -128,39 +56,26 @@ class TrussArm:
             np.concatenate([scatter.member, truss.actuators]), np.concatenate([scatter.column, own]), labels
         )
 
-    @property
-    def bays(self) -> Truss:
-        """The truss itself."""
-        return self.truss
-
     def nodes(self, q: Array) -> Array:
         """Return the configuration itself."""
         return q
 
     def measured(self, q: Array) -> Array:
         """See ``arm.Arm``: the distances of the members' ends."""
-        points, (first, last) = self.points(q), self._ends_of_bodies
-        way = points.take(first, axis=0) - points.take(last, axis=0)
+        points = self.points(q)
+        way = points.take(self._first, axis=0) - points.take(self._last, axis=0)
         return np.asarray(np.sqrt(np.einsum("mc,mc->m", way, way)))
 
-    @cached_property
-    def _ends_of_bodies(self) -> Array:
-        return np.ascontiguousarray(self.bodies.points.T)
-
     def based(self, q: Array, pose: Pose) -> Array:
-        """See ``arm.Arm``."""
         return np.where(self.truss.base[:, None], self.truss.home @ pose.rotation.T + pose.position, q)
 
     def carried(self, q: Array, before: Pose, after: Pose) -> Array:
-        """See ``arm.Arm``."""
         return before.carry(q, after)
 
     def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``."""
         return q + nodes
 
     def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
-        """See ``arm.Arm``."""
         q = q.copy()
         q[self.truss.free] += solve()
         return q
@@ -171,9 +86,9 @@ class TrussArm:
 
     def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:
         """See ``arm.Arm``: an end in an offset joint is moved by the three nodes that orient that."""
-        if self._ends is None:
-            return points, coefficients
         ends, (count, slots) = self._ends, points.shape
+        if ends is None:
+            return points, coefficients
         ends.evaluate(q)
         member, end = points >> 1, points & 1
         by_nodes = np.einsum("rsc,rscn->rsn", coefficients, ends.jacobian[member, end])
@@ -181,53 +96,30 @@ class TrussArm:
 
     @cached_property
     def _ends(self) -> EndKinematics | None:
-        return None if self.truss.joints is None else EndKinematics(self.truss)
+        truss = self.truss
+        return None if truss.joints is None else EndKinematics(truss.members, truss.joints)
 
     def travel(self, motion: Array) -> float:
-        """See ``arm.Arm``."""
         return float(np.abs(motion).max())
 
     def reach(self) -> Array:
-        """See ``arm.Arm``."""
-        tip = self.end_effector
-        return np.asarray(
-            longest_ways(self.truss, np.flatnonzero(self.truss.base))[:, tip.nodes] @ np.abs(tip.weights)
-        )
+        ways, tip = longest_ways(self.truss, np.flatnonzero(self.base)), self.end_effector
+        return np.asarray(ways[:, tip.nodes] @ np.abs(tip.weights))
 
     def hollow(self) -> float:
-        """See ``arm.Arm``."""
         return hollow(self.truss)
 
     def unreachable(self) -> tuple[str, ...]:
-        """See ``arm.Arm``."""
         return describe(self.truss).unreachable
 
     def deviation(self, start: Array, end: Array) -> float:
         """See ``arm.Arm``: offset joints turn on the way."""
         return 2.0 * chord_deviation(self.truss, start, end)
 
-    @property
-    def segments(self) -> int:
-        """Number of bays."""
-        return self.truss.bays
-
-    @cached_property
-    def bodies(self) -> Bodies:
-        """The members, between their nodes or, in offset joints, between ends of their own."""
-        truss = self.truss
-        points = truss.members if truss.joints is None else np.arange(2 * truss.member_count).reshape(-1, 2)
-        return capsules(points, truss.radius, truss.member_names, joints=truss.members)
-
-    def kinematics(self, *, compiled: bool = True) -> TrussKinematics:
-        """See ``arm.Arm``."""
-        return TrussKinematics(self.truss, compiled=compiled)
-
     def symbols(self, constants: Constants) -> TrussSymbols:
-        """See ``arm.Arm``."""
         return TrussSymbols(self.truss, constants)
 
     def describe(self) -> TrussDescription:
-        """See ``arm.Arm``."""
         return describe(self.truss)
 
     def record(self) -> dict[str, Any]:
@@ -238,10 +130,7 @@ class TrussArm:
         ``radius`` (M), ``tip`` (``nodes``, ``weights``, ``frame`` at home) and ``joints`` (``triangle``, ``offset``,
         see ``truss.Joints``; None for pin joints). Lengths in m; None means no limit.
         """
-        truss = self.truss
-        joints = truss.joints
-        ends = truss.home[truss.members]
-        pin_lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+        truss, joints = self.truss, self.truss.joints
         return {
             "module": truss.module,
             "bays": truss.bays,
@@ -250,7 +139,7 @@ class TrussArm:
             "base": np.flatnonzero(truss.base).tolist(),
             "member_names": list(truss.member_names),
             "actuated": truss.actuated.tolist(),
-            "length": (pin_lengths if joints is None else truss.home_lengths).tolist(),
+            "length": truss.home_lengths.tolist(),
             "stroke": truss.stroke.tolist(),
             "rate": or_none(truss.rate),
             "acceleration": or_none(truss.acceleration),
@@ -266,7 +155,6 @@ class TrussArm:
         }
 
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
-        """See ``arm.Arm``."""
         return {
             "nodes": q,
             "members": self.truss.members,

@@ -7,35 +7,24 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from vgtm_qp.arm.truss import modules
-from vgtm_qp.arm.truss.assembly import Limits
 from vgtm_qp.arm.truss.graph import truss_from_graph
-from vgtm_qp.arm.truss.plate import plate
-from vgtm_qp.arm.truss.truss import Array, Truss
+from vgtm_qp.arm.truss.modules import plate, stacked, tetrahedral
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.errors import TrussError, nearest
 from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, PlateTruss, TetrahedralTruss
-
-_MODULES = {
-    "octahedral": modules.octahedral,
-    "double-octahedral": modules.double_octahedral,
-    "hexapod": modules.hexapod,
-    "longeron": modules.longeron,
-}
 
 
 class LockError(TrussError):
     """Locked members are not actuated ones; `wrong` has place in the list, name and expectation of each."""
 
     def __init__(self, wrong: Sequence[tuple[int, str, str]]) -> None:
-        self.wrong = tuple(wrong)
-        super().__init__(
-            "\n".join(
-                f'locked[{place}]: found "{name}"; expected {expected}' for place, name, expected in wrong
-            )
-        )
+        super().__init__(wrong)
+        self.wrong = wrong
 
-    def __reduce__(self) -> tuple[type[LockError], tuple[tuple[tuple[int, str, str], ...]]]:
-        return type(self), (self.wrong,)
+    def __str__(self) -> str:
+        return "\n".join(
+            f'locked[{place}]: found "{name}"; expected {expected}' for place, name, expected in self.wrong
+        )
 
 
 def build_truss(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
@@ -54,29 +43,17 @@ def build_truss(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) 
         A locked member is not an actuated one.
     """
     truss = _unlocked(spec)
-    names = [lock.member for lock in spec.locked]
-    _check_actuated(truss, names)
+    _check_actuated(truss, [lock.member for lock in spec.locked])
     return lock_members(truss, [lock.member for lock in spec.locked if lock.time == 0.0])
 
 
-def lock_members(truss: Truss, names: Iterable[str], X: Array | None = None) -> Truss:
-    """Return the truss with actuated members fixed at their length at node positions `X` (N, 3), or home.
-
-    Raises
-    ------
-    LockError
-        A name is not that of an actuated member.
-    """
-    names = list(names)
-    if not names:
-        return truss
-    _check_actuated(truss, names)
-    locked = np.array([truss.member(name) for name in names])
-    ends = truss.member_ends(truss.home if X is None else X)[locked]
+def lock_members(truss: Truss, names: Iterable[str]) -> Truss:
+    """Return the truss with actuated members fixed at their home length."""
+    locked = np.array([truss.member(name) for name in names], dtype=np.int64)
     actuated, stroke = truss.actuated.copy(), truss.stroke.copy()
     rate, acceleration = truss.rate.copy(), truss.acceleration.copy()
     actuated[locked] = False
-    stroke[locked] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[:, None]
+    stroke[locked] = truss.home_lengths[locked, None]
     rate[locked] = acceleration[locked] = np.inf
     return dataclasses.replace(truss, actuated=actuated, stroke=stroke, rate=rate, acceleration=acceleration)
 
@@ -84,23 +61,12 @@ def lock_members(truss: Truss, names: Iterable[str], X: Array | None = None) -> 
 def _unlocked(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
     if isinstance(spec, GraphTruss):
         return truss_from_graph(spec)
-    limits = Limits(
-        stroke=spec.stroke,
-        rate=spec.rate,
-        acceleration=spec.acceleration,
-        member_radius=spec.member_radius,
-        joint_offset=spec.joint_offset,
-    )
     if isinstance(spec, PlateTruss):
-        return plate(spec.rows, spec.columns, spacing=spec.spacing, depth=spec.depth, **limits)
-    if isinstance(spec, TetrahedralTruss):
-        return modules.tetrahedral(
-            spec.bays, longeron=spec.longeron, batten=spec.batten, actuated=spec.actuated, **limits
-        )
-    return _MODULES[spec.module](spec.bays, longeron=spec.longeron, batten=spec.batten, **limits)
+        return plate(spec)
+    return tetrahedral(spec) if isinstance(spec, TetrahedralTruss) else stacked(spec)
 
 
-def _check_actuated(truss: Truss, names: Iterable[str]) -> None:
+def _check_actuated(truss: Truss, names: Sequence[str]) -> None:
     actuated = [truss.member_names[k] for k in truss.actuators]
     some = f"{', '.join(actuated[:6])}{', ...' if len(actuated) > 6 else ''}"
     wrong = []

@@ -6,14 +6,15 @@ stress.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import qr
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
+from vgtm_qp.arm.truss.kinematics import length_gradients
 from vgtm_qp.arm.truss.truss import Array, Truss
 from vgtm_qp.errors import TrussError
 
@@ -59,30 +60,11 @@ def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
     X : (N, 3), optional
         Node positions, m; home if not given.
     """
-    X = truss.home if X is None else np.asarray(X, dtype=np.float64)
-    if truss.joints is None:
-        nodes = truss.members
-        direction = X[nodes[:, 0]] - X[nodes[:, 1]]
-        direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-        gradient = np.stack([direction, -direction], axis=1)
-    else:
-        from vgtm_qp.arm.truss.kinematics import TrussKinematics
-
-        kinematics = TrussKinematics(truss, compiled=False)
-        kinematics.evaluate(X)
-        nodes, gradient = truss.member_nodes, kinematics.gradient
-    column = np.full(truss.node_count, -1, dtype=np.int64)
-    column[truss.free] = np.arange(len(truss.free))
-    rows = np.broadcast_to(np.arange(truss.member_count)[:, None, None], gradient.shape)
-    columns = 3 * column[nodes][:, :, None] + np.arange(3)
-    unknown = np.broadcast_to((column[nodes] >= 0)[:, :, None], gradient.shape)
-    shape = (truss.member_count, 3 * len(truss.free))
-    return sparse.csc_array((gradient[unknown], (rows[unknown], columns[unknown])), shape=shape)
+    X = truss.home if X is None else X
+    return sparse.csc_array(truss.scatter.sparse(length_gradients(truss, X)))
 
 
-def check_determinacy(
-    truss: Truss, X: Array | None = None, J: sparse.sparray | Array | None = None
-) -> DeterminacyReport:
+def check_determinacy(truss: Truss, X: Array | None = None) -> DeterminacyReport:
     """Return the report of a statically determinate truss; refuse any other.
 
     Parameters
@@ -91,8 +73,6 @@ def check_determinacy(
         Its stages need not be set.
     X : (N, 3), optional
         Node positions, m; home if not given.
-    J : (M, 3 (N - N_c)), optional
-        Length Jacobian in the place of :func:`length_jacobian` at `X`.
 
     Raises
     ------
@@ -100,7 +80,7 @@ def check_determinacy(
         The number of members is not 3 (N - N_c) or the length Jacobian is singular. The message names the
         nodes of a free motion with their directions, and the members of a state of self-stress.
     """
-    matrix = sparse.csc_array(length_jacobian(truss, X) if J is None else J)
+    matrix = length_jacobian(truss, X)
     members, coordinates = matrix.shape
     if coordinates == 0:
         raise TrussError("every node is fixed: nothing can move; expected at least one node that is not")
@@ -141,10 +121,13 @@ def _refusal(truss: Truss, J: sparse.csc_array) -> str:
         "statically determinate is as many of both and no free motion"
     ]
     if motions.shape[1]:
-        names = _name_motion(truss, _localised(motions).reshape(-1, 3))
+        motion = _localised(motions).reshape(-1, 3)
+        size = np.linalg.norm(motion, axis=1)
+        free = [truss.node_names[i] for i in truss.free]
+        names = _largest(size, "nodes", lambda i: f"node {free[i]} along {in_words(motion[i] / size[i])}")
         parts.append(f"{motions.shape[1]} free motion(s), one of them {names}: a member has to hinder it")
     if stresses.shape[1]:
-        names = _name_members(truss, _localised(stresses))
+        names = _largest(np.abs(_localised(stresses)), "members", truss.member_names.__getitem__)
         parts.append(f"{stresses.shape[1]} redundant member(s), one of them among {names}: it has to go")
     return ". ".join(parts)
 
@@ -179,28 +162,16 @@ def _localised(basis: Array) -> Array:
     return np.asarray(echelon[:, np.argmin(np.count_nonzero(np.abs(echelon) > 1e-6, axis=0))])
 
 
-def _name_motion(truss: Truss, motion: Array) -> str:
-    size = np.linalg.norm(motion, axis=1)
-    order = [int(i) for i in _from_largest(size) if size[i] > 1e-6 * size.max()]
-    names = [f"node {truss.node_names[truss.free[i]]} along {_direction(motion[i])}" for i in order[:_NAMED]]
-    return _listed(names, len(order), "nodes")
+def _largest(size: Array, what: str, name: Callable[[int], str]) -> str:
+    """Return the names of what is greatest in `size` (K,); what differs by rounding alone stays in order."""
+    greatest = float(size.max())
+    order = np.argsort(-np.round(size / greatest, 9), kind="stable")
+    order = order[size[order] > 1e-6 * greatest]
+    more = f" and {len(order) - _NAMED} more {what}" if len(order) > _NAMED else ""
+    return ", ".join(name(k) for k in order[:_NAMED].tolist()) + more
 
 
-def _direction(vector: Array) -> str:
-    unit = np.round(vector / np.linalg.norm(vector), 3) + 0.0
-    return f"({unit[0]:g}, {unit[1]:g}, {unit[2]:g})"
-
-
-def _name_members(truss: Truss, stress: Array) -> str:
-    order = [int(k) for k in _from_largest(np.abs(stress)) if abs(stress[k]) > 1e-6]
-    return _listed([truss.member_names[k] for k in order[:_NAMED]], len(order), "members")
-
-
-def _listed(names: list[str], count: int, what: str) -> str:
-    more = f" and {count - len(names)} more {what}" if count > len(names) else ""
-    return ", ".join(names) + more
-
-
-def _from_largest(size: Array) -> NDArray[np.int64]:
-    """Return the indices of `size` (K,) from the largest on; what differs by rounding alone stays in order."""
-    return np.argsort(-np.round(size / max(float(size.max(initial=0.0)), 1e-300), 9), kind="stable")
+def in_words(vector: Array) -> str:
+    """Return ``"(x, y, z)"`` to three decimals."""
+    x, y, z = np.round(vector, 3) + 0.0
+    return f"({x:g}, {y:g}, {z:g})"

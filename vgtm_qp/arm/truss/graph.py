@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import sparse
@@ -15,50 +14,12 @@ from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
 from vgtm_qp.arm.truss.joints import Joints, axial_joints, joint_triangles
 from vgtm_qp.arm.truss.mobility import trackable_coordinates
 from vgtm_qp.arm.truss.stages import placement_stages
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Array, Index, Truss, check_stroke
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import GraphTruss, Member
 
 _LENGTH_SLACK = 1e-3
 """Positions this near, as a fraction, to the given lengths are corrected to them: rounded, not mistaken."""
-
-
-def graph_truss(
-    nodes: Sequence[Mapping[str, Any]],
-    members: Sequence[Mapping[str, Any]],
-    tip: Iterable[str],
-    faces: Iterable[Iterable[str]] = (),
-    **more: Any,
-) -> Truss:
-    """Build a truss from plain tables, the same as those of a problem file.
-
-    Parameters
-    ----------
-    nodes : sequence of mappings
-        ``name``, ``position`` (m), ``fixed`` and ``joint``.
-    members : sequence of mappings
-        ``name``, ``nodes`` (two names), ``actuated``, ``length``, ``stroke``, ``rate``, ``acceleration``,
-        ``radius`` and ``offsets``.
-    tip : names
-        Nodes whose centroid is the end effector; three or more have a frame too.
-    faces : triples of names
-        What a curve's nodes are tracked by, the base face first.
-    **more
-        The other keys of ``[truss]``: ``stroke``, ``rate``, ``acceleration``, ``member_radius``,
-        ``joint_offset``.
-
-    Raises
-    ------
-    ProblemError
-        The tables contradict themselves: one mistake for each.
-    TrussError
-        As :func:`truss_from_graph`.
-    """
-    tables = {"node": tuple(nodes), "member": tuple(members), "tip": tuple(tip)}
-    spec = GraphTruss.model_validate(
-        {"module": "graph", **tables, "faces": tuple(tuple(face) for face in faces), **more}
-    )
-    return truss_from_graph(spec)
 
 
 def truss_from_graph(spec: GraphTruss) -> Truss:
@@ -249,10 +210,6 @@ def _strokes(spec: GraphTruss, truss: Truss) -> Array:
             raise TrussError(
                 f"actuated member {member.name} has no stroke; expected one of its own or of the truss"
             )
-        if not stroke[0] - 1e-9 <= lengths[k] <= stroke[1] + 1e-9:
-            raise TrussError(
-                f"the home length of member {member.name}, {lengths[k]:g} m, is outside its stroke "
-                f"[{stroke[0]:g}, {stroke[1]:g}] m"
-            )
+        check_stroke(member.name, lengths[k], stroke)
         strokes[k] = stroke
     return strokes

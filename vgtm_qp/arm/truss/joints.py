@@ -37,8 +37,7 @@ class Joints:
 
 def axial_joints(home: Array, members: Index, triangle: Index, offset: Array) -> Joints:
     """Return joints whose members end `offset` (M, 2), m, from their nodes, on the members' axes at home."""
-    direction = home[members[:, 1]] - home[members[:, 0]]
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = _unit(home[members[:, 1]] - home[members[:, 0]])
     outward = np.stack([direction, -direction], axis=1) * offset[:, :, None]
     frames = joint_frames(home, triangle)
     return Joints(triangle, np.einsum("mexy,mex->mey", frames[members], outward))
@@ -47,13 +46,8 @@ def axial_joints(home: Array, members: Index, triangle: Index, offset: Array) ->
 def joint_frames(X: Array, triangle: Index) -> Array:
     """Return (N, 3, 3) joint rotations: z the triangle's normal, x its outward bisector at the node."""
     corner = X[triangle]
-    first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    first = first / np.linalg.norm(first, axis=1, keepdims=True)
-    second = second / np.linalg.norm(second, axis=1, keepdims=True)
-    z = np.cross(first, second)
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
-    x = -(first + second)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    first, second = _unit(corner[:, 1] - corner[:, 0]), _unit(corner[:, 2] - corner[:, 0])
+    z, x = _unit(np.cross(first, second)), _unit(-(first + second))
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
@@ -128,3 +122,7 @@ def _normal(home: Array, i: int, a: int, b: int) -> tuple[Array, float]:
     first, second = home[a] - home[i], home[b] - home[i]
     normal = np.cross(first, second) / (np.linalg.norm(first) * np.linalg.norm(second))
     return normal, float(np.linalg.norm(normal))
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -1,21 +1,20 @@
-"""Kinematics of a truss by CasADi: lengths, face frames, tip pose and their Jacobians (paper, section 3.3).
-
-One member and one face are written as CasADi graphs, differentiated by CasADi, mapped over the truss and compiled.
-"""
+"""Lengths of members and their gradients by CasADi, one member mapped over the truss; how nodes follow."""
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import casadi as ca
 import numpy as np
+from scipy.sparse.linalg import splu
 
-from vgtm_qp.arm.frames import frames_at
-from vgtm_qp.arm.truss.joints import Array
-from vgtm_qp.arm.truss.lengths import LengthRows
+from vgtm_qp.arm.truss.joints import Array, Index, Joints
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.errors import TrussError
+from vgtm_qp.errors import SolverError
+
+_DENSE = 150
+"""Up to so many node coordinates LAPACK is faster than any use of the structure."""
+
+_SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
 
 def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:
@@ -23,13 +22,13 @@ def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:
 
     z is the triangle's normal, x the outward bisector of the two members that meet at the node.
     """
-    to_first = (first - node) / ca.norm_2(first - node)
-    to_second = (second - node) / ca.norm_2(second - node)
-    z = ca.cross(to_first, to_second)
-    z /= ca.norm_2(z)
-    x = -(to_first + to_second)
-    x /= ca.norm_2(x)
+    to_first, to_second = _unit(first - node), _unit(second - node)
+    z, x = _unit(ca.cross(to_first, to_second)), _unit(-(to_first + to_second))
     return ca.horzcat(x, ca.cross(z, x), z)
+
+
+def _unit(vector: ca.SX) -> ca.SX:
+    return vector / ca.norm_2(vector)
 
 
 def member_function(truss: Truss) -> ca.Function:
@@ -43,16 +42,22 @@ def member_function(truss: Truss) -> ca.Function:
         length = ca.norm_2(nodes[:, 0] - nodes[:, 1])
         return ca.Function("member", [nodes], [length, ca.gradient(length, nodes)])
     nodes, offsets = ca.SX.sym("nodes", 3, 6), ca.SX.sym("offsets", 3, 2)
-    ends = [
-        nodes[:, 3 * e] + joint_frame(*(nodes[:, 3 * e + c] for c in range(3))) @ offsets[:, e]
-        for e in range(2)
-    ]
-    length = ca.norm_2(ends[0] - ends[1])
+    length = ca.norm_2(_end(nodes[:, :3], offsets[:, 0]) - _end(nodes[:, 3:], offsets[:, 1]))
     return ca.Function("member", [nodes, offsets], [length, ca.gradient(length, nodes)])
 
 
-_FEW_FACES = 20
-"""Another compiled function without the faces does not pay for so few."""
+def length_gradients(truss: Truss, X: Array) -> Array:
+    """Return (M, Q, 3) the gradients of the lengths by the nodes of ``Truss.member_nodes`` at positions `X` (N, 3)."""
+    arguments = [X[truss.member_nodes].reshape(-1, 3).T]
+    if truss.joints is not None:
+        arguments.append(truss.joints.offset.reshape(-1, 3).T)
+    _, gradients = member_function(truss).map(truss.member_count)(*arguments)
+    return np.asarray(gradients).T.reshape(truss.member_count, -1, 3)
+
+
+def _end(corners: ca.SX, offset: ca.SX) -> ca.SX:
+    """Return a member's end at `offset` (3,) in the joint at `corners` (3, 3), see ``joints.joint_ends``."""
+    return corners[:, 0] + joint_frame(*ca.horzsplit(corners)) @ offset
 
 
 class EndKinematics:
@@ -68,16 +73,13 @@ class EndKinematics:
         d end / d (positions of ``nodes``).
     """
 
-    def __init__(self, truss: Truss, *, compiled: bool = True) -> None:
-        if truss.joints is None:
-            raise TrussError("this truss has pin joints: its members end in the nodes")
-        self.nodes = truss.joints.triangle[truss.members]
+    def __init__(self, members: Index, joints: Joints, *, compiled: bool = True) -> None:
+        self.nodes = joints.triangle[members]
         corners, offset = ca.SX.sym("corners", 3, 3), ca.SX.sym("offset", 3)
-        end = corners[:, 0] + joint_frame(*(corners[:, c] for c in range(3))) @ offset
+        end = _end(corners, offset)
         one = ca.Function("end", [corners, offset], [end, ca.densify(ca.jacobian(end, ca.vec(corners)))])
-        count = 2 * truss.member_count
-        self._kernel = Kernel(one.map(count), compiled=compiled)
-        self._kernel.inputs[1][:] = truss.joints.offset.reshape(-1)
+        self._kernel = Kernel(one.map(2 * len(members)), compiled=compiled)
+        self._kernel.inputs[1][:] = joints.offset.reshape(-1)
         self.ends = self._kernel.outputs[0].reshape(-1, 2, 3)
         self.jacobian = self._kernel.outputs[1].reshape(-1, 2, 9, 3).transpose(0, 1, 3, 2)
 
@@ -87,70 +89,43 @@ class EndKinematics:
         self._kernel()
 
 
-class TrussKinematics:
-    """A truss at one configuration, in arrays that are overwritten by `evaluate`; see ``arm.Kinematics``.
+class LengthRows:
+    """J d_rho - E d_a = rhs, eqs. (22)-(24) with the actuated members beside the fixed ones; see ``arm.MotionRows``.
 
     Attributes
     ----------
-    quantities : (M,)
-        Member lengths, m.
     gradient : (M, Q, 3)
-        d length / d (positions of ``Truss.member_nodes``).
-    station_rotation, station_spin : (F, 3, 3), (F, 3, 9)
-        Face frames and their angular-velocity rows with respect to the face's nodes.
-    tip_rotation, tip_spin : (3, 3), (3, 3K)
-        The same for the end effector; identity and zeros where the tip has fewer than three nodes.
+    rhs : (M,)
+        m.
     """
 
-    def __init__(self, truss: Truss, *, compiled: bool = True) -> None:
-        self.truss = truss
-        self._compiled = compiled
-        self._kernel = Kernel(_whole(truss), compiled=compiled)
-        outputs = self._kernel.outputs
-        members, faces, tips = truss.member_count, len(truss.faces), len(truss.tip)
-        has_tip_frame = tips >= 3
-        self.quantities = outputs[0]
-        self.gradient = outputs[1].reshape(members, -1, 3)
-        self.station_rotation = outputs[2].reshape(faces, 3, 3).transpose(0, 2, 1)
-        self.station_spin = outputs[3].reshape(faces, 9, 3).transpose(0, 2, 1)
-        self.tip_rotation = outputs[4].reshape(3, 3).T if has_tip_frame else np.eye(3)
-        self.tip_spin = outputs[5].reshape(3 * tips, 3).T if has_tip_frame else np.zeros((3, 3 * tips))
+    def __init__(self, truss: Truss, gradient: Array, rhs: Array) -> None:
+        self.truss, self.gradient, self.rhs = truss, gradient, rhs
 
-    def evaluate(self, X: Array) -> None:
-        """Overwrite every attribute with its value at node positions `X` (N, 3), m."""
-        self._kernel.inputs[0][:] = X.reshape(-1)
-        self._kernel()
+    @property
+    def values(self) -> Array:
+        truss = self.truss
+        gradients = self.gradient.reshape(-1)[truss.scatter.flat]
+        return np.concatenate([gradients, np.full(len(truss.actuators), -1.0)])
 
-    @cached_property
-    def _without_faces(self) -> Kernel:
-        """The same without the faces, writing to the same arrays."""
-        kernel = Kernel(_whole(self.truss, faces=False), compiled=self._compiled)
-        for k in (0, 1, 4, 5):
-            kernel.bind_output(k, self._kernel.outputs[k])
-        return kernel
+    def jacobian(self) -> Array:
+        """Return the dense length Jacobian (M, 3 (N - N_c))."""
+        return self.truss.scatter.dense(self.gradient)
 
-    def evaluate_quantities(self, X: Array) -> None:
-        """Overwrite lengths, gradient and tip alone, at a quarter of the cost for a long arm; `X` (N, 3), m."""
-        kernel = self._kernel if len(self.truss.faces) <= _FEW_FACES else self._without_faces
-        kernel.inputs[0][:] = X.reshape(-1)
-        kernel()
-
-    def motion(self) -> LengthRows:
-        """Return how the nodes move at the configuration evaluated last; see ``arm.Kinematics``."""
-        return LengthRows(self.truss, self.gradient.copy(), np.zeros(self.truss.member_count))
-
-
-def _whole(truss: Truss, *, faces: bool = True) -> ca.Function:
-    """Return positions (3, N) -> member lengths and gradients, face frames and spins, tip frame and spin."""
-    X = ca.MX.sym("X", 3, truss.node_count)
-    columns = X[:, truss.member_nodes.reshape(-1).tolist()]
-    member = member_function(truss).map(truss.member_count)
-    if truss.joints is None:
-        lengths, gradients = member(columns)
-    else:
-        lengths, gradients = member(columns, ca.DM(truss.joints.offset.reshape(-1, 3).T))
-    shown = truss.faces if faces else truss.faces[:0]
-    frames = frames_at(X, truss.home[shown], truss.face_frames[: len(shown)], shown)
-    tips = truss.tip[None] if len(truss.tip) >= 3 else truss.tip[None][:0]
-    tip = frames_at(X, truss.home[tips], truss.tip_frame[None][: len(tips)], tips)
-    return ca.Function("truss" if faces else "members", [X], [lengths, gradients, *frames, *tip])
+    def response(self) -> tuple[Array, Array]:
+        """Return K and r with J K = E, J r = rhs; see ``arm.MotionRows``."""
+        truss = self.truss
+        members, count = truss.member_count, len(truss.actuators)
+        known = np.zeros((members, count + 1))
+        known[truss.actuators, np.arange(count)] = 1.0
+        known[:, -1] = self.rhs
+        try:
+            if members <= _DENSE:
+                answer = np.asarray(np.linalg.solve(self.jacobian(), known), dtype=float)
+            else:
+                answer = splu(truss.scatter.sparse(self.gradient)).solve(known)
+        except (np.linalg.LinAlgError, RuntimeError) as reason:
+            raise SolverError(_SINGULAR) from reason
+        if not np.isfinite(answer).all():
+            raise SolverError(_SINGULAR)
+        return answer[:, :-1], answer[:, -1]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from vgtm_qp.arm.rank import rank
-from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, length_jacobian
-from vgtm_qp.arm.truss.kinematics import TrussKinematics
+from vgtm_qp.arm.arm import has_full_rank, rank
+from vgtm_qp.arm.frames import frame_spins
+from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, in_words, length_jacobian
 from vgtm_qp.arm.truss.truss import Array, Index, Truss
 
 _ROLL_REASON = (
@@ -70,71 +70,58 @@ class TrussDescription:
         return "\n".join(lines)
 
 
-def actuator_response(truss: Truss, rows: Array, X: Array | None = None) -> Array:
-    """Return (R, n_a) rates of R functions of the nodes for unit rates of each actuator, fixed members kept.
+def pose_response(truss: Truss, nodes: Index, weights: Array, rotations: Array, X: Array) -> Array:
+    """Return (F, 6, n_a) twists of F poses for unit rates of each actuator, fixed members kept.
+
+    Three rows for the velocity of each centroid, m/m, and three for its angular velocity, rad/m, both in the base
+    frame; the first three alone where a pose has no frame.
 
     Parameters
     ----------
     truss : Truss
         Statically determinate.
-    rows : (R, N, 3)
-        Derivatives of the functions with respect to all node positions; those of base nodes are left out.
-    X : (N, 3), optional
-        Node positions, m; home if not given.
+    nodes, weights : (F, K)
+        What each pose is made of; three nodes or more have a frame.
+    rotations : (F, 3, 3)
+        At home.
+    X : (N, 3)
+        Node positions, m.
     """
-    J = length_jacobian(truss, X)
-    unknown = np.ascontiguousarray(rows[:, truss.free].reshape(len(rows), -1).T)
-    return np.asarray(splu(J).solve(unknown, trans="T").T[:, truss.actuators])
+    count, corners = nodes.shape
+    rows = np.zeros((count, 6 if corners >= 3 else 3, truss.node_count, 3))
+    every = np.arange(count)[:, None]
+    rows[every, :3, nodes] = weights[:, :, None, None] * np.eye(3)
+    if corners >= 3:
+        spins = frame_spins(X, truss.home, rotations, nodes).reshape(count, 3, corners, 3)
+        rows[every, 3:, nodes] = spins.transpose(0, 2, 1, 3)
+    unknown = np.ascontiguousarray(rows[:, :, truss.free].reshape(-1, 3 * len(truss.free)).T)
+    response = splu(length_jacobian(truss, X)).solve(unknown, trans="T")
+    twists: Array = response.T[:, truss.actuators].reshape(count, rows.shape[1], -1)
+    return twists
 
 
 def tip_response(truss: Truss, X: Array | None = None) -> Array:
-    """Return (6, n_a), or (3, n_a) where the tip has no frame: tip twist for unit rates of the actuators.
-
-    Three rows for the velocity of the tip's centroid, m/m, and three for its angular velocity, rad/m, both
-    in the base frame.
-    """
-    X = truss.home if X is None else X
-    kinematics = TrussKinematics(truss, compiled=False)
-    kinematics.evaluate(X)
-    spin = kinematics.tip_spin if len(truss.tip) >= 3 else None
-    return actuator_response(truss, _pose_rows(truss, truss.tip, truss.tip_weights, spin), X)
+    """Return :func:`pose_response` (6, n_a) or (3, n_a) of the tip alone, at home if `X` (N, 3) is not given."""
+    at = truss.home if X is None else X
+    twist = pose_response(truss, truss.tip[None], truss.tip_weights[None], truss.tip_frame[None], at)
+    return twist.reshape(-1, len(truss.actuators))
 
 
-def face_response(truss: Truss, X: Array | None = None) -> Array:
-    """Return (F - 1, 6, n_a): twists of the faces beyond the base's for unit rates of the actuators."""
-    X = truss.home if X is None else X
-    kinematics = TrussKinematics(truss, compiled=False)
-    kinematics.evaluate(X)
-    rows = [
-        _pose_rows(truss, truss.faces[k], truss.face_weights[k], kinematics.station_spin[k])
-        for k in range(1, len(truss.faces))
-    ]
-    return actuator_response(truss, np.concatenate(rows), X).reshape(len(rows), 6, -1)
-
-
-def trackable_coordinates(truss: Truss, *, face_stride: int = 1) -> tuple[str, ...]:
-    """Return what the faces of a truss can track at home at once, by rank; see ``Truss.trackable``.
-
-    Parameters
-    ----------
-    truss : Truss
-        Statically determinate, with faces.
-    face_stride : int
-        Take every `face_stride`-th face only.
-    """
-    if len(truss.faces) <= face_stride:
+def trackable_coordinates(truss: Truss) -> tuple[str, ...]:
+    """Return what every ``face_stride``-th face of a determinate truss can track at home at once, by rank."""
+    tracked = slice(truss.face_stride, None, truss.face_stride)
+    faces, frames = truss.faces[tracked], truss.face_frames[tracked]
+    if not len(faces):
         return ()
-    taken = slice(face_stride, None, face_stride)
-    response = face_response(truss)[face_stride - 1 :: face_stride]
-    turns = np.swapaxes(truss.face_frames[taken], 1, 2) @ response[:, 3:] * _size(truss)
+    response = pose_response(truss, faces, truss.face_weights[tracked], frames, truss.home)
+    turns = np.swapaxes(frames, 1, 2) @ response[:, 3:] * _size(truss)
     local = np.concatenate([response[:, :3], turns], axis=1)
-    tracked: tuple[str, ...] = ()
+    coordinates: tuple[str, ...] = ()
     for coordinate, count in (("position", 3), ("pointing", 5), ("orientation", 6)):
-        rows = local[:, :count].reshape(-1, local.shape[-1])
-        if rows.shape[0] > rows.shape[1] or rank(np.linalg.svd(rows, compute_uv=False)) < rows.shape[0]:
+        if not has_full_rank(local[:, :count].reshape(-1, local.shape[-1])):
             break
-        tracked += (coordinate,)
-    return tracked
+        coordinates += (coordinate,)
+    return coordinates
 
 
 def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
@@ -172,17 +159,10 @@ def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
         determinacy=report,
         tip_rank=tip_rank,
         tip_coordinates=len(response),
-        unreachable=tuple(_in_words(twist, truss) for twist in _roll_first(left[:, tip_rank:], truss).T),
+        unreachable=tuple(
+            _twist_in_words(twist, truss) for twist in _roll_first(left[:, tip_rank:], truss).T
+        ),
     )
-
-
-def _pose_rows(truss: Truss, nodes: Index, weights: Array, spin: Array | None) -> Array:
-    """Return (6, N, 3) rows of a weighted centroid and its frame's spin, or (3, N, 3) without `spin`."""
-    rows = np.zeros((3 if spin is None else 6, truss.node_count, 3))
-    rows[:3, nodes] = weights[None, :, None] * np.eye(3)[:, None, :]
-    if spin is not None:
-        rows[3:, nodes] = spin.reshape(3, len(nodes), 3)
-    return rows
 
 
 def _size(truss: Truss) -> float:
@@ -205,19 +185,14 @@ def _roll_first(missing: Array, truss: Truss) -> Array:
     return np.column_stack([roll, basis[:, 1 : missing.shape[1]]])
 
 
-def _in_words(twist: Array, truss: Truss) -> str:
+def _twist_in_words(twist: Array, truss: Truss) -> str:
     """Return the words for a `twist` of the tip: velocity, angular velocity times the truss's size."""
     velocity, spin = twist[:3], twist[3:]
     if np.linalg.norm(spin) < 1e-6:
-        return f"motion along {_vector(velocity)}"
-    turn = f"a turn about {_vector(spin / np.linalg.norm(spin))}"
+        return f"motion along {in_words(velocity)}"
+    turn = f"a turn about {in_words(spin / np.linalg.norm(spin))}"
     if np.linalg.norm(velocity) > 1e-6:
-        return f"{turn} with motion along {_vector(velocity / np.linalg.norm(velocity))}"
+        return f"{turn} with motion along {in_words(velocity / np.linalg.norm(velocity))}"
     if abs(spin @ truss.tip_frame[:, 2]) < (1.0 - 1e-6) * np.linalg.norm(spin):
         return turn
     return f"roll, {turn}{_ROLL_REASON if 'octahedral' in truss.module else ''}"
-
-
-def _vector(vector: Array) -> str:
-    rounded = np.round(vector, 3) + 0.0
-    return f"({rounded[0]:g}, {rounded[1]:g}, {rounded[2]:g})"

@@ -1,151 +1,99 @@
-"""The periodic trusses of the paper: each builder stacks one module along +z of the base frame.
+"""The trusses of the paper from their tables: modules that are stacked along +z of the base frame, and plates.
 
-A name is a kind, a layer of nodes (0 is the base) and a place in it (from 1): node ``n0-1``, batten ``B4-1``,
-longeron or leg ``L3-2``, diagonal ``D2-1``. Lengths given here are distances between nodes.
+In a stack a name is a kind, a layer of nodes (0 is the base) and a place in it (from 1): node ``n0-1``, batten
+``B4-1``, longeron or leg ``L3-2``, diagonal ``D2-1``. Lengths of a table are distances between nodes.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Unpack
+from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.arm.truss.assembly import Limits, MemberRow, assemble
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
+from vgtm_qp.arm.truss.truss import Array, Index, Truss, check_stroke
 from vgtm_qp.errors import TrussError
+from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
+
+_POSE = ("position", "pointing", "orientation")
 
 
-def octahedral(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:
-    """Octahedral bays: six fixed longerons to the face below and three actuated battens, three free motions.
+class MemberRow(NamedTuple):
+    """A member before its truss: name, indices of its two nodes, and whether it changes its length."""
 
-    The height of a bay between equal faces is sqrt(L^2 - b^2 / 3) for longeron L and batten b.
+    name: str
+    nodes: tuple[int, int]
+    actuated: bool
 
-    Parameters
+
+class _Module(NamedTuple):
+    """What tells the modules of triangular layers apart.
+
+    Attributes
     ----------
-    bays : int
-        Number of bays, at least 1.
-    longeron, batten : float
-        Home lengths, m; batten < sqrt(3) longeron.
-    **limits
-        See :class:`Limits`; the stroke of a batten is 0.6 to 1.5 times its home length where not given.
+    longerons : bool
+        Whether the members between two layers are actuated (but for diagonals).
+    battens : tuple of bool
+        Whether the battens of each layer of a bay are.
+    stroke : (2,)
+        Least and greatest length of an actuated member over its home length, where a table has none.
+    trackable, face_stride
+        See ``Truss``.
+    """
+
+    longerons: bool
+    battens: tuple[bool, ...]
+    stroke: tuple[float, float]
+    trackable: tuple[str, ...]
+    face_stride: int = 1
+
+
+_MODULES = {
+    # Three free motions a bay. Between equal faces a bay is sqrt(L^2 - b^2 / 3) high.
+    "octahedral": _Module(False, (True,), (0.6, 1.5), ("position",)),
+    # Three free motions a bay of two layers; the arm's faces are the rigid ones.
+    "double-octahedral": _Module(False, (True, False), (0.6, 1.5), ("position",)),
+    # Rigid faces joined by six legs: six free motions a bay.
+    "hexapod": _Module(True, (False,), (0.7, 1.4), _POSE),
+    # Rigid faces, longerons and fixed diagonals: three free motions a bay.
+    "longeron": _Module(True, (False,), (0.6, 1.4), _POSE, face_stride=2),
+}
+
+
+def stacked(spec: ModuleTruss) -> Truss:
+    """Return octahedral, double-octahedral, hexapod or longeron bays; each layer of three nodes is a stage.
 
     Raises
     ------
     TrussError
-        A dimension is not positive, the bay would be flat, or a home length is outside its stroke.
+        A home length is outside its stroke, or the joint offsets leave no member.
     """
-    _check_dimensions(bays, longeron=longeron, batten=batten)
+    module = _MODULES[spec.module]
+    per_bay = len(module.battens)
+    layers, is_prism = spec.bays * per_bay, spec.module == "longeron"
     members: list[MemberRow] = []
-    for layer in range(1, bays + 1):
-        members += [*_zigzag(layer, actuated=False), *_battens(layer, actuated=True)]
-    home = _antiprism(bays, longeron, batten)
-    return _stacked("octahedral", home, members, limits, (0.6, 1.5), trackable=("position",))
-
-
-def double_octahedral(
-    bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]
-) -> Truss:
-    """Double octahedral bays: two octahedral layers, the middle face actuated, the end face rigid.
-
-    Three free motions a double bay; the arm's faces are the rigid ones. Layers 2k - 1 and 2k belong to bay k.
-    Each layer is a stage of its own: six longerons and three battens place its three nodes.
-
-    Parameters
-    ----------
-    bays : int
-        Number of double bays, at least 1.
-    longeron, batten : float
-        Home lengths, m; batten < sqrt(3) longeron.
-    **limits
-        See :class:`Limits`; the stroke of a middle batten is 0.6 to 1.5 times its home length if not given.
-
-    Raises
-    ------
-    TrussError
-        As :func:`octahedral`.
-    """
-    _check_dimensions(bays, longeron=longeron, batten=batten)
-    members: list[MemberRow] = []
-    for layer in range(1, 2 * bays + 1):
-        members += [*_zigzag(layer, actuated=False), *_battens(layer, actuated=layer % 2 == 1)]
-    home = _antiprism(2 * bays, longeron, batten)
-    return _stacked(
-        "double-octahedral", home, members, limits, (0.6, 1.5), trackable=("position",), layers_per_bay=2
+    for layer in range(1, layers + 1):
+        members += _prism(layer) if is_prism else _antiprism(layer, actuated=module.longerons)
+        members += _battens(layer, actuated=module.battens[(layer - 1) % per_bay])
+    turn, height = 0.0, spec.longeron
+    if not is_prism:
+        turn, height = math.pi / 3.0, math.sqrt(spec.longeron**2 - spec.batten**2 / 3.0)
+    home = np.vstack([_triangle(spec.batten, (k % 2) * turn, k * height) for k in range(layers + 1)])
+    return _layered(
+        spec,
+        home,
+        members,
+        module.stroke,
+        layers_per_bay=per_bay,
+        trackable=module.trackable,
+        face_stride=module.face_stride,
     )
 
 
-def hexapod(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:
-    """Hexapod bays: rigid faces joined by six actuated legs, six free motions each.
-
-    Parameters
-    ----------
-    bays : int
-        Number of bays, at least 1.
-    longeron, batten : float
-        Home length of a leg and length of a side of a face, m; batten < sqrt(3) longeron.
-    **limits
-        See :class:`Limits`; the stroke of a leg is 0.7 to 1.4 times its home length where not given.
-
-    Raises
-    ------
-    TrussError
-        As :func:`octahedral`.
-    """
-    _check_dimensions(bays, longeron=longeron, batten=batten)
-    members: list[MemberRow] = []
-    for layer in range(1, bays + 1):
-        members += [*_zigzag(layer, actuated=True), *_battens(layer, actuated=False)]
-    home = _antiprism(bays, longeron, batten)
-    trackable = ("position", "pointing", "orientation")
-    return _stacked("hexapod", home, members, limits, (0.7, 1.4), trackable=trackable)
-
-
-def longeron(bays: int, *, longeron: float = 1.0, batten: float = 1.0, **limits: Unpack[Limits]) -> Truss:
-    """Prismatic bays: three actuated longerons, three fixed diagonals and a rigid face, three free motions.
-
-    The hand of the diagonals alternates from bay to bay: with one hand alone, extension would twist the arm
-    by 3.5 rad per unit of height, and two bays could not meet all six coordinates of a face.
-
-    Parameters
-    ----------
-    bays : int
-        Number of bays, at least 1.
-    longeron, batten : float
-        Home length of a longeron and length of a side of a face, m.
-    **limits
-        See :class:`Limits`; the stroke of a longeron is 0.6 to 1.4 times its home length where not given.
-
-    Raises
-    ------
-    TrussError
-        A dimension is not positive or a home length is outside its stroke.
-    """
-    _check_dimensions(bays, longeron=longeron, batten=batten)
-    members: list[MemberRow] = []
-    for layer in range(1, bays + 1):
-        below, above = 3 * (layer - 1), 3 * layer
-        hand = 1 if layer % 2 else 2
-        members += [MemberRow(f"L{layer}-{i + 1}", (below + i, above + i), True) for i in range(3)]
-        members += [
-            MemberRow(f"D{layer}-{i + 1}", (below + i, above + (i + hand) % 3), False) for i in range(3)
-        ]
-        members += _battens(layer, actuated=False)
-    home = np.vstack([_triangle(batten, 0.0, layer * longeron) for layer in range(bays + 1)])
-    trackable = ("position", "pointing", "orientation")
-    return _stacked("longeron", home, members, limits, (0.6, 1.4), trackable=trackable, face_stride=2)
-
-
-def tetrahedral(
-    bays: int,
-    *,
-    longeron: float = 1.0,
-    batten: float = 1.0,
-    actuated: Sequence[int] = (1, 2, 3),
-    **limits: Unpack[Limits],
-) -> Truss:
-    """Tetrahedra face on face (Boerdijk-Coxeter helix): each node hangs by three members on the three before.
+def tetrahedral(spec: TetrahedralTruss) -> Truss:
+    """Return tetrahedra face on face (Boerdijk-Coxeter helix): each node hangs by three members on the three before.
 
     A bay is three nodes, and every node is a stage of its own. Members (i, i-1) and (i, i-2) are the battens
     ``B`` and ``D``, members (i, i-3) the longerons ``L``. The home pose is a helix about z, theta its turn a
@@ -153,52 +101,77 @@ def tetrahedral(
     w = 1 / (2 (1 - cos theta)), have their mean on its axis (w = 0.3 where L = b). No face is normal to the
     axis, the base neither: its axis point is the origin.
 
-    Parameters
-    ----------
-    bays : int
-        Number of bays of three nodes, at least 1.
-    longeron, batten : float
-        Home length of members (i, i-3), and of members (i, i-1) and (i, i-2), m;
-        longeron < sqrt(3) batten.
-    actuated : sequence of int
-        Which k of the members (i, i-k) are actuated: three, six or nine free motions a bay.
-    **limits
-        See :class:`Limits`; the stroke is 0.75 to 1.3 times the home length where not given.
-
     Raises
     ------
     TrussError
-        A dimension is not positive, the longeron is too long for a helix, `actuated` is not one to three of
-        the numbers 1, 2, 3, or a home length is outside its stroke.
+        A home length is outside its stroke, or the joint offsets leave no member.
     """
-    _check_dimensions(bays, longeron=longeron, batten=batten)
-    if not actuated or len(set(actuated)) < len(actuated) or not set(actuated) <= {1, 2, 3}:
-        raise TrussError(f"actuated is {list(actuated)}; expected one to three different numbers of 1, 2, 3")
-    home, cosine = _helix(3 * (bays + 1), longeron, batten)
+    home, cosine = _helix(3 * (spec.bays + 1), spec.longeron, spec.batten)
     members = [
-        MemberRow(f"{kind}{i // 3}-{i % 3 + 1}", (i - k, i), k in actuated)
+        MemberRow(f"{kind}{i // 3}-{i % 3 + 1}", (i - k, i), k in spec.actuated)
         for i in range(3, len(home))
         for k, kind in ((1, "B"), (2, "D"), (3, "L"))
     ]
     weight = 1.0 / (2.0 * (1.0 - cosine))
-    return _stacked(
-        "tetrahedral",
+    return _layered(
+        spec,
         home,
         members,
-        limits,
         (0.75, 1.3),
-        trackable=("position", "pointing", "orientation") if len(actuated) > 1 else ("position",),
+        trackable=_POSE if len(spec.actuated) > 1 else ("position",),
         weights=(weight, 1.0 - 2.0 * weight, weight),
         stage=np.maximum(np.arange(len(home)) - 3, -1),
     )
 
 
-def _check_dimensions(bays: int, **lengths: float) -> None:
-    if bays < 1:
-        raise TrussError(f"bays is {bays}; expected at least 1")
-    for name, length in lengths.items():
-        if not (math.isfinite(length) and length > 0.0):
-            raise TrussError(f"{name} is {length:g} m; expected a finite length greater than 0")
+def plate(spec: PlateTruss) -> Truss:
+    """Return a plate in the xz plane that grows along +z; its first two rows and the apexes between are the base.
+
+    Nodes ``n<row>-<column>`` of the surface and ``a<row>-<column>`` over the cells' centres, towards -y. A
+    free row is a stage: its surface nodes and the apexes below it. Three fixed legs ``G`` carry each apex;
+    longitudinals ``L``, transverses ``T``, one diagonal ``D`` a row, and the apexes' longitudinals ``M`` and
+    one transverse ``U`` are actuated. A diagonal in every cell has the right count but leaves a mechanism.
+
+    Raises
+    ------
+    TrussError
+        A home length is outside its stroke, or the joint offsets leave no member.
+    """
+    rows, columns, spacing = spec.rows, spec.columns, spec.spacing
+    names: list[str] = []
+    positions: list[tuple[float, float, float]] = []
+    stages: list[int] = []
+    left = -0.5 * spacing * (columns - 1)
+    for i in range(rows):
+        if i:
+            for j in range(columns - 1):
+                names.append(f"a{i - 1}-{j + 1}")
+                positions.append((left + spacing * (j + 0.5), -spec.depth, spacing * (i - 0.5)))
+                stages.append(max(i - 2, -1))
+        for j in range(columns):
+            names.append(f"n{i}-{j + 1}")
+            positions.append((left + spacing * j, 0.0, spacing * i))
+            stages.append(max(i - 2, -1))
+    index = {name: i for i, name in enumerate(names)}
+    members = [
+        MemberRow(name, (index[first], index[second]), name[0] != "G")
+        for i in range(2, rows)
+        for name, first, second in _row(i, columns)
+    ]
+    return _assemble(
+        spec,
+        tuple(names),
+        np.array(positions),
+        np.array(stages, dtype=np.int64),
+        members,
+        (0.7, 1.4),
+        faces=np.empty((0, 3), dtype=np.int64),
+        weights=(1 / 3, 1 / 3, 1 / 3),
+        tip=np.array([index[f"n{rows - 1}-1"], index[f"n{rows - 1}-{columns}"]]),
+        tip_weights=(0.5, 0.5),
+        bays=rows - 2,
+        trackable=("position",),
+    )
 
 
 def _triangle(batten: float, angle: float, z: float) -> Array:
@@ -208,18 +181,6 @@ def _triangle(batten: float, angle: float, z: float) -> Array:
     return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.full(3, z)])
 
 
-def _antiprism(layers: int, side: float, batten: float) -> Array:
-    """Triangles turned by 60 degrees at every second layer, each node at `side` from two nodes below."""
-    height_squared = side**2 - batten**2 / 3.0
-    if height_squared <= 1e-9 * side**2:
-        raise TrussError(
-            f"batten is {batten:g} m: the bay folds flat; expected less than sqrt(3) times the longeron, "
-            f"{math.sqrt(3.0) * side:g} m"
-        )
-    height = math.sqrt(height_squared)
-    return np.vstack([_triangle(batten, (k % 2) * math.pi / 3.0, k * height) for k in range(layers + 1)])
-
-
 def _helix(count: int, longeron: float, batten: float) -> tuple[Array, float]:
     """Return `count` nodes of the helix about z, the second one at z = 0, and the cosine of its turn a node.
 
@@ -227,11 +188,6 @@ def _helix(count: int, longeron: float, batten: float) -> tuple[Array, float]:
     squared for k = 1 and 2, `longeron` squared for k = 3.
     """
     cosine = -0.5 - longeron**2 / (6.0 * batten**2)
-    if cosine <= -1.0 + 1e-9:
-        raise TrussError(
-            f"longeron is {longeron:g} m: the helix folds flat; expected less than sqrt(3) times the batten, "
-            f"{math.sqrt(3.0) * batten:g} m"
-        )
     chord_squared = 1.5 * batten**2 / (1.0 - cosine)
     radius = math.sqrt(chord_squared / (2.0 * (1.0 - cosine)))
     rise = math.sqrt(batten**2 - chord_squared)
@@ -240,7 +196,7 @@ def _helix(count: int, longeron: float, batten: float) -> tuple[Array, float]:
     return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), (steps - 1) * rise]), cosine
 
 
-def _zigzag(layer: int, *, actuated: bool) -> Iterator[MemberRow]:
+def _antiprism(layer: int, *, actuated: bool) -> Iterator[MemberRow]:
     """Yield the six members of an antiprism between `layer` and the layer below it."""
     # Odd layers are turned by 60 degrees: node i stands between nodes i and i+1 below. Even layers turn back.
     other = 1 if layer % 2 else 2
@@ -249,16 +205,28 @@ def _zigzag(layer: int, *, actuated: bool) -> Iterator[MemberRow]:
         yield MemberRow(f"L{layer}-{place}", (3 * (layer - 1) + below, 3 * layer + i), actuated)
 
 
+def _prism(layer: int) -> Iterator[MemberRow]:
+    """Yield three actuated longerons and three fixed diagonals between `layer` and the layer below it.
+
+    The hand of the diagonals alternates from bay to bay: with one hand alone, extension would twist the arm
+    by 3.5 rad per unit of height, and two bays could not meet all six coordinates of a face.
+    """
+    below, above, hand = 3 * (layer - 1), 3 * layer, 1 if layer % 2 else 2
+    for i in range(3):
+        yield MemberRow(f"L{layer}-{i + 1}", (below + i, above + i), True)
+    for i in range(3):
+        yield MemberRow(f"D{layer}-{i + 1}", (below + i, above + (i + hand) % 3), False)
+
+
 def _battens(layer: int, *, actuated: bool) -> Iterator[MemberRow]:
     for i in range(3):
         yield MemberRow(f"B{layer}-{i + 1}", (3 * layer + i, 3 * layer + (i + 1) % 3), actuated)
 
 
-def _stacked(
-    module: str,
+def _layered(
+    spec: ModuleTruss | TetrahedralTruss,
     home: Array,
     members: Sequence[MemberRow],
-    limits: Limits,
     stroke_factors: tuple[float, float],
     *,
     trackable: tuple[str, ...],
@@ -267,22 +235,114 @@ def _stacked(
     weights: Sequence[float] = (1 / 3, 1 / 3, 1 / 3),
     stage: Index | None = None,
 ) -> Truss:
-    """Assemble a truss of layers of three nodes; a face ends each bay, and all face frames are the base's."""
+    """Assemble a truss of layers of three nodes; a face ends each bay."""
     nodes = np.arange(len(home))
     faces = nodes.reshape(-1, 3)[::layers_per_bay]
-    return assemble(
-        module,
+    return _assemble(
+        spec,
         tuple(f"n{i // 3}-{i % 3 + 1}" for i in range(len(home))),
         home,
         nodes // 3 - 1 if stage is None else stage,
         members,
-        limits,
         stroke_factors,
         faces=faces,
         weights=weights,
         tip=faces[-1],
         tip_weights=weights,
-        bays=len(faces) - 1,
+        bays=spec.bays,
         trackable=trackable,
         face_stride=face_stride,
+    )
+
+
+def _row(i: int, columns: int) -> list[tuple[str, str, str]]:
+    """Return name and node names of the members that place row `i` and the apexes below it."""
+    members: list[tuple[str, str, str]] = []
+    for j in range(1, columns):
+        apex = f"a{i - 1}-{j}"
+        # With three columns the second apex stands on the mirror image of the first one's legs.
+        mirrored = columns == 3 and j == 2
+        feet = (
+            (f"n{i - 1}-{j + 1}", f"n{i}-{j + 1}", f"n{i}-{j}")
+            if mirrored
+            else (f"n{i - 1}-{j}", f"n{i}-{j}", f"n{i}-{j + 1}")
+        )
+        members += [(f"G{i}-{3 * (j - 1) + k}", apex, foot) for k, foot in enumerate(feet, start=1)]
+    members += [(f"L{i}-{j}", f"n{i - 1}-{j}", f"n{i}-{j}") for j in range(1, columns + 1)]
+    members += [(f"T{i}-{j}", f"n{i}-{j}", f"n{i}-{j + 1}") for j in range(1, columns)]
+    members += [(f"D{i}-1", f"n{i - 1}-1", f"n{i}-2")]
+    members += [(f"M{i}-{j}", f"a{i - 2}-{j}", f"a{i - 1}-{j}") for j in range(1, columns)]
+    members += [(f"U{i}-1", f"a{i - 1}-{columns - 2}", f"a{i - 1}-{columns - 1}")]
+    return members
+
+
+def _assemble(
+    spec: ModuleTruss | TetrahedralTruss | PlateTruss,
+    node_names: tuple[str, ...],
+    home: Array,
+    stage: Index,
+    members: Sequence[MemberRow],
+    stroke_factors: tuple[float, float],
+    *,
+    faces: Index,
+    weights: Sequence[float],
+    tip: Index,
+    tip_weights: Sequence[float],
+    bays: int,
+    trackable: tuple[str, ...],
+    face_stride: int = 1,
+) -> Truss:
+    """Return the truss of a table, whose face and tip frames at home are those of the base.
+
+    Parameters
+    ----------
+    stroke_factors
+        Least and greatest length of an actuated member over its home length, where the table has no stroke.
+    weights
+        Of the three nodes of every face.
+
+    Other parameters are as in :class:`vgtm_qp.arm.truss.truss.Truss`.
+    """
+    names = tuple(member.name for member in members)
+    pairs = np.array([member.nodes for member in members], dtype=np.int64)
+    actuated = np.array([member.actuated for member in members])
+    lengths = np.linalg.norm(home[pairs[:, 0]] - home[pairs[:, 1]], axis=1)
+    offset, joints = spec.joint_offset, None
+    if not 2.0 * offset < lengths.min():
+        raise TrussError(
+            f"joint_offset is {offset:g} m; expected at least 0 and less than half the shortest member, "
+            f"{lengths.min() / 2:g} m"
+        )
+    if offset > 0.0:
+        triangle = joint_triangles(node_names, home, pairs, stage)
+        joints = axial_joints(home, pairs, triangle, np.full((len(members), 2), offset))
+    strokes = np.column_stack([lengths - 2.0 * offset] * 2)
+    strokes[actuated] *= stroke_factors
+    if spec.stroke is not None:
+        for k in np.flatnonzero(actuated):
+            check_stroke(names[k], lengths[k] - 2.0 * offset, spec.stroke)
+        strokes[actuated] = spec.stroke
+    return Truss(
+        module=spec.module,
+        node_names=node_names,
+        member_names=names,
+        home=home,
+        base=stage < 0,
+        members=pairs,
+        actuated=actuated,
+        stroke=strokes,
+        rate=np.where(actuated, spec.rate or np.inf, np.inf),
+        acceleration=np.where(actuated, spec.acceleration or np.inf, np.inf),
+        radius=np.full(len(members), spec.member_radius),
+        faces=faces,
+        face_weights=np.tile(np.asarray(weights, dtype=np.float64), (len(faces), 1)),
+        face_frames=np.tile(np.eye(3), (len(faces), 1, 1)),
+        tip=tip,
+        tip_weights=np.asarray(tip_weights, dtype=np.float64),
+        tip_frame=np.eye(3),
+        stage=stage,
+        bays=bays,
+        trackable=trackable,
+        face_stride=face_stride,
+        joints=joints,
     )

@@ -45,23 +45,23 @@ def placement_stages(base: Mask, members: Index) -> Index:
     )
     count, component = connected_components(links, connection="strong")
 
-    needs: list[set[int]] = [set() for _ in range(count)]
-    serves: list[set[int]] = [set() for _ in range(count)]
     start, end = links.nonzero()
-    for a, b in zip(component[start].tolist(), component[end].tolist(), strict=True):
-        if a != b:
-            needs[a].add(b)
-            serves[b].add(a)
+    pairs = np.unique(np.stack([component[start], component[end]]), axis=1)
+    pairs = pairs[:, pairs[0] != pairs[1]]
+    needs = np.bincount(pairs[0], minlength=count)
+    serves: list[list[int]] = [[] for _ in range(count)]
+    for later, earlier in pairs.T.tolist():
+        serves[earlier].append(later)
     first = np.full(count, len(free))
     np.minimum.at(first, component, np.arange(len(free)))
-    ready = [(int(first[c]), c) for c in range(count) if not needs[c]]
+    ready = [(int(first[c]), int(c)) for c in np.flatnonzero(needs == 0)]
     heapq.heapify(ready)
     order = np.empty(count, dtype=np.int64)
     for position in range(count):
         _, done = heapq.heappop(ready)
         order[done] = position
         for c in serves[done]:
-            needs[c].discard(done)
+            needs[c] -= 1
             if not needs[c]:
                 heapq.heappush(ready, (int(first[c]), c))
 

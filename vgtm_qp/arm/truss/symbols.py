@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arm.symbols import ArmSymbols, Constants
 from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.arm.truss.truss import Index, Truss
 
@@ -32,8 +33,8 @@ class PlacedNodes:
     earlier: Index
 
 
-def elimination_stages(truss: Truss) -> list[PlacedNodes] | None:
-    """Return the stages of the truss in order, or None where a stage does not have three members for each node."""
+def elimination_stages(truss: Truss) -> list[PlacedNodes]:
+    """Return the stages of the truss in order; none where a stage does not have three members for each node."""
     node_stage = np.where(truss.base, -1, truss.stage)
     member_stage = node_stage[truss.member_nodes].max(axis=1)
     stages = []
@@ -41,7 +42,7 @@ def elimination_stages(truss: Truss) -> list[PlacedNodes] | None:
         nodes = truss.free[node_stage[truss.free] == stage]
         members = np.flatnonzero(member_stage == stage)
         if len(members) != 3 * len(nodes):
-            return None
+            return []
         used = np.unique(truss.member_nodes[members])
         earlier = used[(node_stage[used] < stage) & ~truss.base[used]]
         stages.append(PlacedNodes(nodes, members, earlier))
@@ -55,31 +56,45 @@ def stage_faces(truss: Truss, stages: list[PlacedNodes], tracked: Sequence[int])
     """
     nodes_of = {frozenset(truss.faces[face].tolist()): int(face) for face in tracked}
     faces = [nodes_of.get(frozenset(stage.nodes.tolist()), -1) for stage in stages]
+    if not faces or min(faces) < 0 or len(faces) != len(tracked):
+        return None
     three = all(int(truss.actuated[stage.members].sum()) == 3 for stage in stages)
-    return np.array(faces) if three and min(faces) >= 0 and len(faces) == len(tracked) else None
+    return np.array(faces) if three else None
 
 
-class TrussSymbols:
+class TrussSymbols(ArmSymbols):
     """Lengths and gradients of a truss at symbolic positions X (3, N); see ``arm.ArmSymbols``."""
 
     def __init__(self, truss: Truss, constants: Constants) -> None:
+        super().__init__(truss.home_lengths, truss.actuators, constants)
         self._truss = truss
         self.shape = 3, truss.node_count
         self.given: list[int] = np.flatnonzero(truss.base).tolist()
-        self.home = constants.add("home_lengths", truss.home_lengths)
         self._offsets: list[ca.MX] = []
         if truss.joints is not None:
             self._offsets = [constants.add("offsets", truss.joints.offset.reshape(-1, 3))]
         self._member = member_function(truss)
         self._solvers: dict[object, ca.Function] = {}
         self._columns = truss.member_nodes.reshape(-1).tolist()
-        self._stages = elimination_stages(truss)
-        self.can_eliminate = self._stages is not None
-        self._blocks = [self._pattern(stage) for stage in self._stages or ()]
         self._place = {int(node): 3 * k for k, node in enumerate(truss.free)}
 
+    @cached_property
+    def _stages(self) -> list[PlacedNodes]:
+        return elimination_stages(self._truss)
+
+    @cached_property
+    def _patterns(self) -> list[tuple[_Layers, _Layers]]:
+        """Layers of the blocks D and L of each stage."""
+        return [
+            (self._layers(stage.members, stage.nodes), self._layers(stage.members, stage.earlier))
+            for stage in self._stages
+        ]
+
+    @property
+    def can_eliminate(self) -> bool:
+        return bool(self._stages)
+
     def nodes(self, X: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         return X
 
     def quantities(self, X: ca.MX) -> ca.MX:
@@ -110,7 +125,6 @@ class TrussSymbols:
         return nodes
 
     def along(self, X: ca.MX, coordinates: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         zero, place = ca.DM.zeros(3), self._place
         columns = (
             coordinates[place[n] : place[n] + 3] if n in place else zero
@@ -118,26 +132,15 @@ class TrussSymbols:
         )
         return X + ca.horzcat(*columns)
 
-    def _aims(self, lengths: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        aim, actuators = self.home * 1.0, self._truss.actuators.tolist()
-        aim[actuators] = ca.fmax(lower, ca.fmin(upper, lengths[actuators]))
-        return aim
-
-    def error(self, lengths: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
-        return ca.norm_2(self._aims(lengths, lower, upper) - lengths)
-
     def closed(self, X: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         lengths, gradients = self._lengths(X)
-        error = self._aims(lengths, lower, upper) - lengths
-        blocks = [self._stage_blocks(k, gradients) for k in range(len(self._blocks))]
-        rhs = [error[stage.members.tolist()] for stage in self._stages or ()]
-        return X + self._substituted(blocks, rhs)
+        error = self.aims(lengths, lower, upper) - lengths
+        rhs = [error[stage.members.tolist()] for stage in self._stages]
+        return X + self._substituted(self._blocks(gradients), rhs)
 
     def held(self, tracked: Sequence[int]) -> Callable[[ca.MX, ca.MX], ca.MX] | None:
         """See ``arm.ArmSymbols``: actuated members take the lengths that follow."""
-        faces = stage_faces(self._truss, self._stages, tracked) if self._stages else None
+        faces = stage_faces(self._truss, self._stages, tracked)
         if faces is None:
             return None
         truss, order = self._truss, list(tracked)
@@ -147,10 +150,13 @@ class TrussSymbols:
             error = self.home - lengths
             centres = (X[:, truss.faces[face].tolist()] @ ca.DM(truss.face_weights[face]) for face in order)
             gaps = points - ca.horzcat(*centres)
-            blocks, rhs = [], []
-            for k, (stage, face) in enumerate(zip(self._stages or (), faces.tolist(), strict=True)):
+            blocks, rhs, placed = (
+                [],
+                [],
+                zip(self._stages, self._blocks(gradients), faces.tolist(), strict=True),
+            )
+            for stage, (D, L), face in placed:
                 fixed = np.flatnonzero(~truss.actuated[stage.members]).tolist()
-                D, L = self._stage_blocks(k, gradients)
                 weight = dict(zip(truss.faces[face].tolist(), truss.face_weights[face], strict=True))
                 centre = ca.sparsify(ca.DM(np.kron([weight[int(n)] for n in stage.nodes], np.eye(3))))
                 blocks.append((ca.vertcat(D[fixed, :], centre), ca.vertcat(L[fixed, :], ca.MX(3, L.size2()))))
@@ -160,69 +166,55 @@ class TrussSymbols:
         return step
 
     def response(self, X: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``."""
         gradients, rhs = self.motion(X, at, moved)
         truss = self._truss
-        actuators = truss.actuators.tolist()
-        count = len(actuators)
         place: dict[int, ca.MX] = {}
-        for k, stage in enumerate(self._stages or ()):
-            D, L = self._stage_blocks(k, gradients)
-            own = [(row, actuators.index(int(m))) for row, m in enumerate(stage.members) if truss.actuated[m]]
-            unit = ca.DM(len(stage.members), len(own))
-            for column, (row, _) in enumerate(own):
-                unit[row, column] = 1.0
-            earlier = len(stage.earlier)
-            arguments: list[ca.MX] = [ca.densify(-L)] if earlier else []
-            arguments += [ca.MX(ca.densify(unit))] if own else []
-            width = 3 * earlier + len(own) + 1
-            solved = self._solver(D.sparsity(), width)(D, ca.horzcat(*arguments, rhs[stage.members.tolist()]))
-            particular = solved[:, -1]
-            columns = ca.MX(len(stage.members), count)
+        count = len(truss.actuators)
+        for stage, (D, L) in zip(self._stages, self._blocks(gradients), strict=True):
+            own = np.flatnonzero(truss.actuated[stage.members])
+            actuators = np.searchsorted(truss.actuators, stage.members[own])
+            earlier, rows = L.size2(), len(stage.members)
+            unit = ca.MX(ca.DM(np.eye(rows)[:, own]))
+            known = ca.horzcat(ca.densify(-L), unit, rhs[stage.members.tolist()])
+            solved = self._solver(D.sparsity(), known.size2())(D, known)
+            columns, particular = ca.MX(rows, count), solved[:, -1]
             if earlier:
                 before = ca.vertcat(*(place[int(node)] for node in stage.earlier))
-                product = solved[:, : 3 * earlier] @ before
+                product = solved[:, :earlier] @ before
                 columns, particular = product[:, :count], product[:, count] + particular
-            if own:
-                spread = ca.DM(
-                    ca.Sparsity.triplet(len(own), count, list(range(len(own))), [c for _, c in own]), 1.0
-                )
-                columns = columns + solved[:, 3 * earlier : 3 * earlier + len(own)] @ spread
+            if len(own):
+                spread = ca.sparsify(ca.DM(np.eye(count)[actuators]))
+                columns = columns + solved[:, earlier:-1] @ spread
             block = ca.horzcat(ca.densify(columns), particular)
-            for j, node in enumerate(stage.nodes):
-                place[int(node)] = block[3 * j : 3 * j + 3, :]
+            place |= zip(stage.nodes.tolist(), ca.vertsplit(block, 3), strict=True)
         return ca.vertcat(*(place[int(node)] for node in truss.free))
 
-    def _pattern(self, stage: PlacedNodes) -> tuple[_Layers, _Layers]:
-        """Return the layers of the blocks D and L."""
-        nodes = self._truss.member_nodes[stage.members]
-        terms = []
-        for targets in (stage.nodes, stage.earlier):
-            found: dict[tuple[int, int], list[int]] = {}
-            place = {int(node): 3 * k for k, node in enumerate(targets)}
-            for row, (member, names) in enumerate(zip(stage.members, nodes, strict=True)):
-                for slot, node in enumerate(names):
-                    if int(node) in place:
-                        for axis in range(3):
-                            flat = (int(member) * nodes.shape[1] + slot) * 3 + axis
-                            found.setdefault((row, place[int(node)] + axis), []).append(flat)
-            layers = []
-            for depth in range(max((len(v) for v in found.values()), default=0)):
-                entries = sorted((c, r, v[depth]) for (r, c), v in found.items() if len(v) > depth)
-                sparsity = ca.Sparsity.triplet(
-                    len(stage.members), 3 * len(targets), [e[1] for e in entries], [e[0] for e in entries]
-                )
-                layers.append((np.array([e[2] for e in entries], dtype=np.int64), sparsity))
-            terms.append(layers)
-        return terms[0], terms[1]
+    def _layers(self, members: Index, nodes: Index) -> _Layers:
+        """Return the layers of the block of `members` (rows) and free `nodes` (three columns each)."""
+        scatter = self._truss.scatter
+        row, column = np.full(scatter.shape[0], -1), np.full(scatter.shape[1], -1)
+        row[members] = np.arange(len(members))
+        for k, node in enumerate(nodes.tolist()):
+            column[self._place[node] : self._place[node] + 3] = 3 * k + np.arange(3)
+        rows, columns = row[scatter.member], column[scatter.column]
+        kept = np.flatnonzero((rows >= 0) & (columns >= 0))
+        kept = kept[np.lexsort((rows[kept], columns[kept]))]
+        place = columns[kept] * len(members) + rows[kept]
+        depth = np.arange(len(kept)) - np.searchsorted(place, place)
+        layers = []
+        for k in range(depth.max(initial=-1) + 1):
+            chosen = kept[depth == k]
+            at = rows[chosen].tolist(), columns[chosen].tolist()
+            layers.append((scatter.flat[chosen], ca.Sparsity.triplet(len(members), 3 * len(nodes), *at)))
+        return layers
 
-    def _stage_blocks(self, k: int, gradients: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Return the blocks D and L of stage `k`, sparse."""
-        stage = (self._stages or [])[k]
-        rows = len(stage.members)
-        own, earlier = self._blocks[k]
-        columns = 3 * len(stage.earlier)
-        return _block(own, gradients, (rows, rows)), _block(earlier, gradients, (rows, columns))
+    def _blocks(self, gradients: ca.MX) -> _Blocks:
+        """Return the blocks D and L of each stage, sparse."""
+        blocks = []
+        for stage, (own, earlier) in zip(self._stages, self._patterns, strict=True):
+            D = _block(own, gradients, stage.members, stage.nodes)
+            blocks.append((D, _block(earlier, gradients, stage.members, stage.earlier)))
+        return blocks
 
     def _solver(self, D: ca.Sparsity, width: int) -> ca.Function:
         """Return (D, right-hand sides (rows, width)) -> D^-1 rhs by an unrolled sparse QR factorisation."""
@@ -237,18 +229,17 @@ class TrussSymbols:
     def _substituted(self, blocks: _Blocks, rhs: list[ca.MX]) -> ca.MX:
         """Return displacements (3, N) of all nodes: each stage's blocks D and L place its nodes after earlier ones."""
         place: dict[int, ca.MX] = {}
-        for stage, (D, L), right in zip(self._stages or (), blocks, rhs, strict=True):
+        for stage, (D, L), right in zip(self._stages, blocks, rhs, strict=True):
             if len(stage.earlier):
                 right = right - L @ ca.vertcat(*(place[int(node)] for node in stage.earlier))
             step = self._solver(D.sparsity(), 1)(D, right)
-            for j, node in enumerate(stage.nodes):
-                place[int(node)] = step[3 * j : 3 * j + 3]
+            place |= zip(stage.nodes.tolist(), ca.vertsplit(step, 3), strict=True)
         zero = ca.DM.zeros(3)
         return ca.horzcat(*(place.get(node, zero) for node in range(self._truss.node_count)))
 
 
-def _block(layers: _Layers, gradients: ca.MX, shape: tuple[int, int]) -> ca.MX:
-    block = ca.MX(*shape)
+def _block(layers: _Layers, gradients: ca.MX, members: Index, nodes: Index) -> ca.MX:
+    block = ca.MX(len(members), 3 * len(nodes))
     for flat, sparsity in layers:
         block = block + ca.MX(sparsity, gradients[flat.tolist()])
     return block

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -160,3 +161,12 @@ class Truss:
             return self.member_names.index(name)
         except ValueError:
             raise TrussError(f'no member is called "{name}"{nearest(name, self.member_names)}') from None
+
+
+def check_stroke(name: str, length: float, stroke: Sequence[float]) -> None:
+    """Refuse a home length, m, outside its stroke."""
+    least, greatest = stroke
+    if not least - 1e-9 <= length <= greatest + 1e-9:
+        raise TrussError(
+            f"the home length of member {name}, {length:g} m, is outside its stroke [{least:g}, {greatest:g}] m"
+        )
