@@ -8,8 +8,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from vgtm_qp.problem.fields import (
-    Choice,
-    Count,
+    ORIGIN,
     Direction,
     Distance,
     File,
@@ -17,10 +16,11 @@ from vgtm_qp.problem.fields import (
     Name,
     Number,
     Vector,
+    count,
     exactly,
 )
-from vgtm_qp.problem.table import Place, Table
-from vgtm_qp.problem.truss import BasePose, Lock, increasing, known_names, unique
+from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
+from vgtm_qp.problem.truss import BasePose, Lock
 
 
 class Joint(Table):
@@ -28,15 +28,11 @@ class Joint(Table):
 
     called: ClassVar[str] = "a joint"
     name: Name = Field(description="name of the joint")
-    kind: Annotated[Literal["revolute", "prismatic"], Choice()] = Field(
-        default="revolute", description="how it moves"
-    )
+    kind: Literal["revolute", "prismatic"] = Field(default="revolute", description="how it moves")
     axis: Direction = Field(description="axis in its own frame; need not be a unit vector")
-    position: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="origin in the frame of the joint before, m"
-    )
+    position: Vector = Field(default=ORIGIN, description="origin in the frame of the joint before, m")
     rotation_vector: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="attitude in that frame at joint value 0, rad"
+        default=ORIGIN, description="attitude in that frame at joint value 0, rad"
     )
     limits: Annotated[tuple[Number, Number], exactly(2, "two numbers [least, greatest]")] | None = Field(
         default=None, description="least and greatest joint value, rad or m"
@@ -72,13 +68,11 @@ class ArmTable(Table):
     joint: tuple[Joint, ...] = Field(
         default=(), description="the joints, base first, in the place of a URDF file"
     )
-    tip: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="position of the end effector in the last frame, m"
-    )
+    tip: Vector = Field(default=ORIGIN, description="position of the end effector in the last frame, m")
     link_radius: Distance = Field(
         default=0.03, description="radius of the capsules between successive joints, m"
     )
-    every: Annotated[int, Count(1, 1000)] | None = Field(
+    every: Annotated[int, count(1, 1000)] | None = Field(
         default=None,
         description="which joints' frames track the curve: every so many; where absent, as few as keep to it exactly",
     )

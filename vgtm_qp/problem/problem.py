@@ -15,8 +15,8 @@ from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuv
 from vgtm_qp.problem.method import Method
 from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
 from vgtm_qp.problem.shape import Curve, Surface
-from vgtm_qp.problem.table import Place, Table, key_path, shown, value_at
-from vgtm_qp.problem.truss import PlateTruss, Truss, unique
+from vgtm_qp.problem.table import Place, Table, key_path, shown, unique, value_at
+from vgtm_qp.problem.truss import PlateTruss, Truss
 
 SCHEMA_VERSION = 1
 
@@ -50,14 +50,12 @@ class Problem(Table):
         default=None, description="the reference surface of a plate, in the place of a curve"
     )
     end_effector: EndEffector = Field(
-        default_factory=lambda: EndEffector(), description="which coordinates are steered"
+        default_factory=EndEffector, description="which coordinates are steered"
     )
     maneuver: Maneuver = Field(description="where the end effector goes")
     obstacle: tuple[Obstacle, ...] = Field(default=(), description="what the arm keeps away from")
-    clearance: ClearanceTable = Field(
-        default_factory=lambda: ClearanceTable(), description="how far it keeps away"
-    )
-    method: Method = Field(default_factory=lambda: Method(), description="how each step is solved")
+    clearance: ClearanceTable = Field(default_factory=ClearanceTable, description="how far it keeps away")
+    method: Method = Field(default_factory=Method, description="how each step is solved")
 
     _source: Path | None = PrivateAttr(None)
 

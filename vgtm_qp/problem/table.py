@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any, ClassVar, Self
 
@@ -110,11 +111,11 @@ class Table(BaseModel):
             about = f" ({field.description})" if field and field.description else ""
             phrase, value = f"a value{about}: the key is required", _MISSING
         elif kind == "choice" and isinstance(value, Mapping):
-            key, choices = context["key"], context["choices"].split(",")
-            place = (*place, key)
-            value = value.get(key, _MISSING)
-            hint = nearest(value, choices) if isinstance(value, str) else ""
-            phrase = f"one of {quoted(choices)}{hint}"
+            key = context["key"]
+            place, value = (*place, key), value.get(key, _MISSING)
+            phrase = _one_of(context["choices"].split(","), value)
+        elif kind == "literal_error":
+            phrase = _one_of(re.findall("'([^']+)'", context["expected"]), value)
         elif kind == "tuple_type" and isinstance(value, Mapping):
             phrase = "an array of tables: [[...]] with two brackets, one for each entry"
         elif kind in ("tuple_type", "list_type"):
@@ -128,6 +129,37 @@ class Table(BaseModel):
         else:
             phrase = found["msg"][:1].lower() + found["msg"][1:]
         return InitErrorDetails(type=unexpected(phrase), loc=place, input=value)
+
+
+def increasing(key: str, times: list[float]) -> Iterator[tuple[Place, str]]:
+    """Yield each entry of the array `key` whose time is not later than the one before."""
+    for i in range(1, len(times)):
+        if times[i] <= times[i - 1]:
+            yield (key, i, "time"), f"a time after that of the entry before, {times[i - 1]:g} s"
+
+
+def unique(key: str, within: str, names: Sequence[str | int]) -> Iterator[tuple[Place, str]]:
+    """Yield each entry of the array `key` whose name is that of an earlier one."""
+    seen: set[str | int] = set()
+    for i, name in enumerate(names):
+        if name in seen:
+            yield (key, i, within), "a name that no other entry has"
+        seen.add(name)
+
+
+def known_names(
+    place: Place, names: Iterable[str], known: Mapping[str, Any], key: str | None = None
+) -> Iterator[tuple[Place, str]]:
+    """Yield each name, or the value of `key` at `place`, that is not among the known ones."""
+    for i, name in enumerate(names):
+        if name not in known:
+            some = quoted(list(known)[:8]) + (", ..." if len(known) > 8 else "")
+            yield (*place, i if key is None else key), f"the name of one of {some}{nearest(name, known)}"
+
+
+def _one_of(choices: Sequence[str], value: Any) -> str:
+    hint = nearest(value, choices) if isinstance(value, str) else ""
+    return f"{'one of ' if len(choices) > 1 else ''}{quoted(choices)}{hint}"
 
 
 def _is_own(found: ErrorDetails, kind: str) -> bool:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, GetJsonSchemaHandler, Tag, model_validator
+from pydantic import Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from vgtm_qp.errors import nearest
 from vgtm_qp.problem.fields import (
+    ORIGIN,
     ByKey,
-    Choice,
-    Count,
     Distance,
     Flag,
     Length,
@@ -24,11 +22,11 @@ from vgtm_qp.problem.fields import (
     Seconds,
     Stroke,
     Vector,
+    count,
     exactly,
-    quoted,
     unexpected,
 )
-from vgtm_qp.problem.table import Place, Table
+from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
 
 _SLACK = 1e-9
 
@@ -62,8 +60,8 @@ class BasePose(Table):
 
     called: ClassVar[str] = "a base pose"
     time: Seconds = Field(description="time at which the base is there, s")
-    position: Vector = Field(default=(0.0, 0.0, 0.0), description="position of the base frame's origin, m")
-    rotation_vector: Vector = Field(default=(0.0, 0.0, 0.0), description="rotation of the base frame, rad")
+    position: Vector = Field(default=ORIGIN, description="position of the base frame's origin, m")
+    rotation_vector: Vector = Field(default=ORIGIN, description="rotation of the base frame, rad")
 
 
 class _Truss(Table):
@@ -91,7 +89,7 @@ class _Truss(Table):
 
 class _Stack(_Truss):
     called: ClassVar[str] = "a truss made of bays"
-    bays: Annotated[int, Count(1, 10_000)] = Field(description="number of bays")
+    bays: Annotated[int, count(1, 10_000)] = Field(description="number of bays")
     longeron: Length = Field(
         default=1.0, description="home length of the members that join one face to the next, m"
     )
@@ -119,7 +117,7 @@ class ModuleTruss(_Stack):
     """Triangular faces stacked along +z: octahedral, double-octahedral, hexapod or longeron bays."""
 
     called: ClassVar[str] = "a truss of this module"
-    module: Annotated[Literal["octahedral", "double-octahedral", "hexapod", "longeron"], Choice()] = Field(
+    module: Literal["octahedral", "double-octahedral", "hexapod", "longeron"] = Field(
         description="octahedral: fixed longerons, actuated battens; double-octahedral: two such bays, every "
         "second face rigid; hexapod: rigid faces, six actuated legs; longeron: actuated longerons, fixed "
         "diagonals of alternating hand"
@@ -141,12 +139,12 @@ class TetrahedralTruss(_Stack):
     """Tetrahedra face on face: each node hangs by three members on the three nodes before it."""
 
     called: ClassVar[str] = "a tetrahedral truss"
-    module: Annotated[Literal["tetrahedral"], Choice()]
+    module: Literal["tetrahedral"]
     longeron: Length = Field(default=1.0, description="home length of the member to the third node before, m")
     batten: Length = Field(
         default=1.0, description="home length of the members to the first and second node before, m"
     )
-    actuated: tuple[Annotated[int, Count(1, 3)], ...] = Field(
+    actuated: tuple[Annotated[int, count(1, 3)], ...] = Field(
         default=(1, 2, 3),
         min_length=1,
         description="which k of a node's members, to the k-th node before, are actuated",
@@ -169,11 +167,11 @@ class PlateTruss(_Truss):
     """A plate of two layers whose nodes track a surface; its first two rows are clamped."""
 
     called: ClassVar[str] = "a plate"
-    module: Annotated[Literal["plate"], Choice()]
-    rows: Annotated[int, Count(3, 200)] = Field(
+    module: Literal["plate"]
+    rows: Annotated[int, count(3, 200)] = Field(
         description="rows of nodes along +z, the two clamped ones included"
     )
-    columns: Annotated[int, Count(3, 200)] = Field(description="nodes in a row")
+    columns: Annotated[int, count(3, 200)] = Field(description="nodes in a row")
     spacing: Length = Field(default=1.0, description="distance of neighbouring nodes of a layer at home, m")
     depth: Length = Field(default=math.sqrt(0.5), description="distance of the two layers at home, m")
     stroke: Stroke | None = Field(
@@ -241,7 +239,7 @@ class GraphTruss(_Truss):
     """Any truss, given by its nodes and members."""
 
     called: ClassVar[str] = "a truss given as a graph"
-    module: Annotated[Literal["graph"], Choice()]
+    module: Literal["graph"]
     node: tuple[Node, ...] = Field(min_length=2, description="the nodes")
     member: tuple[Member, ...] = Field(min_length=1, description="the members")
     tip: tuple[Name, ...] = Field(
@@ -319,39 +317,7 @@ class GraphTruss(_Truss):
                 yield ("member", i, "nodes"), f'two nodes that no other member joins; "{other}" joins these'
 
 
-_TRUSSES = {
-    "octahedral": "<module>",
-    "double-octahedral": "<module>",
-    "hexapod": "<module>",
-    "longeron": "<module>",
-    "tetrahedral": "<tetrahedral>",
-    "graph": "<graph>",
-    "plate": "<plate>",
-}
-
-Truss = Annotated[
-    Annotated[ModuleTruss, Tag("<module>")]
-    | Annotated[TetrahedralTruss, Tag("<tetrahedral>")]
-    | Annotated[GraphTruss, Tag("<graph>")]
-    | Annotated[PlateTruss, Tag("<plate>")],
-    ByKey("module", _TRUSSES),
-]
-
-
-def increasing(key: str, times: list[float]) -> Iterator[tuple[Place, str]]:
-    """Yield each entry of the array `key` whose time is not later than the one before."""
-    for i in range(1, len(times)):
-        if times[i] <= times[i - 1]:
-            yield (key, i, "time"), f"a time after that of the entry before, {times[i - 1]:g} s"
-
-
-def unique(key: str, within: str, names: Sequence[str | int]) -> Iterator[tuple[Place, str]]:
-    """Yield each entry of the array `key` whose name is that of an earlier one."""
-    seen: set[str | int] = set()
-    for i, name in enumerate(names):
-        if name in seen:
-            yield (key, i, within), "a name that no other entry has"
-        seen.add(name)
+Truss = Annotated[ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss, ByKey("module")]
 
 
 def holds_home(
@@ -360,13 +326,3 @@ def holds_home(
     """Yield the stroke if it excludes a home length."""
     if not stroke[0] - _SLACK <= home <= stroke[1] + _SLACK:
         yield place, f"a stroke that holds the home length, {home:g} m ({of})"
-
-
-def known_names(
-    place: Place, names: Iterable[str], known: Mapping[str, Any], key: str | None = None
-) -> Iterator[tuple[Place, str]]:
-    """Yield each name, or the value of `key` at `place`, that is not among the known ones."""
-    for i, name in enumerate(names):
-        if name not in known:
-            some = quoted(list(known)[:8]) + (", ..." if len(known) > 8 else "")
-            yield (*place, i if key is None else key), f"the name of one of {some}{nearest(name, known)}"
