@@ -132,7 +132,7 @@ def make(kind: str, turn: Array) -> BoxBody | BallBody | CylinderBody | MeshBody
     if kind == "cylinder":
         return CylinderBody(*placed, radius=0.3, half_height=0.5)
     triangle = np.array([[[0.5, 0.0, 0.0], [-0.2, 0.4, 0.1], [0.0, -0.3, 0.2]]])
-    return MeshBody(*placed, triangles=triangle @ placed[3].T, closed=False)
+    return MeshBody(*placed, triangles=triangle, closed=False)
 
 
 @many

@@ -13,7 +13,7 @@ from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import RecordedArm
-from vgtm_qp.verify.clearance import AgainstBody, MemberMotion
+from vgtm_qp.verify.clearance import AgainstBody, RecordedMotion
 from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.view.drawing import obstacle_meshes
 
@@ -267,7 +267,7 @@ class _Simulation:
 
     def _run_of(self, nodes: Array, lengths: Array, contacts: int) -> ReplayRun:
         errors = lengths - self._maneuver.member_lengths
-        motion = MemberMotion(self._arm, self._maneuver.time, nodes)
+        motion = RecordedMotion(self._arm, self._maneuver.time, nodes)
         pairs = [AgainstBody(motion, body) for body in self._bodies]
         least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(nodes))]
         return ReplayRun(

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.base import base_poses
 from vgtm_qp.result.certificate import Certificate
-from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.result.chain import RecordedChain, is_serial
 from vgtm_qp.result.file import read_result, write_result
 from vgtm_qp.result.layout import check_arrays, frozen, names_of, plain
 from vgtm_qp.result.manifest import check_manifest
-from vgtm_qp.result.record import is_serial
 
 Array = NDArray[np.float64]
 

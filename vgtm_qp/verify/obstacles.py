@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ Index = NDArray[np.int64]
 class Body(ABC):
     """An obstacle; positions it takes and gives are relative to its centre, in directions of the base frame.
 
+    Methods with an underscore are those of its shape, in directions of its own axes.
+
     Attributes
     ----------
     name : str
@@ -44,31 +47,39 @@ class Body(ABC):
     velocity: Array
     rotation: Array
 
-    def at(self, time: float) -> Array:
-        """Return (3,) the centre at `time`, s."""
-        return np.asarray(self.center + self.velocity * time)
+    def at(self, time: Array) -> Array:
+        """Return (P, 3) the centre at times (P,), s."""
+        return np.asarray(self.center + self.velocity * time[:, None])
 
     @property
-    @abstractmethod
     def corners(self) -> Array:
         """(K, C, 3) points whose convex hulls hold the K convex pieces, m."""
+        return np.asarray(self._corners() @ self.rotation.T)
 
-    @abstractmethod
     def separation(self, start: Array, end: Array, piece: Index) -> Separation:
         """Return distances and normals of P segments against the pieces (P,) of this body."""
+        distance, normal = self._separation(start @ self.rotation, end @ self.rotation, piece)
+        return distance, normal @ self.rotation.T
 
-    @abstractmethod
     def support(self, normal: Array, piece: Index) -> Array:
         """Return (P,) the greatest ``normal . x`` over the points x of the pieces, m."""
+        return np.asarray(self._support(normal @ self.rotation, piece))
 
     def encloses(self, points: Array) -> NDArray[np.bool_]:
         """Return (Q,) True for points (Q, 3) inside without a surface near, as only a closed mesh has."""
         return np.zeros(len(points), dtype=np.bool_)
 
+    @abstractmethod
+    def _corners(self) -> Array: ...
 
-def _box_corners(half: Array, rotation: Array) -> Array:
-    signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(1, 8, 3)
-    return np.asarray((signs * half) @ rotation.T)
+    @abstractmethod
+    def _separation(self, start: Array, end: Array, piece: Index) -> Separation: ...
+
+    @abstractmethod
+    def _support(self, normal: Array, piece: Index) -> Array: ...
+
+
+_BOX_CORNERS: Array = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))[None]
 
 
 @dataclass(frozen=True)
@@ -77,19 +88,14 @@ class BoxBody(Body):
 
     half: Array
 
-    @property
-    def corners(self) -> Array:
-        """(1, 8, 3) m."""
-        return _box_corners(self.half, self.rotation)
+    def _corners(self) -> Array:
+        return np.asarray(_BOX_CORNERS * self.half)
 
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
-        """Return distances and normals of P segments."""
-        distance, normal = segment_box(start @ self.rotation, end @ self.rotation, self.half)
-        return distance, normal @ self.rotation.T
+    def _separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
+        return segment_box(start, end, self.half)
 
-    def support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
-        """Return (P,) greatest extents along `normal`, m."""
-        return np.asarray(np.abs(normal @ self.rotation) @ self.half)
+    def _support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
+        return np.asarray(np.abs(normal) @ self.half)
 
 
 @dataclass(frozen=True)
@@ -98,17 +104,13 @@ class BallBody(Body):
 
     radius: float
 
-    @property
-    def corners(self) -> Array:
-        """(1, 8, 3) m."""
-        return _box_corners(np.full(3, self.radius), np.eye(3))
+    def _corners(self) -> Array:
+        return _BOX_CORNERS * self.radius
 
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
-        """Return distances and normals of P segments."""
+    def _separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
         return segment_ball(start, end, self.radius)
 
-    def support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
-        """Return (P,) greatest extents along `normal`, m."""
+    def _support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
         return np.asarray(self.radius * np.linalg.norm(normal, axis=1))
 
 
@@ -119,42 +121,31 @@ class CylinderBody(Body):
     radius: float
     half_height: float
 
-    @property
-    def corners(self) -> Array:
-        """(1, 8, 3) m."""
-        return _box_corners(np.array([self.radius, self.radius, self.half_height]), self.rotation)
+    def _corners(self) -> Array:
+        return _BOX_CORNERS * np.array([self.radius, self.radius, self.half_height])
 
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
-        """Return distances and normals of P segments."""
-        local = (start @ self.rotation, end @ self.rotation)
-        distance, normal = segment_cylinder(*local, self.radius, self.half_height)
-        return distance, normal @ self.rotation.T
+    def _separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
+        return segment_cylinder(start, end, self.radius, self.half_height)
 
-    def support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
-        """Return (P,) greatest extents along `normal`, m."""
-        local = normal @ self.rotation
-        radial = np.linalg.norm(local[:, :2], axis=1)
-        return np.asarray(self.radius * radial + self.half_height * np.abs(local[:, 2]))
+    def _support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
+        radial = np.linalg.norm(normal[:, :2], axis=1)
+        return np.asarray(self.radius * radial + self.half_height * np.abs(normal[:, 2]))
 
 
 @dataclass(frozen=True)
 class MeshBody(Body):
-    """A surface of `triangles` (F, 3, 3), m, already turned to its attitude; solid where `closed`."""
+    """A surface of `triangles` (F, 3, 3), m, along its own axes; solid where `closed`."""
 
     triangles: Array
     closed: bool
 
-    @property
-    def corners(self) -> Array:
-        """(F, 3, 3) m."""
+    def _corners(self) -> Array:
         return self.triangles
 
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:
-        """Return distances and normals of P segments against the triangles (P,)."""
+    def _separation(self, start: Array, end: Array, piece: Index) -> Separation:
         return segment_triangle(start, end, self.triangles[piece])
 
-    def support(self, normal: Array, piece: Index) -> Array:
-        """Return (P,) greatest extents of the triangles along `normal`, m."""
+    def _support(self, normal: Array, piece: Index) -> Array:
         return np.asarray(np.einsum("pkc,pc->pk", self.triangles[piece], normal).max(axis=1))
 
     def encloses(self, points: Array) -> NDArray[np.bool_]:
@@ -165,6 +156,7 @@ class MeshBody(Body):
         inside = np.zeros(len(points), dtype=np.bool_)
         if not self.closed:
             return inside
+        points = points @ self.rotation
         flat = self.triangles.reshape(-1, 3)
         near = np.flatnonzero(((points > flat.min(axis=0)) & (points < flat.max(axis=0))).all(axis=1))
         for q in near:
@@ -230,7 +222,7 @@ def _read_mesh(
     """Return the mesh, and what is wrong with its file."""
     import trimesh
 
-    name, rotation = placed[0], placed[3]
+    name = placed[0]
     path = directory / str(entry.get("file", ""))
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -249,4 +241,4 @@ def _read_mesh(
     else:
         complaint = ""
     scaled = triangles * float(entry.get("scale") or 1.0)
-    return MeshBody(*placed, triangles=scaled @ rotation.T, closed=bool(surface.is_watertight)), complaint
+    return MeshBody(*placed, triangles=scaled, closed=bool(surface.is_watertight)), complaint

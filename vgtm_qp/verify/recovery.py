@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.verify.clearance import Encounters, Least
+from vgtm_qp.verify.clearance import Encounters, Least, Pairs
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,8 @@ def excuse_recovering(
             if not pairs:
                 continue
             found += 1
-            distance = _distances(group, pairs)
+            index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
+            distance = np.array([group.distances(k, index).min() for k in range(len(group.motion.time))])
             kept = np.flatnonzero(distance >= floor - tolerance)
             since = int(kept[0]) if len(kept) else len(distance)
             if since == 0 or abs(distance[0] - wanted[name]) > tolerance:
@@ -56,7 +57,7 @@ def excuse_recovering(
                     f"recovered: {name} is {distance[0]:.9g} m apart at home, not {wanted[name]:.9g} m"
                 )
                 continue
-            wrong += _nearer(group, pairs, name, distance[: since + 1], floor, tolerance, tolerance_between)
+            wrong += _nearer(group, index, name, distance[: since + 1], floor, tolerance, tolerance_between)
             group.held_from.update(dict.fromkeys(pairs, since))
             until, states = max(until, since), len(distance)
     if found < len(wanted):
@@ -73,21 +74,9 @@ def _note(distance: Mapping[str, float], until: int, states: int) -> str:
     )
 
 
-def _distances(group: Encounters, pairs: Sequence[tuple[int, int]]) -> Array:
-    """Return (T,) the least distance of the pairs at each state, m."""
-    index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
-    states = len(group.motion.nodes)
-    found = np.empty(states)
-    for state in range(states):
-        step = max(min(state, states - 2), 0)
-        share = np.full(len(pairs), 1.0 if step < state else 0.0)
-        found[state] = group.separation(group.place(step, index, share), index)[0].min()
-    return found
-
-
 def _nearer(
     group: Encounters,
-    pairs: Sequence[tuple[int, int]],
+    pairs: Pairs,
     name: str,
     distance: Array,
     floor: float,
@@ -95,7 +84,6 @@ def _nearer(
     tolerance_between: float,
 ) -> list[str]:
     """Return where a pair comes nearer than at the state before, up to the last of `distance` (K,)."""
-    index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
     wrong = []
     for state in range(len(distance) - 1):
         least = min(float(distance[state]), floor)
@@ -103,7 +91,7 @@ def _nearer(
             wrong.append(
                 f"recovered: {name} is {distance[state + 1]:.9g} m apart at state {state + 1} after {least:.9g} m"
             )
-        limit, bound = group.divide(state, index, Least(), Least())
+        limit, bound = group.divide(state, pairs, Least(), Least())
         least_between = min(limit.value, bound.value)
         if least_between < least - tolerance_between:
             wrong.append(

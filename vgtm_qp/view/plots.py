@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import recorded_arm
 from vgtm_qp.verify.check import TIP_TOLERANCE
-from vgtm_qp.verify.path import check_path
+from vgtm_qp.verify.path import tip_error
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def plot_strokes(maneuver: Result, *, axes: Axes | None = None) -> Figure:
 
 def plot_tip_error(maneuver: Result, *, axes: Axes | None = None) -> Figure:
     """Plot the distance of the tip from its target over the tracked axes, m."""
-    error = check_path(maneuver, maneuver.tip_position).tip_error(maneuver.tip_position)
+    error = tip_error(maneuver, maneuver.tip_position)
     with _on(axes) as axes:
         if error is not None:
             axes.semilogy(
