@@ -349,7 +349,7 @@ def test_a_base_may_turn_on_past_half_a_turn_and_past_a_whole_one():
 
 
 def test_the_base_that_verification_places_turns_on_too():
-    from vgtm_qp.result.base import base_poses
+    from vgtm_qp.result.poses import base_poses
     from vgtm_qp.step.base import BaseMotion
 
     problem = serial_problem({**chain(), "base_motion": TURNING})

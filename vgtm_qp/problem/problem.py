@@ -158,7 +158,7 @@ def check_is_problem(value: object) -> None:
     else:
         expected = "a problem, from vgtm_qp.load_problem(path) or vgtm_qp.Problem(...)"
     found = shown(str(value) if isinstance(value, Path) else value)
-    raise ProblemError("argument", [Mistake("problem", found, expected)])
+    raise ProblemError.at("argument", "problem", found, expected)
 
 
 def _unmet(end_effector: EndEffector, waypoint: Waypoint) -> Iterator[tuple[str, str]]:

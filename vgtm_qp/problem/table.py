@@ -23,6 +23,15 @@ from vgtm_qp.problem.fields import entry, quoted, unexpected
 Place = tuple[str | int, ...]
 
 _MISSING = object()
+_PHRASES = {
+    "tuple_type": "an array [...]",
+    "list_type": "an array [...]",
+    "too_short": "at least {min_length} of them",
+    "too_long": "at most {max_length} of them",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "choice": "a table",
+}
 _nested: ContextVar[bool] = ContextVar("_nested", default=False)
 
 
@@ -51,7 +60,7 @@ class Table(BaseModel):
 
     def _immutable(self, name: str, value: Any) -> ProblemError:
         expected = "no change, since problems are immutable: problem.replace({...}) returns a changed one"
-        return ProblemError(type(self).__name__, [Mistake(name, shown(value), expected)])
+        return ProblemError.at(type(self).__name__, name, shown(value), expected)
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         """Yield place and expectation of each value that contradicts another one of this table."""
@@ -118,14 +127,8 @@ class Table(BaseModel):
             phrase = _one_of(re.findall("'([^']+)'", context["expected"]), value)
         elif kind == "tuple_type" and isinstance(value, Mapping):
             phrase = "an array of tables: [[...]] with two brackets, one for each entry"
-        elif kind in ("tuple_type", "list_type"):
-            phrase = "an array [...]"
-        elif kind == "too_short":
-            phrase = f"at least {context['min_length']} of them"
-        elif kind == "too_long":
-            phrase = f"at most {context['max_length']} of them"
-        elif kind in ("model_type", "model_attributes_type", "choice"):
-            phrase = "a table"
+        elif kind in _PHRASES:
+            phrase = _PHRASES[kind].format_map(context)
         else:
             phrase = found["msg"][:1].lower() + found["msg"][1:]
         return InitErrorDetails(type=unexpected(phrase), loc=place, input=value)

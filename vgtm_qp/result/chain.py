@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.rotation import rotations
+from vgtm_qp.result.poses import rotations
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +20,7 @@ SCHEMA_VERSION = 1
 
 STATUSES = ("solved", "blocked", "infeasible")
 
-_PACKAGES = (
-    "vgtm-qp",
-    "numpy",
-    "casadi",
-    "daqp",
-    "osqp",
-    "piqp",
-    "python-fcl",
-    "qpsolvers",
-    "trimesh",
-)
+_PACKAGES = ("vgtm-qp", "numpy", "casadi", "daqp", "osqp", "piqp", "python-fcl", "qpsolvers", "trimesh")
 _MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "blocked_by", "versions")
 
 
@@ -49,7 +39,6 @@ def make_manifest(
     setup_time: float,
     directory: str | Path = ".",
     meshes: Mapping[str, Mapping[str, Any]] | None = None,
-    path: Sequence[Sequence[float]] | None = None,
 ) -> dict[str, Any]:
     """Return the manifest of a result file.
 
@@ -82,8 +71,6 @@ def make_manifest(
         Where the relative paths of the problem start.
     meshes : mapping, optional
         What `mesh_record` returns for each mesh obstacle, by the obstacle's name.
-    path : (K, 3), optional
-        The positions in the problem's path file, m, so that the result can be verified without it.
     """
     return {
         "schema_version": SCHEMA_VERSION,
@@ -102,7 +89,6 @@ def make_manifest(
         "setup_time": float(setup_time),
         "directory": str(Path(directory).resolve()),
         "meshes": {name: dict(record) for name, record in (meshes or {}).items()},
-        "path": None if path is None else [[float(number) for number in row] for row in path],
         "versions": _versions(),
         "certificate": None,
     }

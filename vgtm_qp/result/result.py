@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.base import base_poses
 from vgtm_qp.result.certificate import Certificate
 from vgtm_qp.result.chain import RecordedChain, is_serial
 from vgtm_qp.result.file import read_result, write_result
 from vgtm_qp.result.layout import check_arrays, frozen, names_of, plain
 from vgtm_qp.result.manifest import check_manifest
+from vgtm_qp.result.poses import base_poses
 
 Array = NDArray[np.float64]
 
@@ -134,27 +134,24 @@ class Result:
     @property
     def actuator_names(self) -> tuple[str, ...]:
         """Actuated members, or joints of a serial arm."""
-        if self.joint_names is None:
-            return tuple(self.member_names[self.member_actuated].tolist())
-        return tuple(self.joint_names[self._moving_joints].tolist())
+        names = self.member_names if self.joint_names is None else self.joint_names
+        return tuple(names[self._actuated].tolist())
 
     @property
     def actuator_values(self) -> Array:
         """(T, n_a) lengths of the actuated members, m, or values of the joints, rad or m."""
-        if self.joints is None:
-            return self.member_lengths[:, self.member_actuated]
-        return self.joints[:, self._moving_joints]
+        return (self.member_lengths if self.joints is None else self.joints)[:, self._actuated]
 
     @property
     def actuator_units(self) -> tuple[str, ...]:
         """``"m"`` or ``"rad"``."""
-        if self.joints is None:
-            return ("m",) * int(self.member_actuated.sum())
-        turns = np.asarray(self.manifest["arm"]["revolute"], dtype=np.bool_)[self._moving_joints]
-        return tuple("rad" if turn else "m" for turn in turns)
+        turns = self.manifest["arm"].get("revolute", [False] * len(self._actuated))
+        return tuple("rad" if turn else "m" for turn in np.asarray(turns)[self._actuated])
 
     @property
-    def _moving_joints(self) -> NDArray[np.bool_]:
+    def _actuated(self) -> NDArray[np.bool_]:
+        if self.joints is None:
+            return self.member_actuated
         return np.asarray(self.manifest["arm"]["actuated"], dtype=np.bool_)
 
     @property

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.base import base_poses
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.result.poses import base_poses, rotation_matrix, rotations
 from vgtm_qp.result.result import Result
-from vgtm_qp.result.rotation import rotation_matrix, rotations
 from vgtm_qp.verify.arm import Arm, recorded_arm
 from vgtm_qp.verify.clearance import (
     RESOLUTION,

@@ -213,7 +213,7 @@ class AgainstBody(Encounters):
     def __init__(self, motion: RecordedMotion, body: Body) -> None:
         super().__init__(motion)
         self.body = body
-        corners = body.corners
+        corners = body.corners()
         self._low, self._high = corners.min(axis=1), corners.max(axis=1)
         self._centers = body.at(motion.time)
 

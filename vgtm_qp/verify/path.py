@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ProblemError
+from vgtm_qp.result.poses import rotation_matrix
 from vgtm_qp.result.result import Result
-from vgtm_qp.result.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -87,9 +87,7 @@ def _corners(manifest: Mapping[str, Any], home: Array) -> Array | None:
     """Return (C, 3) the corners of the path, from the home tip on; None if no position is asked for."""
     wanted = manifest["problem"].get("maneuver") or {}
     points: Any
-    if manifest.get("path"):
-        points = manifest["path"]
-    elif wanted.get("path"):
+    if wanted.get("path"):
         from vgtm_qp.problem.path_file import read_path
 
         points = read_path(Path(manifest.get("directory") or ".") / str(wanted["path"])).position
