@@ -115,12 +115,12 @@ def entry(table: Any, key: str) -> Any:
     return getattr(table, key, None) if isinstance(table, BaseModel) else None
 
 
-def exactly(count: int, phrase: str) -> WrapValidator:
-    """Return an annotation that answers an array of another length than `count` by `phrase`."""
+def exactly(size: int, phrase: str) -> WrapValidator:
+    """Return an annotation that answers an array of another length than `size` by `phrase`."""
 
     def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
         entries = value.tolist() if hasattr(value, "tolist") else value
-        if not isinstance(entries, list | tuple) or len(entries) != count:
+        if not isinstance(entries, list | tuple) or len(entries) != size:
             raise unexpected(phrase)
         return handler(entries)
 
@@ -169,9 +169,9 @@ def _file(value: str, info: ValidationInfo) -> str:
     return str(path)
 
 
-def _array(item: dict[str, Any], count: int) -> WithJsonSchema:
+def _array(item: dict[str, Any], size: int) -> WithJsonSchema:
     # Plain `items` with equal bounds, not `prefixItems`: TOML editors know older drafts of JSON Schema only.
-    return WithJsonSchema({"type": "array", "items": item, "minItems": count, "maxItems": count})
+    return WithJsonSchema({"type": "array", "items": item, "minItems": size, "maxItems": size})
 
 
 _LENGTH_SCHEMA = {"type": "number", "exclusiveMinimum": 0, "maximum": GREATEST_LENGTH}

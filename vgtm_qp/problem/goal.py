@@ -21,6 +21,7 @@ from vgtm_qp.problem.fields import (
 from vgtm_qp.problem.table import Place, Table, increasing
 
 Coordinates = Literal["position", "pointing", "orientation", "x", "y", "z"]
+Steps = Annotated[int, count(1, 1_000_000)]
 
 
 class EndEffector(Table):
@@ -74,7 +75,7 @@ class WaypointManeuver(Table):
 
     called: ClassVar[str] = "a maneuver through waypoints"
     kind: Literal["path"] = "path"
-    steps: Annotated[int, count(1, 1_000_000)] = Field(default=50, description="number of steps")
+    steps: Steps = Field(default=50, description="number of steps")
     waypoint: tuple[Waypoint, ...] = Field(min_length=1, description="the waypoints, in the order of time")
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
@@ -101,7 +102,7 @@ class DeploymentManeuver(Table):
 
     called: ClassVar[str] = "a deployment"
     kind: Literal["deployment"]
-    steps: Annotated[int, count(1, 1_000_000)] = Field(default=150, description="number of steps")
+    steps: Steps = Field(default=150, description="number of steps")
     duration: Seconds = Field(default=10.0, description="time from stowed to deployed, s")
     stowed_batten: Length | None = Field(
         default=None, description="length of the battens when stowed, m; 1.65 longerons where absent"

@@ -76,7 +76,8 @@ def _find(path: str | Path) -> Path:
     if not exists and name in bundled:
         return bundled[name]
     if exists:
-        raise ProblemError.at(name, "file", _kind(file), "a problem file in TOML")
+        found = "a folder" if file.is_dir() else "something that is not a regular file"
+        raise ProblemError.at(name, "file", found, "a problem file in TOML")
     try:
         beside = [entry.name for entry in file.parent.iterdir() if entry.suffix == ".toml"]
     except (OSError, ValueError):
@@ -84,10 +85,6 @@ def _find(path: str | Path) -> Path:
     hint = nearest(file.name, [*beside, *bundled])
     expected = f"a problem file that exists, or the name of a bundled problem: {quoted(bundled)}{hint}"
     raise ProblemError.at(name, "file", "nothing", expected)
-
-
-def _kind(file: Path) -> str:
-    return "a folder" if file.is_dir() else "something that is not a regular file"
 
 
 def _read(file: Path) -> str:

@@ -101,9 +101,10 @@ class Table(BaseModel):
 
     @classmethod
     def _misspelt(cls, errors: Sequence[ErrorDetails]) -> set[Place]:
-        """Return the keys of this table that an unknown one is probably meant for."""
-        unknown = [str(found["loc"][0]) for found in errors if _is_own(found, "extra_forbidden")]
-        return {(name,) for key in unknown if (name := closest(key, cls.model_fields)) is not None}
+        """Return the keys of this table itself that an unknown one is probably meant for."""
+        unknown = [found["loc"] for found in errors if found["type"] == "extra_forbidden"]
+        meant = (closest(str(place[0]), cls.model_fields) for place in unknown if len(place) == 1)
+        return {(name,) for name in meant if name is not None}
 
     @classmethod
     def _detail(cls, found: ErrorDetails) -> InitErrorDetails:
@@ -163,11 +164,6 @@ def known_names(
 def _one_of(choices: Sequence[str], value: Any) -> str:
     hint = nearest(value, choices) if isinstance(value, str) else ""
     return f"{'one of ' if len(choices) > 1 else ''}{quoted(choices)}{hint}"
-
-
-def _is_own(found: ErrorDetails, kind: str) -> bool:
-    """Whether an error is of a kind and about a key of the table itself, not of one inside it."""
-    return found["type"] == kind and len(found["loc"]) == 1
 
 
 def _echo(found: ErrorDetails) -> bool:

@@ -86,6 +86,16 @@ class _Truss(Table):
         yield from increasing("base_motion", [pose.time for pose in self.base_motion])
         yield from unique("locked", "member", [lock.member for lock in self.locked])
 
+    def _misfits(
+        self, stroke: Stroke | None, shortest: float, actuated: Mapping[str, float]
+    ) -> Iterator[tuple[Place, str]]:
+        """Yield what the shortest distance of joined nodes, or those of actuated members by their key, exclude."""
+        if 2 * self.joint_offset >= shortest:
+            yield ("joint_offset",), f"less than half the shortest member, {shortest / 2:g} m"
+        elif stroke:
+            for key, length in actuated.items():
+                yield from holds_home(("stroke",), stroke, length - 2 * self.joint_offset, key)
+
 
 class _Stack(_Truss):
     called: ClassVar[str] = "a truss made of bays"
@@ -105,12 +115,7 @@ class _Stack(_Truss):
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from super()._contradictions()
-        shortest = min(self.longeron, self.batten)
-        if 2 * self.joint_offset >= shortest:
-            yield ("joint_offset",), f"less than half the shortest member, {shortest / 2:g} m"
-        elif self.stroke:
-            for key, length in self._actuated_lengths().items():
-                yield from holds_home(("stroke",), self.stroke, length - 2 * self.joint_offset, key)
+        yield from self._misfits(self.stroke, min(self.longeron, self.batten), self._actuated_lengths())
 
 
 class ModuleTruss(_Stack):
@@ -180,10 +185,7 @@ class PlateTruss(_Truss):
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from super()._contradictions()
-        if 2 * self.joint_offset >= self.spacing:
-            yield ("joint_offset",), f"less than half the shortest member, {self.spacing / 2:g} m"
-        elif self.stroke:
-            yield from holds_home(("stroke",), self.stroke, self.spacing - 2 * self.joint_offset, "spacing")
+        yield from self._misfits(self.stroke, self.spacing, {"spacing": self.spacing})
 
 
 class Node(Table):

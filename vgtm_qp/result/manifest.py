@@ -44,16 +44,10 @@ def make_manifest(
 
     Parameters
     ----------
-    problem : mapping
-        The whole problem as JSON data, in the form of the problem file.
-    arm : mapping
-        What the arm's `record` returns.
-    status : str
-        One of `STATUSES`.
-    reached : float
-        Share of the path covered, 0 to 1.
-    blocked_by : iterable of str
-        Names of what stopped it.
+    problem, arm : mapping
+        The whole problem as JSON data, in the form of the problem file; what the arm's `record` returns.
+    status, reached, blocked_by
+        One of `STATUSES`, the share of the path covered, 0 to 1, and the names of what stopped it.
     stop : mapping, optional
         What ``Stop.to_dict`` returns.
     way_out : str
@@ -61,12 +55,8 @@ def make_manifest(
     recovered : mapping, optional
         Pairs below their clearance in the home pose, ``member / obstacle`` or ``member / member``, and their
         distances there, m.
-    method : str
-        As in the problem's ``[method]``.
-    solver : str or None
-        What solved the QPs; None where the method solves none.
-    setup_time : float
-        s.
+    method, solver, setup_time
+        As in the problem's ``[method]``; what solved the QPs, None where the method solves none; s.
     directory : path
         Where the relative paths of the problem start.
     meshes : mapping, optional

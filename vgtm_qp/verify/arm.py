@@ -35,11 +35,9 @@ class RecordedArm:
         Of what moves the arm and what is fixed: names and home lengths of the members.
     length, stroke, rate, acceleration, radius : (M,), (M, 2), (M,), (M,), (M,)
         Home lengths and limits; inf where there is no limit.
-    triangle, offset : (N, 3) int or (N, 1) int, (M, 2, 3)
-        Nodes that orient each node's joint, and the members' ends in the joint frames, eqs. (12)-(13); the
-        node alone and zeros for pin joints.
-    corners : (M, 2, 1 or 3) int
-        Nodes that place the two ends of each member.
+    corners, offset : (M, 2, 3) int or (M, 2, 1) int, (M, 2, 3)
+        Nodes that place the two ends of each member and orient its joint there, and the ends in the joint
+        frames, eqs. (12)-(13); the end's node alone and zeros for pin joints.
     """
 
     unit, body, rigid_body = "m", "member", "fixed member"
@@ -64,10 +62,10 @@ class RecordedArm:
             self.tip_weights = numbers(tip, "weights", (len(self.tip),))
             self.tip_frame = numbers(tip, "frame", (3, 3))
             if joints is None:
-                self.triangle = np.arange(nodes)[:, None]
+                triangle = np.arange(nodes)[:, None]
                 self.offset = np.zeros((count, 2, 3))
             else:
-                self.triangle = _indices(joints["triangle"], "joints.triangle", nodes).reshape(nodes, 3)
+                triangle = _indices(joints["triangle"], "joints.triangle", nodes).reshape(nodes, 3)
                 self.offset = numbers(joints, "offset", (count, 2, 3))
         except KeyError as error:
             raise ResultError(f"manifest.arm lacks {error}") from None
@@ -75,7 +73,7 @@ class RecordedArm:
             raise ResultError(f"manifest.arm is malformed: {error}") from None
         if len(self.member_names) != count or self.actuated.shape != (count,):
             raise ResultError(f"manifest.arm does not describe {count} members, as array members does")
-        self.members, self.corners = members, self.triangle[members]
+        self.members, self.corners = members, triangle[members]
         self.quantity_names, self.home_quantities = self.member_names, self.length
         self.free = np.setdiff1d(np.arange(nodes), self.base)
         # Fewer than three nodes have no attitude.
@@ -84,7 +82,7 @@ class RecordedArm:
     @property
     def has_pin_joints(self) -> bool:
         """True where members end in their nodes, and so move along straight lines when the nodes do."""
-        return bool(self.triangle.shape[1] == 1)
+        return bool(self.corners.shape[2] == 1)
 
     def ends(self, nodes: Array) -> Array:
         """Return (..., M, 2, 3) the members' ends r_ik, eq. (13), m, at node positions (..., N, 3)."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate, Measure
@@ -317,7 +317,7 @@ def _record_contradictions(maneuver: Result, arm: Arm) -> list[str]:
                 continue
             given = entries.get(member, {}).get(name.removeprefix("member_"))
             wanted = truss.get(name) if given is None else given
-            if wanted is not None and not np.allclose(recorded[k], wanted, rtol=0.0, atol=LIMIT_TOLERANCE):
+            if wanted is not None and not _same(recorded[k], wanted):
                 differing.append(f"{member} (problem: {wanted})")
         if differing:
             more = f" and {len(differing) - 1} more members" if len(differing) > 1 else ""
@@ -353,14 +353,17 @@ def _chain_contradictions(maneuver: Result, arm: RecordedChain) -> list[str]:
             "kind": (float(arm.revolute[k]), float(joint.get("kind", "revolute") == "revolute")),
         }
         for key, (recorded, given) in wanted.items():
-            if not np.allclose(recorded, given, rtol=0.0, atol=LIMIT_TOLERANCE):
+            if not _same(recorded, given):
                 found.append(f"the arm record's {key} of joint {name} differs from the problem's")
-    if not np.allclose(arm.tip, table.get("tip") or origin, rtol=0.0, atol=LIMIT_TOLERANCE):
+    if not _same(arm.tip, table.get("tip") or origin):
         found.append("the arm record's tip differs from the problem's")
-    radius = table.get("link_radius")
-    if radius is not None and not np.allclose(arm.radius, radius, rtol=0.0, atol=LIMIT_TOLERANCE):
+    if table.get("link_radius") is not None and not _same(arm.radius, table["link_radius"]):
         found.append("the arm record's link radius differs from the problem's")
     return found
+
+
+def _same(recorded: ArrayLike, given: ArrayLike) -> bool:
+    return bool(np.allclose(recorded, given, rtol=0.0, atol=LIMIT_TOLERANCE))
 
 
 def _outcome_contradictions(maneuver: Result) -> list[str]:

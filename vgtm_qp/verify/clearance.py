@@ -88,14 +88,14 @@ class Encounters(ABC):
         """Return the pairs of that name, an empty list if there are none."""
 
     @abstractmethod
-    def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:
+    def _near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:
         """Return the pairs (P,), (P,) that may be nearer than `limit`, m.
 
         `low`, `high` (M, 3) bound each member from state `start` to state `stop`.
         """
 
     @abstractmethod
-    def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
+    def _points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
         """Return (P, 2 or 4, 3) the points that the pairs' separation depends on, m.
 
         `ends` gives (P, 2, 3) the ends of members (P,) at the times (P,), s.
@@ -106,14 +106,14 @@ class Encounters(ABC):
         """Return the exact surface distance (P,), m, and the normal (P, 3) at those points."""
 
     @abstractmethod
-    def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
+    def _apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """Return (P,) how far a plane across `normal` holds the surfaces apart, m.
 
         With a zero normal it is the value of axes that touch.
         """
 
     @abstractmethod
-    def bend(self, step: int, pair: Pairs) -> Array:
+    def _bend(self, step: int, pair: Pairs) -> Array:
         """Return (P,) bounds, m, of the pairs' second derivative that comes from turning joints."""
 
     @abstractmethod
@@ -123,7 +123,7 @@ class Encounters(ABC):
     def distances(self, state: int, pair: Pairs) -> Array:
         """Return the exact distances (P,) of pairs at a state, m."""
         ends, time = self.motion.ends[state], np.full(len(pair[0]), self.motion.time[state])
-        return self.separation(self.points(pair, lambda member: ends[member], time), pair)[0]
+        return self.separation(self._points(pair, lambda member: ends[member], time), pair)[0]
 
     def at_state(self, state: int) -> Least:
         """Return the exact least clearance at a state."""
@@ -146,8 +146,8 @@ class Encounters(ABC):
         return np.inf
 
     def _counting(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Iterator[Pairs]:
-        """Yield what `near` finds and counts from state `start` on, some pairs at a time."""
-        first, second = self.near(low, high, start, stop, limit)
+        """Yield what `_near` finds and counts from state `start` on, some pairs at a time."""
+        first, second = self._near(low, high, start, stop, limit)
         if self.held_from:
             each = zip(first.tolist(), second.tolist(), strict=True)
             kept = np.array([self.held_from.get(pair, 0) <= start for pair in each], dtype=bool)
@@ -174,7 +174,7 @@ class Encounters(ABC):
     def divide(self, step: int, pair: Pairs, limit: Least, bound: Least) -> tuple[Least, Least]:
         """Return `limit` and `bound` lowered by pairs (P,), (P,) in the motion from state `step` to the next."""
         start, width = np.zeros(len(pair[0])), 1.0
-        bend = self.bend(step, pair)
+        bend = self._bend(step, pair)
         for depth in range(_GREATEST_DEPTH):
             shares = (start, np.minimum(start + width, 1.0))
             edges = [self._points_between(step, pair, share) for share in shares]
@@ -182,8 +182,8 @@ class Encounters(ABC):
             for points, share in zip(edges, shares, strict=True):
                 distance, normal = self.separation(points, pair)
                 limit = limit.or_lower(distance, self._called_between(step, share, pair))
-                held = np.minimum(*(self.apart(ends, normal, pair) for ends in edges))
-                touching = self.apart(points, np.zeros_like(normal), pair)
+                held = np.minimum(*(self._apart(ends, normal, pair) for ends in edges))
+                touching = self._apart(points, np.zeros_like(normal), pair)
                 proven = np.maximum(proven, np.maximum(held - bend * width**2 / 8.0, touching))
             open_ = (proven < limit.value - RESOLUTION) & np.isfinite(bend)
             if depth == _GREATEST_DEPTH - 1 or open_.sum() > _GREATEST_COUNT:
@@ -201,7 +201,7 @@ class Encounters(ABC):
     def _points_between(self, step: int, pair: Pairs, share: Array) -> Array:
         before, after = self.motion.time[step : step + 2]
         time = before + share * (after - before)
-        return self.points(pair, lambda member: self.motion.ends_between(step, member, share), time)
+        return self._points(pair, lambda member: self.motion.ends_between(step, member, share), time)
 
     def _called_between(self, step: int, share: Array, pair: Pairs) -> Callable[[int], str]:
         return lambda k: self._called(f"step {step + 1} at {share[k]:.4f}", pair)(k)
@@ -222,8 +222,7 @@ class AgainstBody(Encounters):
         named = [k for k in range(len(self.motion.arm.member_names)) if self.name((k, 0)) == name]
         return [(member, piece) for member in named for piece in range(len(self._low))]
 
-    def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:
-        """Return the pairs (member, piece) whose bounding boxes are nearer than `limit`."""
+    def _near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:
         reach = limit + self.motion.arm.radius
         shift = self._centers[start : stop + 1]
         low, high = low - shift.max(axis=0), high - shift.min(axis=0)
@@ -245,8 +244,7 @@ class AgainstBody(Encounters):
         depth = np.where(inside, -self.motion.arm.radius, np.inf)
         return super().at_state(state).or_lower(depth, lambda k: f"state {state}: {self.name((k, 0))}")
 
-    def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
-        """Return (P, 2, 3) the members' ends relative to the obstacle's centre."""
+    def _points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
         return np.asarray(ends(pair[0]) - self.body.at(time)[:, None])
 
     def separation(self, points: Array, pair: Pairs) -> Separation:
@@ -254,13 +252,11 @@ class AgainstBody(Encounters):
         distance, normal = self.body.separation(points[:, 0], points[:, 1], pair[1])
         return distance - self.motion.arm.radius[pair[0]], normal
 
-    def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
-        """Return how far a plane across `normal` holds member and piece apart."""
+    def _apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         nearest = np.einsum("pec,pc->pe", points, normal).min(axis=1)
         return np.asarray(nearest - self.body.support(normal, pair[1]) - self.motion.arm.radius[pair[0]])
 
-    def bend(self, step: int, pair: Pairs) -> Array:
-        """Return bounds of the members' bending paths."""
+    def _bend(self, step: int, pair: Pairs) -> Array:
         return self.motion.bend(step, pair[0])
 
     def name(self, pair: tuple[int, int]) -> str:
@@ -278,8 +274,7 @@ class AgainstMembers(Encounters):
         found = [(a, b) for a in apart for b in range(len(names)) if self.name((a, b)) == name]
         return [pair for a, b in found if not np.isin(nodes[a], nodes[b]).any() for pair in ((a, b), (b, a))]
 
-    def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:  # noqa: ARG002
-        """Return the pairs whose bounding boxes are nearer than `limit`, swept along the longest axis."""
+    def _near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:  # noqa: ARG002
         axis = int(np.argmax(high.max(axis=0) - low.min(axis=0)))
         radius = self.motion.arm.radius
         reach = limit + 2.0 * float(radius.max())
@@ -296,8 +291,7 @@ class AgainstMembers(Encounters):
         gap = _box_gap(low[a], high[a], low[b], high[b]) - radius[a] - radius[b]
         return a[gap < limit], b[gap < limit]
 
-    def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:  # noqa: ARG002
-        """Return (P, 4, 3) the ends of both members."""
+    def _points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:  # noqa: ARG002
         return np.concatenate([ends(member) for member in pair], axis=1)
 
     def separation(self, points: Array, pair: Pairs) -> Separation:
@@ -305,13 +299,11 @@ class AgainstMembers(Encounters):
         distance, normal = segment_segment(*(points[:, k] for k in range(4)))
         return distance - self._radii(pair), normal
 
-    def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
-        """Return how far a plane across `normal` holds the members apart."""
+    def _apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         along = np.einsum("pec,pc->pe", points, normal)
         return np.asarray(along[:, :2].min(axis=1) - along[:, 2:].max(axis=1) - self._radii(pair))
 
-    def bend(self, step: int, pair: Pairs) -> Array:
-        """Return bounds of both members' bending paths together."""
+    def _bend(self, step: int, pair: Pairs) -> Array:
         return self.motion.bend(step, pair[0]) + self.motion.bend(step, pair[1])
 
     def name(self, pair: tuple[int, int]) -> str:

@@ -89,11 +89,8 @@ def segment_segment(start: Array, end: Array, other_start: Array, other_end: Arr
         -_to_segment(other_end, start, first),
     ]
     a, e = np.sum(first * first, axis=1), np.sum(second * second, axis=1)
-    b, c, f = (
-        np.sum(first * second, axis=1),
-        np.sum(first * between, axis=1),
-        np.sum(second * between, axis=1),
-    )
+    b, c = np.sum(first * second, axis=1), np.sum(first * between, axis=1)
+    f = np.sum(second * between, axis=1)
     determinant = a * e - b * b
     skew = determinant > 1e-14 * a * e
     safe = np.where(skew, determinant, 1.0)
