@@ -10,7 +10,7 @@ from pydantic import Field, PrivateAttr, WithJsonSchema, model_validator
 
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem.arm import ArmTable
-from vgtm_qp.problem.fields import Name, expect
+from vgtm_qp.problem.fields import Name, entry, expect
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
 from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
@@ -128,9 +128,7 @@ class Problem(Table):
         """Add the default curve, or surface of a plate, where a truss or arm has neither."""
         if not isinstance(data, Mapping) or data.get("curve") is not None or data.get("surface") is not None:
             return data
-        truss = data.get("truss")
-        module = truss.get("module") if isinstance(truss, Mapping) else getattr(truss, "module", None)
-        return {**data, "surface" if module == "plate" else "curve": {}}
+        return {**data, "surface" if entry(data.get("truss"), "module") == "plate" else "curve": {}}
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.truss is None and self.arm is None:

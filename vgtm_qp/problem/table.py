@@ -97,7 +97,11 @@ class Table(BaseModel):
         if not outermost:
             raise wrong
         source = (info.context or {}).get("source") or cls.__name__
-        raise ProblemError(str(source), mistakes_in(wrong, data)) from None
+        mistakes = [
+            Mistake(key_path(data, found["loc"]), shown(found["input"]), found["msg"])
+            for found in wrong.errors(include_url=False)
+        ]
+        raise ProblemError(str(source), mistakes) from None
 
     @classmethod
     def _misspelt(cls, errors: Sequence[ErrorDetails]) -> set[Place]:
@@ -169,14 +173,6 @@ def _one_of(choices: Sequence[str], value: Any) -> str:
 def _echo(found: ErrorDetails) -> bool:
     """Whether an array is called too short only because an entry, which has its own error, was left out."""
     return found["type"] == "too_short" and len(found["input"]) >= found["ctx"]["min_length"]
-
-
-def mistakes_in(error: ValidationError, data: Any) -> list[Mistake]:
-    """Return each error of a validated `data` as a mistake with its key path."""
-    return [
-        Mistake(key_path(data, found["loc"]), shown(found["input"]), found["msg"])
-        for found in error.errors(include_url=False)
-    ]
 
 
 def key_path(data: Any, place: Place) -> str:

@@ -39,7 +39,6 @@ class RecordedChain:
     """
 
     unit, body, rigid_body = "rad or m", "link", "link"
-    has_pin_joints = False
 
     def __init__(self, record: Mapping[str, Any]) -> None:
         try:
@@ -74,7 +73,7 @@ class RecordedChain:
         home = np.concatenate([self.home_quantities, np.zeros(6)])[None]
         points, _, frames = self.placed(home)
         self.home, self._home_tip = points[0], frames[0]
-        self.length = np.linalg.norm(np.diff(self.home[self.links], axis=1)[:, 0], axis=1)
+        self.length = self.lengths(self.home)
         self._reaches = self._greatest_reaches()
 
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
@@ -99,9 +98,8 @@ class RecordedChain:
         return np.asarray(points[..., self.links, :])
 
     def lengths(self, points: Array) -> Array:
-        """Return (B,) the lengths of the links, m, where the points (J + 2, 3) are."""
-        ends = self.ends(points)
-        return np.asarray(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
+        """Return (..., B) the lengths of the links, m, where the points (..., J + 2, 3) are."""
+        return np.asarray(np.linalg.norm(np.diff(self.ends(points), axis=-2)[..., 0, :], axis=-1))
 
     def quantities(self, q: Array) -> Array:
         """Return (T, J) the joints' values at configurations (T, J + 6)."""

@@ -190,8 +190,7 @@ class Result:
         Entries that come from the certificate are None before verification. A certificate measures penetration
         no deeper than a member's radius; beyond that the clearance at the states replaces the one between them.
         """
-        certificate = self.certificate
-        manifest = self.manifest
+        certificate, manifest = self.certificate, self.manifest
         finite = self.clearance[np.isfinite(self.clearance)]
         least = float(finite.min()) if len(finite) else None
 
@@ -220,7 +219,7 @@ class Result:
             "step_time": self._step_time(),
             "setup_time": manifest.get("setup_time"),
             "blocked_by": list(self.blocked_by),
-            "way_out": str(self.manifest.get("way_out", "")),
+            "way_out": str(manifest.get("way_out", "")),
             "verified": None if certificate is None else certificate.ok,
             "failures": [] if certificate is None else list(certificate.failures()),
             "result": None if result is None else str(result),
@@ -267,11 +266,10 @@ def _links(chain: RecordedChain, q: Array) -> dict[str, NDArray[Any]]:
             f"array joints holds {q.shape[1] - 6} joints; manifest.arm describes {len(chain.quantity_names)}"
         )
     points = chain.placed(q)[0]
-    ends = chain.ends(points)
     return {
         "nodes": points,
         "members": chain.links,
         "member_names": np.array(chain.member_names),
-        "member_actuated": np.zeros(len(chain.links), dtype=np.bool_),
-        "member_lengths": np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2),
+        "member_actuated": chain.stretches,
+        "member_lengths": chain.lengths(points),
     }
