@@ -15,6 +15,8 @@ from vgtm_qp.result.poses import base_poses, rotation_matrix, rotations
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm, recorded_arm
 from vgtm_qp.verify.clearance import (
+    BETWEEN_TOLERANCE,
+    CLEARANCE_TOLERANCE,
     RESOLUTION,
     AgainstBody,
     AgainstMembers,
@@ -23,7 +25,7 @@ from vgtm_qp.verify.clearance import (
     RecordedMotion,
 )
 from vgtm_qp.verify.obstacles import read_obstacles
-from vgtm_qp.verify.path import check_path, direction_error, tip_error
+from vgtm_qp.verify.path import DIRECTION_TOLERANCE, TIP_TOLERANCE, check_path, direction_error, tip_error
 from vgtm_qp.verify.recovery import excuse_recovering
 
 Array = NDArray[np.float64]
@@ -32,14 +34,6 @@ MEMBER_TOLERANCE = 1e-9
 """Fixed and locked members, base nodes, m."""
 LIMIT_TOLERANCE = 1e-9
 """Strokes, rates and accelerations, m, m/s, m/s^2."""
-CLEARANCE_TOLERANCE = 1e-9
-"""Clearances at states, m."""
-BETWEEN_TOLERANCE = 1e-4
-"""Clearances between states, m."""
-TIP_TOLERANCE = 1e-6
-"""Tip position and its target's distance from the path, m."""
-DIRECTION_TOLERANCE = 1e-6
-"""Tip direction and orientation, rad."""
 ARRAY_TOLERANCE = 1e-9
 """Stored arrays against the same recomputed, m."""
 
@@ -169,7 +163,7 @@ def _clearances(
     recovered = manifest.get("recovered") or []
     if recovered:
         kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
-        nearer, remarks = excuse_recovering(recovered, kept, CLEARANCE_TOLERANCE, BETWEEN_TOLERANCE)
+        nearer, remarks = excuse_recovering(recovered, kept)
         wrong, notes = [*wrong, *nearer], [*notes, *remarks]
         at, between, _ = _least_clearances(motion, against)
         self_at, self_between, _ = _least_clearances(motion, members)

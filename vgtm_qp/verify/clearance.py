@@ -22,6 +22,10 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Pairs = tuple[Index, Index]
 
+CLEARANCE_TOLERANCE = 1e-9
+"""Clearances at states, m."""
+BETWEEN_TOLERANCE = 1e-4
+"""Clearances between states, m."""
 RESOLUTION = 1e-6
 """The bound between states is at most this much below the least clearance found there, m."""
 

@@ -15,8 +15,10 @@ from vgtm_qp.result.result import Result
 
 Array = NDArray[np.float64]
 
-_DIRECTION_TOLERANCE = 1e-6
-_POSITION_TOLERANCE = 1e-6
+TIP_TOLERANCE = 1e-6
+"""Tip position and its target's distance from the path, m."""
+DIRECTION_TOLERANCE = 1e-6
+"""Tip direction and orientation, rad."""
 
 
 def tip_error(maneuver: Result, tip: Array) -> Array | None:
@@ -67,7 +69,7 @@ def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], l
         targets = maneuver.tip_target_position
         target_error = _to_polyline(targets[:, axes], corners[:, axes])
         missed = float(np.linalg.norm(targets[-1, axes] - corners[-1, axes]))
-        if maneuver.status == "solved" and missed > _POSITION_TOLERANCE:
+        if maneuver.status == "solved" and missed > TIP_TOLERANCE:
             contradictions.append(f"solved, but the last target is {missed:.3g} m from the end of the path")
     contradictions += _last_direction(maneuver, wanted.get("waypoint") or ())
     return target_error, contradictions, notes
@@ -121,7 +123,7 @@ def _last_direction(maneuver: Result, waypoints: Sequence[Mapping[str, Any]]) ->
             off = float(_angle(targets[-1:], goals[-1][None])[0])
         else:
             off = float(_rotation_angle(targets[-1:], rotation_matrix(goals[-1])[None])[0])
-        if off > _DIRECTION_TOLERANCE:
+        if off > DIRECTION_TOLERANCE:
             yield f"solved, but the last {kind} target is {off:.3g} rad from the problem's"
 
 

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.verify.clearance import Encounters, Least, Pairs
+from vgtm_qp.verify.clearance import BETWEEN_TOLERANCE, CLEARANCE_TOLERANCE, Encounters, Least, Pairs
 
 Array = NDArray[np.float64]
 
 
 def excuse_recovering(
-    record: Any, encounters: Iterable[tuple[Encounters, float]], tolerance: float, tolerance_between: float
+    record: Any, encounters: Iterable[tuple[Encounters, float]]
 ) -> tuple[list[str], list[str]]:
     """Return the faults of recovering pairs, one line each, and a note that sums them up.
 
@@ -28,8 +28,6 @@ def excuse_recovering(
         Of the manifest: entries with ``pair``, as encounters name it, and ``distance`` at home, m.
     encounters
         Each with the distance that its pairs keep, m.
-    tolerance, tolerance_between
-        Of distances at states and between them, m.
 
     Raises
     ------
@@ -50,14 +48,14 @@ def excuse_recovering(
             found += 1
             index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
             distance = np.array([group.distances(k, index).min() for k in range(len(group.motion.time))])
-            kept = np.flatnonzero(distance >= floor - tolerance)
+            kept = np.flatnonzero(distance >= floor - CLEARANCE_TOLERANCE)
             since = int(kept[0]) if len(kept) else len(distance)
-            if since == 0 or abs(distance[0] - wanted[name]) > tolerance:
+            if since == 0 or abs(distance[0] - wanted[name]) > CLEARANCE_TOLERANCE:
                 wrong.append(
                     f"recovered: {name} is {distance[0]:.9g} m apart at home, not {wanted[name]:.9g} m"
                 )
                 continue
-            wrong += _nearer(group, index, name, distance[: since + 1], floor, tolerance, tolerance_between)
+            wrong += _nearer(group, index, name, distance[: since + 1], floor)
             group.held_from.update(dict.fromkeys(pairs, since))
             until, states = max(until, since), len(distance)
     if found < len(wanted):
@@ -74,26 +72,18 @@ def _note(distance: Mapping[str, float], until: int, states: int) -> str:
     )
 
 
-def _nearer(
-    group: Encounters,
-    pairs: Pairs,
-    name: str,
-    distance: Array,
-    floor: float,
-    tolerance: float,
-    tolerance_between: float,
-) -> list[str]:
+def _nearer(group: Encounters, pairs: Pairs, name: str, distance: Array, floor: float) -> list[str]:
     """Return where a pair comes nearer than at the state before, up to the last of `distance` (K,)."""
     wrong = []
     for state in range(len(distance) - 1):
         least = min(float(distance[state]), floor)
-        if distance[state + 1] < least - tolerance:
+        if distance[state + 1] < least - CLEARANCE_TOLERANCE:
             wrong.append(
                 f"recovered: {name} is {distance[state + 1]:.9g} m apart at state {state + 1} after {least:.9g} m"
             )
         limit, bound = group.divide(state, pairs, Least(), Least())
         least_between = min(limit.value, bound.value)
-        if least_between < least - tolerance_between:
+        if least_between < least - BETWEEN_TOLERANCE:
             wrong.append(
                 f"recovered: {name} comes as near as {least_between:.9g} m in step {state + 1} from {least:.9g} m"
             )

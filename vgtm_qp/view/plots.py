@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import recorded_arm
-from vgtm_qp.verify.check import TIP_TOLERANCE
-from vgtm_qp.verify.path import tip_error
+from vgtm_qp.verify.path import TIP_TOLERANCE, tip_error
 
 Array = NDArray[np.float64]
 
