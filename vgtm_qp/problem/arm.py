@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -23,10 +23,9 @@ from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
 from vgtm_qp.problem.truss import BasePose, Lock
 
 
-class Joint(Table):
+class Joint(Table, called="a joint"):
     """A joint of a serial arm, placed in the frame of the joint before it."""
 
-    called: ClassVar[str] = "a joint"
     name: Name = Field(description="name of the joint")
     kind: Literal["revolute", "prismatic"] = Field(default="revolute", description="how it moves")
     axis: Direction = Field(description="axis in its own frame; need not be a unit vector")
@@ -50,10 +49,9 @@ class Joint(Table):
             yield ("home",), f"a value within the limits, {self.limits[0]:g} to {self.limits[1]:g}"
 
 
-class ArmTable(Table):
+class ArmTable(Table, called="an arm"):
     """A serial arm."""
 
-    called: ClassVar[str] = "an arm"
     urdf: File | None = Field(default=None, description="URDF file, relative to the problem file")
     base_link: Name | None = Field(
         default=None, description="first link taken from the URDF; its root where absent"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -24,10 +24,9 @@ Coordinates = Literal["position", "pointing", "orientation", "x", "y", "z"]
 Steps = Annotated[int, count(1, 1_000_000)]
 
 
-class EndEffector(Table):
+class EndEffector(Table, called="an end effector"):
     """Which coordinates of the end effector follow the path, and how strictly."""
 
-    called: ClassVar[str] = "an end effector"
     track: tuple[Coordinates, ...] = Field(
         default=("position",),
         min_length=1,
@@ -52,10 +51,9 @@ class EndEffector(Table):
                 yield ("track", i), "pointing or orientation, not both"
 
 
-class Waypoint(Table):
+class Waypoint(Table, called="a waypoint"):
     """A pose that the end effector passes at a time."""
 
-    called: ClassVar[str] = "a waypoint"
     time: Seconds = Field(description="time since the start at the home pose, s")
     position: Vector | None = Field(default=None, description="position in the base frame, m")
     pointing: Direction | None = Field(
@@ -70,10 +68,9 @@ class Waypoint(Table):
             yield ("pointing",), "pointing or rotation_vector, not both"
 
 
-class WaypointManeuver(Table):
+class WaypointManeuver(Table, called="a maneuver through waypoints"):
     """From the home pose through waypoints, in equal steps of time."""
 
-    called: ClassVar[str] = "a maneuver through waypoints"
     kind: Literal["path"] = "path"
     steps: Steps = Field(default=50, description="number of steps")
     waypoint: tuple[Waypoint, ...] = Field(min_length=1, description="the waypoints, in the order of time")
@@ -82,10 +79,9 @@ class WaypointManeuver(Table):
         yield from increasing("waypoint", [waypoint.time for waypoint in self.waypoint])
 
 
-class PathManeuver(Table):
+class PathManeuver(Table, called="a maneuver along a path file"):
     """Along a path from a file, one step a row."""
 
-    called: ClassVar[str] = "a maneuver along a path file"
     kind: Literal["path"] = "path"
     path: File = Field(description="CSV file with the columns t,x,y,z and, if wanted, rx,ry,rz (s, m, rad)")
     approach_steps: Annotated[int, count(0, 1_000_000)] = Field(
@@ -97,10 +93,9 @@ class PathManeuver(Table):
     )
 
 
-class DeploymentManeuver(Table):
+class DeploymentManeuver(Table, called="a deployment"):
     """From the stowed to the deployed truss, along a guide curve, tip first."""
 
-    called: ClassVar[str] = "a deployment"
     kind: Literal["deployment"]
     steps: Steps = Field(default=150, description="number of steps")
     duration: Seconds = Field(default=10.0, description="time from stowed to deployed, s")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -25,10 +25,9 @@ TRUSS_TERMS = ("node_rate", "actuator_rate", "stroke_centring", "obstacle_potent
 CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 
 
-class Weights(Table):
+class Weights(Table, called="[method.weights]"):
     """Weights of the terms of one step's QP; the terms are half squares of displacements over the step."""
 
-    called: ClassVar[str] = "[method.weights]"
     node_rate: Weight = Field(default=1.0, description="node displacements, m^2; unit 1")
     actuator_rate: Weight = Field(default=0.02, description="changes of actuator lengths, m^2; unit 1")
     stroke_centring: Weight = Field(
@@ -68,10 +67,9 @@ class Weights(Table):
     )
 
 
-class Gains(Table):
+class Gains(Table, called="[method.gains]"):
     """Gains of the null-space vector of eq. (38), where the curve is solved before the truss."""
 
-    called: ClassVar[str] = "[method.gains]"
     spacing: Weight = Field(
         default=1.0, description="spacings of the curve nodes less those at home, m^2; unit 1"
     )
@@ -86,10 +84,9 @@ class Gains(Table):
     )
 
 
-class Method(Table):
+class Method(Table, called="[method]"):
     """How each step is solved."""
 
-    called: ClassVar[str] = "[method]"
     name: Literal["qp", "pseudoinverse", "curve-pseudoinverse"] = Field(
         default="qp", description="the QP, eq. (28), or eqs. (37)-(39)"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, PrivateAttr, WithJsonSchema, model_validator
 
@@ -21,7 +21,7 @@ from vgtm_qp.problem.truss import PlateTruss, Truss
 SCHEMA_VERSION = 1
 
 
-class Problem(Table):
+class Problem(Table, called="a problem"):
     """A problem as its file gives it; in Python, keywords and dictionaries of the same names make it too.
 
     Files that it names are held as absolute paths; relative ones are taken from the problem file's folder, or
@@ -33,7 +33,6 @@ class Problem(Table):
         With one :class:`~vgtm_qp.errors.Mistake` per mistake.
     """
 
-    called: ClassVar[str] = "a problem"
     schema_version: Annotated[
         int,
         Field(strict=True, ge=SCHEMA_VERSION, le=SCHEMA_VERSION),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -11,10 +11,9 @@ from vgtm_qp.problem.fields import ByKey, Factor, NonNegative, Vector, count, ex
 from vgtm_qp.problem.table import Place, Table, unique
 
 
-class VertexGoal(Table):
+class VertexGoal(Table, called="a control vertex goal"):
     """A place that a control vertex is drawn to in the null space of the tip's motion."""
 
-    called: ClassVar[str] = "a control vertex goal"
     index: Annotated[int, count(0, 999)] = Field(
         description="number of the control vertex, from 0 at the base"
     )
@@ -46,20 +45,18 @@ class _Curve(Table):
                 yield ("control_vertex_goals", i, "index"), f"a control vertex, 0 to {last}"
 
 
-class BezierCurve(_Curve):
+class BezierCurve(_Curve, called="a Bezier curve"):
     """One Bezier curve of degree V - 1."""
 
-    called: ClassVar[str] = "a Bezier curve"
     family: Literal["bezier"] = "bezier"
     control_vertices: Annotated[int, count(3, 60)] = Field(
         default=6, description="number V of control vertices"
     )
 
 
-class BSplineCurve(_Curve):
+class BSplineCurve(_Curve, called="a B-spline curve"):
     """A clamped uniform B-spline."""
 
-    called: ClassVar[str] = "a B-spline curve"
     family: Literal["b-spline"]
     degree: Annotated[int, count(1, 20)] = Field(
         default=3, description="degree, less than the number of vertices"
@@ -71,10 +68,9 @@ class BSplineCurve(_Curve):
             yield ("degree",), f"a degree less than the number of control vertices, {self.control_vertices}"
 
 
-class BetaSplineCurve(_Curve):
+class BetaSplineCurve(_Curve, called="a Beta-spline curve"):
     """A uniform cubic Beta-spline through its end vertices."""
 
-    called: ClassVar[str] = "a Beta-spline curve"
     family: Literal["beta-spline"]
     bias: Factor = Field(
         default=1.0, description="ratio of the speeds after and before a joint; 1 is unbiased"
@@ -85,10 +81,9 @@ class BetaSplineCurve(_Curve):
 Curve = Annotated[BezierCurve | BSplineCurve | BetaSplineCurve, ByKey("family")]
 
 
-class Surface(Table):
+class Surface(Table, called="a surface"):
     """A tensor-product Bezier surface, for plates."""
 
-    called: ClassVar[str] = "a surface"
     control_vertices: Annotated[
         tuple[Annotated[int, count(2, 30)], Annotated[int, count(2, 30)]],
         exactly(2, "two integers [along, across]"),

@@ -48,6 +48,11 @@ class Table(BaseModel):
 
     called: ClassVar[str] = "this table"
 
+    def __init_subclass__(cls, *, called: str | None = None, **options: Any) -> None:
+        """Name the table in messages as `called`, where given."""
+        super().__init_subclass__(**options)
+        cls.called = called or cls.called
+
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuse a new value of a key."""
         if not name.startswith("_"):

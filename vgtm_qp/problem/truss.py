@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
@@ -31,10 +31,9 @@ from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
 _SLACK = 1e-9
 
 
-class Lock(Table):
+class Lock(Table, called="a locked member"):
     """An actuator that is stuck at its length, from the start or from a time on."""
 
-    called: ClassVar[str] = "a locked member"
     member: Name = Field(description="name of the actuated member")
     time: Onset = Field(default=0.0, description="time at which it jams, s; 0 is from the start")
 
@@ -55,10 +54,9 @@ class Lock(Table):
         return {"anyOf": [{"type": "string", "minLength": 1}, dict(table)]}
 
 
-class BasePose(Table):
+class BasePose(Table, called="a base pose"):
     """A pose of the base that it reaches at a time, eqs. (7)-(8); its home pose at time 0 is the identity."""
 
-    called: ClassVar[str] = "a base pose"
     time: Seconds = Field(description="time at which the base is there, s")
     position: Vector = Field(default=ORIGIN, description="position of the base frame's origin, m")
     rotation_vector: Vector = Field(default=ORIGIN, description="rotation of the base frame, rad")
@@ -97,8 +95,7 @@ class _Truss(Table):
                 yield from holds_home(("stroke",), stroke, length - 2 * self.joint_offset, key)
 
 
-class _Stack(_Truss):
-    called: ClassVar[str] = "a truss made of bays"
+class _Stack(_Truss, called="a truss made of bays"):
     bays: Annotated[int, count(1, 10_000)] = Field(description="number of bays")
     longeron: Length = Field(
         default=1.0, description="home length of the members that join one face to the next, m"
@@ -118,10 +115,9 @@ class _Stack(_Truss):
         yield from self._misfits(self.stroke, min(self.longeron, self.batten), self._actuated_lengths())
 
 
-class ModuleTruss(_Stack):
+class ModuleTruss(_Stack, called="a truss of this module"):
     """Triangular faces stacked along +z: octahedral, double-octahedral, hexapod or longeron bays."""
 
-    called: ClassVar[str] = "a truss of this module"
     module: Literal["octahedral", "double-octahedral", "hexapod", "longeron"] = Field(
         description="octahedral: fixed longerons, actuated battens; double-octahedral: two such bays, every "
         "second face rigid; hexapod: rigid faces, six actuated legs; longeron: actuated longerons, fixed "
@@ -140,10 +136,9 @@ class ModuleTruss(_Stack):
             yield ("batten",), f"less than sqrt(3) times the longeron, {flat:g} m, where a bay folds flat"
 
 
-class TetrahedralTruss(_Stack):
+class TetrahedralTruss(_Stack, called="a tetrahedral truss"):
     """Tetrahedra face on face: each node hangs by three members on the three nodes before it."""
 
-    called: ClassVar[str] = "a tetrahedral truss"
     module: Literal["tetrahedral"]
     longeron: Length = Field(default=1.0, description="home length of the member to the third node before, m")
     batten: Length = Field(
@@ -168,10 +163,9 @@ class TetrahedralTruss(_Stack):
             yield ("longeron",), f"less than sqrt(3) times the batten, {flat:g} m, where the helix folds flat"
 
 
-class PlateTruss(_Truss):
+class PlateTruss(_Truss, called="a plate"):
     """A plate of two layers whose nodes track a surface; its first two rows are clamped."""
 
-    called: ClassVar[str] = "a plate"
     module: Literal["plate"]
     rows: Annotated[int, count(3, 200)] = Field(
         description="rows of nodes along +z, the two clamped ones included"
@@ -188,10 +182,9 @@ class PlateTruss(_Truss):
         yield from self._misfits(self.stroke, self.spacing, {"spacing": self.spacing})
 
 
-class Node(Table):
+class Node(Table, called="a node"):
     """A node of a graph."""
 
-    called: ClassVar[str] = "a node"
     name: Name = Field(description="name of the node")
     position: Vector = Field(description="home position, m")
     fixed: Flag = Field(default=False, description="whether it belongs to the base, eq. (7)")
@@ -201,10 +194,9 @@ class Node(Table):
     )
 
 
-class Member(Table):
+class Member(Table, called="a member"):
     """A member of a graph; its length is fixed where it is not actuated."""
 
-    called: ClassVar[str] = "a member"
     name: Name = Field(description="name of the member")
     nodes: Annotated[tuple[Name, Name], exactly(2, "the names of two nodes")] = Field(
         description="names of its two nodes"
@@ -237,10 +229,9 @@ class Member(Table):
             yield from holds_home(("stroke",), self.stroke, self.length, "length")
 
 
-class GraphTruss(_Truss):
+class GraphTruss(_Truss, called="a truss given as a graph"):
     """Any truss, given by its nodes and members."""
 
-    called: ClassVar[str] = "a truss given as a graph"
     module: Literal["graph"]
     node: tuple[Node, ...] = Field(min_length=2, description="the nodes")
     member: tuple[Member, ...] = Field(min_length=1, description="the members")
