@@ -30,6 +30,9 @@ from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
 
 _SLACK = 1e-9
 
+_NodePair = Annotated[tuple[Name, Name], exactly(2, "the names of two nodes")]
+_Positions = Annotated[tuple[Vector, Vector], exactly(2, "two positions [[x, y, z], [x, y, z]]")]
+
 
 class Lock(Table, called="a locked member"):
     """An actuator that is stuck at its length, from the start or from a time on."""
@@ -188,7 +191,7 @@ class Node(Table, called="a node"):
     name: Name = Field(description="name of the node")
     position: Vector = Field(description="home position, m")
     fixed: Flag = Field(default=False, description="whether it belongs to the base, eq. (7)")
-    joint: Annotated[tuple[Name, Name], exactly(2, "the names of two nodes")] | None = Field(
+    joint: _NodePair | None = Field(
         default=None,
         description="two other nodes that span its joint's frame with it, counter-clockwise about z",
     )
@@ -198,9 +201,7 @@ class Member(Table, called="a member"):
     """A member of a graph; its length is fixed where it is not actuated."""
 
     name: Name = Field(description="name of the member")
-    nodes: Annotated[tuple[Name, Name], exactly(2, "the names of two nodes")] = Field(
-        description="names of its two nodes"
-    )
+    nodes: _NodePair = Field(description="names of its two nodes")
     actuated: Flag = Field(default=False, description="whether it changes its length")
     length: Length | None = Field(
         default=None, description="home length, m; as the node positions give it where absent"
@@ -211,11 +212,8 @@ class Member(Table, called="a member"):
     radius: Distance | None = Field(
         default=None, description="radius, m; the truss's member_radius where absent"
     )
-    offsets: Annotated[tuple[Vector, Vector], exactly(2, "two positions [[x, y, z], [x, y, z]]")] | None = (
-        Field(
-            default=None,
-            description="positions of its two ends in the frames of its nodes' joints, eq. (12), m",
-        )
+    offsets: _Positions | None = Field(
+        default=None, description="positions of its two ends in the frames of its nodes' joints, eq. (12), m"
     )
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:

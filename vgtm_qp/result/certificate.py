@@ -116,7 +116,7 @@ class Certificate:
     @property
     def measures(self) -> dict[str, Measure]:
         """All measures by name."""
-        return {f.name: value for f in fields(self) if isinstance(value := getattr(self, f.name), Measure)}
+        return {name: value for name, value in vars(self).items() if isinstance(value, Measure)}
 
     @property
     def ok(self) -> bool:
