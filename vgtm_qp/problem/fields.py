@@ -198,8 +198,7 @@ Length = Annotated[
 ]
 Distance = Annotated[float, Within("a distance in metres, 0 or more", ge=0, le=GREATEST_LENGTH)]
 Angle = Annotated[
-    float,
-    Within("an angle in radians, 0 or more and less than a right angle (1.5708)", ge=0, lt=math.pi / 2),
+    float, Within("an angle in radians, 0 or more and less than a right angle (1.5708)", ge=0, lt=math.pi / 2)
 ]
 Limit = Annotated[float, Within("a limit greater than 0; leave the key out for no limit", gt=0, le=1e9)]
 Seconds = Annotated[float, Within("a time in seconds, greater than 0", ge=LEAST_LENGTH, le=1e9)]

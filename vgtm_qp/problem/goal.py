@@ -7,17 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from vgtm_qp.problem.fields import (
-    ByKey,
-    Direction,
-    File,
-    Length,
-    NonNegative,
-    Seconds,
-    Vector,
-    count,
-    entry,
-)
+from vgtm_qp.problem.fields import ByKey, Direction, File, Length, NonNegative, Seconds, Vector, count, entry
 from vgtm_qp.problem.table import Place, Table, increasing
 
 Coordinates = Literal["position", "pointing", "orientation", "x", "y", "z"]
@@ -88,8 +78,7 @@ class PathManeuver(Table, called="a maneuver along a path file"):
         default=0, description="steps of the straight run from the home tip to the first row"
     )
     approach_time: Seconds | None = Field(
-        default=None,
-        description="duration of that run, s; approach_steps mean row intervals where absent",
+        default=None, description="duration of that run, s; approach_steps mean row intervals where absent"
     )
 
 

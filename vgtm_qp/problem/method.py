@@ -41,8 +41,7 @@ class Weights(Table, called="[method.weights]"):
         default=0.05, description="angles between face normals and curve, rad^2; unit m^2/rad^2"
     )
     roll: Weight = Field(
-        default=0.05,
-        description="roll between faces and curve, rad^2, with torsion_vertices; unit m^2/rad^2",
+        default=0.05, description="roll between faces and curve, rad^2, with torsion_vertices; unit m^2/rad^2"
     )
     spacing: Weight = Field(
         default=0.0, description="spacings of the curve nodes less those at home, m^2; unit 1"

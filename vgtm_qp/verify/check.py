@@ -252,12 +252,7 @@ def _singular_values(arm: Arm, nodes: Array) -> Array:
 
 
 def _worst(
-    errors: Array | None,
-    unit: str,
-    bound: float | None,
-    names: Sequence[str] = (),
-    *,
-    array: str = "",
+    errors: Array | None, unit: str, bound: float | None, names: Sequence[str] = (), *, array: str = ""
 ) -> Measure:
     """Return the greatest of errors (T,) or (T, M, ...), with its row and the name in the second axis."""
     if errors is None:

@@ -13,13 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.result.poses import rotation_matrix
-from vgtm_qp.verify.distance import (
-    Separation,
-    segment_ball,
-    segment_box,
-    segment_cylinder,
-    segment_triangle,
-)
+from vgtm_qp.verify.distance import Separation, segment_ball, segment_box, segment_cylinder, segment_triangle
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
