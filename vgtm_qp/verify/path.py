@@ -32,9 +32,9 @@ def tip_error(maneuver: Result, tip: Array) -> Array | None:
 def direction_error(maneuver: Result, rotation: Array) -> Array | None:
     """Return (T,) angles of the tip's attitude (T, 3, 3) or z axis from its targets, rad; None if not tracked."""
     errors = []
-    if "orientation" in tracked(maneuver) and maneuver.tip_target_rotation is not None:
+    if "orientation" in _tracked(maneuver) and maneuver.tip_target_rotation is not None:
         errors.append(_rotation_angle(rotation, maneuver.tip_target_rotation))
-    if "pointing" in tracked(maneuver) and maneuver.tip_target_pointing is not None:
+    if "pointing" in _tracked(maneuver) and maneuver.tip_target_pointing is not None:
         errors.append(_angle(rotation[:, :, 2], maneuver.tip_target_pointing))
     return np.max(errors, axis=0) if errors else None
 
@@ -54,7 +54,7 @@ def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], l
     contradictions = [
         f"{kind} is tracked, but there is no array {array}"
         for kind, array in (("orientation", "tip_target_rotation"), ("pointing", "tip_target_pointing"))
-        if kind in tracked(maneuver) and getattr(maneuver, array) is None
+        if kind in _tracked(maneuver) and getattr(maneuver, array) is None
     ]
     notes, corners = [], None
     if wanted.get("kind") == "deployment":
@@ -75,13 +75,13 @@ def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], l
     return target_error, contradictions, notes
 
 
-def tracked(maneuver: Result) -> tuple[str, ...]:
+def _tracked(maneuver: Result) -> tuple[str, ...]:
     """Return which coordinates of the tip its problem steers."""
     return tuple((maneuver.manifest["problem"].get("end_effector") or {}).get("track") or ("position",))
 
 
 def _tracked_axes(maneuver: Result) -> list[int]:
-    track = tracked(maneuver)
+    track = _tracked(maneuver)
     return [k for k, axis in enumerate("xyz") if axis in track or "position" in track]
 
 
@@ -117,7 +117,7 @@ def _last_direction(maneuver: Result, waypoints: Sequence[Mapping[str, Any]]) ->
         ("orientation", "rotation_vector", maneuver.tip_target_rotation),
     ):
         goals = [np.asarray(entry[key], dtype=np.float64) for entry in waypoints if entry.get(key)]
-        if maneuver.status != "solved" or not goals or kind not in tracked(maneuver) or targets is None:
+        if maneuver.status != "solved" or not goals or kind not in _tracked(maneuver) or targets is None:
             continue
         if kind == "pointing":
             off = float(_angle(targets[-1:], goals[-1][None])[0])
