@@ -80,6 +80,7 @@ class ByKey:
 
     def __init__(self, key: str, pick: Callable[[Any], type[BaseModel] | None] | None = None) -> None:
         self.key, self.pick = key, pick or self._by_key
+        # Both are read from the tables of the union when its schema is built.
         self.tables: dict[str, type[BaseModel]] = {}
         self.default: str | None = None
 
