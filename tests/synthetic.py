@@ -161,11 +161,11 @@ def found_clearances(maneuver: Maneuver) -> Maneuver:
     from pathlib import Path
 
     from vgtm_qp.verify.arm import RecordedArm
-    from vgtm_qp.verify.clearance import AgainstBody, AgainstMembers, MemberMotion
+    from vgtm_qp.verify.clearance import AgainstBody, AgainstMembers, RecordedMotion
     from vgtm_qp.verify.obstacles import read_obstacles
 
     manifest = maneuver.manifest
-    motion = MemberMotion(RecordedArm(manifest["arm"], maneuver.members), maneuver.time, maneuver.nodes)
+    motion = RecordedMotion(RecordedArm(manifest["arm"], maneuver.members), maneuver.time, maneuver.nodes)
     bodies, _, _ = read_obstacles(manifest["problem"], manifest["meshes"], Path(manifest["directory"]))
     states = range(len(maneuver.time))
     bodily = [AgainstBody(motion, body) for body in bodies]

@@ -19,7 +19,7 @@ from vgtm_qp.errors import ResultError
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.verify import check, verify, verify_file
 from vgtm_qp.verify.arm import RecordedArm
-from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Least, MemberMotion
+from vgtm_qp.verify.clearance import RESOLUTION, AgainstBody, AgainstMembers, Least, RecordedMotion
 from vgtm_qp.verify.obstacles import read_obstacles
 
 
@@ -301,7 +301,7 @@ def test_offset_joints_place_ends_and_bound_their_paths() -> None:
         before = truss.home + 0.05 * rng.normal(size=(5, 3))
         after = before + 0.1 * rng.normal(size=(5, 3))
         np.testing.assert_allclose(arm.ends(before), truss.member_ends(before), atol=1e-14)
-        motion = MemberMotion(arm, np.array([0.0, 1.0]), np.stack([before, after]))
+        motion = RecordedMotion(arm, np.array([0.0, 1.0]), np.stack([before, after]))
         bend = motion.bend(0, member)
         h = 1e-3
         for share in np.linspace(h, 1.0 - h, 40):
@@ -312,10 +312,10 @@ def test_offset_joints_place_ends_and_bound_their_paths() -> None:
             assert (second <= bend * (1 + 1e-6) + 1e-6).all()
 
 
-def encounters(truss: Any, nodes: Any, obstacles: list[dict[str, Any]]) -> tuple[MemberMotion, list[Any]]:
+def encounters(truss: Any, nodes: Any, obstacles: list[dict[str, Any]]) -> tuple[RecordedMotion, list[Any]]:
     maneuver = maneuver_of(nodes, np.arange(float(len(nodes))), truss, problem={"obstacle": obstacles})
     arm = RecordedArm(maneuver.manifest["arm"], truss.members)
-    motion = MemberMotion(arm, maneuver.time, maneuver.nodes)
+    motion = RecordedMotion(arm, maneuver.time, maneuver.nodes)
     bodies, _, _ = read_obstacles(maneuver.manifest["problem"], {}, Path())
     return motion, [*(AgainstBody(motion, body) for body in bodies), AgainstMembers(motion)]
 
@@ -359,7 +359,7 @@ def frozen(pair: Any, nodes: Any, share: float) -> float:
         points = np.concatenate([ends[index[0]], ends[index[1]]], axis=1)
     else:
         index = (np.arange(6), np.zeros(6, dtype=int))
-        points = ends - pair.body.at(share)
+        points = ends - pair.body.at(np.array([share]))
     return float(pair.separation(points, index)[0].min())
 
 
@@ -376,7 +376,7 @@ def test_culling_changes_nothing() -> None:
     for pair in pairs[:-1]:
         every = (np.arange(count), np.zeros(count, dtype=int))
         for state in range(3):
-            points = pair.motion.ends[state] - pair.body.at(state)
+            points = pair.motion.ends[state] - pair.body.at(np.array([float(state)]))
             assert pair.at_state(state).value == pytest.approx(
                 pair.separation(points, every)[0].min(), abs=1e-14
             )

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from vgtm_qp.result.rotation import rotation_matrix
+from vgtm_qp.result.poses import rotation_matrix
 from vgtm_qp.verify.distance import (
     segment_ball,
     segment_box,
@@ -18,7 +18,7 @@ from vgtm_qp.verify.distance import (
     segment_segment,
     segment_triangle,
 )
-from vgtm_qp.verify.obstacles import BallBody, BoxBody, CylinderBody, MeshBody
+from vgtm_qp.verify.obstacles import Body, ball, box, cylinder, mesh
 
 Array = NDArray[np.float64]
 
@@ -123,16 +123,16 @@ def test_segment_triangle(a: Array, b: Array, u: Array, v: Array, w: Array) -> N
 bodies = st.sampled_from(["box", "ball", "cylinder", "mesh"])
 
 
-def make(kind: str, turn: Array) -> BoxBody | BallBody | CylinderBody | MeshBody:
+def make(kind: str, turn: Array) -> Body:
     placed = (kind, np.zeros(3), np.zeros(3), rotation_matrix(turn))
     if kind == "box":
-        return BoxBody(*placed, half=np.array([0.3, 0.5, 0.2]))
+        return Body(*placed, box(np.array([0.3, 0.5, 0.2])))
     if kind == "ball":
-        return BallBody(*placed, radius=0.4)
+        return Body(*placed, ball(0.4))
     if kind == "cylinder":
-        return CylinderBody(*placed, radius=0.3, half_height=0.5)
+        return Body(*placed, cylinder(0.3, half_height=0.5))
     triangle = np.array([[[0.5, 0.0, 0.0], [-0.2, 0.4, 0.1], [0.0, -0.3, 0.2]]])
-    return MeshBody(*placed, triangles=triangle @ placed[3].T, closed=False)
+    return Body(*placed, mesh(triangle, closed=False))
 
 
 @many
@@ -155,7 +155,7 @@ def test_plane_across_the_normal_separates_by_the_whole_distance(
 def test_support_and_corners_hold_the_body(kind: str, turn: Array, normal: Array) -> None:
     body = make(kind, turn)
     support = float(body.support(normal[None], np.zeros(1, dtype=int))[0])
-    hull = float((body.corners[0] @ normal).max())
+    hull = float((body.corners()[0] @ normal).max())
     assert support <= hull + 1e-12
     assert support >= -1e-12 or kind == "mesh"
 
@@ -164,9 +164,15 @@ def test_winding_number_tells_inside_from_outside() -> None:
     import trimesh
 
     surface = trimesh.creation.torus(1.0, 0.3, major_sections=24, minor_sections=12)
-    mesh = MeshBody("ring", np.zeros(3), np.zeros(3), np.eye(3), np.asarray(surface.triangles), closed=True)
+    shape = mesh(np.asarray(surface.triangles), closed=True)
+    ring = Body("ring", np.zeros(3), np.zeros(3), np.eye(3), shape)
     points = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -1.1, 0.05], [1.0, 0.0, 0.29 + 0.05]])
-    assert mesh.encloses(points).tolist() == [True, False, True, False]
+    assert ring.encloses(points).tolist() == [
+        True,
+        False,
+        True,
+        False,
+    ]
 
 
 @many

@@ -32,6 +32,11 @@ class ProblemError(VgtmError):
         self.mistakes = tuple(mistakes)
         super().__init__("\n".join(f"{source}: {mistake}" for mistake in self.mistakes))
 
+    @classmethod
+    def at(cls, source: object, key: str, value: str, expected: str) -> ProblemError:
+        """Return the error of one mistake."""
+        return cls(str(source), [Mistake(key, value, expected)])
+
     def __reduce__(self) -> tuple[type[ProblemError], tuple[str, tuple[Mistake, ...]]]:
         return type(self), (self.source, self.mistakes)
 

@@ -14,7 +14,7 @@ from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import RecordedArm
-from vgtm_qp.verify.clearance import AgainstBody, MemberMotion
+from vgtm_qp.verify.clearance import AgainstBody, RecordedMotion
 from vgtm_qp.verify.obstacles import read_obstacles
 
 Array = NDArray[np.float64]
@@ -154,7 +154,7 @@ class _Simulation:
             contacts += move(k)
             nodes[k], lengths[k] = self._data.site_xpos, self._data.ten_length
         errors = lengths - maneuver.member_lengths
-        motion = MemberMotion(arm, maneuver.time, nodes)
+        motion = RecordedMotion(arm, maneuver.time, nodes)
         pairs = [AgainstBody(motion, body) for body in self._bodies]
         least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(nodes))]
         return ReplayRun(

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from vgtm_qp.problem.fields import (
-    Choice,
-    Count,
+    ORIGIN,
     Direction,
     Distance,
     File,
@@ -17,26 +16,22 @@ from vgtm_qp.problem.fields import (
     Name,
     Number,
     Vector,
+    count,
     exactly,
 )
-from vgtm_qp.problem.table import Place, Table
-from vgtm_qp.problem.truss import BasePose, Lock, increasing, known_names, unique
+from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
+from vgtm_qp.problem.truss import BasePose, Lock
 
 
-class Joint(Table):
+class Joint(Table, called="a joint"):
     """A joint of a serial arm, placed in the frame of the joint before it."""
 
-    called: ClassVar[str] = "a joint"
     name: Name = Field(description="name of the joint")
-    kind: Annotated[Literal["revolute", "prismatic"], Choice()] = Field(
-        default="revolute", description="how it moves"
-    )
+    kind: Literal["revolute", "prismatic"] = Field(default="revolute", description="how it moves")
     axis: Direction = Field(description="axis in its own frame; need not be a unit vector")
-    position: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="origin in the frame of the joint before, m"
-    )
+    position: Vector = Field(default=ORIGIN, description="origin in the frame of the joint before, m")
     rotation_vector: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="attitude in that frame at joint value 0, rad"
+        default=ORIGIN, description="attitude in that frame at joint value 0, rad"
     )
     limits: Annotated[tuple[Number, Number], exactly(2, "two numbers [least, greatest]")] | None = Field(
         default=None, description="least and greatest joint value, rad or m"
@@ -54,10 +49,9 @@ class Joint(Table):
             yield ("home",), f"a value within the limits, {self.limits[0]:g} to {self.limits[1]:g}"
 
 
-class ArmTable(Table):
+class ArmTable(Table, called="an arm"):
     """A serial arm."""
 
-    called: ClassVar[str] = "an arm"
     urdf: File | None = Field(default=None, description="URDF file, relative to the problem file")
     base_link: Name | None = Field(
         default=None, description="first link taken from the URDF; its root where absent"
@@ -72,13 +66,11 @@ class ArmTable(Table):
     joint: tuple[Joint, ...] = Field(
         default=(), description="the joints, base first, in the place of a URDF file"
     )
-    tip: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="position of the end effector in the last frame, m"
-    )
+    tip: Vector = Field(default=ORIGIN, description="position of the end effector in the last frame, m")
     link_radius: Distance = Field(
         default=0.03, description="radius of the capsules between successive joints, m"
     )
-    every: Annotated[int, Count(1, 1000)] | None = Field(
+    every: Annotated[int, count(1, 1000)] | None = Field(
         default=None,
         description="which joints' frames track the curve: every so many; where absent, as few as keep to it exactly",
     )

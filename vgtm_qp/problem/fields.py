@@ -10,7 +10,6 @@ from typing import Annotated, Any, get_args
 from pydantic import (
     AfterValidator,
     BaseModel,
-    Discriminator,
     Field,
     GetCoreSchemaHandler,
     ValidationError,
@@ -26,6 +25,7 @@ from vgtm_qp.errors import nearest
 # Beyond these a square overflows the tolerances of the certificate; no arm is that long or that fine.
 LEAST_LENGTH = 1e-6
 GREATEST_LENGTH = 1e6
+ORIGIN = (0.0, 0.0, 0.0)
 
 
 def unexpected(phrase: str) -> PydanticCustomError:
@@ -50,40 +50,21 @@ def quoted(names: Iterable[str]) -> str:
     return ", ".join(f'"{name}"' for name in names)
 
 
-class Choice:
-    """Annotation of a ``Literal`` of strings: a wrong value is answered by the choices."""
+class Within:
+    """Annotation of an integer, or of a finite number, with bounds as ``ge=0``: `phrase` answers all others."""
+
+    def __init__(self, phrase: str, **bounds: Any) -> None:
+        self.phrase, self.bounds = phrase, bounds
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        choices = get_args(source)
-
-        def validate(value: Any, inner: ValidatorFunctionWrapHandler) -> Any:
-            try:
-                return inner(value)
-            except ValidationError:
-                hint = nearest(value, choices) if isinstance(value, str) else ""
-                only = quoted(choices) if len(choices) == 1 else f"one of {quoted(choices)}"
-                raise unexpected(f"{only}{hint}") from None
-
-        return core_schema.no_info_wrap_validator_function(validate, handler(source))
+        finite = None if source is int else False
+        bounds = Field(strict=True, allow_inf_nan=finite, **self.bounds)
+        return handler(Annotated[source, bounds, expect(self.phrase)])
 
 
-class Count:
-    """Annotation of an integer from `least` to `greatest`."""
-
-    def __init__(self, least: int, greatest: int) -> None:
-        self.least, self.greatest = least, greatest
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        phrase = f"an integer from {self.least} to {self.greatest}"
-
-        def validate(value: Any, inner: ValidatorFunctionWrapHandler) -> Any:
-            try:
-                return inner(value)
-            except ValidationError:
-                raise unexpected(phrase) from None
-
-        bounds = core_schema.int_schema(ge=self.least, le=self.greatest, strict=True)
-        return core_schema.no_info_wrap_validator_function(validate, bounds)
+def count(least: int, greatest: int) -> Within:
+    """Return the annotation of an integer from `least` to `greatest`."""
+    return Within(f"an integer from {least} to {greatest}", ge=least, le=greatest)
 
 
 class ByKey:
@@ -92,39 +73,40 @@ class ByKey:
     Parameters
     ----------
     key
-        The key.
-    tags
-        From every value of `key` to the ``Tag`` of its table; a tag is written ``"<...>"`` so that it can be
-        told from a key in the place of a mistake.
-    default
-        Value of `key` where a table has none.
+        The key, a ``Literal`` of strings in each table; a table in which it has a default needs no key.
     pick
-        Returns the tag of a table in the place of the look-up in `tags`, or None.
+        Returns the table for a value in the place of the look-up by the key, or None.
     """
 
-    def __init__(
-        self,
-        key: str,
-        tags: Mapping[str, str],
-        *,
-        default: str | None = None,
-        pick: Callable[[Any], str | None] | None = None,
-    ) -> None:
-        self.key, self.tags, self.default, self.pick = key, tags, default, pick or self._tag
+    def __init__(self, key: str, pick: Callable[[Any], type[BaseModel] | None] | None = None) -> None:
+        self.key, self.pick = key, pick or self._by_key
+        # Both are read from the tables of the union when its schema is built.
+        self.tables: dict[str, type[BaseModel]] = {}
+        self.default: str | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        discriminator = Discriminator(
-            self.pick,
+        tables = get_args(source)
+        for table in tables:
+            field = table.model_fields[self.key]
+            self.tables |= dict.fromkeys(get_args(field.annotation), table)
+            self.default = self.default if field.is_required() else field.default
+        return core_schema.tagged_union_schema(
+            {_tag(table): handler.generate_schema(table) for table in tables},
+            lambda value: _tag(self.pick(value)),
             custom_error_type="choice",
             custom_error_message="a table",
-            custom_error_context={"key": self.key, "choices": ",".join(self.tags)},
+            custom_error_context={"key": self.key, "choices": ",".join(self.tables)},
         )
-        return discriminator.__get_pydantic_core_schema__(source, handler)
 
-    def _tag(self, value: Any) -> str | None:
+    def _by_key(self, value: Any) -> type[BaseModel] | None:
         chosen = entry(value, self.key)
         chosen = self.default if chosen is None and isinstance(value, Mapping) else chosen
-        return self.tags.get(chosen) if isinstance(chosen, str) else None
+        return self.tables.get(chosen) if isinstance(chosen, str) else None
+
+
+def _tag(table: type[BaseModel] | None) -> str | None:
+    """Return the tag of a table; the brackets tell it from a key in the place of a mistake."""
+    return None if table is None else f"<{table.__name__}>"
 
 
 def entry(table: Any, key: str) -> Any:
@@ -134,12 +116,12 @@ def entry(table: Any, key: str) -> Any:
     return getattr(table, key, None) if isinstance(table, BaseModel) else None
 
 
-def exactly(count: int, phrase: str) -> WrapValidator:
-    """Return an annotation that answers an array of another length than `count` by `phrase`."""
+def exactly(size: int, phrase: str) -> WrapValidator:
+    """Return an annotation that answers an array of another length than `size` by `phrase`."""
 
     def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
         entries = value.tolist() if hasattr(value, "tolist") else value
-        if not isinstance(entries, list | tuple) or len(entries) != count:
+        if not isinstance(entries, list | tuple) or len(entries) != size:
             raise unexpected(phrase)
         return handler(entries)
 
@@ -188,59 +170,43 @@ def _file(value: str, info: ValidationInfo) -> str:
     return str(path)
 
 
-def _array(item: dict[str, Any], count: int) -> WithJsonSchema:
+def _array(item: dict[str, Any], size: int) -> WithJsonSchema:
     # Plain `items` with equal bounds, not `prefixItems`: TOML editors know older drafts of JSON Schema only.
-    return WithJsonSchema({"type": "array", "items": item, "minItems": count, "maxItems": count})
+    return WithJsonSchema({"type": "array", "items": item, "minItems": size, "maxItems": size})
 
 
 _LENGTH_SCHEMA = {"type": "number", "exclusiveMinimum": 0, "maximum": GREATEST_LENGTH}
 _COORDINATE_SCHEMA = {"type": "number", "minimum": -GREATEST_LENGTH, "maximum": GREATEST_LENGTH}
 
 Flag = Annotated[bool, Field(strict=True), expect("true or false")]
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e6, le=1e6), expect("a finite number")]
+Number = Annotated[float, Within("a finite number", ge=-1e6, le=1e6)]
 Coordinate = Annotated[
     float,
-    Field(strict=True, allow_inf_nan=False, ge=-GREATEST_LENGTH, le=GREATEST_LENGTH),
-    expect(f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"),
+    Within(
+        f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}",
+        ge=-GREATEST_LENGTH,
+        le=GREATEST_LENGTH,
+    ),
 ]
 Length = Annotated[
     float,
-    Field(strict=True, allow_inf_nan=False, ge=LEAST_LENGTH, le=GREATEST_LENGTH),
+    Within(
+        f"a length in metres greater than 0 (from {LEAST_LENGTH:g} to {GREATEST_LENGTH:g})",
+        ge=LEAST_LENGTH,
+        le=GREATEST_LENGTH,
+    ),
     WithJsonSchema(_LENGTH_SCHEMA),
-    expect(f"a length in metres greater than 0 (from {LEAST_LENGTH:g} to {GREATEST_LENGTH:g})"),
 ]
-Distance = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False, ge=0, le=GREATEST_LENGTH),
-    expect("a distance in metres, 0 or more"),
-]
+Distance = Annotated[float, Within("a distance in metres, 0 or more", ge=0, le=GREATEST_LENGTH)]
 Angle = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False, ge=0, lt=math.pi / 2),
-    expect("an angle in radians, 0 or more and less than a right angle (1.5708)"),
+    float, Within("an angle in radians, 0 or more and less than a right angle (1.5708)", ge=0, lt=math.pi / 2)
 ]
-Limit = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False, gt=0, le=1e9),
-    expect("a limit greater than 0; leave the key out for no limit"),
-]
-Seconds = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False, ge=LEAST_LENGTH, le=1e9),
-    expect("a time in seconds, greater than 0"),
-]
-Onset = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e9), expect("a time in seconds, 0 or more")
-]
-Weight = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e12), expect("a weight, 0 or more")
-]
-Factor = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e6), expect("a number greater than 0")
-]
-NonNegative = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6), expect("a number, 0 or more")
-]
+Limit = Annotated[float, Within("a limit greater than 0; leave the key out for no limit", gt=0, le=1e9)]
+Seconds = Annotated[float, Within("a time in seconds, greater than 0", ge=LEAST_LENGTH, le=1e9)]
+Onset = Annotated[float, Within("a time in seconds, 0 or more", ge=0, le=1e9)]
+Weight = Annotated[float, Within("a weight, 0 or more", ge=0, le=1e12)]
+Factor = Annotated[float, Within("a number greater than 0", gt=0, le=1e6)]
+NonNegative = Annotated[float, Within("a number, 0 or more", ge=0, le=1e6)]
 Name = Annotated[
     str,
     Field(

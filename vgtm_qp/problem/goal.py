@@ -3,38 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, Tag
+from pydantic import Field
 
-from vgtm_qp.problem.fields import (
-    ByKey,
-    Choice,
-    Count,
-    Direction,
-    File,
-    Length,
-    NonNegative,
-    Seconds,
-    Vector,
-    entry,
-)
-from vgtm_qp.problem.table import Place, Table
-from vgtm_qp.problem.truss import increasing
+from vgtm_qp.problem.fields import ByKey, Direction, File, Length, NonNegative, Seconds, Vector, count, entry
+from vgtm_qp.problem.table import Place, Table, increasing
 
 Coordinates = Literal["position", "pointing", "orientation", "x", "y", "z"]
+Steps = Annotated[int, count(1, 1_000_000)]
 
 
-class EndEffector(Table):
+class EndEffector(Table, called="an end effector"):
     """Which coordinates of the end effector follow the path, and how strictly."""
 
-    called: ClassVar[str] = "an end effector"
-    track: tuple[Annotated[Coordinates, Choice()], ...] = Field(
+    track: tuple[Coordinates, ...] = Field(
         default=("position",),
         min_length=1,
         description="position, pointing (two angles), orientation (three), or x, y, z",
     )
-    mode: Annotated[Literal["scaled", "hard", "elastic"], Choice()] = Field(
+    mode: Literal["scaled", "hard", "elastic"] = Field(
         default="scaled",
         description="scaled: slows down along the path; hard: stays on time or stops; elastic: may leave the "
         "path, at the price of the weight end_effector",
@@ -53,10 +41,9 @@ class EndEffector(Table):
                 yield ("track", i), "pointing or orientation, not both"
 
 
-class Waypoint(Table):
+class Waypoint(Table, called="a waypoint"):
     """A pose that the end effector passes at a time."""
 
-    called: ClassVar[str] = "a waypoint"
     time: Seconds = Field(description="time since the start at the home pose, s")
     position: Vector | None = Field(default=None, description="position in the base frame, m")
     pointing: Direction | None = Field(
@@ -71,39 +58,35 @@ class Waypoint(Table):
             yield ("pointing",), "pointing or rotation_vector, not both"
 
 
-class WaypointManeuver(Table):
+class WaypointManeuver(Table, called="a maneuver through waypoints"):
     """From the home pose through waypoints, in equal steps of time."""
 
-    called: ClassVar[str] = "a maneuver through waypoints"
-    kind: Annotated[Literal["path"], Choice()] = "path"
-    steps: Annotated[int, Count(1, 1_000_000)] = Field(default=50, description="number of steps")
+    kind: Literal["path"] = "path"
+    steps: Steps = Field(default=50, description="number of steps")
     waypoint: tuple[Waypoint, ...] = Field(min_length=1, description="the waypoints, in the order of time")
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from increasing("waypoint", [waypoint.time for waypoint in self.waypoint])
 
 
-class PathManeuver(Table):
+class PathManeuver(Table, called="a maneuver along a path file"):
     """Along a path from a file, one step a row."""
 
-    called: ClassVar[str] = "a maneuver along a path file"
-    kind: Annotated[Literal["path"], Choice()] = "path"
+    kind: Literal["path"] = "path"
     path: File = Field(description="CSV file with the columns t,x,y,z and, if wanted, rx,ry,rz (s, m, rad)")
-    approach_steps: Annotated[int, Count(0, 1_000_000)] = Field(
+    approach_steps: Annotated[int, count(0, 1_000_000)] = Field(
         default=0, description="steps of the straight run from the home tip to the first row"
     )
     approach_time: Seconds | None = Field(
-        default=None,
-        description="duration of that run, s; approach_steps mean row intervals where absent",
+        default=None, description="duration of that run, s; approach_steps mean row intervals where absent"
     )
 
 
-class DeploymentManeuver(Table):
+class DeploymentManeuver(Table, called="a deployment"):
     """From the stowed to the deployed truss, along a guide curve, tip first."""
 
-    called: ClassVar[str] = "a deployment"
-    kind: Annotated[Literal["deployment"], Choice()]
-    steps: Annotated[int, Count(1, 1_000_000)] = Field(default=150, description="number of steps")
+    kind: Literal["deployment"]
+    steps: Steps = Field(default=150, description="number of steps")
     duration: Seconds = Field(default=10.0, description="time from stowed to deployed, s")
     stowed_batten: Length | None = Field(
         default=None, description="length of the battens when stowed, m; 1.65 longerons where absent"
@@ -118,19 +101,14 @@ class DeploymentManeuver(Table):
     )
 
 
-def _pick(value: Any) -> str | None:
+def _pick(value: Any) -> type[Table] | None:
     kind = entry(value, "kind")
     if kind == "deployment":
-        return "<deployment>"
+        return DeploymentManeuver
     if kind not in (None, "path") or not isinstance(value, Mapping | Table):
         return None
     has_path = entry(value, "path") is not None and entry(value, "waypoint") is None
-    return "<path file>" if has_path else "<waypoints>"
+    return PathManeuver if has_path else WaypointManeuver
 
 
-Maneuver = Annotated[
-    Annotated[WaypointManeuver, Tag("<waypoints>")]
-    | Annotated[PathManeuver, Tag("<path file>")]
-    | Annotated[DeploymentManeuver, Tag("<deployment>")],
-    ByKey("kind", {"path": "<waypoints>", "deployment": "<deployment>"}, pick=_pick),
-]
+Maneuver = Annotated[WaypointManeuver | PathManeuver | DeploymentManeuver, ByKey("kind", _pick)]

@@ -35,7 +35,7 @@ def load_problem(path: str | Path) -> Problem:
     version = data.get("schema_version")
     if isinstance(version, bool) or version != SCHEMA_VERSION:
         expected = f"{SCHEMA_VERSION}, the version of the problem file that this release reads"
-        raise ProblemError(str(file), [Mistake("schema_version", shown(version), expected)])
+        raise ProblemError.at(file, "schema_version", shown(version), expected)
     mistakes = _path_mistakes(file, data)
     try:
         problem = Problem.from_dict(data, source=file, check_files=True)
@@ -76,35 +76,30 @@ def _find(path: str | Path) -> Path:
     if not exists and name in bundled:
         return bundled[name]
     if exists:
-        raise ProblemError(name, [Mistake("file", _kind(file), "a problem file in TOML")])
+        found = "a folder" if file.is_dir() else "something that is not a regular file"
+        raise ProblemError.at(name, "file", found, "a problem file in TOML")
     try:
         beside = [entry.name for entry in file.parent.iterdir() if entry.suffix == ".toml"]
     except (OSError, ValueError):
         beside = []
     hint = nearest(file.name, [*beside, *bundled])
     expected = f"a problem file that exists, or the name of a bundled problem: {quoted(bundled)}{hint}"
-    raise ProblemError(name, [Mistake("file", "nothing", expected)])
-
-
-def _kind(file: Path) -> str:
-    return "a folder" if file.is_dir() else "something that is not a regular file"
+    raise ProblemError.at(name, "file", "nothing", expected)
 
 
 def _read(file: Path) -> str:
     try:
         if file.stat().st_size > _GREATEST_BYTES:
-            raise ProblemError(
-                str(file), [Mistake("file", "a huge file", f"less than {_GREATEST_BYTES // 1_000_000} MB")]
-            )
+            raise ProblemError.at(file, "file", "a huge file", f"less than {_GREATEST_BYTES // 1_000_000} MB")
         raw = file.read_bytes()
     except OSError as error:
-        raise ProblemError(str(file), [Mistake("file", error.strerror or "", "a readable file")]) from None
+        raise ProblemError.at(file, "file", error.strerror or "", "a readable file") from None
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        raise ProblemError(
-            str(file), [Mistake(f"line {line}", f"the byte 0x{raw[error.start]:02x}", "text in UTF-8")]
+        raise ProblemError.at(
+            file, f"line {line}", f"the byte 0x{raw[error.start]:02x}", "text in UTF-8"
         ) from None
 
 

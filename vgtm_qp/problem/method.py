@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
-from vgtm_qp.problem.fields import Choice, Factor, Flag, Length, Name, Weight
+from vgtm_qp.problem.fields import Factor, Flag, Length, Name, Weight, quoted
 from vgtm_qp.problem.table import Place, Table
 
 NullSpaceTerm = Literal[
@@ -25,10 +25,9 @@ TRUSS_TERMS = ("node_rate", "actuator_rate", "stroke_centring", "obstacle_potent
 CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 
 
-class Weights(Table):
+class Weights(Table, called="[method.weights]"):
     """Weights of the terms of one step's QP; the terms are half squares of displacements over the step."""
 
-    called: ClassVar[str] = "[method.weights]"
     node_rate: Weight = Field(default=1.0, description="node displacements, m^2; unit 1")
     actuator_rate: Weight = Field(default=0.02, description="changes of actuator lengths, m^2; unit 1")
     stroke_centring: Weight = Field(
@@ -42,8 +41,7 @@ class Weights(Table):
         default=0.05, description="angles between face normals and curve, rad^2; unit m^2/rad^2"
     )
     roll: Weight = Field(
-        default=0.05,
-        description="roll between faces and curve, rad^2, with torsion_vertices; unit m^2/rad^2",
+        default=0.05, description="roll between faces and curve, rad^2, with torsion_vertices; unit m^2/rad^2"
     )
     spacing: Weight = Field(
         default=0.0, description="spacings of the curve nodes less those at home, m^2; unit 1"
@@ -68,10 +66,9 @@ class Weights(Table):
     )
 
 
-class Gains(Table):
+class Gains(Table, called="[method.gains]"):
     """Gains of the null-space vector of eq. (38), where the curve is solved before the truss."""
 
-    called: ClassVar[str] = "[method.gains]"
     spacing: Weight = Field(
         default=1.0, description="spacings of the curve nodes less those at home, m^2; unit 1"
     )
@@ -86,21 +83,20 @@ class Gains(Table):
     )
 
 
-class Method(Table):
+class Method(Table, called="[method]"):
     """How each step is solved."""
 
-    called: ClassVar[str] = "[method]"
-    name: Annotated[Literal["qp", "pseudoinverse", "curve-pseudoinverse"], Choice()] = Field(
+    name: Literal["qp", "pseudoinverse", "curve-pseudoinverse"] = Field(
         default="qp", description="the QP, eq. (28), or eqs. (37)-(39)"
     )
-    tracking: Annotated[Literal["coupled", "recursive", "parallel", "none"], Choice()] = Field(
+    tracking: Literal["coupled", "recursive", "parallel", "none"] = Field(
         default="coupled",
         description="truss and curve together; curve first, then bay after bay or all bays at once; no curve",
     )
     hard_tracking: Flag = Field(
         default=False, description="whether faces stay on the curve exactly; elastic otherwise"
     )
-    hard_coordinates: tuple[Annotated[HardCoordinate, Choice()], ...] = Field(
+    hard_coordinates: tuple[HardCoordinate, ...] = Field(
         default=("position",),
         min_length=1,
         description="what of each face hard_tracking keeps on the curve: position; position and pointing; or "
@@ -119,10 +115,10 @@ class Method(Table):
         default=None,
         description="greatest displacement of a node in one step, m; set from the members where absent",
     )
-    variant: Annotated[Literal["moore-penrose", "weighted", "damped", "truncated"], Choice()] = Field(
+    variant: Literal["moore-penrose", "weighted", "damped", "truncated"] = Field(
         default="moore-penrose", description="pseudoinverse of eq. (28)"
     )
-    algebra: Annotated[Literal["dense", "sparse"], Choice()] = Field(
+    algebra: Literal["dense", "sparse"] = Field(
         default="dense", description="how eq. (28) is solved: dense matrices, or a banded KKT system"
     )
     correct: Flag = Field(
@@ -130,7 +126,7 @@ class Method(Table):
         description="whether the pseudoinverse methods correct lengths and tip after each step by Newton's "
         "method; the paper does not",
     )
-    null_space: tuple[Annotated[NullSpaceTerm, Choice()], ...] | None = Field(
+    null_space: tuple[NullSpaceTerm, ...] | None = Field(
         default=None,
         description="terms of the null-space vector of a pseudoinverse method; none if empty, and the usual "
         "ones of that method where absent",
@@ -139,21 +135,19 @@ class Method(Table):
     truncation: Factor = Field(
         default=0.001, description="singular values below this part of the greatest are zero when truncated"
     )
-    weights: Weights = Field(default_factory=lambda: Weights(), description="weights of the null-space terms")
+    weights: Weights = Field(default_factory=Weights, description="weights of the null-space terms")
     gains: Gains = Field(
-        default_factory=lambda: Gains(), description="gains of the curve's null-space vector, eq. (38)"
+        default_factory=Gains, description="gains of the curve's null-space vector, eq. (38)"
     )
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.hard_tracking and self.tracking == "none":
             yield ("hard_tracking",), 'false, since tracking is "none"'
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
-            choices = ", ".join(f'"{name}"' for name in HARD_COORDINATES)
-            yield ("hard_coordinates",), f"the first one, two or three of {choices}"
+            yield ("hard_coordinates",), f"the first one, two or three of {quoted(HARD_COORDINATES)}"
         if self.variant == "truncated" and self.algebra == "sparse":
             yield ("algebra",), '"dense", since the variant truncated needs the singular values'
         known = {"pseudoinverse": TRUSS_TERMS, "curve-pseudoinverse": CURVE_TERMS}.get(self.name)
         for i, term in enumerate(self.null_space or ()):
             if known is not None and term not in known:
-                choices = ", ".join(f'"{name}"' for name in known)
-                yield ("null_space", i), f"a term of the method {self.name}: {choices}"
+                yield ("null_space", i), f"a term of the method {self.name}: {quoted(known)}"

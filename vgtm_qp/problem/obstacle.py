@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, Tag
+from pydantic import Field
 
 from vgtm_qp.problem.fields import (
+    ORIGIN,
     Angle,
     ByKey,
-    Choice,
     Distance,
     Edges,
     Factor,
@@ -26,60 +26,47 @@ from vgtm_qp.problem.table import Place, Table
 class _Obstacle(Table):
     name: Name = Field(description="its name in messages and results")
     center: Vector = Field(description="position of its centre at time 0, m")
-    rotation_vector: Vector = Field(default=(0.0, 0.0, 0.0), description="attitude, rad")
-    velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="constant velocity, m/s")
+    rotation_vector: Vector = Field(default=ORIGIN, description="attitude, rad")
+    velocity: Vector = Field(default=ORIGIN, description="constant velocity, m/s")
 
 
-class Box(_Obstacle):
+class Box(_Obstacle, called="a box"):
     """A box centred at `center`."""
 
-    called: ClassVar[str] = "a box"
-    shape: Annotated[Literal["box"], Choice()]
+    shape: Literal["box"]
     size: Edges = Field(description="edge length, or [sx, sy, sz], m")
 
 
-class Sphere(_Obstacle):
+class Sphere(_Obstacle, called="a sphere"):
     """A sphere."""
 
-    called: ClassVar[str] = "a sphere"
-    shape: Annotated[Literal["sphere"], Choice()]
+    shape: Literal["sphere"]
     radius: Length = Field(description="radius, m")
 
 
-class Cylinder(_Obstacle):
+class Cylinder(_Obstacle, called="a cylinder"):
     """A cylinder centred at `center`, its axis along its own z."""
 
-    called: ClassVar[str] = "a cylinder"
-    shape: Annotated[Literal["cylinder"], Choice()]
+    shape: Literal["cylinder"]
     radius: Length = Field(description="radius, m")
     height: Length = Field(description="height along its axis, m")
 
 
-class Mesh(_Obstacle):
+class Mesh(_Obstacle, called="a mesh"):
     """A triangle mesh from a file."""
 
-    called: ClassVar[str] = "a mesh"
-    shape: Annotated[Literal["mesh"], Choice()]
+    shape: Literal["mesh"]
     file: File = Field(description="STL or OBJ file, relative to the problem file")
-    center: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="position of the mesh's own origin at time 0, m"
-    )
+    center: Vector = Field(default=ORIGIN, description="position of the mesh's own origin at time 0, m")
     scale: Factor = Field(default=1.0, description="factor that brings the file's unit to metres")
 
 
-Obstacle = Annotated[
-    Annotated[Box, Tag("<box>")]
-    | Annotated[Sphere, Tag("<sphere>")]
-    | Annotated[Cylinder, Tag("<cylinder>")]
-    | Annotated[Mesh, Tag("<mesh>")],
-    ByKey("shape", {"box": "<box>", "sphere": "<sphere>", "cylinder": "<cylinder>", "mesh": "<mesh>"}),
-]
+Obstacle = Annotated[Box | Sphere | Cylinder | Mesh, ByKey("shape")]
 
 
-class ClearanceTable(Table):
+class ClearanceTable(Table, called="[clearance]"):
     """Distances, from surface to surface, that are kept at states and between them."""
 
-    called: ClassVar[str] = "[clearance]"
     safe: Distance = Field(default=0.05, description="least distance from an obstacle, m")
     influence: Length = Field(default=0.5, description="distance below which a pair is in the QP, m")
     margin: Distance = Field(

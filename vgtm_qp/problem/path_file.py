@@ -80,20 +80,18 @@ def _read(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the header and the rows that are not empty, with their line numbers."""
     try:
         if not file.is_file():
-            raise ProblemError(str(file), [Mistake("file", "nothing", "a CSV file")])
+            raise ProblemError.at(file, "file", "nothing", "a CSV file")
         if file.stat().st_size > _GREATEST_BYTES:
-            raise ProblemError(
-                str(file), [Mistake("file", "a huge file", f"less than {_GREATEST_BYTES} bytes")]
-            )
+            raise ProblemError.at(file, "file", "a huge file", f"less than {_GREATEST_BYTES} bytes")
         with file.open(encoding="utf-8-sig", newline="") as lines:
             reader = csv.reader(lines, skipinitialspace=True)
             rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(cells)]
     except UnicodeDecodeError as error:
-        raise ProblemError(str(file), [Mistake("file", f"byte {error.start}", "text in UTF-8")]) from None
+        raise ProblemError.at(file, "file", f"byte {error.start}", "text in UTF-8") from None
     except csv.Error as error:
-        raise ProblemError(str(file), [Mistake("file", str(error), "comma-separated numbers")]) from None
+        raise ProblemError.at(file, "file", str(error), "comma-separated numbers") from None
     except OSError as error:
-        raise ProblemError(str(file), [Mistake("file", error.strerror or "", "a readable file")]) from None
+        raise ProblemError.at(file, "file", error.strerror or "", "a readable file") from None
     return (rows[0][1], rows[1:]) if rows else ([], [])
 
 

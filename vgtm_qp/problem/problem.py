@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, PrivateAttr, WithJsonSchema, model_validator
 
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem.arm import ArmTable
-from vgtm_qp.problem.fields import Name, expect
+from vgtm_qp.problem.fields import Name, entry, expect
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
 from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
 from vgtm_qp.problem.shape import Curve, Surface
-from vgtm_qp.problem.table import Place, Table, key_path, shown, value_at
-from vgtm_qp.problem.truss import PlateTruss, Truss, unique
+from vgtm_qp.problem.table import Place, Table, key_path, shown, unique, value_at
+from vgtm_qp.problem.truss import PlateTruss, Truss
 
 SCHEMA_VERSION = 1
 
 
-class Problem(Table):
+class Problem(Table, called="a problem"):
     """A problem as its file gives it; in Python, keywords and dictionaries of the same names make it too.
 
     Files that it names are held as absolute paths; relative ones are taken from the problem file's folder, or
@@ -33,7 +33,6 @@ class Problem(Table):
         With one :class:`~vgtm_qp.errors.Mistake` per mistake.
     """
 
-    called: ClassVar[str] = "a problem"
     schema_version: Annotated[
         int,
         Field(strict=True, ge=SCHEMA_VERSION, le=SCHEMA_VERSION),
@@ -50,14 +49,12 @@ class Problem(Table):
         default=None, description="the reference surface of a plate, in the place of a curve"
     )
     end_effector: EndEffector = Field(
-        default_factory=lambda: EndEffector(), description="which coordinates are steered"
+        default_factory=EndEffector, description="which coordinates are steered"
     )
     maneuver: Maneuver = Field(description="where the end effector goes")
     obstacle: tuple[Obstacle, ...] = Field(default=(), description="what the arm keeps away from")
-    clearance: ClearanceTable = Field(
-        default_factory=lambda: ClearanceTable(), description="how far it keeps away"
-    )
-    method: Method = Field(default_factory=lambda: Method(), description="how each step is solved")
+    clearance: ClearanceTable = Field(default_factory=ClearanceTable, description="how far it keeps away")
+    method: Method = Field(default_factory=Method, description="how each step is solved")
 
     _source: Path | None = PrivateAttr(None)
 
@@ -130,9 +127,7 @@ class Problem(Table):
         """Add the default curve, or surface of a plate, where a truss or arm has neither."""
         if not isinstance(data, Mapping) or data.get("curve") is not None or data.get("surface") is not None:
             return data
-        truss = data.get("truss")
-        module = truss.get("module") if isinstance(truss, Mapping) else getattr(truss, "module", None)
-        return {**data, "surface" if module == "plate" else "curve": {}}
+        return {**data, "surface" if entry(data.get("truss"), "module") == "plate" else "curve": {}}
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.truss is None and self.arm is None:
@@ -160,7 +155,7 @@ def check_is_problem(value: object) -> None:
     else:
         expected = "a problem, from vgtm_qp.load_problem(path) or vgtm_qp.Problem(...)"
     found = shown(str(value) if isinstance(value, Path) else value)
-    raise ProblemError("argument", [Mistake("problem", found, expected)])
+    raise ProblemError.at("argument", "problem", found, expected)
 
 
 def _unmet(end_effector: EndEffector, waypoint: Waypoint) -> Iterator[tuple[str, str]]:

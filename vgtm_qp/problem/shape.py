@@ -3,35 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, Tag
+from pydantic import Field
 
-from vgtm_qp.problem.fields import ByKey, Choice, Count, Factor, NonNegative, Vector, exactly
-from vgtm_qp.problem.table import Place, Table
-from vgtm_qp.problem.truss import unique
+from vgtm_qp.problem.fields import ByKey, Factor, NonNegative, Vector, count, exactly
+from vgtm_qp.problem.table import Place, Table, unique
 
 
-class VertexGoal(Table):
+class VertexGoal(Table, called="a control vertex goal"):
     """A place that a control vertex is drawn to in the null space of the tip's motion."""
 
-    called: ClassVar[str] = "a control vertex goal"
-    index: Annotated[int, Count(0, 999)] = Field(
+    index: Annotated[int, count(0, 999)] = Field(
         description="number of the control vertex, from 0 at the base"
     )
     position: Vector = Field(description="where it should go, m")
 
 
 class _Curve(Table):
-    control_vertices: Annotated[int, Count(3, 1000)] = Field(
+    control_vertices: Annotated[int, count(3, 1000)] = Field(
         default=6,
         description="number V of control vertices; at most the number of bays plus 2 for the curve methods",
     )
-    torsion_vertices: Annotated[int, Count(0, 1000)] = Field(
+    torsion_vertices: Annotated[int, count(0, 1000)] = Field(
         default=0,
         description="number of torsion coordinates of the curve's frame; 0 is no torsion of its own",
     )
-    nodes: Annotated[Literal["parameter", "arc-length"], Choice()] = Field(
+    nodes: Literal["parameter", "arc-length"] = Field(
         default="parameter",
         description="whether curve nodes keep their parameter or their share of the arc length",
     )
@@ -47,22 +45,20 @@ class _Curve(Table):
                 yield ("control_vertex_goals", i, "index"), f"a control vertex, 0 to {last}"
 
 
-class BezierCurve(_Curve):
+class BezierCurve(_Curve, called="a Bezier curve"):
     """One Bezier curve of degree V - 1."""
 
-    called: ClassVar[str] = "a Bezier curve"
-    family: Annotated[Literal["bezier"], Choice()] = "bezier"
-    control_vertices: Annotated[int, Count(3, 60)] = Field(
+    family: Literal["bezier"] = "bezier"
+    control_vertices: Annotated[int, count(3, 60)] = Field(
         default=6, description="number V of control vertices"
     )
 
 
-class BSplineCurve(_Curve):
+class BSplineCurve(_Curve, called="a B-spline curve"):
     """A clamped uniform B-spline."""
 
-    called: ClassVar[str] = "a B-spline curve"
-    family: Annotated[Literal["b-spline"], Choice()]
-    degree: Annotated[int, Count(1, 20)] = Field(
+    family: Literal["b-spline"]
+    degree: Annotated[int, count(1, 20)] = Field(
         default=3, description="degree, less than the number of vertices"
     )
 
@@ -72,34 +68,23 @@ class BSplineCurve(_Curve):
             yield ("degree",), f"a degree less than the number of control vertices, {self.control_vertices}"
 
 
-class BetaSplineCurve(_Curve):
+class BetaSplineCurve(_Curve, called="a Beta-spline curve"):
     """A uniform cubic Beta-spline through its end vertices."""
 
-    called: ClassVar[str] = "a Beta-spline curve"
-    family: Annotated[Literal["beta-spline"], Choice()]
+    family: Literal["beta-spline"]
     bias: Factor = Field(
         default=1.0, description="ratio of the speeds after and before a joint; 1 is unbiased"
     )
     tension: NonNegative = Field(default=0.0, description="pull towards the control vertices; 0 is none")
 
 
-Curve = Annotated[
-    Annotated[BezierCurve, Tag("<bezier>")]
-    | Annotated[BSplineCurve, Tag("<b-spline>")]
-    | Annotated[BetaSplineCurve, Tag("<beta-spline>")],
-    ByKey(
-        "family",
-        {"bezier": "<bezier>", "b-spline": "<b-spline>", "beta-spline": "<beta-spline>"},
-        default="bezier",
-    ),
-]
+Curve = Annotated[BezierCurve | BSplineCurve | BetaSplineCurve, ByKey("family")]
 
 
-class Surface(Table):
+class Surface(Table, called="a surface"):
     """A tensor-product Bezier surface, for plates."""
 
-    called: ClassVar[str] = "a surface"
     control_vertices: Annotated[
-        tuple[Annotated[int, Count(2, 30)], Annotated[int, Count(2, 30)]],
+        tuple[Annotated[int, count(2, 30)], Annotated[int, count(2, 30)]],
         exactly(2, "two integers [along, across]"),
     ] = Field(default=(4, 4), description="numbers of control vertices along and across")

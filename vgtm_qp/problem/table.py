@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any, ClassVar, Self
 
@@ -22,6 +23,15 @@ from vgtm_qp.problem.fields import entry, quoted, unexpected
 Place = tuple[str | int, ...]
 
 _MISSING = object()
+_PHRASES = {
+    "tuple_type": "an array [...]",
+    "list_type": "an array [...]",
+    "too_short": "at least {min_length} of them",
+    "too_long": "at most {max_length} of them",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "choice": "a table",
+}
 _nested: ContextVar[bool] = ContextVar("_nested", default=False)
 
 
@@ -38,6 +48,11 @@ class Table(BaseModel):
 
     called: ClassVar[str] = "this table"
 
+    def __init_subclass__(cls, *, called: str | None = None, **options: Any) -> None:
+        """Name the table in messages as `called`, where given."""
+        super().__init_subclass__(**options)
+        cls.called = called or cls.called
+
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuse a new value of a key."""
         if not name.startswith("_"):
@@ -50,7 +65,7 @@ class Table(BaseModel):
 
     def _immutable(self, name: str, value: Any) -> ProblemError:
         expected = "no change, since problems are immutable: problem.replace({...}) returns a changed one"
-        return ProblemError(type(self).__name__, [Mistake(name, shown(value), expected)])
+        return ProblemError.at(type(self).__name__, name, shown(value), expected)
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         """Yield place and expectation of each value that contradicts another one of this table."""
@@ -87,13 +102,18 @@ class Table(BaseModel):
         if not outermost:
             raise wrong
         source = (info.context or {}).get("source") or cls.__name__
-        raise ProblemError(str(source), mistakes_in(wrong, data)) from None
+        mistakes = [
+            Mistake(key_path(data, found["loc"]), shown(found["input"]), found["msg"])
+            for found in wrong.errors(include_url=False)
+        ]
+        raise ProblemError(str(source), mistakes) from None
 
     @classmethod
     def _misspelt(cls, errors: Sequence[ErrorDetails]) -> set[Place]:
-        """Return the keys of this table that an unknown one is probably meant for."""
-        unknown = [str(found["loc"][0]) for found in errors if _is_own(found, "extra_forbidden")]
-        return {(name,) for key in unknown if (name := closest(key, cls.model_fields)) is not None}
+        """Return the keys of this table itself that an unknown one is probably meant for."""
+        unknown = [found["loc"] for found in errors if found["type"] == "extra_forbidden"]
+        meant = (closest(str(place[0]), cls.model_fields) for place in unknown if len(place) == 1)
+        return {(name,) for name in meant if name is not None}
 
     @classmethod
     def _detail(cls, found: ErrorDetails) -> InitErrorDetails:
@@ -110,42 +130,54 @@ class Table(BaseModel):
             about = f" ({field.description})" if field and field.description else ""
             phrase, value = f"a value{about}: the key is required", _MISSING
         elif kind == "choice" and isinstance(value, Mapping):
-            key, choices = context["key"], context["choices"].split(",")
-            place = (*place, key)
-            value = value.get(key, _MISSING)
-            hint = nearest(value, choices) if isinstance(value, str) else ""
-            phrase = f"one of {quoted(choices)}{hint}"
+            key = context["key"]
+            place, value = (*place, key), value.get(key, _MISSING)
+            phrase = _one_of(context["choices"].split(","), value)
+        elif kind == "literal_error":
+            phrase = _one_of(re.findall("'([^']+)'", context["expected"]), value)
         elif kind == "tuple_type" and isinstance(value, Mapping):
             phrase = "an array of tables: [[...]] with two brackets, one for each entry"
-        elif kind in ("tuple_type", "list_type"):
-            phrase = "an array [...]"
-        elif kind == "too_short":
-            phrase = f"at least {context['min_length']} of them"
-        elif kind == "too_long":
-            phrase = f"at most {context['max_length']} of them"
-        elif kind in ("model_type", "model_attributes_type", "choice"):
-            phrase = "a table"
+        elif kind in _PHRASES:
+            phrase = _PHRASES[kind].format_map(context)
         else:
             phrase = found["msg"][:1].lower() + found["msg"][1:]
         return InitErrorDetails(type=unexpected(phrase), loc=place, input=value)
 
 
-def _is_own(found: ErrorDetails, kind: str) -> bool:
-    """Whether an error is of a kind and about a key of the table itself, not of one inside it."""
-    return found["type"] == kind and len(found["loc"]) == 1
+def increasing(key: str, times: list[float]) -> Iterator[tuple[Place, str]]:
+    """Yield each entry of the array `key` whose time is not later than the one before."""
+    for i in range(1, len(times)):
+        if times[i] <= times[i - 1]:
+            yield (key, i, "time"), f"a time after that of the entry before, {times[i - 1]:g} s"
+
+
+def unique(key: str, within: str, names: Sequence[str | int]) -> Iterator[tuple[Place, str]]:
+    """Yield each entry of the array `key` whose name is that of an earlier one."""
+    seen: set[str | int] = set()
+    for i, name in enumerate(names):
+        if name in seen:
+            yield (key, i, within), "a name that no other entry has"
+        seen.add(name)
+
+
+def known_names(
+    place: Place, names: Iterable[str], known: Mapping[str, Any], key: str | None = None
+) -> Iterator[tuple[Place, str]]:
+    """Yield each name, or the value of `key` at `place`, that is not among the known ones."""
+    for i, name in enumerate(names):
+        if name not in known:
+            some = quoted(list(known)[:8]) + (", ..." if len(known) > 8 else "")
+            yield (*place, i if key is None else key), f"the name of one of {some}{nearest(name, known)}"
+
+
+def _one_of(choices: Sequence[str], value: Any) -> str:
+    hint = nearest(value, choices) if isinstance(value, str) else ""
+    return f"{'one of ' if len(choices) > 1 else ''}{quoted(choices)}{hint}"
 
 
 def _echo(found: ErrorDetails) -> bool:
     """Whether an array is called too short only because an entry, which has its own error, was left out."""
     return found["type"] == "too_short" and len(found["input"]) >= found["ctx"]["min_length"]
-
-
-def mistakes_in(error: ValidationError, data: Any) -> list[Mistake]:
-    """Return each error of a validated `data` as a mistake with its key path."""
-    return [
-        Mistake(key_path(data, found["loc"]), shown(found["input"]), found["msg"])
-        for found in error.errors(include_url=False)
-    ]
 
 
 def key_path(data: Any, place: Place) -> str:

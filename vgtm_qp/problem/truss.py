@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, GetJsonSchemaHandler, Tag, model_validator
+from pydantic import Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from vgtm_qp.errors import nearest
 from vgtm_qp.problem.fields import (
+    ORIGIN,
     ByKey,
-    Choice,
-    Count,
     Distance,
     Flag,
     Length,
@@ -24,19 +22,21 @@ from vgtm_qp.problem.fields import (
     Seconds,
     Stroke,
     Vector,
+    count,
     exactly,
-    quoted,
     unexpected,
 )
-from vgtm_qp.problem.table import Place, Table
+from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
 
 _SLACK = 1e-9
 
+_NodePair = Annotated[tuple[Name, Name], exactly(2, "the names of two nodes")]
+_Positions = Annotated[tuple[Vector, Vector], exactly(2, "two positions [[x, y, z], [x, y, z]]")]
 
-class Lock(Table):
+
+class Lock(Table, called="a locked member"):
     """An actuator that is stuck at its length, from the start or from a time on."""
 
-    called: ClassVar[str] = "a locked member"
     member: Name = Field(description="name of the actuated member")
     time: Onset = Field(default=0.0, description="time at which it jams, s; 0 is from the start")
 
@@ -57,13 +57,12 @@ class Lock(Table):
         return {"anyOf": [{"type": "string", "minLength": 1}, dict(table)]}
 
 
-class BasePose(Table):
+class BasePose(Table, called="a base pose"):
     """A pose of the base that it reaches at a time, eqs. (7)-(8); its home pose at time 0 is the identity."""
 
-    called: ClassVar[str] = "a base pose"
     time: Seconds = Field(description="time at which the base is there, s")
-    position: Vector = Field(default=(0.0, 0.0, 0.0), description="position of the base frame's origin, m")
-    rotation_vector: Vector = Field(default=(0.0, 0.0, 0.0), description="rotation of the base frame, rad")
+    position: Vector = Field(default=ORIGIN, description="position of the base frame's origin, m")
+    rotation_vector: Vector = Field(default=ORIGIN, description="rotation of the base frame, rad")
 
 
 class _Truss(Table):
@@ -88,10 +87,19 @@ class _Truss(Table):
         yield from increasing("base_motion", [pose.time for pose in self.base_motion])
         yield from unique("locked", "member", [lock.member for lock in self.locked])
 
+    def _misfits(
+        self, stroke: Stroke | None, shortest: float, actuated: Mapping[str, float]
+    ) -> Iterator[tuple[Place, str]]:
+        """Yield what the shortest distance of joined nodes, or those of actuated members by their key, exclude."""
+        if 2 * self.joint_offset >= shortest:
+            yield ("joint_offset",), f"less than half the shortest member, {shortest / 2:g} m"
+        elif stroke:
+            for key, length in actuated.items():
+                yield from holds_home(("stroke",), stroke, length - 2 * self.joint_offset, key)
 
-class _Stack(_Truss):
-    called: ClassVar[str] = "a truss made of bays"
-    bays: Annotated[int, Count(1, 10_000)] = Field(description="number of bays")
+
+class _Stack(_Truss, called="a truss made of bays"):
+    bays: Annotated[int, count(1, 10_000)] = Field(description="number of bays")
     longeron: Length = Field(
         default=1.0, description="home length of the members that join one face to the next, m"
     )
@@ -107,19 +115,13 @@ class _Stack(_Truss):
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from super()._contradictions()
-        shortest = min(self.longeron, self.batten)
-        if 2 * self.joint_offset >= shortest:
-            yield ("joint_offset",), f"less than half the shortest member, {shortest / 2:g} m"
-        elif self.stroke:
-            for key, length in self._actuated_lengths().items():
-                yield from holds_home(("stroke",), self.stroke, length - 2 * self.joint_offset, key)
+        yield from self._misfits(self.stroke, min(self.longeron, self.batten), self._actuated_lengths())
 
 
-class ModuleTruss(_Stack):
+class ModuleTruss(_Stack, called="a truss of this module"):
     """Triangular faces stacked along +z: octahedral, double-octahedral, hexapod or longeron bays."""
 
-    called: ClassVar[str] = "a truss of this module"
-    module: Annotated[Literal["octahedral", "double-octahedral", "hexapod", "longeron"], Choice()] = Field(
+    module: Literal["octahedral", "double-octahedral", "hexapod", "longeron"] = Field(
         description="octahedral: fixed longerons, actuated battens; double-octahedral: two such bays, every "
         "second face rigid; hexapod: rigid faces, six actuated legs; longeron: actuated longerons, fixed "
         "diagonals of alternating hand"
@@ -137,16 +139,15 @@ class ModuleTruss(_Stack):
             yield ("batten",), f"less than sqrt(3) times the longeron, {flat:g} m, where a bay folds flat"
 
 
-class TetrahedralTruss(_Stack):
+class TetrahedralTruss(_Stack, called="a tetrahedral truss"):
     """Tetrahedra face on face: each node hangs by three members on the three nodes before it."""
 
-    called: ClassVar[str] = "a tetrahedral truss"
-    module: Annotated[Literal["tetrahedral"], Choice()]
+    module: Literal["tetrahedral"]
     longeron: Length = Field(default=1.0, description="home length of the member to the third node before, m")
     batten: Length = Field(
         default=1.0, description="home length of the members to the first and second node before, m"
     )
-    actuated: tuple[Annotated[int, Count(1, 3)], ...] = Field(
+    actuated: tuple[Annotated[int, count(1, 3)], ...] = Field(
         default=(1, 2, 3),
         min_length=1,
         description="which k of a node's members, to the k-th node before, are actuated",
@@ -165,15 +166,14 @@ class TetrahedralTruss(_Stack):
             yield ("longeron",), f"less than sqrt(3) times the batten, {flat:g} m, where the helix folds flat"
 
 
-class PlateTruss(_Truss):
+class PlateTruss(_Truss, called="a plate"):
     """A plate of two layers whose nodes track a surface; its first two rows are clamped."""
 
-    called: ClassVar[str] = "a plate"
-    module: Annotated[Literal["plate"], Choice()]
-    rows: Annotated[int, Count(3, 200)] = Field(
+    module: Literal["plate"]
+    rows: Annotated[int, count(3, 200)] = Field(
         description="rows of nodes along +z, the two clamped ones included"
     )
-    columns: Annotated[int, Count(3, 200)] = Field(description="nodes in a row")
+    columns: Annotated[int, count(3, 200)] = Field(description="nodes in a row")
     spacing: Length = Field(default=1.0, description="distance of neighbouring nodes of a layer at home, m")
     depth: Length = Field(default=math.sqrt(0.5), description="distance of the two layers at home, m")
     stroke: Stroke | None = Field(
@@ -182,33 +182,26 @@ class PlateTruss(_Truss):
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from super()._contradictions()
-        if 2 * self.joint_offset >= self.spacing:
-            yield ("joint_offset",), f"less than half the shortest member, {self.spacing / 2:g} m"
-        elif self.stroke:
-            yield from holds_home(("stroke",), self.stroke, self.spacing - 2 * self.joint_offset, "spacing")
+        yield from self._misfits(self.stroke, self.spacing, {"spacing": self.spacing})
 
 
-class Node(Table):
+class Node(Table, called="a node"):
     """A node of a graph."""
 
-    called: ClassVar[str] = "a node"
     name: Name = Field(description="name of the node")
     position: Vector = Field(description="home position, m")
     fixed: Flag = Field(default=False, description="whether it belongs to the base, eq. (7)")
-    joint: Annotated[tuple[Name, Name], exactly(2, "the names of two nodes")] | None = Field(
+    joint: _NodePair | None = Field(
         default=None,
         description="two other nodes that span its joint's frame with it, counter-clockwise about z",
     )
 
 
-class Member(Table):
+class Member(Table, called="a member"):
     """A member of a graph; its length is fixed where it is not actuated."""
 
-    called: ClassVar[str] = "a member"
     name: Name = Field(description="name of the member")
-    nodes: Annotated[tuple[Name, Name], exactly(2, "the names of two nodes")] = Field(
-        description="names of its two nodes"
-    )
+    nodes: _NodePair = Field(description="names of its two nodes")
     actuated: Flag = Field(default=False, description="whether it changes its length")
     length: Length | None = Field(
         default=None, description="home length, m; as the node positions give it where absent"
@@ -219,11 +212,8 @@ class Member(Table):
     radius: Distance | None = Field(
         default=None, description="radius, m; the truss's member_radius where absent"
     )
-    offsets: Annotated[tuple[Vector, Vector], exactly(2, "two positions [[x, y, z], [x, y, z]]")] | None = (
-        Field(
-            default=None,
-            description="positions of its two ends in the frames of its nodes' joints, eq. (12), m",
-        )
+    offsets: _Positions | None = Field(
+        default=None, description="positions of its two ends in the frames of its nodes' joints, eq. (12), m"
     )
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
@@ -237,11 +227,10 @@ class Member(Table):
             yield from holds_home(("stroke",), self.stroke, self.length, "length")
 
 
-class GraphTruss(_Truss):
+class GraphTruss(_Truss, called="a truss given as a graph"):
     """Any truss, given by its nodes and members."""
 
-    called: ClassVar[str] = "a truss given as a graph"
-    module: Annotated[Literal["graph"], Choice()]
+    module: Literal["graph"]
     node: tuple[Node, ...] = Field(min_length=2, description="the nodes")
     member: tuple[Member, ...] = Field(min_length=1, description="the members")
     tip: tuple[Name, ...] = Field(
@@ -319,39 +308,7 @@ class GraphTruss(_Truss):
                 yield ("member", i, "nodes"), f'two nodes that no other member joins; "{other}" joins these'
 
 
-_TRUSSES = {
-    "octahedral": "<module>",
-    "double-octahedral": "<module>",
-    "hexapod": "<module>",
-    "longeron": "<module>",
-    "tetrahedral": "<tetrahedral>",
-    "graph": "<graph>",
-    "plate": "<plate>",
-}
-
-Truss = Annotated[
-    Annotated[ModuleTruss, Tag("<module>")]
-    | Annotated[TetrahedralTruss, Tag("<tetrahedral>")]
-    | Annotated[GraphTruss, Tag("<graph>")]
-    | Annotated[PlateTruss, Tag("<plate>")],
-    ByKey("module", _TRUSSES),
-]
-
-
-def increasing(key: str, times: list[float]) -> Iterator[tuple[Place, str]]:
-    """Yield each entry of the array `key` whose time is not later than the one before."""
-    for i in range(1, len(times)):
-        if times[i] <= times[i - 1]:
-            yield (key, i, "time"), f"a time after that of the entry before, {times[i - 1]:g} s"
-
-
-def unique(key: str, within: str, names: Sequence[str | int]) -> Iterator[tuple[Place, str]]:
-    """Yield each entry of the array `key` whose name is that of an earlier one."""
-    seen: set[str | int] = set()
-    for i, name in enumerate(names):
-        if name in seen:
-            yield (key, i, within), "a name that no other entry has"
-        seen.add(name)
+Truss = Annotated[ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss, ByKey("module")]
 
 
 def holds_home(
@@ -360,13 +317,3 @@ def holds_home(
     """Yield the stroke if it excludes a home length."""
     if not stroke[0] - _SLACK <= home <= stroke[1] + _SLACK:
         yield place, f"a stroke that holds the home length, {home:g} m ({of})"
-
-
-def known_names(
-    place: Place, names: Iterable[str], known: Mapping[str, Any], key: str | None = None
-) -> Iterator[tuple[Place, str]]:
-    """Yield each name, or the value of `key` at `place`, that is not among the known ones."""
-    for i, name in enumerate(names):
-        if name not in known:
-            some = quoted(list(known)[:8]) + (", ..." if len(known) > 8 else "")
-            yield (*place, i if key is None else key), f"the name of one of {some}{nearest(name, known)}"

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.arm import ArmSymbols
-from vgtm_qp.arm.symbols import Bound, Constants, rotated
+from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants, rotated
 from vgtm_qp.qp.graph import tip_frames
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.settle import AT_BOUND, LEFT, SETTLED, SETTLING_STEPS, WORST_CONDITION

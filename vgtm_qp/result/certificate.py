@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
 from vgtm_qp.errors import ResultError
@@ -66,10 +66,9 @@ class Certificate:
 
     Attributes
     ----------
-    member_error : Measure
-        Greatest deviation of a fixed or locked member from its length, m.
-    base_error : Measure
-        Greatest motion of a base node away from where the problem holds it, m.
+    member_error, base_error : Measure
+        Greatest deviation of a fixed or locked member from its length, and of a base node from where the problem
+        holds it, m.
     stroke_violation, rate_violation, acceleration_violation : Measure
         How far actuated members pass their limits, m, m/s and m/s^2; zero where they keep them.
     clearance, clearance_between : Measure
@@ -78,24 +77,20 @@ class Certificate:
         The same between members that share no node, m.
     member_angle : Measure
         Least angle between members that share a node, rad.
-    tip_error : Measure
-        Greatest distance of the tip from its target over the tracked axes, m.
-    tip_direction_error : Measure
-        Greatest angle between tip and target direction or orientation, rad.
+    tip_error, tip_direction_error : Measure
+        Greatest distance of the tip from its target over the tracked axes, m, and greatest angle between tip and
+        target direction or orientation, rad.
     target_error : Measure
         Greatest distance of a tip target from the path that the problem asks for, m.
     array_error : Measure
         Greatest difference between a stored array and the same recomputed from the nodes, m.
-    length_singular_value : Measure
-        Least singular value of the square length Jacobian along the maneuver.
-    tip_singular_value : Measure
-        Least singular value of the tip's translation with respect to the actuated lengths, m/m.
+    length_singular_value, tip_singular_value : Measure
+        Least singular value of the square length Jacobian, and of the tip's translation with respect to the
+        actuated lengths, m/m.
     tip_error_per_millimetre : Measure
         Greatest singular value of the same: mm at the tip for actuator errors whose squares sum to 1 mm^2.
-    contradictions : tuple of str
-        What in the file disagrees with itself or with its problem, one line each.
-    notes : tuple of str
-        What could not be checked, and why.
+    contradictions, notes : tuple of str
+        What in the file disagrees with itself or with its problem, and what could not be checked, one line each.
     """
 
     member_error: Measure
@@ -121,7 +116,7 @@ class Certificate:
     @property
     def measures(self) -> dict[str, Measure]:
         """All measures by name."""
-        return {f.name: value for f in fields(self) if isinstance(value := getattr(self, f.name), Measure)}
+        return {name: value for name, value in vars(self).items() if isinstance(value, Measure)}
 
     @property
     def ok(self) -> bool:
@@ -135,16 +130,8 @@ class Certificate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data that strict JSON can hold; `from_dict` reads it back."""
-        measures = {
-            name: {f.name: getattr(measure, f.name) for f in fields(measure)}
-            for name, measure in self.measures.items()
-        }
-        return {
-            "ok": self.ok,
-            **measures,
-            "contradictions": list(self.contradictions),
-            "notes": list(self.notes),
-        }
+        texts = {"contradictions": list(self.contradictions), "notes": list(self.notes)}
+        return {"ok": self.ok, **asdict(self), **texts}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Certificate:

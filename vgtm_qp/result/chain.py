@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.record import numbers
-from vgtm_qp.result.rotation import rotations
+from vgtm_qp.result.poses import rotations
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -35,10 +34,11 @@ class RecordedChain:
         have one in common.
     radius, length : (B,)
         Of the links, m.
+    stretches : (B,) bool
+        Links that are drawn as changing their lengths: none.
     """
 
     unit, body, rigid_body = "rad or m", "link", "link"
-    has_pin_joints = False
 
     def __init__(self, record: Mapping[str, Any]) -> None:
         try:
@@ -69,16 +69,12 @@ class RecordedChain:
         if links and not (self.links.min() >= 0 and self.links.max() < joints + 2):
             raise ResultError(f"manifest.arm.links names a point outside 0..{joints + 1}")
         self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
+        self.stretches = np.zeros(links, dtype=np.bool_)
         home = np.concatenate([self.home_quantities, np.zeros(6)])[None]
         points, _, frames = self.placed(home)
         self.home, self._home_tip = points[0], frames[0]
-        self.length = np.linalg.norm(np.diff(self.home[self.links], axis=1)[:, 0], axis=1)
+        self.length = self.lengths(self.home)
         self._reaches = self._greatest_reaches()
-
-    @property
-    def stretches(self) -> NDArray[np.bool_]:
-        """(B,) bodies that are drawn as changing their lengths: none."""
-        return np.zeros(len(self.links), dtype=np.bool_)
 
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
         """Return points (P, J + 2, 3), m, axes (P, J, 3) and last frames (P, 3, 3) at configurations (P, J + 6)."""
@@ -102,9 +98,8 @@ class RecordedChain:
         return np.asarray(points[..., self.links, :])
 
     def lengths(self, points: Array) -> Array:
-        """Return (B,) the lengths of the links, m, where the points (J + 2, 3) are."""
-        ends = self.ends(points)
-        return np.asarray(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
+        """Return (..., B) the lengths of the links, m, where the points (..., J + 2, 3) are."""
+        return np.asarray(np.linalg.norm(np.diff(self.ends(points), axis=-2)[..., 0, :], axis=-1))
 
     def quantities(self, q: Array) -> Array:
         """Return (T, J) the joints' values at configurations (T, J + 6)."""
@@ -114,9 +109,9 @@ class RecordedChain:
         """Return (T, 3) the end effector's position, m."""
         return np.asarray(self.placed(q)[0][:, -1])
 
-    def tip_rotation(self, q: Array) -> Array:
-        """Return (3, 3) the end effector's attitude at a configuration (J + 6,): that at home, turned."""
-        return np.asarray(self.placed(q[None])[2][0] @ self._home_tip.T @ self.tip_frame)
+    def tip_rotations(self, q: Array) -> Array:
+        """Return (T, 3, 3) the end effector's attitude at configurations (T, J + 6): that at home, turned."""
+        return np.asarray(self.placed(q)[2] @ self._home_tip.T @ self.tip_frame)
 
     def singular_values(self, q: Array) -> tuple[float, float, float] | None:
         """Return 1, for joints are the configuration, and least and greatest singular value of the tip's Jacobian."""
@@ -125,11 +120,21 @@ class RecordedChain:
         jacobian = np.where(self.revolute[:, None], arms, axes[0])[self.actuated]
         if not len(jacobian):
             return None
-        values = np.linalg.svd(jacobian, compute_uv=False)
-        return 1.0, float(values[-1]) if len(values) == 3 else 0.0, float(values[0])
+        return 1.0, *extreme_values(jacobian)
 
-    def bend(self, before: Array, after: Array) -> float:
-        """Return a bound, m, of |d2 r / d share2| of any point of the arm as the configuration moves straight.
+    def states_ends(self, q: Array) -> Array:
+        """Return (T, B, 2, 3) the ends of the links, m, at configurations (T, J + 6)."""
+        return self.ends(self.placed(q)[0])
+
+    def ends_between(self, before: Array, after: Array, share: Array, link: Index) -> Array:
+        """Return (P, 2, 3) the ends, m, of links (P,) at shares (P,) of the straight way between configurations."""
+        # Many pairs are asked about at few instants.
+        instants, which = np.unique(share, return_inverse=True)
+        points = self.placed(before + instants[:, None] * (after - before))[0]
+        return np.asarray(points[which[:, None], self.links[link]])
+
+    def bend(self, before: Array, after: Array, link: Index) -> Array:
+        """Return (P,) a bound, m, of |d2 r / d share2| of any point of the links as the configuration moves straight.
 
         A point's velocity is a sum over the joints before it of w a x (r - o) and v a. The axes a turn with the joints
         before them, and r - o changes by no more than what the joints from there on do to it.
@@ -140,7 +145,7 @@ class RecordedChain:
         turn, slide = np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
         earlier = np.cumsum(turn) - turn
         beyond = np.cumsum((turn * self._reaches + slide)[::-1])[::-1]
-        return float(turn @ (2.0 * earlier * self._reaches + beyond) + slide @ earlier)
+        return np.full(len(link), turn @ (2.0 * earlier * self._reaches + beyond) + slide @ earlier)
 
     def _greatest_reaches(self) -> Array:
         """Return (J + 1,) how far the tip may be from the base and from each joint, m."""
@@ -148,3 +153,25 @@ class RecordedChain:
         slides = np.where(self.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
         after = np.cumsum((ways[1:] + slides)[::-1])[::-1]
         return np.concatenate([[after[0] + ways[0]], after])
+
+
+def numbers(record: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+    """Return ``record[key]`` as floats of that shape, inf for None."""
+    array = np.asarray(record[key], dtype=np.float64)
+    array = np.where(np.isnan(array), np.inf, array)
+    if array.ndim != len(shape) or any(
+        size not in (None, found) for size, found in zip(shape, array.shape, strict=True)
+    ):
+        raise ResultError(f"manifest.arm.{key} has shape {array.shape}; expected {shape}")
+    return array
+
+
+def is_serial(record: Mapping[str, Any]) -> bool:
+    """Whether the arm is a serial one."""
+    return record.get("kind") == "serial"
+
+
+def extreme_values(jacobian: NDArray[Any]) -> tuple[float, float]:
+    """Return the least and the greatest singular value of the tip's Jacobian (n, 3)."""
+    values = np.linalg.svd(jacobian, compute_uv=False)
+    return float(values[-1]) if len(values) == 3 else 0.0, float(values[0])

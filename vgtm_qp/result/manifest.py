@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +20,7 @@ SCHEMA_VERSION = 1
 
 STATUSES = ("solved", "blocked", "infeasible")
 
-_PACKAGES = (
-    "vgtm-qp",
-    "numpy",
-    "casadi",
-    "daqp",
-    "osqp",
-    "piqp",
-    "python-fcl",
-    "qpsolvers",
-    "trimesh",
-)
+_PACKAGES = ("vgtm-qp", "numpy", "casadi", "daqp", "osqp", "piqp", "python-fcl", "qpsolvers", "trimesh")
 _MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "blocked_by", "versions")
 
 
@@ -49,22 +39,15 @@ def make_manifest(
     setup_time: float,
     directory: str | Path = ".",
     meshes: Mapping[str, Mapping[str, Any]] | None = None,
-    path: Sequence[Sequence[float]] | None = None,
 ) -> dict[str, Any]:
     """Return the manifest of a result file.
 
     Parameters
     ----------
-    problem : mapping
-        The whole problem as JSON data, in the form of the problem file.
-    arm : mapping
-        What the arm's `record` returns.
-    status : str
-        One of `STATUSES`.
-    reached : float
-        Share of the path covered, 0 to 1.
-    blocked_by : iterable of str
-        Names of what stopped it.
+    problem, arm : mapping
+        The whole problem as JSON data, in the form of the problem file; what the arm's `record` returns.
+    status, reached, blocked_by
+        One of `STATUSES`, the share of the path covered, 0 to 1, and the names of what stopped it.
     stop : mapping, optional
         What ``Stop.to_dict`` returns.
     way_out : str
@@ -72,18 +55,12 @@ def make_manifest(
     recovered : mapping, optional
         Pairs below their clearance in the home pose, ``member / obstacle`` or ``member / member``, and their
         distances there, m.
-    method : str
-        As in the problem's ``[method]``.
-    solver : str or None
-        What solved the QPs; None where the method solves none.
-    setup_time : float
-        s.
+    method, solver, setup_time
+        As in the problem's ``[method]``; what solved the QPs, None where the method solves none; s.
     directory : path
         Where the relative paths of the problem start.
     meshes : mapping, optional
         What `mesh_record` returns for each mesh obstacle, by the obstacle's name.
-    path : (K, 3), optional
-        The positions in the problem's path file, m, so that the result can be verified without it.
     """
     return {
         "schema_version": SCHEMA_VERSION,
@@ -102,7 +79,6 @@ def make_manifest(
         "setup_time": float(setup_time),
         "directory": str(Path(directory).resolve()),
         "meshes": {name: dict(record) for name, record in (meshes or {}).items()},
-        "path": None if path is None else [[float(number) for number in row] for row in path],
         "versions": _versions(),
         "certificate": None,
     }

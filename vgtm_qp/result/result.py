@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.base import base_poses
 from vgtm_qp.result.certificate import Certificate
-from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.result.chain import RecordedChain, is_serial
 from vgtm_qp.result.file import read_result, write_result
 from vgtm_qp.result.layout import check_arrays, frozen, names_of, plain
 from vgtm_qp.result.manifest import check_manifest
-from vgtm_qp.result.record import is_serial
+from vgtm_qp.result.poses import base_poses
 
 Array = NDArray[np.float64]
 
@@ -135,27 +134,24 @@ class Result:
     @property
     def actuator_names(self) -> tuple[str, ...]:
         """Actuated members, or joints of a serial arm."""
-        if self.joint_names is None:
-            return tuple(self.member_names[self.member_actuated].tolist())
-        return tuple(self.joint_names[self._moving_joints].tolist())
+        names = self.member_names if self.joint_names is None else self.joint_names
+        return tuple(names[self._actuated].tolist())
 
     @property
     def actuator_values(self) -> Array:
         """(T, n_a) lengths of the actuated members, m, or values of the joints, rad or m."""
-        if self.joints is None:
-            return self.member_lengths[:, self.member_actuated]
-        return self.joints[:, self._moving_joints]
+        return (self.member_lengths if self.joints is None else self.joints)[:, self._actuated]
 
     @property
     def actuator_units(self) -> tuple[str, ...]:
         """``"m"`` or ``"rad"``."""
-        if self.joints is None:
-            return ("m",) * int(self.member_actuated.sum())
-        turns = np.asarray(self.manifest["arm"]["revolute"], dtype=np.bool_)[self._moving_joints]
-        return tuple("rad" if turn else "m" for turn in turns)
+        turns = self.manifest["arm"].get("revolute", [False] * len(self._actuated))
+        return tuple("rad" if turn else "m" for turn in np.asarray(turns)[self._actuated])
 
     @property
-    def _moving_joints(self) -> NDArray[np.bool_]:
+    def _actuated(self) -> NDArray[np.bool_]:
+        if self.joints is None:
+            return self.member_actuated
         return np.asarray(self.manifest["arm"]["actuated"], dtype=np.bool_)
 
     @property
@@ -194,8 +190,7 @@ class Result:
         Entries that come from the certificate are None before verification. A certificate measures penetration
         no deeper than a member's radius; beyond that the clearance at the states replaces the one between them.
         """
-        certificate = self.certificate
-        manifest = self.manifest
+        certificate, manifest = self.certificate, self.manifest
         finite = self.clearance[np.isfinite(self.clearance)]
         least = float(finite.min()) if len(finite) else None
 
@@ -224,7 +219,7 @@ class Result:
             "step_time": self._step_time(),
             "setup_time": manifest.get("setup_time"),
             "blocked_by": list(self.blocked_by),
-            "way_out": str(self.manifest.get("way_out", "")),
+            "way_out": str(manifest.get("way_out", "")),
             "verified": None if certificate is None else certificate.ok,
             "failures": [] if certificate is None else list(certificate.failures()),
             "result": None if result is None else str(result),
@@ -271,11 +266,10 @@ def _links(chain: RecordedChain, q: Array) -> dict[str, NDArray[Any]]:
             f"array joints holds {q.shape[1] - 6} joints; manifest.arm describes {len(chain.quantity_names)}"
         )
     points = chain.placed(q)[0]
-    ends = chain.ends(points)
     return {
         "nodes": points,
         "members": chain.links,
         "member_names": np.array(chain.member_names),
-        "member_actuated": np.zeros(len(chain.links), dtype=np.bool_),
-        "member_lengths": np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2),
+        "member_actuated": chain.stretches,
+        "member_lengths": chain.lengths(points),
     }

@@ -9,19 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.chain import RecordedChain
-from vgtm_qp.result.record import is_serial, numbers
+from vgtm_qp.result.chain import RecordedChain, extreme_values, is_serial, numbers
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _DENSE_UNKNOWNS = 300
 """Above this many free coordinates singular values come from a sparse factorisation."""
-
-
-def recorded_arm(record: Mapping[str, Any], members: Index) -> RecordedArm | RecordedChain:
-    """Return the arm of a manifest's record; `members` (M, 2) are the nodes of each."""
-    return RecordedChain(record) if is_serial(record) else RecordedArm(record, members)
 
 
 class RecordedArm:
@@ -35,14 +29,18 @@ class RecordedArm:
         Home positions of the nodes, m.
     base, free : (N_c,) int, (N - N_c,) int
         Given nodes, and the others.
-    actuated : (M,) bool
+    actuated, stretches : (M,) bool
         True where a member changes its length.
+    quantity_names, home_quantities : (M,)
+        Of what moves the arm and what is fixed: names and home lengths of the members.
     length, stroke, rate, acceleration, radius : (M,), (M, 2), (M,), (M,), (M,)
         Home lengths and limits; inf where there is no limit.
-    triangle, offset : (N, 3) int or (N, 1) int, (M, 2, 3)
-        Nodes that orient each node's joint, and the members' ends in the joint frames, eqs. (12)-(13); the
-        node alone and zeros for pin joints.
+    corners, offset : (M, 2, 3) int or (M, 2, 1) int, (M, 2, 3)
+        Nodes that place the two ends of each member and orient its joint there, and the ends in the joint
+        frames, eqs. (12)-(13); the end's node alone and zeros for pin joints.
     """
+
+    unit, body, rigid_body = "m", "member", "fixed member"
 
     def __init__(self, record: Mapping[str, Any], members: Index) -> None:
         count = len(members)
@@ -53,7 +51,7 @@ class RecordedArm:
             nodes = len(self.home)
             self.base = _indices(record["base"], "base", nodes)
             self.member_names = tuple(str(name) for name in record["member_names"])
-            self.actuated = np.asarray(record["actuated"], dtype=np.bool_)
+            self.actuated = self.stretches = np.asarray(record["actuated"], dtype=np.bool_)
             self.length = numbers(record, "length", (count,))
             self.stroke = numbers(record, "stroke", (count, 2))
             self.rate = numbers(record, "rate", (count,))
@@ -64,10 +62,10 @@ class RecordedArm:
             self.tip_weights = numbers(tip, "weights", (len(self.tip),))
             self.tip_frame = numbers(tip, "frame", (3, 3))
             if joints is None:
-                self.triangle = np.arange(nodes)[:, None]
+                triangle = np.arange(nodes)[:, None]
                 self.offset = np.zeros((count, 2, 3))
             else:
-                self.triangle = _indices(joints["triangle"], "joints.triangle", nodes).reshape(nodes, 3)
+                triangle = _indices(joints["triangle"], "joints.triangle", nodes).reshape(nodes, 3)
                 self.offset = numbers(joints, "offset", (count, 2, 3))
         except KeyError as error:
             raise ResultError(f"manifest.arm lacks {error}") from None
@@ -75,99 +73,95 @@ class RecordedArm:
             raise ResultError(f"manifest.arm is malformed: {error}") from None
         if len(self.member_names) != count or self.actuated.shape != (count,):
             raise ResultError(f"manifest.arm does not describe {count} members, as array members does")
-        self.members = members
+        self.members, self.corners = members, triangle[members]
+        self.quantity_names, self.home_quantities = self.member_names, self.length
         self.free = np.setdiff1d(np.arange(nodes), self.base)
-        self._tip_fit = polygon_frame(self.home[self.tip], None) if self.has_tip_frame else None
-
-    unit, body, rigid_body = "m", "member", "fixed member"
-
-    @property
-    def quantity_names(self) -> tuple[str, ...]:
-        """Names of what moves the arm and of what is fixed: its members."""
-        return self.member_names
-
-    @property
-    def stretches(self) -> NDArray[np.bool_]:
-        """(M,) bodies that change their lengths."""
-        return np.asarray(self.actuated)
-
-    @property
-    def home_quantities(self) -> Array:
-        """(M,) the lengths at home, m."""
-        return self.length
-
-    def quantities(self, nodes: Array) -> Array:
-        """Return (T, M) member lengths, m, at node positions (T, N, 3)."""
-        return np.stack([self.lengths(state) for state in nodes])
-
-    @property
-    def has_tip_frame(self) -> bool:
-        """True where the end effector has three nodes or more, so that it has an attitude."""
-        return bool(len(self.tip) >= 3)
+        # Fewer than three nodes have no attitude.
+        self._tip_fit = polygon_frame(self.home[self.tip], None) if len(self.tip) >= 3 else None
 
     @property
     def has_pin_joints(self) -> bool:
         """True where members end in their nodes, and so move along straight lines when the nodes do."""
-        return bool(self.triangle.shape[1] == 1)
+        return bool(self.corners.shape[2] == 1)
 
-    def corners(self, member: Index) -> Index:
-        """Return (P, 2, 1 or 3) the nodes that place the two ends of each of the members (P,)."""
-        return np.asarray(self.triangle[self.members[member]])
+    def ends(self, nodes: Array) -> Array:
+        """Return (..., M, 2, 3) the members' ends r_ik, eq. (13), m, at node positions (..., N, 3)."""
+        return self._ends_at(nodes[..., self.corners, :], self.offset)
 
-    def ends(self, nodes: Array, member: Index | None = None) -> Array:
-        """Return (P, 2, 3) the ends r_ik, eq. (13), m, of members (P,) at node positions `nodes` (N, 3)."""
-        member = np.arange(len(self.members)) if member is None else member
-        return self.ends_at(nodes[self.corners(member)], member)
+    states_ends = ends
 
-    def ends_at(self, corner: Array, member: Index) -> Array:
-        """Return (P, 2, 3) the same from the positions (P, 2, 1 or 3, 3) of the nodes in `corners`."""
+    def ends_between(self, before: Array, after: Array, share: Array, member: Index) -> Array:
+        """Return (P, 2, 3) the ends, m, of members (P,) at shares (P,) of the straight way between nodes (N, 3)."""
+        start, stop = before[self.corners[member]], after[self.corners[member]]
+        return self._ends_at(start + share[:, None, None, None] * (stop - start), self.offset[member])
+
+    def _ends_at(self, corner: Array, offset: Array) -> Array:
+        """Return (..., P, 2, 3) ends from the positions (..., P, 2, 1 or 3, 3) of their corners."""
+        origin = corner[..., 0, :]
         if self.has_pin_joints:
-            return corner[:, :, 0]
-        origin = corner[:, :, 0]
-        to_first, to_second = _unit(corner[:, :, 1] - origin), _unit(corner[:, :, 2] - origin)
+            return origin
+        to_first, to_second = _unit(corner[..., 1, :] - origin), _unit(corner[..., 2, :] - origin)
         x = _unit(-(to_first + to_second))
         z = _unit(np.cross(to_first, to_second))
         y = np.cross(z, x)
-        offset = self.offset[member]
         return np.asarray(origin + offset[..., :1] * x + offset[..., 1:2] * y + offset[..., 2:] * z)
 
+    def bend(self, before: Array, after: Array, member: Index) -> Array:
+        """Return (P,) an upper bound, m, of |d2 r / d share2| of members' ends between node positions (N, 3).
+
+        Zero for pin joints. The joint frame's axes are unit vectors of polynomials w of the share, and
+        |(w/|w|)''| <= |w''|/|w| + 3 (|w'|/|w|)^2, with |w| bounded below from its ends; inf where that fails.
+        """
+        if self.has_pin_joints:
+            return np.zeros(len(member))
+        corner = self.corners[member]
+        first = [nodes[corner[..., 1]] - nodes[corner[..., 0]] for nodes in (before, after)]
+        second = [nodes[corner[..., 2]] - nodes[corner[..., 0]] for nodes in (before, after)]
+        x_rate, x_bend = _bisector_bounds(first, second)
+        z_rate, z_bend = _normal_bounds(first, second)
+        offset = np.abs(self.offset[member])
+        y_bend = z_bend + 2.0 * z_rate * x_rate + x_bend
+        with np.errstate(invalid="ignore"):
+            bound = offset[..., 0] * x_bend + offset[..., 1] * y_bend + offset[..., 2] * z_bend
+        return np.asarray(np.where(np.isnan(bound), 0.0, bound).max(axis=1))
+
     def lengths(self, nodes: Array) -> Array:
-        """Return (M,) member lengths, m, at node positions (N, 3)."""
+        """Return (..., M) member lengths, m, at node positions (..., N, 3)."""
         ends = self.ends(nodes)
-        return np.asarray(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
+        return _norm(ends[..., 1, :] - ends[..., 0, :])
+
+    quantities = lengths
 
     def tip_position(self, nodes: Array) -> Array:
         """Return (..., 3) the end effector's position, m, at nodes (..., N, 3)."""
         return np.asarray(np.einsum("k,...kc->...c", self.tip_weights, nodes[..., self.tip, :]))
 
-    def tip_rotation(self, nodes: Array) -> Array:
-        """Return (3, 3) the end effector's attitude at nodes (N, 3): that at home, turned by the best fit."""
+    def tip_rotations(self, nodes: Array) -> Array:
+        """Return (T, 3, 3) the end effector's attitude at nodes (T, N, 3): that at home, turned by the best fit."""
         if self._tip_fit is None:
-            return self.tip_frame
+            return np.tile(self.tip_frame, (len(nodes), 1, 1))
         home_frame, angles = self._tip_fit
-        frame, _ = polygon_frame(nodes[self.tip], angles)
-        return np.asarray(frame @ home_frame.T @ self.tip_frame)
+        frames = [polygon_frame(polygon, angles)[0] for polygon in nodes[:, self.tip]]
+        return np.asarray(frames @ home_frame.T @ self.tip_frame)
 
-    def length_gradient(self, nodes: Array) -> tuple[Array, Index]:
+    def _length_gradient(self, nodes: Array) -> tuple[Array, Index]:
         """Return (M, Q, 3) the gradients of the lengths with respect to (M, Q) nodes, m/m.
 
         For offset joints by central differences of the joints' own corners: exact to about 1e-9.
         """
-        member = np.arange(len(self.members))
-        corner = self.corners(member)
-        place = nodes[corner]
+        place = nodes[self.corners]
         if self.has_pin_joints:
             direction = _unit(place[:, 1, 0] - place[:, 0, 0])
             return np.stack([-direction, direction], axis=1), self.members
         step = 1e-6 * float(self.length.max())
-        gradient = np.empty((len(member), 2, 3, 3))
+        gradient = np.empty((len(self.members), 2, 3, 3))
         for e, c, axis in np.ndindex(2, 3, 3):
             change = np.zeros((2, 3, 3))
             change[e, c, axis] = step
-            ahead, behind = (self.ends_at(place + sign * change, member) for sign in (1.0, -1.0))
-            spans = [np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) for ends in (ahead, behind)]
-            gradient[:, e, c, axis] = (spans[0] - spans[1]) / (2.0 * step)
-        return gradient.reshape(-1, 6, 3), corner.reshape(-1, 6)
+            ahead, behind = (self._ends_at(place + sign * change, self.offset) for sign in (1.0, -1.0))
+            longer, shorter = (_norm(ends[:, 1] - ends[:, 0]) for ends in (ahead, behind))
+            gradient[:, e, c, axis] = (longer - shorter) / (2.0 * step)
+        return gradient.reshape(-1, 6, 3), self.corners.reshape(-1, 6)
 
     def singular_values(self, nodes: Array) -> tuple[float, float, float] | None:
         """Return the least singular value of the length Jacobian, and the least and greatest of the tip's.
@@ -178,7 +172,7 @@ class RecordedArm:
         unknowns = 3 * len(self.free)
         if unknowns != len(self.members) or not self.actuated.any():
             return None
-        gradient, index = self.length_gradient(nodes)
+        gradient, index = self._length_gradient(nodes)
         column = np.full(len(self.home), -1)
         column[self.free] = np.arange(len(self.free))
         place = column[index]
@@ -202,7 +196,7 @@ class RecordedArm:
         least = float(np.linalg.svd(J, compute_uv=False)[-1])
         if least == 0.0:
             return 0.0, 0.0, np.inf
-        return least, *_extremes(np.linalg.solve(J.T, tip)[self.actuated])
+        return least, *extreme_values(np.linalg.solve(J.T, tip)[self.actuated])
 
     def _sparse_values(
         self, rows: Index, columns: Index, values: Array, tip: Array
@@ -224,7 +218,15 @@ class RecordedArm:
             before, growth = growth, float(np.linalg.norm(v))
             if abs(growth - before) <= 1e-8 * growth:
                 break
-        return float(1.0 / np.sqrt(growth)), *_extremes(factors.solve(tip, trans="T")[self.actuated])
+        return float(1.0 / np.sqrt(growth)), *extreme_values(factors.solve(tip, trans="T")[self.actuated])
+
+
+Arm = RecordedArm | RecordedChain
+
+
+def recorded_arm(record: Mapping[str, Any], members: Index) -> Arm:
+    """Return the arm of a manifest's record; `members` (M, 2) are the nodes of each."""
+    return RecordedChain(record) if is_serial(record) else RecordedArm(record, members)
 
 
 def polygon_frame(points: Array, angles: Array | None) -> tuple[Array, Array]:
@@ -247,10 +249,41 @@ def polygon_frame(points: Array, angles: Array | None) -> tuple[Array, Array]:
     return np.stack([u, v, z], axis=1), np.angle(planar)
 
 
-def _extremes(G: NDArray[Any]) -> tuple[float, float]:
-    values = np.linalg.svd(G, compute_uv=False)
-    least = float(values[-1]) if len(values) == 3 else 0.0
-    return least, float(values[0])
+def _unit_bounds(least: Array, rate: Array, bend: Array) -> tuple[Array, Array]:
+    """Bounds of the first and second derivative of w/|w| from |w| >= least, |w'| <= rate, |w''| <= bend."""
+    held = least > 0.0
+    safe = np.where(held, least, 1.0)
+    relative = rate / safe
+    return np.where(held, relative, np.inf), np.where(held, bend / safe + 3.0 * relative**2, np.inf)
+
+
+def _bisector_bounds(first: list[Array], second: list[Array]) -> tuple[Array, Array]:
+    """Bounds of the derivatives of the outward bisector's direction."""
+    rates, bends, units = [], [], []
+    for before, after in (first, second):
+        rate = _norm(after - before)
+        least = (_norm(before) + _norm(after) - rate) / 2.0
+        unit_rate, unit_bend = _unit_bounds(least, rate, np.zeros_like(rate))
+        rates.append(unit_rate)
+        bends.append(unit_bend)
+        units.append([before / _norm(before)[..., None], after / _norm(after)[..., None]])
+    rate, bend = rates[0] + rates[1], bends[0] + bends[1]
+    sums = [_norm(units[0][k] + units[1][k]) for k in range(2)]
+    return _unit_bounds((sums[0] + sums[1] - rate) / 2.0, rate, bend)
+
+
+def _normal_bounds(first: list[Array], second: list[Array]) -> tuple[Array, Array]:
+    """Bounds of the derivatives of the direction of first x second, which is quadratic in the share."""
+    change = [after - before for before, after in (first, second)]
+    bend = 2.0 * _norm(np.cross(change[0], change[1]))
+    slopes = [np.cross(change[0], second[k]) + np.cross(first[k], change[1]) for k in range(2)]
+    rate = np.maximum(_norm(slopes[0]), _norm(slopes[1]))
+    areas = [_norm(np.cross(first[k], second[k])) for k in range(2)]
+    return _unit_bounds((areas[0] + areas[1] - rate) / 2.0, rate, bend)
+
+
+def _norm(vectors: Array) -> Array:
+    return np.asarray(np.linalg.norm(vectors, axis=-1))
 
 
 def _unit(vectors: Array) -> Array:

@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.base import base_poses
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.result.poses import base_poses, rotation_matrix, rotations
 from vgtm_qp.result.result import Result
-from vgtm_qp.result.rotation import rotation_matrix, rotations
-from vgtm_qp.verify.arm import RecordedArm, recorded_arm
+from vgtm_qp.verify.arm import Arm, recorded_arm
 from vgtm_qp.verify.clearance import (
+    BETWEEN_TOLERANCE,
+    CLEARANCE_TOLERANCE,
     RESOLUTION,
     AgainstBody,
     AgainstMembers,
-    ChainMotion,
     Encounters,
     Least,
-    MemberMotion,
-    motion_of,
+    RecordedMotion,
 )
 from vgtm_qp.verify.obstacles import read_obstacles
-from vgtm_qp.verify.path import check_path
+from vgtm_qp.verify.path import DIRECTION_TOLERANCE, TIP_TOLERANCE, check_path, direction_error, tip_error
 from vgtm_qp.verify.recovery import excuse_recovering
 
 Array = NDArray[np.float64]
@@ -36,14 +34,6 @@ MEMBER_TOLERANCE = 1e-9
 """Fixed and locked members, base nodes, m."""
 LIMIT_TOLERANCE = 1e-9
 """Strokes, rates and accelerations, m, m/s, m/s^2."""
-CLEARANCE_TOLERANCE = 1e-9
-"""Clearances at states, m."""
-BETWEEN_TOLERANCE = 1e-4
-"""Clearances between states, m."""
-TIP_TOLERANCE = 1e-6
-"""Tip position and its target's distance from the path, m."""
-DIRECTION_TOLERANCE = 1e-6
-"""Tip direction and orientation, rad."""
 ARRAY_TOLERANCE = 1e-9
 """Stored arrays against the same recomputed, m."""
 
@@ -76,41 +66,20 @@ def verify(maneuver: Result) -> Certificate:
     ResultError
         The arm record in the manifest is malformed, or describes another number of nodes.
     """
-    manifest = maneuver.manifest
-    problem = manifest["problem"]
-    arm = recorded_arm(manifest["arm"], maneuver.members)
+    arm = recorded_arm(maneuver.manifest["arm"], maneuver.members)
     if maneuver.nodes.shape[1] != len(arm.home):
         raise ResultError(
             f"array nodes holds {maneuver.nodes.shape[1]} nodes; manifest.arm describes {len(arm.home)}"
         )
-    states = maneuver.configurations
-    motion = motion_of(arm, maneuver.time, states)
-    lengths, names, unit = arm.quantities(states), arm.quantity_names, arm.unit
-    per = f"({unit})" if " " in unit else unit
-
-    bodies, wrong, notes = read_obstacles(
-        problem, manifest.get("meshes") or {}, Path(manifest.get("directory") or ".")
-    )
-    rules = problem.get("clearance") or {}
-    safe = float(rules.get("safe", _SAFE))
-    self_safe = _SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
-    if not rules.get("self_collision", True):
-        self_safe = -np.inf
-    against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]
-    at, between, clearance = _clearances(motion, against)
-    self_at, self_between, self_clearance = _clearances(motion, members)
-    recovered = manifest.get("recovered") or []
-    if recovered:
-        kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
-        nearer, remarks = excuse_recovering(recovered, kept, CLEARANCE_TOLERANCE, BETWEEN_TOLERANCE)
-        wrong, notes = [*wrong, *nearer], [*notes, *remarks]
-        at, between, _ = _clearances(motion, against)
-        self_at, self_between, _ = _clearances(motion, members)
-
-    tip = arm.tip_position(states)
-    rotation = np.stack([arm.tip_rotation(state) for state in states])
-    path = check_path(maneuver, tip)
-    moved = _base_error(arm, maneuver, problem)
+    motion = RecordedMotion(arm, maneuver.time, maneuver.configurations)
+    clearances, clearance, self_clearance, wrong, notes = _clearances(maneuver, motion)
+    values = _singular_values(arm, motion.states)
+    if len(motion.states) > _FEW_STATES and 3 * len(arm.free) > _MANY_UNKNOWNS:
+        notes.append(f"singular values are those of {_FEW_STATES} states")
+    tip, rotation = arm.tip_position(motion.states), arm.tip_rotations(motion.states)
+    target_error, astray, remarks = check_path(maneuver, tip)
+    effector = maneuver.manifest["problem"].get("end_effector") or {}
+    is_elastic = effector.get("mode") == "elastic"
     differences = {
         "tip_position": np.abs(maneuver.tip_position - tip),
         "tip_rotation": np.abs(maneuver.tip_rotation - rotation),
@@ -118,62 +87,98 @@ def verify(maneuver: Result) -> Certificate:
         "self_clearance": _clearance_difference(maneuver.self_clearance, self_clearance, arm),
     }
     if maneuver.joints is None:
-        differences["member_lengths"] = np.abs(maneuver.member_lengths - lengths)
+        differences["member_lengths"] = np.abs(maneuver.member_lengths - arm.quantities(motion.states))
     furthest = max(differences, key=lambda name: float(np.max(differences[name], initial=0.0)))
-    values = _singular_values(arm, states)
-    if len(states) > _FEW_STATES and 3 * len(arm.free) > _MANY_UNKNOWNS:
-        notes.append(f"singular values are those of {_FEW_STATES} states")
-
     return Certificate(
-        member_error=_worst(_held(arm, problem, maneuver.time, lengths), unit, MEMBER_TOLERANCE, names),
-        base_error=_worst(moved, "m", MEMBER_TOLERANCE, [f"node {k}" for k in arm.base]),
-        stroke_violation=_worst(_beyond_stroke(arm, lengths), unit, LIMIT_TOLERANCE, names),
-        rate_violation=_worst(
-            _beyond_rate(arm, maneuver.time, lengths),
-            f"{per}/s",
-            LIMIT_TOLERANCE,
-            names,
-        ),
-        acceleration_violation=_worst(
-            np.where(
-                _locking_rows(arm, problem, maneuver.time),
-                0.0,
-                _beyond_acceleration(arm, maneuver.time, lengths),
-            ),
-            f"{per}/s^2",
-            LIMIT_TOLERANCE,
-            names,
-        ),
-        clearance=_least(at, safe - CLEARANCE_TOLERANCE),
-        clearance_between=_least(between, safe - BETWEEN_TOLERANCE),
-        self_clearance=_least(self_at, self_safe - CLEARANCE_TOLERANCE),
-        self_clearance_between=_least(self_between, self_safe - BETWEEN_TOLERANCE),
-        member_angle=_least(
-            _member_angle(motion), float(rules.get("minimum_angle") or -np.inf) - DIRECTION_TOLERANCE, "rad"
-        ),
-        tip_error=_worst(path.tip_error(tip), "m", None if path.is_elastic else TIP_TOLERANCE),
+        **_limits(maneuver, arm, arm.quantities(motion.states)),
+        **clearances,
+        tip_error=_worst(tip_error(maneuver, tip), "m", None if is_elastic else TIP_TOLERANCE),
         tip_direction_error=_worst(
-            path.direction_error(rotation), "rad", None if path.is_elastic else DIRECTION_TOLERANCE
+            direction_error(maneuver, rotation), "rad", None if is_elastic else DIRECTION_TOLERANCE
         ),
-        target_error=_worst(path.target_error, "m", TIP_TOLERANCE),
+        target_error=_worst(target_error, "m", TIP_TOLERANCE),
         array_error=_worst(differences[furthest], "m", ARRAY_TOLERANCE, array=furthest),
         length_singular_value=_least_of(values[:, 0], ""),
         tip_singular_value=_least_of(values[:, 1], "m/m"),
         tip_error_per_millimetre=_worst(values[:, 2] if len(values) else None, "mm", None),
         contradictions=(
             *wrong,
-            *path.contradictions,
+            *astray,
             *_record_contradictions(maneuver, arm),
-            *_jams_between_rows(maneuver, problem),
+            *_jams_between_rows(maneuver),
             *_outcome_contradictions(maneuver),
         ),
-        notes=(*notes, *path.notes),
+        notes=(*notes, *remarks),
     )
 
 
+def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
+    """Return how far lengths or joint values (T, M), and the base, are from where they are held, and from limits.
+
+    A rate is the mean over a step. An acceleration is the change of the rate from step to step over the time between
+    their middles; that of a member which stops because it locks does not count.
+    """
+    time, unit, names = maneuver.time, arm.unit, arm.quantity_names
+    per = f"({unit})" if " " in unit else unit
+    locks = [(names.index(name), since) for name, since in _locks(maneuver) if name in names]
+    held = np.where(arm.actuated, 0.0, np.abs(lengths - arm.home_quantities))
+    for k, since in locks:
+        rows = np.flatnonzero(time >= since - _INSTANT)
+        held[rows, k] = np.maximum(held[rows, k], np.abs(lengths[rows, k] - lengths[rows[:1], k]))
+    rates = np.diff(lengths, axis=0) / np.diff(time)[:, None]
+    accelerations = np.diff(rates, axis=0) / np.diff((time[1:] + time[:-1]) / 2.0)[:, None]
+    for k, since in locks:
+        accelerations[np.abs(time[1:-1] - since) <= _INSTANT, k] = 0.0
+    poses = base_poses(maneuver.manifest["problem"], time)
+    placed = arm.home[arm.base] @ np.swapaxes(rotations(poses[:, 3:]), 1, 2) + poses[:, None, :3]
+    moved = np.linalg.norm(maneuver.nodes[:, arm.base] - placed, axis=2)
+
+    def beyond(excess: Array, unit: str) -> Measure:
+        return _worst(np.where(arm.actuated, np.maximum(excess, 0.0), 0.0), unit, LIMIT_TOLERANCE, names)
+
+    return {
+        "member_error": _worst(held, unit, MEMBER_TOLERANCE, names),
+        "base_error": _worst(moved, "m", MEMBER_TOLERANCE, [f"node {k}" for k in arm.base]),
+        "stroke_violation": beyond(np.maximum(arm.stroke[:, 0] - lengths, lengths - arm.stroke[:, 1]), unit),
+        "rate_violation": beyond(np.abs(rates) - arm.rate, f"{per}/s"),
+        "acceleration_violation": beyond(np.abs(accelerations) - arm.acceleration, f"{per}/s^2"),
+    }
+
+
 def _clearances(
-    motion: MemberMotion | ChainMotion, encounters: Sequence[Encounters]
-) -> tuple[Least, Least, Array]:
+    maneuver: Result, motion: RecordedMotion
+) -> tuple[dict[str, Measure], Array, Array, list[str], list[str]]:
+    """Return the measures, the clearances and self-clearances at each state (T,), contradictions and notes."""
+    manifest = maneuver.manifest
+    directory = Path(manifest.get("directory") or ".")
+    bodies, wrong, notes = read_obstacles(manifest["problem"], manifest.get("meshes") or {}, directory)
+    rules = manifest["problem"].get("clearance") or {}
+    safe = float(rules.get("safe", _SAFE))
+    self_safe = _SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
+    if not rules.get("self_collision", True):
+        self_safe = -np.inf
+    against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]
+    at, between, clearance = _least_clearances(motion, against)
+    self_at, self_between, self_clearance = _least_clearances(motion, members)
+    recovered = manifest.get("recovered") or []
+    if recovered:
+        kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
+        nearer, remarks = excuse_recovering(recovered, kept)
+        wrong, notes = [*wrong, *nearer], [*notes, *remarks]
+        at, between, _ = _least_clearances(motion, against)
+        self_at, self_between, _ = _least_clearances(motion, members)
+    angle = float(rules.get("minimum_angle") or -np.inf)
+    measures = {
+        "clearance": _least(at, safe - CLEARANCE_TOLERANCE),
+        "clearance_between": _least(between, safe - BETWEEN_TOLERANCE),
+        "self_clearance": _least(self_at, self_safe - CLEARANCE_TOLERANCE),
+        "self_clearance_between": _least(self_between, self_safe - BETWEEN_TOLERANCE),
+        "member_angle": _least(_member_angle(motion), angle - DIRECTION_TOLERANCE, "rad"),
+    }
+    return measures, clearance, self_clearance, wrong, notes
+
+
+def _least_clearances(motion: RecordedMotion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
     """Return the least clearance at states, a bound of it between them, and the least at each state (T,)."""
     count = len(motion.time)
     each = [
@@ -191,7 +196,7 @@ def _clearances(
     return at, between, np.array([least.value for least in each])
 
 
-def _clearance_difference(stored: Array, found: Array, arm: RecordedArm | RecordedChain) -> Array:
+def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
     """Return (T,) how far clearances differ; how deep a member is inside an obstacle is not compared."""
     floor = -float(arm.radius.min(initial=np.inf))
     with np.errstate(invalid="ignore"):
@@ -199,50 +204,24 @@ def _clearance_difference(stored: Array, found: Array, arm: RecordedArm | Record
     return np.asarray(np.where(stored == found, 0.0, difference))
 
 
-def _held(arm: RecordedArm | RecordedChain, problem: Mapping[str, Any], time: Array, lengths: Array) -> Array:
-    """Return (T, M) how far fixed members are from their lengths, and locked ones from where they stuck."""
-    errors = np.where(arm.actuated, 0.0, np.abs(lengths - arm.home_quantities))
-    for entry in (problem.get("truss") or problem.get("arm") or {}).get("locked") or ():
-        name, since = (
-            (entry, 0.0) if isinstance(entry, str) else (entry["member"], float(entry.get("time", 0.0)))
-        )
-        if name not in arm.quantity_names:
-            continue
-        k = arm.quantity_names.index(name)
-        rows = np.flatnonzero(time >= since - _INSTANT)
-        if len(rows):
-            errors[rows, k] = np.maximum(errors[rows, k], np.abs(lengths[rows, k] - lengths[rows[0], k]))
-    return errors
+def _locks(maneuver: Result) -> list[tuple[str, float]]:
+    """Return name and time, s, of what the problem locks."""
+    problem = maneuver.manifest["problem"]
+    entries = (problem.get("truss") or problem.get("arm") or {}).get("locked") or ()
+    tables = ({"member": entry} if isinstance(entry, str) else entry for entry in entries)
+    return [(table["member"], float(table.get("time", 0.0))) for table in tables]
 
 
-def _jams_between_rows(maneuver: Result, problem: Mapping[str, Any]) -> list[str]:
+def _jams_between_rows(maneuver: Result) -> list[str]:
     """Return the members that lock at a time which no row has: nothing says what length they stuck at."""
-    found = []
-    for entry in (problem.get("truss") or problem.get("arm") or {}).get("locked") or ():
-        since = 0.0 if isinstance(entry, str) else float(entry.get("time", 0.0))
-        if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > _INSTANT:
-            found.append(f"{entry['member']} locks at {since:g} s, where there is no state")
-    return found
+    return [
+        f"{name} locks at {since:g} s, where there is no state"
+        for name, since in _locks(maneuver)
+        if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > _INSTANT
+    ]
 
 
-def _locking_rows(arm: RecordedArm | RecordedChain, problem: Mapping[str, Any], time: Array) -> Array:
-    """Return (T - 2, M) whether an acceleration is that of a member which stops because it locks."""
-    middle = np.zeros((max(len(time) - 2, 0), len(arm.quantity_names)), dtype=bool)
-    for entry in (problem.get("truss") or problem.get("arm") or {}).get("locked") or ():
-        if not isinstance(entry, str) and entry["member"] in arm.quantity_names:
-            since = float(entry.get("time", 0.0))
-            middle[:, arm.quantity_names.index(entry["member"])] = np.abs(time[1:-1] - since) <= _INSTANT
-    return middle
-
-
-def _base_error(arm: RecordedArm | RecordedChain, maneuver: Result, problem: Mapping[str, Any]) -> Array:
-    """Return (T, N_c) how far base nodes are from where the problem holds them, m."""
-    poses = base_poses(problem, maneuver.time)
-    placed = arm.home[arm.base] @ np.swapaxes(rotations(poses[:, 3:]), 1, 2) + poses[:, None, :3]
-    return np.asarray(np.linalg.norm(maneuver.nodes[:, arm.base] - placed, axis=2))
-
-
-def _member_angle(motion: MemberMotion | ChainMotion) -> Least:
+def _member_angle(motion: RecordedMotion) -> Least:
     """Return the least angle at any state between two members that share a node, rad."""
     members = motion.arm.members
     node = members.reshape(-1)
@@ -263,30 +242,7 @@ def _member_angle(motion: MemberMotion | ChainMotion) -> Least:
     return least
 
 
-def _beyond_stroke(arm: RecordedArm | RecordedChain, lengths: Array) -> Array:
-    """Return (T, M) how far actuated members are outside their strokes, m."""
-    outside = np.maximum(arm.stroke[:, 0] - lengths, lengths - arm.stroke[:, 1])
-    return np.asarray(np.where(arm.actuated, np.maximum(outside, 0.0), 0.0))
-
-
-def _beyond_rate(arm: RecordedArm | RecordedChain, time: Array, lengths: Array) -> Array:
-    """Return (T - 1, M) how far mean rates over the steps pass their limits, m/s."""
-    rates = np.diff(lengths, axis=0) / np.diff(time)[:, None]
-    return np.asarray(np.where(arm.actuated, np.maximum(np.abs(rates) - arm.rate, 0.0), 0.0))
-
-
-def _beyond_acceleration(arm: RecordedArm | RecordedChain, time: Array, lengths: Array) -> Array:
-    """Return (T - 2, M) how far accelerations pass their limits, m/s^2.
-
-    An acceleration is the change of the mean rate from step to step over the time between their middles.
-    """
-    rates = np.diff(lengths, axis=0) / np.diff(time)[:, None]
-    middles = (time[1:] + time[:-1]) / 2.0
-    changes = np.diff(rates, axis=0) / np.diff(middles)[:, None]
-    return np.asarray(np.where(arm.actuated, np.maximum(np.abs(changes) - arm.acceleration, 0.0), 0.0))
-
-
-def _singular_values(arm: RecordedArm | RecordedChain, nodes: Array) -> Array:
+def _singular_values(arm: Arm, nodes: Array) -> Array:
     """Return (S, 3) least of the length Jacobian, least and greatest of the tip's, at S states."""
     states = np.arange(len(nodes))
     if 3 * len(arm.free) > _MANY_UNKNOWNS:
@@ -296,12 +252,7 @@ def _singular_values(arm: RecordedArm | RecordedChain, nodes: Array) -> Array:
 
 
 def _worst(
-    errors: Array | None,
-    unit: str,
-    bound: float | None,
-    names: Sequence[str] = (),
-    *,
-    array: str = "",
+    errors: Array | None, unit: str, bound: float | None, names: Sequence[str] = (), *, array: str = ""
 ) -> Measure:
     """Return the greatest of errors (T,) or (T, M, ...), with its row and the name in the second axis."""
     if errors is None:
@@ -326,7 +277,7 @@ def _least_of(values: Array, unit: str) -> Measure:
     return Measure(float(values.min()) if len(values) else None, unit, None, "least")
 
 
-def _record_contradictions(maneuver: Result, arm: RecordedArm | RecordedChain) -> list[str]:
+def _record_contradictions(maneuver: Result, arm: Arm) -> list[str]:
     """Return where the arm record disagrees with the arrays, with itself or with the problem."""
     if isinstance(arm, RecordedChain):
         return _chain_contradictions(maneuver, arm)
@@ -355,7 +306,7 @@ def _record_contradictions(maneuver: Result, arm: RecordedArm | RecordedChain) -
                 continue
             given = entries.get(member, {}).get(name.removeprefix("member_"))
             wanted = truss.get(name) if given is None else given
-            if wanted is not None and not np.allclose(recorded[k], wanted, rtol=0.0, atol=LIMIT_TOLERANCE):
+            if wanted is not None and not _same(recorded[k], wanted):
                 differing.append(f"{member} (problem: {wanted})")
         if differing:
             more = f" and {len(differing) - 1} more members" if len(differing) > 1 else ""
@@ -379,32 +330,29 @@ def _chain_contradictions(maneuver: Result, arm: RecordedChain) -> list[str]:
     origin = (0.0, 0.0, 0.0)
     for k, (name, joint) in enumerate(joints.items()):
         axis = np.array(joint["axis"], dtype=float)
-        limits = joint.get("limits") or (-np.inf, np.inf)
+        turn = np.array(joint.get("rotation_vector") or origin, dtype=float)
         wanted = {
             "axis": (arm.axis[k], axis / np.linalg.norm(axis)),
             "position": (arm.position[k], joint.get("position") or origin),
-            "rotation": (
-                arm.rotation[k],
-                rotation_matrix(np.array(joint.get("rotation_vector") or origin, dtype=float)),
-            ),
+            "rotation": (arm.rotation[k], rotation_matrix(turn)),
             "home": (arm.home_quantities[k], joint.get("home") or 0.0),
-            "limits": (arm.stroke[k], limits),
-            "rate": (arm.rate[k], np.inf if joint.get("rate") is None else joint["rate"]),
-            "acceleration": (
-                arm.acceleration[k],
-                np.inf if joint.get("acceleration") is None else joint["acceleration"],
-            ),
+            "limits": (arm.stroke[k], joint.get("limits") or (-np.inf, np.inf)),
+            "rate": (arm.rate[k], joint.get("rate") or np.inf),
+            "acceleration": (arm.acceleration[k], joint.get("acceleration") or np.inf),
             "kind": (float(arm.revolute[k]), float(joint.get("kind", "revolute") == "revolute")),
         }
         for key, (recorded, given) in wanted.items():
-            if not np.allclose(recorded, given, rtol=0.0, atol=LIMIT_TOLERANCE):
+            if not _same(recorded, given):
                 found.append(f"the arm record's {key} of joint {name} differs from the problem's")
-    if not np.allclose(arm.tip, table.get("tip") or origin, rtol=0.0, atol=LIMIT_TOLERANCE):
+    if not _same(arm.tip, table.get("tip") or origin):
         found.append("the arm record's tip differs from the problem's")
-    radius = table.get("link_radius")
-    if radius is not None and not np.allclose(arm.radius, radius, rtol=0.0, atol=LIMIT_TOLERANCE):
+    if table.get("link_radius") is not None and not _same(arm.radius, table["link_radius"]):
         found.append("the arm record's link radius differs from the problem's")
     return found
+
+
+def _same(recorded: ArrayLike, given: ArrayLike) -> bool:
+    return bool(np.allclose(recorded, given, rtol=0.0, atol=LIMIT_TOLERANCE))
 
 
 def _outcome_contradictions(maneuver: Result) -> list[str]:

@@ -46,13 +46,10 @@ def _beyond(points: Array, half: Array) -> Array:
 
 def segment_ball(start: Array, end: Array, radius: float) -> Separation:
     """Segments against the solid ball round the origin."""
-    along = end - start
-    square = np.maximum(np.sum(along * along, axis=1), np.finfo(np.float64).tiny)
-    share = np.clip(-np.sum(start * along, axis=1) / square, 0.0, 1.0)
-    point = start + share[:, None] * along
+    point = _to_segment(np.zeros(3), start, end - start)
     span = np.linalg.norm(point, axis=1)
     outside = np.maximum(span - radius, 0.0)
-    return outside, np.where(outside[:, None] > 0.0, point / np.maximum(span, 1e-300)[:, None], 0.0)
+    return outside, np.where(outside[:, None] > 0.0, -point / np.maximum(span, 1e-300)[:, None], 0.0)
 
 
 def segment_cylinder(start: Array, end: Array, radius: float, half_height: float) -> Separation:
@@ -92,11 +89,8 @@ def segment_segment(start: Array, end: Array, other_start: Array, other_end: Arr
         -_to_segment(other_end, start, first),
     ]
     a, e = np.sum(first * first, axis=1), np.sum(second * second, axis=1)
-    b, c, f = (
-        np.sum(first * second, axis=1),
-        np.sum(first * between, axis=1),
-        np.sum(second * between, axis=1),
-    )
+    b, c = np.sum(first * second, axis=1), np.sum(first * between, axis=1)
+    f = np.sum(second * between, axis=1)
     determinant = a * e - b * b
     skew = determinant > 1e-14 * a * e
     safe = np.where(skew, determinant, 1.0)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
+import itertools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,21 +12,77 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.result.rotation import rotation_matrix
-from vgtm_qp.verify.distance import (
-    Separation,
-    segment_ball,
-    segment_box,
-    segment_cylinder,
-    segment_triangle,
-)
+from vgtm_qp.result.poses import rotation_matrix
+from vgtm_qp.verify.distance import Separation, segment_ball, segment_box, segment_cylinder, segment_triangle
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Body(ABC):
+class Shape:
+    """K convex pieces about the origin, along their own axes.
+
+    Attributes
+    ----------
+    corners : (K, C, 3)
+        Points whose convex hulls hold the pieces, m.
+    separation
+        Distances and normals of P segments, from start to end (P, 3), against the pieces (P,).
+    support
+        Greatest ``normal . x`` (P,) over the points x of the pieces (P,) for normals (P, 3), m.
+    closed : bool or None
+        Whether the pieces are a closed surface, with an inside; None where they are solid themselves.
+    """
+
+    corners: Array
+    separation: Callable[[Array, Array, Index], Separation]
+    support: Callable[[Array, Index], Array]
+    closed: bool | None = None
+
+
+_BOX_CORNERS: Array = np.array([list(itertools.product((-1.0, 1.0), repeat=3))])
+
+
+def box(half: Array) -> Shape:
+    """Return a solid box of half edges `half` (3,), m."""
+    return Shape(
+        _BOX_CORNERS * half,
+        lambda start, end, _: segment_box(start, end, half),
+        lambda normal, _: np.asarray(np.abs(normal) @ half),
+    )
+
+
+def ball(radius: float) -> Shape:
+    """Return a solid sphere of radius `radius`, m."""
+    return Shape(
+        _BOX_CORNERS * radius,
+        lambda start, end, _: segment_ball(start, end, radius),
+        lambda normal, _: np.asarray(radius * np.linalg.norm(normal, axis=1)),
+    )
+
+
+def cylinder(radius: float, half_height: float) -> Shape:
+    """Return a solid cylinder round the z axis, of radius `radius` and height 2 `half_height`, m."""
+    return Shape(
+        _BOX_CORNERS * np.array([radius, radius, half_height]),
+        lambda start, end, _: segment_cylinder(start, end, radius, half_height),
+        lambda normal, _: radius * np.linalg.norm(normal[:, :2], axis=1) + half_height * np.abs(normal[:, 2]),
+    )
+
+
+def mesh(triangles: Array, closed: bool) -> Shape:
+    """Return a surface of `triangles` (F, 3, 3), m; that of a solid where `closed`."""
+    return Shape(
+        triangles,
+        lambda start, end, piece: segment_triangle(start, end, triangles[piece]),
+        lambda normal, piece: np.einsum("pkc,pc->pk", triangles[piece], normal).max(axis=1),
+        closed,
+    )
+
+
+@dataclass(frozen=True)
+class Body:
     """An obstacle; positions it takes and gives are relative to its centre, in directions of the base frame.
 
     Attributes
@@ -37,138 +93,47 @@ class Body(ABC):
         Position at time 0, m, and its rate, m/s.
     rotation : (3, 3)
         Its attitude.
+    shape : Shape
+        In directions of its own axes.
     """
 
     name: str
     center: Array
     velocity: Array
     rotation: Array
+    shape: Shape
 
-    def at(self, time: float) -> Array:
-        """Return (3,) the centre at `time`, s."""
-        return np.asarray(self.center + self.velocity * time)
+    def at(self, time: Array) -> Array:
+        """Return (P, 3) the centre at times (P,), s."""
+        return np.asarray(self.center + self.velocity * time[:, None])
 
-    @property
-    @abstractmethod
     def corners(self) -> Array:
-        """(K, C, 3) points whose convex hulls hold the K convex pieces, m."""
+        """Return (K, C, 3) points whose convex hulls hold the K convex pieces, m."""
+        return np.asarray(self.shape.corners @ self.rotation.T)
 
-    @abstractmethod
     def separation(self, start: Array, end: Array, piece: Index) -> Separation:
         """Return distances and normals of P segments against the pieces (P,) of this body."""
+        distance, normal = self.shape.separation(start @ self.rotation, end @ self.rotation, piece)
+        return distance, normal @ self.rotation.T
 
-    @abstractmethod
     def support(self, normal: Array, piece: Index) -> Array:
         """Return (P,) the greatest ``normal . x`` over the points x of the pieces, m."""
+        return self.shape.support(normal @ self.rotation, piece)
 
     def encloses(self, points: Array) -> NDArray[np.bool_]:
-        """Return (Q,) True for points (Q, 3) inside without a surface near, as only a closed mesh has."""
-        return np.zeros(len(points), dtype=np.bool_)
+        """Return (Q,) True for points (Q, 3) inside a closed mesh: its winding number round them is not zero.
 
-
-def _box_corners(half: Array, rotation: Array) -> Array:
-    signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(1, 8, 3)
-    return np.asarray((signs * half) @ rotation.T)
-
-
-@dataclass(frozen=True)
-class BoxBody(Body):
-    """A solid box of half edges `half` (3,), m."""
-
-    half: Array
-
-    @property
-    def corners(self) -> Array:
-        """(1, 8, 3) m."""
-        return _box_corners(self.half, self.rotation)
-
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
-        """Return distances and normals of P segments."""
-        distance, normal = segment_box(start @ self.rotation, end @ self.rotation, self.half)
-        return distance, normal @ self.rotation.T
-
-    def support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
-        """Return (P,) greatest extents along `normal`, m."""
-        return np.asarray(np.abs(normal @ self.rotation) @ self.half)
-
-
-@dataclass(frozen=True)
-class BallBody(Body):
-    """A solid sphere of radius `radius`, m."""
-
-    radius: float
-
-    @property
-    def corners(self) -> Array:
-        """(1, 8, 3) m."""
-        return _box_corners(np.full(3, self.radius), np.eye(3))
-
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
-        """Return distances and normals of P segments."""
-        return segment_ball(start, end, self.radius)
-
-    def support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
-        """Return (P,) greatest extents along `normal`, m."""
-        return np.asarray(self.radius * np.linalg.norm(normal, axis=1))
-
-
-@dataclass(frozen=True)
-class CylinderBody(Body):
-    """A solid cylinder round its own z axis, of radius `radius` and height 2 `half_height`, m."""
-
-    radius: float
-    half_height: float
-
-    @property
-    def corners(self) -> Array:
-        """(1, 8, 3) m."""
-        return _box_corners(np.array([self.radius, self.radius, self.half_height]), self.rotation)
-
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:  # noqa: ARG002
-        """Return distances and normals of P segments."""
-        local = (start @ self.rotation, end @ self.rotation)
-        distance, normal = segment_cylinder(*local, self.radius, self.half_height)
-        return distance, normal @ self.rotation.T
-
-    def support(self, normal: Array, piece: Index) -> Array:  # noqa: ARG002
-        """Return (P,) greatest extents along `normal`, m."""
-        local = normal @ self.rotation
-        radial = np.linalg.norm(local[:, :2], axis=1)
-        return np.asarray(self.radius * radial + self.half_height * np.abs(local[:, 2]))
-
-
-@dataclass(frozen=True)
-class MeshBody(Body):
-    """A surface of `triangles` (F, 3, 3), m, already turned to its attitude; solid where `closed`."""
-
-    triangles: Array
-    closed: bool
-
-    @property
-    def corners(self) -> Array:
-        """(F, 3, 3) m."""
-        return self.triangles
-
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:
-        """Return distances and normals of P segments against the triangles (P,)."""
-        return segment_triangle(start, end, self.triangles[piece])
-
-    def support(self, normal: Array, piece: Index) -> Array:
-        """Return (P,) greatest extents of the triangles along `normal`, m."""
-        return np.asarray(np.einsum("pkc,pc->pk", self.triangles[piece], normal).max(axis=1))
-
-    def encloses(self, points: Array) -> NDArray[np.bool_]:
-        """Return (Q,) True where the winding number of the closed surface round a point is not zero.
-
-        The solid angle of each triangle is that of Van Oosterom and Strackee (1983).
+        Of other solids the distance says it. The solid angle of each triangle is that of Van Oosterom and
+        Strackee (1983).
         """
         inside = np.zeros(len(points), dtype=np.bool_)
-        if not self.closed:
+        if not self.shape.closed:
             return inside
-        flat = self.triangles.reshape(-1, 3)
+        points, triangles = points @ self.rotation, self.shape.corners
+        flat = triangles.reshape(-1, 3)
         near = np.flatnonzero(((points > flat.min(axis=0)) & (points < flat.max(axis=0))).all(axis=1))
         for q in near:
-            a, b, c = np.moveaxis(self.triangles - points[q], 1, 0)
+            a, b, c = np.moveaxis(triangles - points[q], 1, 0)
             la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
             numerator = np.sum(a * np.cross(b, c), axis=1)
             denominator = la * lb * lc + np.sum(a * b, axis=1) * lc
@@ -198,39 +163,32 @@ def read_obstacles(
         name = str(entry.get("name") or f"obstacle {number}")
         vectors = (entry.get(key) or (0.0, 0.0, 0.0) for key in ("center", "velocity", "rotation_vector"))
         center, velocity, turn = (np.asarray(vector, dtype=np.float64) for vector in vectors)
-        placed = (name, center, velocity, rotation_matrix(turn))
-        shape = entry.get("shape", "box")
-        if shape == "box":
-            bodies.append(
-                BoxBody(*placed, half=np.broadcast_to(np.asarray(entry["size"], dtype=float), 3) / 2)
-            )
-        elif shape == "sphere":
-            bodies.append(BallBody(*placed, radius=float(entry["radius"])))
-        elif shape == "cylinder":
-            bodies.append(CylinderBody(*placed, float(entry["radius"]), float(entry["height"]) / 2))
-        elif shape == "mesh":
-            body, complaint = _read_mesh(placed, entry, meshes.get(name), directory)
-            if complaint:
-                contradictions.append(complaint)
-            if body is not None:
-                bodies.append(body)
-                if not body.closed:
-                    notes.append(f"mesh {name} is not closed: only its surface is an obstacle")
+        kind, shape, complaint = entry.get("shape", "box"), None, ""
+        if kind == "box":
+            shape = box(np.broadcast_to(np.asarray(entry["size"], dtype=float), 3) / 2)
+        elif kind == "sphere":
+            shape = ball(float(entry["radius"]))
+        elif kind == "cylinder":
+            shape = cylinder(float(entry["radius"]), float(entry["height"]) / 2)
+        elif kind == "mesh":
+            shape, complaint = _read_mesh(name, entry, meshes.get(name), directory)
         else:
-            contradictions.append(f"obstacle {name} has the unknown shape {shape!r}")
+            complaint = f"obstacle {name} has the unknown shape {kind!r}"
+        if complaint:
+            contradictions.append(complaint)
+        if shape is not None:
+            bodies.append(Body(name, center, velocity, rotation_matrix(turn), shape))
+            if shape.closed is False:
+                notes.append(f"mesh {name} is not closed: only its surface is an obstacle")
     return bodies, contradictions, notes
 
 
 def _read_mesh(
-    placed: tuple[str, Array, Array, Array],
-    entry: Mapping[str, Any],
-    record: Mapping[str, Any] | None,
-    directory: Path,
-) -> tuple[MeshBody | None, str]:
+    name: str, entry: Mapping[str, Any], record: Mapping[str, Any] | None, directory: Path
+) -> tuple[Shape | None, str]:
     """Return the mesh, and what is wrong with its file."""
     import trimesh
 
-    name, rotation = placed[0], placed[3]
     path = directory / str(entry.get("file", ""))
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -248,5 +206,5 @@ def _read_mesh(
         )
     else:
         complaint = ""
-    scaled = triangles * float(entry.get("scale") or 1.0)
-    return MeshBody(*placed, triangles=scaled @ rotation.T, closed=bool(surface.is_watertight)), complaint
+    scale = float(entry.get("scale") or 1.0)
+    return mesh(triangles * scale, closed=bool(surface.is_watertight)), complaint

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
-from vgtm_qp.verify.clearance import Encounters, Least
+from vgtm_qp.verify.clearance import BETWEEN_TOLERANCE, CLEARANCE_TOLERANCE, Encounters, Least, Pairs
 
 Array = NDArray[np.float64]
 
 
 def excuse_recovering(
-    record: Any, encounters: Iterable[tuple[Encounters, float]], tolerance: float, tolerance_between: float
+    record: Any, encounters: Iterable[tuple[Encounters, float]]
 ) -> tuple[list[str], list[str]]:
     """Return the faults of recovering pairs, one line each, and a note that sums them up.
 
@@ -28,8 +28,6 @@ def excuse_recovering(
         Of the manifest: entries with ``pair``, as encounters name it, and ``distance`` at home, m.
     encounters
         Each with the distance that its pairs keep, m.
-    tolerance, tolerance_between
-        Of distances at states and between them, m.
 
     Raises
     ------
@@ -48,15 +46,16 @@ def excuse_recovering(
             if not pairs:
                 continue
             found += 1
-            distance = _distances(group, pairs)
-            kept = np.flatnonzero(distance >= floor - tolerance)
+            index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
+            distance = np.array([group.distances(k, index).min() for k in range(len(group.motion.time))])
+            kept = np.flatnonzero(distance >= floor - CLEARANCE_TOLERANCE)
             since = int(kept[0]) if len(kept) else len(distance)
-            if since == 0 or abs(distance[0] - wanted[name]) > tolerance:
+            if since == 0 or abs(distance[0] - wanted[name]) > CLEARANCE_TOLERANCE:
                 wrong.append(
                     f"recovered: {name} is {distance[0]:.9g} m apart at home, not {wanted[name]:.9g} m"
                 )
                 continue
-            wrong += _nearer(group, pairs, name, distance[: since + 1], floor, tolerance, tolerance_between)
+            wrong += _nearer(group, index, name, distance[: since + 1], floor)
             group.held_from.update(dict.fromkeys(pairs, since))
             until, states = max(until, since), len(distance)
     if found < len(wanted):
@@ -73,39 +72,18 @@ def _note(distance: Mapping[str, float], until: int, states: int) -> str:
     )
 
 
-def _distances(group: Encounters, pairs: Sequence[tuple[int, int]]) -> Array:
-    """Return (T,) the least distance of the pairs at each state, m."""
-    index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
-    states = len(group.motion.nodes)
-    found = np.empty(states)
-    for state in range(states):
-        step = max(min(state, states - 2), 0)
-        share = np.full(len(pairs), 1.0 if step < state else 0.0)
-        found[state] = group.separation(group.place(step, index, share), index)[0].min()
-    return found
-
-
-def _nearer(
-    group: Encounters,
-    pairs: Sequence[tuple[int, int]],
-    name: str,
-    distance: Array,
-    floor: float,
-    tolerance: float,
-    tolerance_between: float,
-) -> list[str]:
+def _nearer(group: Encounters, pairs: Pairs, name: str, distance: Array, floor: float) -> list[str]:
     """Return where a pair comes nearer than at the state before, up to the last of `distance` (K,)."""
-    index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
     wrong = []
     for state in range(len(distance) - 1):
         least = min(float(distance[state]), floor)
-        if distance[state + 1] < least - tolerance:
+        if distance[state + 1] < least - CLEARANCE_TOLERANCE:
             wrong.append(
                 f"recovered: {name} is {distance[state + 1]:.9g} m apart at state {state + 1} after {least:.9g} m"
             )
-        limit, bound = group.divide(state, index, Least(), Least())
+        limit, bound = group.divide(state, pairs, Least(), Least())
         least_between = min(limit.value, bound.value)
-        if least_between < least - tolerance_between:
+        if least_between < least - BETWEEN_TOLERANCE:
             wrong.append(
                 f"recovered: {name} comes as near as {least_between:.9g} m in step {state + 1} from {least:.9g} m"
             )

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import recorded_arm
-from vgtm_qp.verify.check import TIP_TOLERANCE
-from vgtm_qp.verify.path import check_path
+from vgtm_qp.verify.path import TIP_TOLERANCE, tip_error
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Distinct in every common form of colour blindness (Okabe and Ito, 2008)."""
@@ -78,7 +77,7 @@ def _draw_strokes(axes: Axes, maneuver: Result) -> None:
 
 def _draw_tip_error(axes: Axes, maneuver: Result) -> None:
     """Draw the distance of the tip from its target over the tracked axes, m."""
-    error = check_path(maneuver, maneuver.tip_position).tip_error(maneuver.tip_position)
+    error = tip_error(maneuver, maneuver.tip_position)
     if error is not None:
         shown = np.maximum(error, _SMALLEST)
         axes.semilogy(maneuver.time, shown, color=_COLOURS[0], marker=".", markersize=3.0)
