@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from vgtm_qp.curve import Curve, b_spline, beta_spline, bezier, make_family, straight_curve
+from vgtm_qp.curve.curve import increasing_roots
 from vgtm_qp.errors import CurveError
 
 FAMILIES = [
@@ -149,7 +150,6 @@ def test_straight_home_curve(name):
     s = np.linspace(0.0, 1.0, 9)
     np.testing.assert_allclose(curve.position(s), np.c_[0 * s, 0 * s, 0.5 + 4.0 * s], atol=1e-12)
     np.testing.assert_allclose(curve.frame(s), np.broadcast_to(np.eye(3), (9, 3, 3)), atol=1e-14)
-    np.testing.assert_allclose(curve.curvature(s), 0.0, atol=1e-14)
     np.testing.assert_allclose(curve.length(s), 4.0 * s, atol=1e-12)
     roll = curve.orientation_jacobian(s)[:, 2]
     np.testing.assert_allclose(roll, 0.0, atol=1e-14)
@@ -162,10 +162,8 @@ def test_torsion_turns_the_tip_by_its_last_coordinate():
     np.testing.assert_allclose(curve.frame(0.0), np.eye(3), atol=1e-14)
 
 
-def test_curvature_of_a_parabola():
+def test_length_of_a_parabola():
     curve = Curve(bezier(3), np.array([[0, 0, 0], [0.5, 0, 0], [1, 1, 0]], dtype=float))
-    s = np.linspace(0.0, 1.0, 7)
-    np.testing.assert_allclose(curve.curvature(s), 2.0 / (1.0 + 4.0 * s**2) ** 1.5, atol=1e-12)
     exact = np.sqrt(5.0) / 2.0 + np.arcsinh(2.0) / 4.0
     np.testing.assert_allclose(curve.length(), exact, atol=1e-12)
 
@@ -199,6 +197,22 @@ def test_arc_nodes_move_along_the_curve_by_the_term_the_paper_omits(family):
     assert np.abs(whole - curve.position_jacobian(s)).max() > 0.1
 
 
+def test_bracketed_roots_survive_flat_falling_and_steep_functions():
+    functions = {
+        "cubic": (lambda x: (x - 0.3) ** 3, lambda x: 3 * (x - 0.3) ** 2, 0.3),
+        "steep": (lambda x: np.arctan(1e6 * (x - 0.9)), lambda x: 1e6 / (1 + 1e12 * (x - 0.9) ** 2), 0.9),
+        "wavy": (lambda x: x - 0.1 + 0.3 * np.sin(9 * x), lambda x: 1 + 2.7 * np.cos(9 * x), None),
+        "at its end": (lambda x: x, lambda x: np.ones_like(x), 0.0),
+    }
+    for name, (value, slope, root) in functions.items():
+        found = increasing_roots(
+            lambda x, v=value, d=slope: (v(x), d(x)), np.array([-0.5 * (root != 0.0)]), np.array([1.0])
+        )
+        assert abs(value(found)) < 1e-9, name
+        if root is not None:
+            np.testing.assert_allclose(found, root, atol=1e-5)
+
+
 @pytest.mark.parametrize("fraction", [-0.1, 1.1, float("nan")])
 def test_fractions_outside_are_refused(fraction):
     with pytest.raises(CurveError, match="0 to 1"):
@@ -211,7 +225,7 @@ def test_fractions_outside_are_refused(fraction):
         (lambda: Curve(bezier(4), np.zeros((5, 3))), r"shape \(4, 3\)"),
         (lambda: Curve(bezier(2), np.full((2, 3), np.nan)), "finite"),
         (lambda: Curve(bezier(2), np.zeros((2, 3))).tangent(0.5), "no tangent"),
-        (lambda: Curve(bezier(2), np.zeros((2, 3))).curvature(0.5), "no curvature"),
+        (lambda: Curve(bezier(2), np.zeros((2, 3))).frame_rate(0.5), "no curvature"),
         (lambda: straight_curve(b_spline(4, 1), [0, 0, 0], [0, 0, 1]).frame(0.5), "kinks"),
         (lambda: straight_curve(bezier(3), [0, 0, 1], [0, 0, 0]).frame(0.5), "against the base normal"),
     ],

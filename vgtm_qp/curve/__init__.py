@@ -3,7 +3,6 @@
 from vgtm_qp.curve.closest import ClosestPoints, closest_to_box, closest_to_point
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import FAMILIES, CurveFamily, b_spline, beta_spline, bezier, make_family
-from vgtm_qp.curve.linear import Conditions, NodeTables, base_conditions, node_tables, tip_condition
 from vgtm_qp.curve.redundancy import (
     Refit,
     add_control_vertices,
@@ -16,14 +15,11 @@ from vgtm_qp.curve.redundancy import (
 __all__ = [
     "FAMILIES",
     "ClosestPoints",
-    "Conditions",
     "Curve",
     "CurveFamily",
-    "NodeTables",
     "Refit",
     "add_control_vertices",
     "b_spline",
-    "base_conditions",
     "beta_spline",
     "bezier",
     "closest_to_box",
@@ -31,9 +27,7 @@ __all__ = [
     "degree_of_redundancy",
     "excess_freedom",
     "make_family",
-    "node_tables",
     "refit",
     "remove_control_vertices",
     "straight_curve",
-    "tip_condition",
 ]

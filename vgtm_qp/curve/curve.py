@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.curve.bernstein import Array, basis
-from vgtm_qp.curve.families import CurveFamily
-from vgtm_qp.curve.roots import increasing_roots
+from vgtm_qp.curve.families import Array, CurveFamily, bernstein
 from vgtm_qp.errors import CurveError
+from vgtm_qp.rotation import rotation_from_vector, turn_between
 
 _FRAME_STEPS_PER_CELL = 4
 _NO_STEP = 1e-9
+_NEWTON_STEPS = 100
+_CONVERGED = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,21 +50,18 @@ class Curve:
     base_frame: Array = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        for name in ("control_vertices", "torsion", "base_frame"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
-        expected = {
+        shapes = {
             "control_vertices": (self.family.control_vertices, 3),
-            "torsion": (self.torsion.size,),
+            "torsion": (np.size(self.torsion),),
             "base_frame": (3, 3),
         }
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            if array.shape != shape:
+        for name, shape in shapes.items():
+            array = np.asarray(getattr(self, name), dtype=float)
+            if array.shape != shape or not np.all(np.isfinite(array)):
                 raise CurveError(
-                    f"{name} of this {self.family.name} must have the shape {shape}, not {array.shape}"
+                    f"{name} of this {self.family.name} must be finite numbers of the shape {shape}, not {array.shape}"
                 )
-            if not np.all(np.isfinite(array)):
-                raise CurveError(f"{name} must be finite numbers")
+            object.__setattr__(self, name, array)
 
     @property
     def coordinates(self) -> int:
@@ -87,12 +85,6 @@ class Curve:
             r' vanishes at some s.
         """
         return _unit(self.derivative(s, 1))
-
-    def curvature(self, s: ArrayLike) -> Array:
-        """Curvature |r' x r''| / |r'|^3, 1/m: (...)."""
-        return np.asarray(
-            np.linalg.norm(_curvature_binormal(self.derivative(s, 1), self.derivative(s, 2)), axis=-1)
-        )
 
     def frame(self, s: ArrayLike) -> Array:
         """F(s): (..., 3, 3), columns x, y and the tangent, eq. (32).
@@ -225,7 +217,7 @@ class Curve:
         return np.asarray(across @ _spread(w1))
 
     def _torsion_weights(self, s: ArrayLike, order: int = 0) -> Array:
-        return basis(self.torsion.size, s, order)[..., 1:]
+        return bernstein(self.torsion.size, s, order)[..., 1:]
 
     def _base_roll(self) -> Array:
         """(3 V,) rate of roll at s = 0: the area swept by the arc from base normal to tangent."""
@@ -278,6 +270,31 @@ def straight_curve(family: CurveFamily, start: ArrayLike, end: ArrayLike) -> Cur
     return Curve(family, start + family.abscissae[:, None] * (end - start))
 
 
+def increasing_roots(function: Callable[[Array], tuple[Array, Array]], low: Array, high: Array) -> Array:
+    """Find the roots (n,) of many functions at once, each negative at its `low` (n,) and positive at its `high`.
+
+    Newton's method, held within the brackets, with bisection wherever a step shrinks by less than half. `function`
+    maps x (n,) to values and slopes, both (n,).
+    """
+    x = (low + high) / 2
+    previous = high - low
+    for _ in range(_NEWTON_STEPS):
+        value, slope = function(x)
+        low, high = np.where(value < 0, x, low), np.where(value < 0, high, x)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            newton = np.clip(x - value / slope, low, high)
+        step = np.abs(newton - x)
+        # Where the function falls, Newton's step leads away from the root. And a step as small as
+        # rounding must not throw the root back to the middle of its bracket.
+        good = (slope > 0) & (step <= np.maximum(previous / 2, _CONVERGED))
+        new = np.where(good, newton, (low + high) / 2)
+        previous = np.abs(new - x)
+        x = new
+        if np.all(previous <= _CONVERGED):
+            break
+    return np.asarray(x)
+
+
 def _unit(vectors: Array) -> Array:
     norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
     if not np.all(norm > 0.0):
@@ -323,12 +340,9 @@ def _reflections(normals: Array) -> Array:
 
 def _least_rotation(start: Array, end: Array) -> Array:
     """Rotation (3, 3) by the least angle from unit vector `start` to `end`."""
-    cosine = float(start @ end)
-    if cosine < -1.0 + 1e-12:
+    if float(start @ end) < -1.0 + 1e-12:
         raise CurveError("the curve leaves its base against the base normal, where its frame is not defined")
-    x, y, z = np.cross(start, end)
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + cosine))
+    return rotation_from_vector(turn_between(start, end))
 
 
 def _rotation_about_z(angle: Array) -> Array:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
+from math import comb, perm
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from vgtm_qp.curve.bernstein import Array, basis
 from vgtm_qp.errors import CurveError, nearest
+
+Array = NDArray[np.float64]
 
 FAMILIES = ("bezier", "b-spline", "beta-spline")
 
@@ -76,7 +78,7 @@ class CurveFamily:
         at = np.clip(given, 0.0, 1.0)
         segment = np.searchsorted(self.breaks[1:-1], at, side="right")
         width = np.diff(self.breaks)[segment]
-        table = basis(self.degree, (at - self.breaks[segment]) / width, order)
+        table = bernstein(self.degree, (at - self.breaks[segment]) / width, order)
         if len(self.breaks) == 2:
             return np.asarray(table @ self.extraction[0])
         table = table / width[..., None] ** order
@@ -257,3 +259,27 @@ def _extraction(knots: Array, degree: int, breaks: Array) -> Array:
                 rows = (1.0 - alpha) * rows[:-1] + alpha * rows[1:]
             matrices[k, j] = rows[0]
     return matrices
+
+
+@cache
+def _difference(size: int, order: int) -> Array:
+    """(size - order, size) matrix of the `order`-th forward difference."""
+    return np.asarray(np.diff(np.eye(size), n=order, axis=0))
+
+
+@cache
+def _binomials(degree: int) -> Array:
+    return np.array([comb(degree, j) for j in range(degree + 1)], dtype=float)
+
+
+def bernstein(degree: int, u: ArrayLike, order: int = 0) -> Array:
+    """Bernstein basis of `degree`, or its derivative of `order`, at `u` of any shape: (..., degree + 1)."""
+    u = np.asarray(u, dtype=float)[..., None]
+    if order > degree:
+        return np.zeros((*u.shape[:-1], degree + 1))
+    low = degree - order
+    j = np.arange(low + 1)
+    table = _binomials(low) * u**j * (1.0 - u) ** (low - j)
+    if order == 0:
+        return np.asarray(table)
+    return np.asarray(perm(degree, order) * (table @ _difference(degree + 1, order)))

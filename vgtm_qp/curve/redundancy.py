@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.curve.bernstein import Array
 from vgtm_qp.curve.curve import Curve
-from vgtm_qp.curve.families import CurveFamily, b_spline, beta_spline, bezier
+from vgtm_qp.curve.families import Array, CurveFamily, b_spline, beta_spline, bezier
 from vgtm_qp.errors import CurveError
 
 BASE_ROWS = 5
