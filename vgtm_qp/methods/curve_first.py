@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
-from vgtm_qp.methods.condensation import CurveNodes, rotation_vectors
+from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
 from vgtm_qp.methods.curve_motion import CURVE_SOLVER, CurveMotion
 from vgtm_qp.methods.resolver import MethodResolver
 from vgtm_qp.methods.segments import make_segments
@@ -55,11 +55,7 @@ class CurveFirstResolver(MethodResolver):
         self.curve: Curve = self.motion.home
         segments = make_segments(setup.layout, setup.task.turns)
         self.tracker = Tracker(
-            setup.layout,
-            setup.kinematics,
-            segments,
-            setup.arm.home_quantities,
-            parallel=method.tracking == "parallel",
+            setup.layout, setup.kinematics, segments, parallel=method.tracking == "parallel"
         )
         self._faces = np.array([segment.face for segment in segments])
         self._frames = any(segment.tracks != "position" for segment in segments)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vgtm_qp.curve import Curve, degree_of_redundancy
 from vgtm_qp.curve.redundancy import BASE_ROWS
 from vgtm_qp.errors import CurveError, SolverError
-from vgtm_qp.methods.condensation import CurveNodes
+from vgtm_qp.methods.assembly import CurveNodes
 from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE, pose_displacement
