@@ -11,11 +11,11 @@ from vgtm_qp.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
 from vgtm_qp.methods.curve_motion import CURVE_SOLVER, CurveMotion
-from vgtm_qp.methods.resolver import MethodResolver
+from vgtm_qp.methods.resolver import MethodResolver, displacement_to
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.methods.tracking import Tracker
 from vgtm_qp.problem import Problem
-from vgtm_qp.rows.limits import actuator_box
+from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State
@@ -59,6 +59,7 @@ class CurveFirstResolver(MethodResolver):
         )
         self._faces = np.array([segment.face for segment in segments])
         self._frames = any(segment.tracks != "position" for segment in segments)
+        self._actuation = Actuation(setup.arm, (), slows_down=False)
         self._correct, self._is_qp = method.correct, method.name == "qp"
         self.solver = CURVE_SOLVER if self._is_qp else None
 
@@ -70,9 +71,8 @@ class CurveFirstResolver(MethodResolver):
         if self._is_qp:
             return self._move_safely(path, start, end, dt)
         state = self.state
-        curve = self.motion.follow(
-            self.curve, path.at(start), path.at(end), state.time, state.nodes, correct=self._correct
-        )
+        goal = displacement_to(path.at(end), path.at(start))
+        curve = self.motion.follow(self.curve, goal, state.time, state.nodes, correct=self._correct)
         nodes = self._nodes(curve)
         self.spend("solve")
         if self._correct:
@@ -90,12 +90,13 @@ class CurveFirstResolver(MethodResolver):
         state, share, reason = self.state, 1.0, ""
         while share >= _SMALLEST:
             goal = start + share * (end - start)
-            piece = path.at(start), path.at(goal)
+            whole = displacement_to(path.at(goal), path.at(start))
             curve, X, progress, time = self.curve, np.array(state.nodes), 0.0, state.time
             for _ in range(_MAX_QPS):
                 try:
                     now = path.at(start + progress * (goal - start))
-                    curve, change, active = self.motion.follow_qp(curve, piece, now, progress, time, X)
+                    now = now._replace(velocity=whole.velocity, spin=whole.spin)
+                    curve, change, active = self.motion.follow_qp(curve, now, progress, time, X)
                     progress = min(max(progress + change, 0.0), 1.0)
                     curve = self.motion.corrected(curve, path.at(start + progress * (goal - start)))
                     self.spend("solve")
@@ -122,24 +123,14 @@ class CurveFirstResolver(MethodResolver):
     def _broken(self, X: Array, dt: float) -> str:
         """Return which limit the step to node positions `X` would break, empty if none."""
         setup, state = self.setup, self.state
-        truss, monitor = setup.truss, setup.monitor
-        actuators = truss.actuators
-        lower, upper = actuator_box(
-            state.quantities[actuators],
-            state.rates[actuators],
-            truss.stroke[actuators],
-            truss.rate[actuators],
-            truss.acceleration[actuators],
-            dt,
-            state.duration or None,
-        )
+        lower, upper = self._actuation.box(state, dt)
         setup.kinematics.evaluate(X)
-        lengths = setup.kinematics.quantities[actuators]
+        lengths = setup.kinematics.quantities[setup.arm.actuators]
         beyond = np.maximum(lower - lengths, lengths - upper)
         worst = int(np.argmax(beyond))
         if beyond[worst] > _SLACK:
-            return f"stroke or rate: {truss.member_names[actuators[worst]]}, {beyond[worst]:.2g} m beyond"
-        time, points = state.time + dt, setup.arm.points(X)
+            return f"stroke or rate: {self._actuation.names[worst]}, {beyond[worst]:.2g} m beyond"
+        monitor, time, points = setup.monitor, state.time + dt, setup.arm.points(X)
         if not monitor.keeps(points, time, setup.safe - _SLACK, setup.self_safe - _SLACK):
             return "clearance at the end of the step"
         floors = setup.safe - _BETWEEN, max(setup.self_safe - _BETWEEN, 0.0)

@@ -173,9 +173,10 @@ def arm_without_curve(problem: Problem) -> Setup:
     return build_arm(problem.replace(changes))
 
 
-def pose_displacement(start: TipGoal, end: TipGoal) -> tuple[Array, Array]:
-    """Return the displacement (3,), m, and the rotation vector (3,), rad, from one pose to another."""
-    return end.position - start.position, vector_from_rotation(end.rotation @ start.rotation.T)
+def displacement_to(goal: TipGoal, start: TipGoal) -> TipGoal:
+    """Return a goal whose rates are the displacement, m, and the rotation vector, rad, to it from the pose `start`."""
+    turned = vector_from_rotation(goal.rotation @ start.rotation.T)
+    return goal._replace(velocity=goal.position - start.position, spin=turned)
 
 
 def _step(status: StepStatus, progress: float, state: State, reason: str) -> Step:

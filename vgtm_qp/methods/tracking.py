@@ -165,10 +165,13 @@ class _Chain:
         passed: dict[int, Array] = {}
         for group, rhs in zip(self.groups, right, strict=True):
             own, before = group.matrices()
-            past = None if group.is_square else travelled[group.columns][:, :, None]
-            total = rhs[:, :, None] if past is None else rhs[:, :, None] + own @ past
+            total = rhs[:, :, None]
+            if not group.is_square:
+                total = total + own @ travelled[group.columns][:, :, None]
             answers = _least_norm(own, np.concatenate([total, before], axis=2))
-            step[group.columns] = (answers[:, :, :1] if past is None else answers[:, :, :1] - past)[:, :, 0]
+            step[group.columns] = answers[:, :, 0]
+            if not group.is_square:
+                step[group.columns] -= travelled[group.columns]
             passed |= zip(group.numbers.tolist(), answers[:, :, 1:], strict=True)
         for segment in self._segments:
             if segment.first < segment.start:
