@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.curve.families import Array, CurveFamily, bernstein
+from vgtm_qp.curve.families import Array, CurveFamily, bernstein, within
 from vgtm_qp.errors import CurveError
 from vgtm_qp.rotation import rotation_from_vector, turn_between
 
@@ -101,12 +101,19 @@ class Curve:
         self._require_smooth()
         s = np.asarray(s, dtype=float)
         flat = np.clip(s.ravel(), 0.0, 1.0)
-        grid = self._frame_grid()
+        grid = np.append(
+            within(self.family.cells, np.arange(_FRAME_STEPS_PER_CELL) / _FRAME_STEPS_PER_CELL), 1.0
+        )
         along = _running_products(self._double_reflections(grid[:-1], grid[1:]))
         step = np.clip(np.searchsorted(grid, flat, side="right") - 1, 0, len(grid) - 2)
         turn = self._double_reflections(grid[step], flat) @ along[step]
         angle = self._torsion_weights(flat) @ self.torsion
-        swing = _least_rotation(self.base_frame[:, 2], self.tangent(0.0))
+        normal, tangent = self.base_frame[:, 2], self.tangent(0.0)
+        if float(normal @ tangent) < -1.0 + 1e-12:
+            raise CurveError(
+                "the curve leaves its base against the base normal, where its frame is not defined"
+            )
+        swing = rotation_from_vector(turn_between(normal, tangent))
         frames = turn @ (swing @ self.base_frame) @ _rotation_about_z(angle)
         return np.asarray(frames.reshape(*s.shape, 3, 3))
 
@@ -210,11 +217,10 @@ class Curve:
     def _tangent_rows(self, w1: Array) -> Array:
         """(..., 3, 3 V) rows of dt/dp from the table of w'."""
         first = w1 @ self.control_vertices
-        tangent = _unit(first)
-        across = (np.eye(3) - tangent[..., :, None] * tangent[..., None, :]) / np.linalg.norm(first, axis=-1)[
-            ..., None, None
-        ]
-        return np.asarray(across @ _spread(w1))
+        speed = _speed(first, "tangent")
+        tangent = first / speed
+        across = np.eye(3) - tangent[..., :, None] * tangent[..., None, :]
+        return np.asarray(across / speed[..., None] @ _spread(w1))
 
     def _torsion_weights(self, s: ArrayLike, order: int = 0) -> Array:
         return bernstein(self.torsion.size, s, order)[..., 1:]
@@ -227,14 +233,6 @@ class Curve:
             / (1.0 + normal @ tangent)
             @ self._tangent_rows(self.family.weights(0.0, 1))
         )
-
-    def _frame_grid(self) -> Array:
-        cells = self.family.cells
-        inner = (
-            cells[:-1, None]
-            + np.diff(cells)[:, None] * np.arange(_FRAME_STEPS_PER_CELL) / _FRAME_STEPS_PER_CELL
-        )
-        return np.append(inner.ravel(), 1.0)
 
     def _double_reflections(self, start: Array, end: Array) -> Array:
         """(n, 3, 3) rotations that carry the frame from each parameter of `start` to that of `end`."""
@@ -250,17 +248,16 @@ class Curve:
         flat = np.clip(s.ravel(), 0.0, 1.0)
         cells = self.family.cells
         nodes, weights = self.family.gauss
-        whole = np.moveaxis(integrand(*self.family.quadrature), 1, -1) @ weights
-        whole = (whole.T * np.diff(cells)).T
+
+        def over(widths: Array, *tables: Array) -> Array:
+            return np.asarray((np.tensordot(weights, integrand(*tables), axes=(0, 1)).T * widths).T)
+
+        whole = over(np.diff(cells), *self.family.quadrature)
         until = np.concatenate([np.zeros((1, *whole.shape[1:])), np.cumsum(whole, axis=0)])
         cell = np.clip(np.searchsorted(cells, flat, side="right") - 1, 0, len(cells) - 2)
         rest = flat - cells[cell]
         points = cells[cell, None] + rest[:, None] * nodes
-        part = (
-            np.moveaxis(integrand(self.family.weights(points, 1), self.family.weights(points, 2)), 1, -1)
-            @ weights
-        )
-        total = until[cell] + (part.T * rest).T
+        total = until[cell] + over(rest, self.family.weights(points, 1), self.family.weights(points, 2))
         return np.asarray(total.reshape(s.shape + total.shape[1:]))
 
 
@@ -296,22 +293,22 @@ def increasing_roots(function: Callable[[Array], tuple[Array, Array]], low: Arra
 
 
 def _unit(vectors: Array) -> Array:
-    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    if not np.all(norm > 0.0):
-        raise CurveError(
-            "the curve has no tangent where its derivative vanishes; part its control vertices there"
-        )
-    return np.asarray(vectors / norm)
+    return np.asarray(vectors / _speed(vectors, "tangent"))
 
 
 def _curvature_binormal(first: Array, second: Array) -> Array:
     """Kappa b = r' x r'' / |r'|^3, 1/m: (..., 3)."""
-    norm = np.linalg.norm(first, axis=-1, keepdims=True)
-    if not np.all(norm > 0.0):
+    return np.asarray(np.cross(first, second) / _speed(first, "curvature") ** 3)
+
+
+def _speed(first: Array, what: str) -> Array:
+    """Return |r'| (..., 1), by which `what` is divided."""
+    speed = np.asarray(np.linalg.norm(first, axis=-1, keepdims=True))
+    if not np.all(speed > 0.0):
         raise CurveError(
-            "the curve has no curvature where its derivative vanishes; part its control vertices there"
+            f"the curve has no {what} where its derivative vanishes; part its control vertices there"
         )
-    return np.asarray(np.cross(first, second) / norm**3)
+    return speed
 
 
 def _spread(weights: Array) -> Array:
@@ -336,13 +333,6 @@ def _reflections(normals: Array) -> Array:
     if not np.all(square > 0.0):
         raise CurveError("the curve turns back on itself within a step; part its control vertices there")
     return np.asarray(np.eye(3) - 2.0 * normals[:, :, None] * normals[:, None, :] / square[:, None, None])
-
-
-def _least_rotation(start: Array, end: Array) -> Array:
-    """Rotation (3, 3) by the least angle from unit vector `start` to `end`."""
-    if float(start @ end) < -1.0 + 1e-12:
-        raise CurveError("the curve leaves its base against the base normal, where its frame is not defined")
-    return rotation_from_vector(turn_between(start, end))
 
 
 def _rotation_about_z(angle: Array) -> Array:

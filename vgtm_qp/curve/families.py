@@ -88,8 +88,7 @@ class CurveFamily:
     def cells(self) -> Array:
         """(C + 1,) a subdivision of the segments, fine enough for quadrature and for moving a frame along."""
         pieces = max(2, -(-_QUADRATURE_CELLS // (len(self.breaks) - 1)))
-        inner = self.breaks[:-1, None] + np.diff(self.breaks)[:, None] * np.arange(pieces) / pieces
-        return np.append(inner.ravel(), 1.0)
+        return np.append(within(self.breaks, np.arange(pieces) / pieces), 1.0)
 
     @cached_property
     def gauss(self) -> tuple[Array, Array]:
@@ -100,7 +99,7 @@ class CurveFamily:
     @cached_property
     def quadrature(self) -> tuple[Array, Array]:
         """(C, G, V) tables of w' and w'' at the Gauss points of the cells."""
-        points = self.cells[:-1, None] + np.diff(self.cells)[:, None] * self.gauss[0]
+        points = within(self.cells, self.gauss[0])
         return self.weights(points, 1), self.weights(points, 2)
 
 
@@ -236,6 +235,11 @@ def make_family(
     raise CurveError(
         f'unknown curve family "{name}"{nearest(name, FAMILIES)}; choose from {", ".join(FAMILIES)}'
     )
+
+
+def within(breaks: Array, fractions: Array) -> Array:
+    """Return (S, F) the parameters at these fractions (F,) of every piece between `breaks` (S + 1,)."""
+    return np.asarray(breaks[:-1, None] + np.diff(breaks)[:, None] * fractions)
 
 
 def _require_vertices(family: str, control_vertices: int, least: int) -> None:

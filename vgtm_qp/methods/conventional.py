@@ -26,6 +26,7 @@ from vgtm_qp.methods.resolver import (
     MAX_CORRECTIONS,
     TIP_TOLERANCE,
     MethodResolver,
+    Moved,
     arm_without_curve,
     displacement_to,
 )
@@ -220,7 +221,7 @@ class ConventionalResolver(MethodResolver):
         self._correct = method.correct
         self._home_fixed = self.setup.arm.home_quantities[self.setup.truss.fixed]
 
-    def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+    def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         setup, state = self.setup, self.state
         kinematics, truss = setup.kinematics, setup.truss
         X = np.array(state.nodes)
@@ -238,7 +239,7 @@ class ConventionalResolver(MethodResolver):
         if self._correct:
             self._newton(X, path, end)
             self.spend("correction")
-        return X, state.control_vertices, 1.0
+        return Moved(X, state.control_vertices, state.torsion)
 
     def _linear(self, X: Array, path: Path, start: float, end: float) -> Linear:
         """Return the system at nodes `X` (N, 3) whose base rests, J d = x, eqs. (25)-(27).

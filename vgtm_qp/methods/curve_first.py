@@ -11,14 +11,13 @@ from vgtm_qp.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
 from vgtm_qp.methods.curve_motion import CURVE_SOLVER, CurveMotion
-from vgtm_qp.methods.resolver import MethodResolver, displacement_to
+from vgtm_qp.methods.resolver import MethodResolver, Moved, displacement_to
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.methods.tracking import Tracker
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.state import State
 
 Array = NDArray[np.float64]
 
@@ -52,7 +51,6 @@ class CurveFirstResolver(MethodResolver):
                 'a moving base takes tracking = "coupled" or "none", or the method pseudoinverse'
             )
         self.motion = CurveMotion(problem, setup)
-        self.curve: Curve = self.motion.home
         segments = make_segments(setup.layout, setup.task.turns)
         self.tracker = Tracker(
             setup.layout, setup.kinematics, segments, parallel=method.tracking == "parallel"
@@ -63,29 +61,30 @@ class CurveFirstResolver(MethodResolver):
         self._correct, self._is_qp = method.correct, method.name == "qp"
         self.solver = CURVE_SOLVER if self._is_qp else None
 
-    def _placed(self, state: State) -> None:
-        if state.control_vertices.shape == self.curve.control_vertices.shape:
-            self.curve = replace(self.curve, control_vertices=state.control_vertices)
+    @property
+    def curve(self) -> Curve:
+        """The reference curve in the present state."""
+        vertices, torsion = self.state.control_vertices, self.state.torsion
+        return replace(self.motion.home, control_vertices=vertices, torsion=torsion)
 
-    def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+    def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         if self._is_qp:
             return self._move_safely(path, start, end, dt)
-        state = self.state
+        state, before = self.state, self.curve
         goal = displacement_to(path.at(end), path.at(start))
-        curve = self.motion.follow(self.curve, goal, state.time, state.nodes, correct=self._correct)
+        curve = self.motion.follow(before, goal, state.time, state.nodes, correct=self._correct)
         nodes = self._nodes(curve)
         self.spend("solve")
         if self._correct:
             X = self.tracker.track(state.nodes, nodes)
         else:
-            before = self._nodes(self.curve)
-            turned = rotation_vectors(nodes.frame @ np.swapaxes(before.frame, 1, 2))
-            X = self.tracker.rates(state.nodes, nodes.position - before.position, turned)
+            old = self._nodes(before)
+            turned = rotation_vectors(nodes.frame @ np.swapaxes(old.frame, 1, 2))
+            X = self.tracker.rates(state.nodes, nodes.position - old.position, turned)
         self.spend("correction")
-        self.curve = curve
-        return X, curve.control_vertices, 1.0
+        return Moved(X, curve.control_vertices, curve.torsion)
 
-    def _move_safely(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+    def _move_safely(self, path: Path, start: float, end: float, dt: float) -> Moved:
         """Move by the curve's QP; halve the piece of path until the tracking truss keeps every limit."""
         state, share, reason = self.state, 1.0, ""
         while share >= _SMALLEST:
@@ -109,8 +108,7 @@ class CurveFirstResolver(MethodResolver):
                 reason = self._broken(X, dt)
                 self.spend("acceptance")
                 if not reason and share * progress >= _LEAST_PROGRESS:
-                    self.curve = curve
-                    return X, curve.control_vertices, share * progress
+                    return Moved(X, curve.control_vertices, curve.torsion, share * progress)
                 if not reason or progress < _LEAST_PROGRESS or reason.startswith("stroke"):
                     reason = reason or ", ".join(active) or "no progress along the path"
                     break

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +31,15 @@ TIP_TOLERANCE = 1e-10
 MAX_CORRECTIONS = 30
 
 
+class Moved(NamedTuple):
+    """Where a step leads: nodes (N, 3), control vertices (V, 3), m, torsion (T,), rad, and progress, 0 to 1."""
+
+    nodes: Array
+    control_vertices: Array
+    torsion: Array
+    progress: float = 1.0
+
+
 class MethodResolver(ABC):
     """Moves an arm step by step, see ``step.mover.Mover``, by one of the other methods.
 
@@ -41,7 +51,8 @@ class MethodResolver(ABC):
 
     def __init__(self, setup: Setup, step_limit: float | None) -> None:
         self.setup = setup
-        self._state = setup.home_state()
+        self.state: State = setup.home_state()
+        """Where the arm is; may be set to another state of this arm."""
         self.phases = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
         self.rank: int | None = None
         """Rank of the Jacobian in the last step, None where the method does not reveal it."""
@@ -50,16 +61,6 @@ class MethodResolver(ABC):
         self._limit = step_limit
         self._steps = 0
         self._mark = 0.0
-
-    @property
-    def state(self) -> State:
-        """Where the arm is; may be set to another state of this arm."""
-        return self._state
-
-    @state.setter
-    def state(self, state: State) -> None:
-        self._state = state
-        self._placed(state)
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
@@ -83,28 +84,27 @@ class MethodResolver(ABC):
         self._steps += 1
         self._mark = perf_counter()
         try:
-            nodes, vertices, progress = self._move(path, start, end, dt)
-            self._refuse_breakdown(nodes, path, start, end)
+            moved = self._move(path, start, end, dt)
+            self._refuse_breakdown(moved.nodes, path, start, end)
         except (SolverError, CurveError, np.linalg.LinAlgError) as error:
-            reason = f"step {self._steps}: {error}"
-            return _step(StepStatus.BLOCKED, 0.0, self.state, reason)
-        kinematics = self.setup.kinematics
-        kinematics.evaluate(nodes)
+            return Step(StepStatus.BLOCKED, 0.0, self.state, f"step {self._steps}: {error}", 0)
+        kinematics, before = self.setup.kinematics, self.state
+        kinematics.evaluate(moved.nodes)
         lengths = frozen(kinematics.quantities)
-        before = self.state
-        self._state = State(
+        self.state = State(
             time=before.time + dt,
-            q=(q := frozen(nodes)),
+            q=(q := frozen(moved.nodes)),
             nodes=q,
-            control_vertices=frozen(vertices),
+            control_vertices=frozen(moved.control_vertices),
+            torsion=frozen(moved.torsion),
             quantities=lengths,
             rates=frozen((lengths - before.quantities) / dt),
-            motion=frozen(nodes - before.nodes),
+            motion=frozen(q - before.nodes),
             duration=dt,
         )
         self.spend("kinematics")
-        status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
-        return _step(status, progress, self.state, "")
+        status = StepStatus.REACHED if moved.progress >= 1.0 - 1e-9 else StepStatus.SLOWED
+        return Step(status, moved.progress, self.state, "", 0)
 
     def brake(self, path: Path, start: float, end: float) -> Step | None:  # noqa: ARG002
         """Return None: every state is one of rest."""
@@ -139,12 +139,9 @@ class MethodResolver(ABC):
         self.phases[phase] += now - self._mark
         self._mark = now
 
-    def _placed(self, state: State) -> None:  # noqa: B027
-        """Take over what else there is in a `state` in which the arm was put."""
-
     @abstractmethod
-    def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
-        """Return node positions, control vertices and progress after the step, or raise SolverError."""
+    def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
+        """Return where the step leads, or raise SolverError."""
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
         truss, lengths = self.setup.truss, self.setup.arm.home_quantities
@@ -177,7 +174,3 @@ def displacement_to(goal: TipGoal, start: TipGoal) -> TipGoal:
     """Return a goal whose rates are the displacement, m, and the rotation vector, rad, to it from the pose `start`."""
     turned = vector_from_rotation(goal.rotation @ start.rotation.T)
     return goal._replace(velocity=goal.position - start.position, spin=turned)
-
-
-def _step(status: StepStatus, progress: float, state: State, reason: str) -> Step:
-    return Step(status, progress, state, reason, 0)
