@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from vgtm_qp.curve import Curve, b_spline, beta_spline, bezier, make_family, straight_curve
-from vgtm_qp.curve.curve import increasing_roots
+from vgtm_qp.curve.curve import Curve, increasing_roots, straight_curve
+from vgtm_qp.curve.families import b_spline, beta_spline, bezier, make_family
 from vgtm_qp.errors import CurveError
 
 FAMILIES = [

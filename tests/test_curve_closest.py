@@ -8,15 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vgtm_qp.curve import (
-    Curve,
-    b_spline,
-    beta_spline,
-    bezier,
-    closest_to_box,
-    closest_to_point,
-    straight_curve,
-)
+from vgtm_qp.curve.closest import closest_to_box, closest_to_point
+from vgtm_qp.curve.curve import Curve, straight_curve
+from vgtm_qp.curve.families import b_spline, beta_spline, bezier
 from vgtm_qp.errors import CurveError
 
 FAMILIES = [

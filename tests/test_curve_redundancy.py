@@ -8,17 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from vgtm_qp.curve import (
-    Curve,
+from vgtm_qp.curve.curve import Curve, straight_curve
+from vgtm_qp.curve.families import b_spline, beta_spline, bezier
+from vgtm_qp.curve.redundancy import (
     add_control_vertices,
-    b_spline,
-    beta_spline,
-    bezier,
     degree_of_redundancy,
     excess_freedom,
     refit,
     remove_control_vertices,
-    straight_curve,
 )
 from vgtm_qp.errors import CurveError
 

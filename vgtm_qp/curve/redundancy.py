@@ -125,7 +125,8 @@ def refit(curve: Curve, family: CurveFamily) -> Refit:
     table = family.weights(s)
     known = np.outer(table[:, :2].sum(axis=1), start) + np.outer(table[:, -1], end)
     # Unknowns: the distance from p_0 to p_1 along the tangent, then the vertices between p_1 and the last.
-    columns = np.concatenate([np.einsum("n,c->nc", table[:, 1], tangent)[..., None], _inner(table)], axis=2)
+    first, inner = np.outer(table[:, 1], tangent), np.kron(table[:, None, 2:-1], np.eye(3))
+    columns = np.concatenate([first[..., None], inner], axis=2)
     goal = (curve.position(s) - known) * weight[:, None]
     matrix = (columns * weight[:, None, None]).reshape(goal.size, -1)
     solution = np.linalg.lstsq(matrix, goal.ravel())[0]
@@ -137,12 +138,6 @@ def refit(curve: Curve, family: CurveFamily) -> Refit:
     control = np.vstack([start, start + solution[0] * tangent, solution[1:].reshape(-1, 3), end])
     fitted = replace(curve, family=family, control_vertices=control)
     return Refit(fitted, _greatest_change(curve, fitted))
-
-
-def _inner(table: Array) -> Array:
-    """(n, 3, 3 (V - 3)) rows of the vertices between p_1 and the last."""
-    inner = table[:, 2:-1]
-    return np.asarray(np.kron(inner[:, None, :], np.eye(3)))
 
 
 def _quadrature(*families: CurveFamily) -> tuple[Array, Array]:

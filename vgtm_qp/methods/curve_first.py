@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.curve import Curve
+from vgtm_qp.curve.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
 from vgtm_qp.methods.curve_motion import CURVE_SOLVER, CurveMotion

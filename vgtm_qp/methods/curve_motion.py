@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.curve import Curve, degree_of_redundancy
-from vgtm_qp.curve.redundancy import BASE_ROWS
+from vgtm_qp.curve.curve import Curve
+from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.assembly import CurveNodes
 from vgtm_qp.methods.objectives import potential_curvature, potential_slope

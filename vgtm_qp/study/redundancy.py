@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.compare import run_method
 from vgtm_qp.comparison.markdown import markdown_table
-from vgtm_qp.curve import degree_of_redundancy
+from vgtm_qp.curve.redundancy import degree_of_redundancy
 from vgtm_qp.problem import load_problem
 from vgtm_qp.study.drawing import MARKS, label, panels
 from vgtm_qp.study.workers import Row, Task
