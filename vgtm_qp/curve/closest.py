@@ -51,14 +51,7 @@ def closest_to_point(curve: Curve, point: ArrayLike) -> ClosestPoints:
         The point is not three finite numbers.
     """
     goal = _vector("the point", point)
-
-    def slope(s: Array) -> Array:
-        return np.asarray(np.sum((curve.position(s) - goal) * curve.derivative(s), axis=1))
-
-    s = _with_roots(slope, curve.family.breaks, 2 * curve.family.degree - 1)
-    position = curve.position(s)
-    witness = np.broadcast_to(goal, position.shape)
-    return _minima(s, position, witness, np.linalg.norm(position - goal, axis=1))
+    return _closest(curve, curve.family.breaks, lambda r: (np.broadcast_to(goal, r.shape), np.ones(len(r))))
 
 
 def closest_to_box(
@@ -91,37 +84,43 @@ def closest_to_box(
     turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
     first, second = np.triu_indices(6, k=1)
 
-    def inside(s: Array) -> Array:
-        return np.asarray((curve.position(s) - middle) @ turn)
+    def heights(s: Array) -> Array:
+        local = (curve.position(s) - middle) @ turn
+        above = np.concatenate([local - half, -local - half], axis=1)
+        return np.concatenate([above, above[:, first] - above[:, second]], axis=1)
 
-    def cuts(s: Array) -> Array:
-        heights = np.concatenate([inside(s) - half, -inside(s) - half], axis=1)
-        return np.concatenate([heights, heights[:, first] - heights[:, second]], axis=1)
+    def nearest(r: Array) -> tuple[Array, Array]:
+        local = (r - middle) @ turn
+        excess = np.abs(local) - half
+        is_deepest = np.arange(3) == np.argmax(excess, axis=1)[:, None]
+        is_outside = np.any(excess > 0.0, axis=1)
+        away = np.where(is_outside[:, None], np.maximum(excess, 0.0), is_deepest * excess)
+        return r - (np.copysign(1.0, local) * away) @ turn.T, np.where(is_outside, 1.0, -1.0)
+
+    return _closest(curve, _with_roots(heights, curve.family.breaks, curve.family.degree), nearest)
+
+
+def _closest(curve: Curve, joints: Array, nearest: Callable[[Array], tuple[Array, Array]]) -> ClosestPoints:
+    """Return all local minima of a distance that is one polynomial between two joints, or the root of one.
+
+    `nearest` returns the witnesses of points r (n, 3) and the signs (n,) of their distances.
+    """
 
     def slope(s: Array) -> Array:
-        away = _from_nearest(inside(s), half)
-        return np.asarray(np.sum(away * (curve.derivative(s) @ turn), axis=1))
+        r = curve.position(s)
+        return np.asarray(np.sum((r - nearest(r)[0]) * curve.derivative(s), axis=1))
 
-    degree = curve.family.degree
-    s = _with_roots(slope, _with_roots(cuts, curve.family.breaks, degree), 2 * degree - 1)
-    local = inside(s)
-    away = _from_nearest(local, half)
-    is_outside = np.any(np.abs(local) > half, axis=1)
-    distance = np.where(is_outside, 1.0, -1.0) * np.linalg.norm(away, axis=1)
-    return _minima(s, curve.position(s), middle + (local - away) @ turn.T, distance)
-
-
-def _from_nearest(local: Array, half: Array) -> Array:
-    """Return (n, 3) the way to points, in the frame of a box, from the nearest point of its surface, m.
-
-    Of a point inside, that is the nearest face's: the way leads inwards.
-    """
-    excess = np.abs(local) - half
-    deepest = np.arange(3) == np.argmax(excess, axis=1)[:, None]
-    is_outside = np.any(excess > 0.0, axis=1)[:, None]
-    return np.asarray(
-        np.copysign(1.0, local) * np.where(is_outside, np.maximum(excess, 0.0), deepest * excess)
-    )
+    s = _with_roots(slope, joints, 2 * curve.family.degree - 1)
+    position = curve.position(s)
+    witness, sign = nearest(position)
+    distance = sign * np.linalg.norm(position - witness, axis=1)
+    # From one of these points to the next the distance is monotonic.
+    level = np.abs(np.diff(distance)) <= _LEVEL * max(1.0, float(np.abs(position).max()))
+    last = np.flatnonzero(np.append(~level, True))
+    rises = np.diff(distance[last]) > 0.0
+    chosen = last[np.append(True, ~rises) & np.append(rises, True)]
+    order = chosen[np.argsort(distance[chosen], kind="stable")]
+    return ClosestPoints(s[order], position[order], witness[order], distance[order])
 
 
 def _with_roots(function: Callable[[Array], Array], joints: Array, degree: int) -> Array:
@@ -138,16 +137,6 @@ def _with_roots(function: Callable[[Array], Array], joints: Array, degree: int) 
             kept = roots.real[(np.abs(roots.imag) < _NEARLY_REAL) & (np.abs(roots.real) < 1.0)]
             found.append(start + half * (kept + 1.0))
     return np.unique(np.concatenate(found))
-
-
-def _minima(s: Array, position: Array, witness: Array, distance: Array) -> ClosestPoints:
-    """Return those of the points along a curve that are local minima; between two of them the distance is monotonic."""
-    level = np.abs(np.diff(distance)) <= _LEVEL * max(1.0, float(np.abs(position).max()))
-    last = np.flatnonzero(np.append(~level, True))
-    rises = np.diff(distance[last]) > 0.0
-    chosen = last[np.append(True, ~rises) & np.append(rises, True)]
-    order = chosen[np.argsort(distance[chosen], kind="stable")]
-    return ClosestPoints(s[order], position[order], witness[order], distance[order])
 
 
 def _vector(name: str, value: ArrayLike) -> Array:

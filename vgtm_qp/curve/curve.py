@@ -65,11 +65,11 @@ class Curve:
 
     @property
     def coordinates(self) -> int:
-        """Number D = 3 V + T of configuration variables."""
+        """Number D = 3 V + T of configuration variables, eq. (33)."""
         return self.control_vertices.size + self.torsion.size
 
     def position(self, s: ArrayLike) -> Array:
-        """r(s), m: (..., 3)."""
+        """r(s), eq. (29), m: (..., 3)."""
         return self.derivative(s, 0)
 
     def derivative(self, s: ArrayLike, order: int = 1) -> Array:
@@ -77,13 +77,7 @@ class Curve:
         return np.asarray(self.family.weights(s, order) @ self.control_vertices)
 
     def tangent(self, s: ArrayLike) -> Array:
-        """t(s), the unit tangent: (..., 3).
-
-        Raises
-        ------
-        CurveError
-            r' vanishes at some s.
-        """
+        """t(s), the unit tangent: (..., 3); CurveError where r' vanishes."""
         return _unit(self.derivative(s, 1))
 
     def frame(self, s: ArrayLike) -> Array:
@@ -131,23 +125,25 @@ class Curve:
     def arc_parameter(self, fraction: ArrayLike) -> Array:
         """Parameters s at which these fractions, 0 to 1, of the whole arc length are reached: (...).
 
-        Raises
-        ------
-        CurveError
-            A fraction is outside 0 to 1 or not a number.
+        Newton's method within the brackets of cells, with bisection wherever a step shrinks by less than half.
         """
         fraction = np.asarray(fraction, dtype=float)
-        if not np.all((fraction >= 0.0) & (fraction <= 1.0)):
-            raise CurveError("fractions of the arc length must be within 0 to 1")
         cells = self.family.cells
         lengths = self.length(cells)
         goal = fraction.ravel() * lengths[-1]
         cell = np.clip(np.searchsorted(lengths, goal, side="right") - 1, 0, len(cells) - 2)
-
-        def excess(s: Array) -> tuple[Array, Array]:
-            return self.length(s) - goal, np.asarray(np.linalg.norm(self.derivative(s, 1), axis=-1))
-
-        s = increasing_roots(excess, cells[cell], cells[cell + 1])
+        low, high = cells[cell], cells[cell + 1]
+        s, step = (low + high) / 2, high - low
+        for _ in range(_NEWTON_STEPS):
+            excess, speed = self.length(s) - goal, np.linalg.norm(self.derivative(s), axis=-1)
+            low, high = np.where(excess < 0, s, low), np.where(excess < 0, high, s)
+            newton = np.clip(s - excess / np.maximum(speed, np.finfo(float).tiny), low, high)
+            # A step as small as rounding must not throw the root back to the middle of its bracket.
+            is_slow = np.abs(newton - s) > np.maximum(step / 2, _CONVERGED)
+            new = np.where(is_slow, (low + high) / 2, newton)
+            step, s = np.abs(new - s), new
+            if np.all(step <= _CONVERGED):
+                break
         s = np.where(fraction.ravel() == 0.0, 0.0, np.where(fraction.ravel() == 1.0, 1.0, s))
         return np.asarray(s.reshape(fraction.shape))
 
@@ -165,11 +161,6 @@ class Curve:
         Two of its three components turn the tangent. The third, about the tangent, is the torsion's rate less
         the integral of w_i' kappa b over 0 to s, kappa b = r' x r'' / |r'|^3, plus what the least rotation at
         the base contributes where the curve leaves it off the normal.
-
-        Raises
-        ------
-        CurveError
-            As `frame`.
         """
         self._require_smooth()
         s = np.asarray(s, dtype=float)
@@ -265,31 +256,6 @@ def straight_curve(family: CurveFamily, start: ArrayLike, end: ArrayLike) -> Cur
     """Lay a straight curve from `start` (3,) to `end` (3,), m: control vertices at the family's abscissae."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     return Curve(family, start + family.abscissae[:, None] * (end - start))
-
-
-def increasing_roots(function: Callable[[Array], tuple[Array, Array]], low: Array, high: Array) -> Array:
-    """Find the roots (n,) of many functions at once, each negative at its `low` (n,) and positive at its `high`.
-
-    Newton's method, held within the brackets, with bisection wherever a step shrinks by less than half. `function`
-    maps x (n,) to values and slopes, both (n,).
-    """
-    x = (low + high) / 2
-    previous = high - low
-    for _ in range(_NEWTON_STEPS):
-        value, slope = function(x)
-        low, high = np.where(value < 0, x, low), np.where(value < 0, high, x)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            newton = np.clip(x - value / slope, low, high)
-        step = np.abs(newton - x)
-        # Where the function falls, Newton's step leads away from the root. And a step as small as
-        # rounding must not throw the root back to the middle of its bracket.
-        good = (slope > 0) & (step <= np.maximum(previous / 2, _CONVERGED))
-        new = np.where(good, newton, (low + high) / 2)
-        previous = np.abs(new - x)
-        x = new
-        if np.all(previous <= _CONVERGED):
-            break
-    return np.asarray(x)
 
 
 def _unit(vectors: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
 from math import comb, perm
@@ -63,7 +63,7 @@ class CurveFamily:
         return len(self.abscissae)
 
     def weights(self, s: ArrayLike, order: int = 0) -> Array:
-        """Weights w_i, or their derivatives of `order` by s, at s of any shape: (..., V).
+        """Weights w_i, eq. (30), or their derivatives of `order` by s, at s of any shape: (..., V).
 
         At a break where a derivative jumps it is the one of the segment that begins there.
 
@@ -112,15 +112,8 @@ def bezier(control_vertices: int) -> CurveFamily:
         Fewer than two control vertices.
     """
     _require_vertices("bezier", control_vertices, 2)
-    return CurveFamily(
-        name="bezier",
-        degree=control_vertices - 1,
-        breaks=np.array([0.0, 1.0]),
-        extraction=np.eye(control_vertices)[None],
-        abscissae=np.linspace(0.0, 1.0, control_vertices),
-        smooth=True,
-        knots=np.empty(0),
-    )
+    without_knots = b_spline(control_vertices, control_vertices - 1)
+    return replace(without_knots, name="bezier", knots=np.empty(0))
 
 
 def b_spline(

@@ -62,13 +62,7 @@ def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
 
     A Bezier curve is raised in degree, a B-spline gets knots, each in the middle of the longest span: they move by
     rounding alone. A uniform Beta-spline has no exact way and moves by `change`.
-
-    Raises
-    ------
-    CurveError
-        `count` is negative.
     """
-    _require_count(count)
     family = curve.family
     if not count:
         return Refit(curve, 0.0)
@@ -92,10 +86,8 @@ def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
     Raises
     ------
     CurveError
-        `count` is negative, or fewer than three control vertices would be left to keep both ends and the base
-        tangent.
+        Fewer than three control vertices would be left to keep both ends and the base tangent.
     """
-    _require_count(count)
     lowered = curve
     for _ in range(count):
         fits = [refit(lowered, family) for family in _lower_families(lowered.family)]
@@ -172,8 +164,3 @@ def _lower_families(family: CurveFamily) -> list[CurveFamily]:
         return [b_spline(vertices, degree - 1)]
     _, first = np.unique(interior, return_index=True)
     return [b_spline(vertices, degree, np.delete(interior, k)) for k in first]
-
-
-def _require_count(count: int) -> None:
-    if count < 0:
-        raise CurveError(f"the number of control vertices to add or remove must be 0 or more, not {count}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.frames import frame_function, frame_tables
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.kinematics import member_function
@@ -26,15 +27,6 @@ class CurveNodes(NamedTuple):
 
     position: Array
     frame: Array
-
-
-class Evaluated(Protocol):
-    """What equations are made of, see ``arm.Kinematics``."""
-
-    quantities: Array
-    gradient: Array
-    station_rotation: Array
-    station_spin: Array
 
 
 class SegmentKinematics:
@@ -94,7 +86,9 @@ class SegmentGroup:
         Whether there are as many equations as unknowns.
     """
 
-    def __init__(self, layout: Layout, segments: Sequence[Segment], kinematics: Evaluated) -> None:
+    def __init__(
+        self, layout: Layout, segments: Sequence[Segment], kinematics: Kinematics | SegmentKinematics
+    ) -> None:
         truss, one = truss_of(layout.arm), segments[0]
         self.is_square = one.is_square
         self.numbers = np.array([segment.number for segment in segments])

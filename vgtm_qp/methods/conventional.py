@@ -242,7 +242,7 @@ class ConventionalResolver(MethodResolver):
         return Moved(X, state.control_vertices, state.torsion)
 
     def _linear(self, X: Array, path: Path, start: float, end: float) -> Linear:
-        """Return the system at nodes `X` (N, 3) whose base rests, J d = x, eqs. (25)-(27).
+        """Return the system at nodes `X` (N, 3) whose base rests, J d = x, eqs. (25) and (27).
 
         The right-hand side is the motion of the goal along the path from `start` to `end`, and none of the fixed
         lengths; with corrections, what lengths and tip lack of the goal at `end`.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
-from vgtm_qp.methods.curve_motion import CURVE_SOLVER, CurveMotion
+from vgtm_qp.methods.curve_motion import CurveMotion
 from vgtm_qp.methods.resolver import MethodResolver, Moved, displacement_to
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.methods.tracking import Tracker
@@ -59,7 +59,7 @@ class CurveFirstResolver(MethodResolver):
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._actuation = Actuation(setup.arm, (), slows_down=False)
         self._correct, self._is_qp = method.correct, method.name == "qp"
-        self.solver = CURVE_SOLVER if self._is_qp else None
+        self.solver = "daqp" if self._is_qp else None
 
     @property
     def curve(self) -> Curve:

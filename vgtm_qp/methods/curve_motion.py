@@ -23,11 +23,10 @@ from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
 
-CURVE_SOLVER = "daqp"
-"""What solves the QP of the curve alone."""
 DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 
 _SAMPLES = 400
+"""Pieces of the curve to whose ends nodes are assigned: the nearest point to a few thousandths."""
 _PROGRESS = 1e3
 _MARGIN = 1e-5
 
@@ -77,7 +76,9 @@ class CurveMotion:
         self._base_rows = np.zeros((BASE_ROWS, self.home.coordinates))
         self._base_rows[:3, :3] = np.eye(3)
         self._base_rows[3:, 3:6] = truss.face_frames[0][:, :2].T
-        self._node_s = _nearest_parameters(self.home, truss.home)
+        s = np.linspace(0.0, 1.0, _SAMPLES + 1)
+        squares = ((self.home.position(s)[None] - truss.home[:, None]) ** 2).sum(axis=2)
+        self._node_s = s[np.argmin(squares, axis=1)]
 
     def nodes(self, curve: Curve, faces: Array, *, frames: bool) -> CurveNodes:
         """Return the curve nodes of `faces` (S,); their frames are identities where they are not asked for."""
@@ -252,10 +253,3 @@ def displaced(curve: Curve, d: Array) -> Curve:
         control_vertices=curve.control_vertices + d[:size].reshape(-1, 3),
         torsion=curve.torsion + d[size:],
     )
-
-
-def _nearest_parameters(curve: Curve, points: Array) -> Array:
-    """Return (N,) parameters of the points of the curve that are nearest to `points`, to a few thousandths."""
-    s = np.linspace(0.0, 1.0, _SAMPLES + 1)
-    squares = ((curve.position(s)[None] - points[:, None]) ** 2).sum(axis=2)
-    return np.asarray(s[np.argmin(squares, axis=1)])

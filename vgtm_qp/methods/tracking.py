@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods.assembly import CurveNodes, Evaluated, SegmentGroup, SegmentKinematics
+from vgtm_qp.methods.assembly import CurveNodes, SegmentGroup, SegmentKinematics
 from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
@@ -145,7 +145,7 @@ class _Chain:
         self,
         layout: Layout,
         segments: Sequence[Segment],
-        kinematics: Evaluated,
+        kinematics: Kinematics | SegmentKinematics,
         evaluate: Callable[[Array], None],
         failure: str,
     ) -> None:
