@@ -26,14 +26,10 @@ class ClosestPoints(NamedTuple):
 
     Attributes
     ----------
-    s : (m,)
-        Curve parameters.
-    position : (m, 3)
-        Points on the curve, m.
-    witness : (m, 3)
-        The points of the obstacle that they are closest to, m.
-    distance : (m,)
-        Distances, m; negative inside a box.
+    s, position : (m,), (m, 3)
+        Parameters and points of the curve, m.
+    witness, distance : (m, 3), (m,)
+        Nearest points of the obstacle, and the distances, m; these are negative inside a box.
     """
 
     s: Array

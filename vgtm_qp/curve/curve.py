@@ -108,7 +108,9 @@ class Curve:
                 "the curve leaves its base against the base normal, where its frame is not defined"
             )
         swing = rotation_from_vector(turn_between(normal, tangent))
-        frames = turn @ (swing @ self.base_frame) @ _rotation_about_z(angle)
+        x, y, z = np.moveaxis(turn @ (swing @ self.base_frame), -1, 0)
+        cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        frames = np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
         return np.asarray(frames.reshape(*s.shape, 3, 3))
 
     def frame_rate(self, s: ArrayLike) -> Array:
@@ -173,7 +175,11 @@ class Curve:
             binormal = _curvature_binormal(w1 @ self.control_vertices, w2 @ self.control_vertices)
             return np.asarray(-w1[..., :, None] * binormal[..., None, :])
 
-        roll = self._integral(roll_rate, s).reshape(*s.shape, -1) + self._base_roll()
+        # At s = 0 it rolls by the area that the arc from base normal to tangent sweeps.
+        normal, base = self.base_frame[:, 2], self.tangent(0.0)
+        swept = np.cross(base, normal) / (1.0 + normal @ base)
+        roll = self._integral(roll_rate, s).reshape(*s.shape, -1)
+        roll = roll + swept @ self._tangent_rows(self.family.weights(0.0, 1))
         rows = np.swapaxes(turn, -1, -2) + tangent[..., :, None] * roll[..., None, :]
         return np.concatenate([rows, tangent[..., :, None] * self._torsion_weights(s)[..., None, :]], axis=-1)
 
@@ -215,15 +221,6 @@ class Curve:
 
     def _torsion_weights(self, s: ArrayLike, order: int = 0) -> Array:
         return bernstein(self.torsion.size, s, order)[..., 1:]
-
-    def _base_roll(self) -> Array:
-        """(3 V,) rate of roll at s = 0: the area swept by the arc from base normal to tangent."""
-        normal, tangent = self.base_frame[:, 2], self.tangent(0.0)
-        return np.asarray(
-            np.cross(tangent, normal)
-            / (1.0 + normal @ tangent)
-            @ self._tangent_rows(self.family.weights(0.0, 1))
-        )
 
     def _double_reflections(self, start: Array, end: Array) -> Array:
         """(n, 3, 3) rotations that carry the frame from each parameter of `start` to that of `end`."""
@@ -299,13 +296,3 @@ def _reflections(normals: Array) -> Array:
     if not np.all(square > 0.0):
         raise CurveError("the curve turns back on itself within a step; part its control vertices there")
     return np.asarray(np.eye(3) - 2.0 * normals[:, :, None] * normals[:, None, :] / square[:, None, None])
-
-
-def _rotation_about_z(angle: Array) -> Array:
-    """(n, 3, 3) rotations about z."""
-    turn = np.zeros((angle.size, 3, 3))
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
-    turn[:, 1, 0] = np.sin(angle)
-    turn[:, 0, 1] = -turn[:, 1, 0]
-    turn[:, 2, 2] = 1.0
-    return turn

@@ -45,8 +45,8 @@ def excess_freedom(curve_dof: int, arm_dof: int) -> str | None:
 
     Parameters
     ----------
-    curve_dof, arm_dof : int
-        Degrees of freedom, either both with the tip held or both with the tip free.
+    curve_dof, arm_dof
+        Either both with the tip held or both with the tip free.
     """
     excess = curve_dof - arm_dof
     if excess <= 0:

@@ -232,13 +232,13 @@ class ConventionalResolver(MethodResolver):
             x_g = x_g - truss.scatter.base_rate(gradient, motion)[truss.fixed]
             X += motion
         terms = self._objective.at(X, kinematics.quantities, state.time)
-        self.spend("kinematics")
+        self._clock.add("kinematics")
         X[truss.free] += self._solution.displacement(system._replace(x_g=x_g), terms).reshape(-1, 3)
         self.rank = self._solution.rank
-        self.spend("solve")
+        self._clock.add("solve")
         if self._correct:
             self._newton(X, path, end)
-            self.spend("correction")
+            self._clock.add("correction")
         return Moved(X, state.control_vertices, state.torsion)
 
     def _linear(self, X: Array, path: Path, start: float, end: float) -> Linear:

@@ -55,7 +55,7 @@ class CurveFirstResolver(MethodResolver):
         self.tracker = Tracker(
             setup.layout, setup.kinematics, segments, parallel=method.tracking == "parallel"
         )
-        self._faces = np.array([segment.face for segment in segments])
+        self._s = self.motion.s[[segment.face for segment in segments]]
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._actuation = Actuation(setup.arm, (), slows_down=False)
         self._correct, self._is_qp = method.correct, method.name == "qp"
@@ -74,14 +74,14 @@ class CurveFirstResolver(MethodResolver):
         goal = displacement_to(path.at(end), path.at(start))
         curve = self.motion.follow(before, goal, state.time, state.nodes, correct=self._correct)
         nodes = self._nodes(curve)
-        self.spend("solve")
+        self._clock.add("solve")
         if self._correct:
             X = self.tracker.track(state.nodes, nodes)
         else:
             old = self._nodes(before)
             turned = rotation_vectors(nodes.frame @ np.swapaxes(old.frame, 1, 2))
             X = self.tracker.rates(state.nodes, nodes.position - old.position, turned)
-        self.spend("correction")
+        self._clock.add("correction")
         return Moved(X, curve.control_vertices, curve.torsion)
 
     def _move_safely(self, path: Path, start: float, end: float, dt: float) -> Moved:
@@ -98,15 +98,15 @@ class CurveFirstResolver(MethodResolver):
                     curve, change, active = self.motion.follow_qp(curve, now, progress, time, X)
                     progress = min(max(progress + change, 0.0), 1.0)
                     curve = self.motion.corrected(curve, path.at(start + progress * (goal - start)))
-                    self.spend("solve")
+                    self._clock.add("solve")
                     X = self.tracker.track(state.nodes, self._nodes(curve))
                 except SolverError as error:
                     reason = str(error)
                     break
-                self.spend("correction")
+                self._clock.add("correction")
                 time = state.time + dt
                 reason = self._broken(X, dt)
-                self.spend("acceptance")
+                self._clock.add("acceptance")
                 if not reason and share * progress >= _LEAST_PROGRESS:
                     return Moved(X, curve.control_vertices, curve.torsion, share * progress)
                 if not reason or progress < _LEAST_PROGRESS or reason.startswith("stroke"):
@@ -116,7 +116,10 @@ class CurveFirstResolver(MethodResolver):
         raise SolverError(reason)
 
     def _nodes(self, curve: Curve) -> CurveNodes:
-        return self.motion.nodes(curve, self._faces, frames=self._frames)
+        """Return the curve nodes of the segments; their frames are identities where none is tracked."""
+        s = self._s
+        frame = curve.frame(s) if self._frames else np.broadcast_to(np.eye(3), (len(s), 3, 3))
+        return CurveNodes(curve.position(s), frame)
 
     def _broken(self, X: Array, dt: float) -> str:
         """Return which limit the step to node positions `X` would break, empty if none."""

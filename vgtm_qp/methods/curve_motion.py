@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
 from vgtm_qp.errors import CurveError, SolverError
-from vgtm_qp.methods.assembly import CurveNodes
 from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE
@@ -79,12 +78,6 @@ class CurveMotion:
         s = np.linspace(0.0, 1.0, _SAMPLES + 1)
         squares = ((self.home.position(s)[None] - truss.home[:, None]) ** 2).sum(axis=2)
         self._node_s = s[np.argmin(squares, axis=1)]
-
-    def nodes(self, curve: Curve, faces: Array, *, frames: bool) -> CurveNodes:
-        """Return the curve nodes of `faces` (S,); their frames are identities where they are not asked for."""
-        s = self.s[faces]
-        frame = curve.frame(s) if frames else np.broadcast_to(np.eye(3), (len(s), 3, 3))
-        return CurveNodes(curve.position(s), frame)
 
     def follow(self, curve: Curve, goal: TipGoal, time: float, X: Array, *, correct: bool) -> Curve:
         """Return the curve after a step by eq. (38) to a goal, whose rates are the displacement to it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from vgtm_qp.errors import CurveError, GoalError, SolverError
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal
+from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
@@ -47,20 +47,21 @@ class MethodResolver(ABC):
     """
 
     draws_vertices = False
-    """Whether control vertices follow goals of their own."""
 
     def __init__(self, setup: Setup, step_limit: float | None) -> None:
         self.setup = setup
         self.state: State = setup.home_state()
-        """Where the arm is; may be set to another state of this arm."""
-        self.phases = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
         self.rank: int | None = None
-        """Rank of the Jacobian in the last step, None where the method does not reveal it."""
         self.solver: str | None = None
-        """Name of the QP solver, None where the method solves no QP."""
+        self._clock = Phases()
+        self._clock.seconds = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
         self._limit = step_limit
         self._steps = 0
-        self._mark = 0.0
+
+    @property
+    def phases(self) -> dict[str, float]:
+        """Seconds spent so far in each phase."""
+        return self._clock.seconds
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
@@ -82,7 +83,7 @@ class MethodResolver(ABC):
         """Move along `path` from its value `start` to `end` in one step; a blocked step has its reason."""
         dt = self.setup.dt if dt is None else dt
         self._steps += 1
-        self._mark = perf_counter()
+        self._clock.start()
         try:
             moved = self._move(path, start, end, dt)
             self._refuse_breakdown(moved.nodes, path, start, end)
@@ -102,7 +103,7 @@ class MethodResolver(ABC):
             motion=frozen(q - before.nodes),
             duration=dt,
         )
-        self.spend("kinematics")
+        self._clock.add("kinematics")
         status = StepStatus.REACHED if moved.progress >= 1.0 - 1e-9 else StepStatus.SLOWED
         return Step(status, moved.progress, self.state, "", 0)
 
@@ -132,12 +133,6 @@ class MethodResolver(ABC):
     def again(self, problem: Problem) -> Mover | None:  # noqa: ARG002
         """Return None: there is no other attempt."""
         return None
-
-    def spend(self, phase: str) -> None:
-        """Add the time since the last call to `phase`."""
-        now = perf_counter()
-        self.phases[phase] += now - self._mark
-        self._mark = now
 
     @abstractmethod
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:

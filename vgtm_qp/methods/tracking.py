@@ -180,13 +180,7 @@ class _Chain:
 
 
 def _least_norm(A: Array, b: Array) -> Array:
-    """Return the solutions of A x = b, or those of least norm where A (K, r, c) has more columns than rows.
-
-    Raises
-    ------
-    SolverError
-        A has dependent rows.
-    """
+    """Return the solutions of A x = b, or those of least norm where A (K, r, c) has more columns than rows."""
     rows, columns = A.shape[1:]
     try:
         if rows == columns:
