@@ -8,15 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vgtm_qp.curve import (
-    Curve,
-    b_spline,
-    beta_spline,
-    bezier,
-    closest_to_box,
-    closest_to_point,
-    straight_curve,
-)
+from vgtm_qp.curve.closest import closest_to_box, closest_to_point
+from vgtm_qp.curve.curve import Curve, straight_curve
+from vgtm_qp.curve.families import b_spline, beta_spline, bezier
 from vgtm_qp.errors import CurveError
 
 FAMILIES = [
@@ -87,7 +81,7 @@ def test_straight_curve_beside_and_through_a_box():
     beside = closest_to_box(curve, [1.15, 0, 2.2], 0.9)
     np.testing.assert_allclose(beside.distance, [0.7], atol=1e-12)
     assert 1.75 - 1e-12 <= beside.position[0, 2] <= 2.65 + 1e-12
-    through = closest_to_box(curve, [0.1, 0, 2.0], [1.0, 2.0, 3.0])
+    through = closest_to_box(curve, [0.1, 0, 2.0], [1.0, 2.0, 6.0])
     np.testing.assert_allclose(through.distance, [-0.4], atol=1e-12)
     np.testing.assert_allclose(through.witness[0, 0], -0.4, atol=1e-12)
     corner = closest_to_box(curve, [1.0, 1.0, 2.0], 1.0, Rotation.from_rotvec([0, 0, np.pi / 4]).as_matrix())

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from vgtm_qp.curve import b_spline, beta_spline, bezier, make_family
+from vgtm_qp.curve.families import b_spline, beta_spline, bezier, make_family
 from vgtm_qp.errors import CurveError
 
 S = np.linspace(0.0, 1.0, 201)

@@ -19,23 +19,6 @@ EQUATIONS = range(1, 40)
 # Those that README.md has no row for.
 UNUSED = {2, 31}
 
-# Those that no function is headed by: a class or module is, or README.md alone says where they are. Who heads a
-# function by one takes it off this list, and nobody adds to it.
-WITHOUT = UNUSED | {
-    1,
-    *range(3, 7),
-    9,
-    10,
-    12,
-    14,
-    15,
-    *range(17, 22),
-    *range(25, 28),
-    29,
-    30,
-    *range(33, 36),
-}
-
 # Those that head several functions, a part each or another form each. Nobody adds to it.
 SEVERAL = {
     36: {"curve/curve.py: Curve.position_jacobian", "curve/curve.py: Curve.orientation_jacobian"},
@@ -103,7 +86,7 @@ def table() -> dict[int, set[str]]:
 @pytest.mark.parametrize("number", EQUATIONS)
 def test_an_equation_heads_one_function(number: int) -> None:
     functions = headed().get(number, set())
-    if number in WITHOUT:
+    if number in UNUSED:
         assert not functions
     elif number in SEVERAL:
         assert functions == SEVERAL[number]

@@ -10,7 +10,7 @@ from steps import numbers_at
 import vgtm_qp as vq
 from vgtm_qp.errors import CurveError
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.methods import condensation, make_resolver
+from vgtm_qp.methods import make_resolver
 from vgtm_qp.methods.conventional import ConventionalResolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.objectives import potential_curvature, potential_field, potential_slope
@@ -74,7 +74,7 @@ def test_parallel_tracking_is_recursive_tracking(module: str, correct: bool) -> 
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     ways = []
     for least in (1, 1000):
-        monkeypatch.setattr(condensation, "THREADED", least)
+        monkeypatch.setattr("vgtm_qp.methods.tracking.THREADED", least)
         problem = free_problem("octahedral", name="curve-pseudoinverse", tracking="parallel", correct=True)
         ways.append(run(CurveFirstResolver(problem), problem, 5))
     np.testing.assert_array_equal(ways[0], ways[1])

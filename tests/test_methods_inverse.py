@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods.banded import BandedSystem
+from vgtm_qp.methods.conventional import BandedSystem
 from vgtm_qp.methods.pseudoinverse import (
     Objective,
     moore_penrose,
@@ -95,16 +95,17 @@ def test_banded_system_solves_what_a_dense_one_does(seed: int, size: int) -> Non
     random = np.random.default_rng(seed)
     rows = np.concatenate([np.arange(size), random.integers(0, size, 3 * size)])
     columns = np.concatenate([np.arange(size), random.integers(0, size, 3 * size)])
-    values = np.concatenate([np.full(size, 8.0), random.uniform(-1, 1, 3 * size)])
+    values = np.concatenate([np.full(size, 16.0), random.uniform(-1, 1, 3 * size)])
     dense = np.zeros((size, size))
     np.add.at(dense, (rows, columns), values)
+    dense += dense.T - np.diag(np.diag(dense))
     rhs = random.normal(size=size)
     np.testing.assert_allclose(
-        BandedSystem(rows, columns, size).solve(values, rhs), np.linalg.solve(dense, rhs), atol=1e-10
+        BandedSystem(rows, columns).solve(values, rhs), np.linalg.solve(dense, rhs), atol=1e-10
     )
 
 
 def test_a_singular_banded_system_is_refused() -> None:
-    system = BandedSystem(np.array([0, 1, 0, 1]), np.array([0, 1, 1, 0]), 2)
+    system = BandedSystem(np.array([0, 1, 1]), np.array([0, 1, 0]))
     with pytest.raises(SolverError, match="singular"):
-        system.solve(np.ones(4), np.ones(2))
+        system.solve(np.ones(3), np.ones(2))

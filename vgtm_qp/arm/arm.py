@@ -110,7 +110,7 @@ class Tip:
         return len(self.nodes) >= 3
 
     def position(self, X: Array) -> Array:
-        """Return (3,) the position of the end effector where the nodes are at `X` (N, 3), m."""
+        """Return (3,) the position of the end effector, eq. (1), where the nodes are at `X` (N, 3), m."""
         return np.asarray(self.weights @ X.take(self.nodes, axis=0))
 
 

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.curve.bernstein import Array, basis
-from vgtm_qp.curve.families import CurveFamily
-from vgtm_qp.curve.roots import increasing_roots
+from vgtm_qp.curve.families import Array, CurveFamily, bernstein, within
 from vgtm_qp.errors import CurveError
+from vgtm_qp.rotation import rotation_from_vector, turn_between
 
 _FRAME_STEPS_PER_CELL = 4
 _NO_STEP = 1e-9
+_NEWTON_STEPS = 100
+_CONVERGED = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,29 +50,26 @@ class Curve:
     base_frame: Array = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        for name in ("control_vertices", "torsion", "base_frame"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
-        expected = {
+        shapes = {
             "control_vertices": (self.family.control_vertices, 3),
-            "torsion": (self.torsion.size,),
+            "torsion": (np.size(self.torsion),),
             "base_frame": (3, 3),
         }
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            if array.shape != shape:
+        for name, shape in shapes.items():
+            array = np.asarray(getattr(self, name), dtype=float)
+            if array.shape != shape or not np.all(np.isfinite(array)):
                 raise CurveError(
-                    f"{name} of this {self.family.name} must have the shape {shape}, not {array.shape}"
+                    f"{name} of this {self.family.name} must be finite numbers of the shape {shape}, not {array.shape}"
                 )
-            if not np.all(np.isfinite(array)):
-                raise CurveError(f"{name} must be finite numbers")
+            object.__setattr__(self, name, array)
 
     @property
     def coordinates(self) -> int:
-        """Number D = 3 V + T of configuration variables."""
+        """Number D = 3 V + T of configuration variables, eq. (33)."""
         return self.control_vertices.size + self.torsion.size
 
     def position(self, s: ArrayLike) -> Array:
-        """r(s), m: (..., 3)."""
+        """r(s), eq. (29), m: (..., 3)."""
         return self.derivative(s, 0)
 
     def derivative(self, s: ArrayLike, order: int = 1) -> Array:
@@ -79,20 +77,8 @@ class Curve:
         return np.asarray(self.family.weights(s, order) @ self.control_vertices)
 
     def tangent(self, s: ArrayLike) -> Array:
-        """t(s), the unit tangent: (..., 3).
-
-        Raises
-        ------
-        CurveError
-            r' vanishes at some s.
-        """
+        """t(s), the unit tangent: (..., 3); CurveError where r' vanishes."""
         return _unit(self.derivative(s, 1))
-
-    def curvature(self, s: ArrayLike) -> Array:
-        """Curvature |r' x r''| / |r'|^3, 1/m: (...)."""
-        return np.asarray(
-            np.linalg.norm(_curvature_binormal(self.derivative(s, 1), self.derivative(s, 2)), axis=-1)
-        )
 
     def frame(self, s: ArrayLike) -> Array:
         """F(s): (..., 3, 3), columns x, y and the tangent, eq. (32).
@@ -109,13 +95,22 @@ class Curve:
         self._require_smooth()
         s = np.asarray(s, dtype=float)
         flat = np.clip(s.ravel(), 0.0, 1.0)
-        grid = self._frame_grid()
+        grid = np.append(
+            within(self.family.cells, np.arange(_FRAME_STEPS_PER_CELL) / _FRAME_STEPS_PER_CELL), 1.0
+        )
         along = _running_products(self._double_reflections(grid[:-1], grid[1:]))
         step = np.clip(np.searchsorted(grid, flat, side="right") - 1, 0, len(grid) - 2)
         turn = self._double_reflections(grid[step], flat) @ along[step]
         angle = self._torsion_weights(flat) @ self.torsion
-        swing = _least_rotation(self.base_frame[:, 2], self.tangent(0.0))
-        frames = turn @ (swing @ self.base_frame) @ _rotation_about_z(angle)
+        normal, tangent = self.base_frame[:, 2], self.tangent(0.0)
+        if float(normal @ tangent) < -1.0 + 1e-12:
+            raise CurveError(
+                "the curve leaves its base against the base normal, where its frame is not defined"
+            )
+        swing = rotation_from_vector(turn_between(normal, tangent))
+        x, y, z = np.moveaxis(turn @ (swing @ self.base_frame), -1, 0)
+        cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        frames = np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
         return np.asarray(frames.reshape(*s.shape, 3, 3))
 
     def frame_rate(self, s: ArrayLike) -> Array:
@@ -132,23 +127,25 @@ class Curve:
     def arc_parameter(self, fraction: ArrayLike) -> Array:
         """Parameters s at which these fractions, 0 to 1, of the whole arc length are reached: (...).
 
-        Raises
-        ------
-        CurveError
-            A fraction is outside 0 to 1 or not a number.
+        Newton's method within the brackets of cells, with bisection wherever a step shrinks by less than half.
         """
         fraction = np.asarray(fraction, dtype=float)
-        if not np.all((fraction >= 0.0) & (fraction <= 1.0)):
-            raise CurveError("fractions of the arc length must be within 0 to 1")
         cells = self.family.cells
         lengths = self.length(cells)
         goal = fraction.ravel() * lengths[-1]
         cell = np.clip(np.searchsorted(lengths, goal, side="right") - 1, 0, len(cells) - 2)
-
-        def excess(s: Array) -> tuple[Array, Array]:
-            return self.length(s) - goal, np.asarray(np.linalg.norm(self.derivative(s, 1), axis=-1))
-
-        s = increasing_roots(excess, cells[cell], cells[cell + 1])
+        low, high = cells[cell], cells[cell + 1]
+        s, step = (low + high) / 2, high - low
+        for _ in range(_NEWTON_STEPS):
+            excess, speed = self.length(s) - goal, np.linalg.norm(self.derivative(s), axis=-1)
+            low, high = np.where(excess < 0, s, low), np.where(excess < 0, high, s)
+            newton = np.clip(s - excess / np.maximum(speed, np.finfo(float).tiny), low, high)
+            # A step as small as rounding must not throw the root back to the middle of its bracket.
+            is_slow = np.abs(newton - s) > np.maximum(step / 2, _CONVERGED)
+            new = np.where(is_slow, (low + high) / 2, newton)
+            step, s = np.abs(new - s), new
+            if np.all(step <= _CONVERGED):
+                break
         s = np.where(fraction.ravel() == 0.0, 0.0, np.where(fraction.ravel() == 1.0, 1.0, s))
         return np.asarray(s.reshape(fraction.shape))
 
@@ -166,11 +163,6 @@ class Curve:
         Two of its three components turn the tangent. The third, about the tangent, is the torsion's rate less
         the integral of w_i' kappa b over 0 to s, kappa b = r' x r'' / |r'|^3, plus what the least rotation at
         the base contributes where the curve leaves it off the normal.
-
-        Raises
-        ------
-        CurveError
-            As `frame`.
         """
         self._require_smooth()
         s = np.asarray(s, dtype=float)
@@ -183,7 +175,11 @@ class Curve:
             binormal = _curvature_binormal(w1 @ self.control_vertices, w2 @ self.control_vertices)
             return np.asarray(-w1[..., :, None] * binormal[..., None, :])
 
-        roll = self._integral(roll_rate, s).reshape(*s.shape, -1) + self._base_roll()
+        # At s = 0 it rolls by the area that the arc from base normal to tangent sweeps.
+        normal, base = self.base_frame[:, 2], self.tangent(0.0)
+        swept = np.cross(base, normal) / (1.0 + normal @ base)
+        roll = self._integral(roll_rate, s).reshape(*s.shape, -1)
+        roll = roll + swept @ self._tangent_rows(self.family.weights(0.0, 1))
         rows = np.swapaxes(turn, -1, -2) + tangent[..., :, None] * roll[..., None, :]
         return np.concatenate([rows, tangent[..., :, None] * self._torsion_weights(s)[..., None, :]], axis=-1)
 
@@ -218,31 +214,13 @@ class Curve:
     def _tangent_rows(self, w1: Array) -> Array:
         """(..., 3, 3 V) rows of dt/dp from the table of w'."""
         first = w1 @ self.control_vertices
-        tangent = _unit(first)
-        across = (np.eye(3) - tangent[..., :, None] * tangent[..., None, :]) / np.linalg.norm(first, axis=-1)[
-            ..., None, None
-        ]
-        return np.asarray(across @ _spread(w1))
+        speed = _speed(first, "tangent")
+        tangent = first / speed
+        across = np.eye(3) - tangent[..., :, None] * tangent[..., None, :]
+        return np.asarray(across / speed[..., None] @ _spread(w1))
 
     def _torsion_weights(self, s: ArrayLike, order: int = 0) -> Array:
-        return basis(self.torsion.size, s, order)[..., 1:]
-
-    def _base_roll(self) -> Array:
-        """(3 V,) rate of roll at s = 0: the area swept by the arc from base normal to tangent."""
-        normal, tangent = self.base_frame[:, 2], self.tangent(0.0)
-        return np.asarray(
-            np.cross(tangent, normal)
-            / (1.0 + normal @ tangent)
-            @ self._tangent_rows(self.family.weights(0.0, 1))
-        )
-
-    def _frame_grid(self) -> Array:
-        cells = self.family.cells
-        inner = (
-            cells[:-1, None]
-            + np.diff(cells)[:, None] * np.arange(_FRAME_STEPS_PER_CELL) / _FRAME_STEPS_PER_CELL
-        )
-        return np.append(inner.ravel(), 1.0)
+        return bernstein(self.torsion.size, s, order)[..., 1:]
 
     def _double_reflections(self, start: Array, end: Array) -> Array:
         """(n, 3, 3) rotations that carry the frame from each parameter of `start` to that of `end`."""
@@ -258,17 +236,16 @@ class Curve:
         flat = np.clip(s.ravel(), 0.0, 1.0)
         cells = self.family.cells
         nodes, weights = self.family.gauss
-        whole = np.moveaxis(integrand(*self.family.quadrature), 1, -1) @ weights
-        whole = (whole.T * np.diff(cells)).T
+
+        def over(widths: Array, *tables: Array) -> Array:
+            return np.asarray((np.tensordot(weights, integrand(*tables), axes=(0, 1)).T * widths).T)
+
+        whole = over(np.diff(cells), *self.family.quadrature)
         until = np.concatenate([np.zeros((1, *whole.shape[1:])), np.cumsum(whole, axis=0)])
         cell = np.clip(np.searchsorted(cells, flat, side="right") - 1, 0, len(cells) - 2)
         rest = flat - cells[cell]
         points = cells[cell, None] + rest[:, None] * nodes
-        part = (
-            np.moveaxis(integrand(self.family.weights(points, 1), self.family.weights(points, 2)), 1, -1)
-            @ weights
-        )
-        total = until[cell] + (part.T * rest).T
+        total = until[cell] + over(rest, self.family.weights(points, 1), self.family.weights(points, 2))
         return np.asarray(total.reshape(s.shape + total.shape[1:]))
 
 
@@ -279,22 +256,22 @@ def straight_curve(family: CurveFamily, start: ArrayLike, end: ArrayLike) -> Cur
 
 
 def _unit(vectors: Array) -> Array:
-    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    if not np.all(norm > 0.0):
-        raise CurveError(
-            "the curve has no tangent where its derivative vanishes; part its control vertices there"
-        )
-    return np.asarray(vectors / norm)
+    return np.asarray(vectors / _speed(vectors, "tangent"))
 
 
 def _curvature_binormal(first: Array, second: Array) -> Array:
     """Kappa b = r' x r'' / |r'|^3, 1/m: (..., 3)."""
-    norm = np.linalg.norm(first, axis=-1, keepdims=True)
-    if not np.all(norm > 0.0):
+    return np.asarray(np.cross(first, second) / _speed(first, "curvature") ** 3)
+
+
+def _speed(first: Array, what: str) -> Array:
+    """Return |r'| (..., 1), by which `what` is divided."""
+    speed = np.asarray(np.linalg.norm(first, axis=-1, keepdims=True))
+    if not np.all(speed > 0.0):
         raise CurveError(
-            "the curve has no curvature where its derivative vanishes; part its control vertices there"
+            f"the curve has no {what} where its derivative vanishes; part its control vertices there"
         )
-    return np.asarray(np.cross(first, second) / norm**3)
+    return speed
 
 
 def _spread(weights: Array) -> Array:
@@ -319,23 +296,3 @@ def _reflections(normals: Array) -> Array:
     if not np.all(square > 0.0):
         raise CurveError("the curve turns back on itself within a step; part its control vertices there")
     return np.asarray(np.eye(3) - 2.0 * normals[:, :, None] * normals[:, None, :] / square[:, None, None])
-
-
-def _least_rotation(start: Array, end: Array) -> Array:
-    """Rotation (3, 3) by the least angle from unit vector `start` to `end`."""
-    cosine = float(start @ end)
-    if cosine < -1.0 + 1e-12:
-        raise CurveError("the curve leaves its base against the base normal, where its frame is not defined")
-    x, y, z = np.cross(start, end)
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + cosine))
-
-
-def _rotation_about_z(angle: Array) -> Array:
-    """(n, 3, 3) rotations about z."""
-    turn = np.zeros((angle.size, 3, 3))
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
-    turn[:, 1, 0] = np.sin(angle)
-    turn[:, 0, 1] = -turn[:, 1, 0]
-    turn[:, 2, 2] = 1.0
-    return turn

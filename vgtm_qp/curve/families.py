@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from itertools import pairwise
+from math import comb, perm
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from vgtm_qp.curve.bernstein import Array, basis
 from vgtm_qp.errors import CurveError, nearest
+
+Array = NDArray[np.float64]
 
 FAMILIES = ("bezier", "b-spline", "beta-spline")
 
@@ -61,7 +63,7 @@ class CurveFamily:
         return len(self.abscissae)
 
     def weights(self, s: ArrayLike, order: int = 0) -> Array:
-        """Weights w_i, or their derivatives of `order` by s, at s of any shape: (..., V).
+        """Weights w_i, eq. (30), or their derivatives of `order` by s, at s of any shape: (..., V).
 
         At a break where a derivative jumps it is the one of the segment that begins there.
 
@@ -76,7 +78,7 @@ class CurveFamily:
         at = np.clip(given, 0.0, 1.0)
         segment = np.searchsorted(self.breaks[1:-1], at, side="right")
         width = np.diff(self.breaks)[segment]
-        table = basis(self.degree, (at - self.breaks[segment]) / width, order)
+        table = bernstein(self.degree, (at - self.breaks[segment]) / width, order)
         if len(self.breaks) == 2:
             return np.asarray(table @ self.extraction[0])
         table = table / width[..., None] ** order
@@ -86,8 +88,7 @@ class CurveFamily:
     def cells(self) -> Array:
         """(C + 1,) a subdivision of the segments, fine enough for quadrature and for moving a frame along."""
         pieces = max(2, -(-_QUADRATURE_CELLS // (len(self.breaks) - 1)))
-        inner = self.breaks[:-1, None] + np.diff(self.breaks)[:, None] * np.arange(pieces) / pieces
-        return np.append(inner.ravel(), 1.0)
+        return np.append(within(self.breaks, np.arange(pieces) / pieces), 1.0)
 
     @cached_property
     def gauss(self) -> tuple[Array, Array]:
@@ -98,7 +99,7 @@ class CurveFamily:
     @cached_property
     def quadrature(self) -> tuple[Array, Array]:
         """(C, G, V) tables of w' and w'' at the Gauss points of the cells."""
-        points = self.cells[:-1, None] + np.diff(self.cells)[:, None] * self.gauss[0]
+        points = within(self.cells, self.gauss[0])
         return self.weights(points, 1), self.weights(points, 2)
 
 
@@ -111,15 +112,8 @@ def bezier(control_vertices: int) -> CurveFamily:
         Fewer than two control vertices.
     """
     _require_vertices("bezier", control_vertices, 2)
-    return CurveFamily(
-        name="bezier",
-        degree=control_vertices - 1,
-        breaks=np.array([0.0, 1.0]),
-        extraction=np.eye(control_vertices)[None],
-        abscissae=np.linspace(0.0, 1.0, control_vertices),
-        smooth=True,
-        knots=np.empty(0),
-    )
+    without_knots = b_spline(control_vertices, control_vertices - 1)
+    return replace(without_knots, name="bezier", knots=np.empty(0))
 
 
 def b_spline(
@@ -236,6 +230,11 @@ def make_family(
     )
 
 
+def within(breaks: Array, fractions: Array) -> Array:
+    """Return (S, F) the parameters at these fractions (F,) of every piece between `breaks` (S + 1,)."""
+    return np.asarray(breaks[:-1, None] + np.diff(breaks)[:, None] * fractions)
+
+
 def _require_vertices(family: str, control_vertices: int, least: int) -> None:
     if control_vertices < least:
         raise CurveError(f"a {family} needs at least {least} control vertices, not {control_vertices}")
@@ -257,3 +256,27 @@ def _extraction(knots: Array, degree: int, breaks: Array) -> Array:
                 rows = (1.0 - alpha) * rows[:-1] + alpha * rows[1:]
             matrices[k, j] = rows[0]
     return matrices
+
+
+@cache
+def _difference(size: int, order: int) -> Array:
+    """(size - order, size) matrix of the `order`-th forward difference."""
+    return np.asarray(np.diff(np.eye(size), n=order, axis=0))
+
+
+@cache
+def _binomials(degree: int) -> Array:
+    return np.array([comb(degree, j) for j in range(degree + 1)], dtype=float)
+
+
+def bernstein(degree: int, u: ArrayLike, order: int = 0) -> Array:
+    """Bernstein basis of `degree`, or its derivative of `order`, at `u` of any shape: (..., degree + 1)."""
+    u = np.asarray(u, dtype=float)[..., None]
+    if order > degree:
+        return np.zeros((*u.shape[:-1], degree + 1))
+    low = degree - order
+    j = np.arange(low + 1)
+    table = _binomials(low) * u**j * (1.0 - u) ** (low - j)
+    if order == 0:
+        return np.asarray(table)
+    return np.asarray(perm(degree, order) * (table @ _difference(degree + 1, order)))

@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.curve.bernstein import Array
 from vgtm_qp.curve.curve import Curve
-from vgtm_qp.curve.families import CurveFamily, b_spline, beta_spline, bezier
+from vgtm_qp.curve.families import Array, CurveFamily, b_spline, beta_spline, bezier, within
 from vgtm_qp.errors import CurveError
 
 BASE_ROWS = 5
@@ -46,8 +45,8 @@ def excess_freedom(curve_dof: int, arm_dof: int) -> str | None:
 
     Parameters
     ----------
-    curve_dof, arm_dof : int
-        Degrees of freedom, either both with the tip held or both with the tip free.
+    curve_dof, arm_dof
+        Either both with the tip held or both with the tip free.
     """
     excess = curve_dof - arm_dof
     if excess <= 0:
@@ -59,27 +58,24 @@ def excess_freedom(curve_dof: int, arm_dof: int) -> str | None:
 
 
 def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
-    """Give a curve more control vertices without moving it.
+    """Give a curve more control vertices where it is.
 
-    A Bezier curve is raised in degree. A B-spline gets knots, each in the middle of the longest span. A
-    uniform Beta-spline has no exact way: it is fitted again, and moves by `change`.
-
-    Raises
-    ------
-    CurveError
-        `count` is negative.
+    A Bezier curve is raised in degree, a B-spline gets knots, each in the middle of the longest span: they move by
+    rounding alone. A uniform Beta-spline has no exact way and moves by `change`.
     """
-    _require_count(count)
-    raised = curve
-    for _ in range(count):
-        if curve.family.name == "bezier":
-            raised = _elevated(raised)
-        elif curve.family.name == "b-spline":
-            raised = _with_knot(raised)
-    if curve.family.name == "beta-spline" and count:
-        family = curve.family
+    family = curve.family
+    if not count:
+        return Refit(curve, 0.0)
+    if family.name == "bezier":
+        return refit(curve, bezier(family.control_vertices + count))
+    if family.name == "beta-spline":
         return refit(curve, beta_spline(family.control_vertices + count, family.bias, family.tension))
-    return Refit(raised, _greatest_change(curve, raised))
+    degree, knots = family.degree, family.knots
+    for _ in range(count):
+        longest = int(np.argmax(np.diff(knots)))
+        knots = np.insert(knots, longest + 1, knots[longest : longest + 2].mean())
+    interior = knots[degree + 1 : -degree - 1]
+    return refit(curve, b_spline(family.control_vertices + count, degree, interior))
 
 
 def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
@@ -90,10 +86,8 @@ def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
     Raises
     ------
     CurveError
-        `count` is negative, or fewer than three control vertices would be left to keep both ends and the base
-        tangent.
+        Fewer than three control vertices would be left to keep both ends and the base tangent.
     """
-    _require_count(count)
     lowered = curve
     for _ in range(count):
         fits = [refit(lowered, family) for family in _lower_families(lowered.family)]
@@ -123,7 +117,8 @@ def refit(curve: Curve, family: CurveFamily) -> Refit:
     table = family.weights(s)
     known = np.outer(table[:, :2].sum(axis=1), start) + np.outer(table[:, -1], end)
     # Unknowns: the distance from p_0 to p_1 along the tangent, then the vertices between p_1 and the last.
-    columns = np.concatenate([np.einsum("n,c->nc", table[:, 1], tangent)[..., None], _inner(table)], axis=2)
+    first, inner = np.outer(table[:, 1], tangent), np.kron(table[:, None, 2:-1], np.eye(3))
+    columns = np.concatenate([first[..., None], inner], axis=2)
     goal = (curve.position(s) - known) * weight[:, None]
     matrix = (columns * weight[:, None, None]).reshape(goal.size, -1)
     solution = np.linalg.lstsq(matrix, goal.ravel())[0]
@@ -137,46 +132,18 @@ def refit(curve: Curve, family: CurveFamily) -> Refit:
     return Refit(fitted, _greatest_change(curve, fitted))
 
 
-def _inner(table: Array) -> Array:
-    """(n, 3, 3 (V - 3)) rows of the vertices between p_1 and the last."""
-    inner = table[:, 2:-1]
-    return np.asarray(np.kron(inner[:, None, :], np.eye(3)))
-
-
 def _quadrature(*families: CurveFamily) -> tuple[Array, Array]:
     """Gauss points of the common segments, exact for squares, and the square roots of their weights."""
     breaks = np.unique(np.concatenate([family.breaks for family in families]))
     nodes, weights = np.polynomial.legendre.leggauss(max(family.degree for family in families) + 1)
     width = np.diff(breaks)[:, None]
-    return (breaks[:-1, None] + width * (nodes + 1.0) / 2.0).ravel(), np.sqrt(width * weights / 2.0).ravel()
+    return within(breaks, (nodes + 1.0) / 2.0).ravel(), np.sqrt(width * weights / 2.0).ravel()
 
 
 def _greatest_change(old: Curve, new: Curve) -> float:
     breaks = np.unique(np.concatenate([old.family.breaks, new.family.breaks]))
-    s = (breaks[:-1, None] + np.diff(breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)).ravel()
+    s = within(breaks, np.linspace(0.0, 1.0, _SAMPLES)).ravel()
     return float(np.linalg.norm(new.position(s) - old.position(s), axis=1).max())
-
-
-def _elevated(curve: Curve) -> Curve:
-    """Give a Bezier curve one control vertex more (degree elevation)."""
-    p = curve.control_vertices
-    fraction = (np.arange(1, len(p)) / len(p))[:, None]
-    raised = np.vstack([p[:1], fraction * p[:-1] + (1.0 - fraction) * p[1:], p[-1:]])
-    return replace(curve, family=bezier(len(raised)), control_vertices=raised)
-
-
-def _with_knot(curve: Curve) -> Curve:
-    """Give a B-spline one knot more, in the middle of its longest span (Boehm's insertion)."""
-    family, p = curve.family, curve.control_vertices
-    degree, knots = family.degree, family.knots
-    longest = int(np.argmax(np.diff(family.breaks)))
-    knot = (family.breaks[longest] + family.breaks[longest + 1]) / 2
-    span = int(np.searchsorted(knots, knot)) - 1
-    i = np.arange(span - degree + 1, span + 1)
-    share = ((knot - knots[i]) / (knots[i + degree] - knots[i]))[:, None]
-    raised = np.vstack([p[: i[0]], share * p[i] + (1.0 - share) * p[i - 1], p[span:]])
-    interior = np.insert(knots, span + 1, knot)[degree + 1 : -degree - 1]
-    return replace(curve, family=b_spline(len(raised), degree, interior), control_vertices=raised)
 
 
 def _lower_families(family: CurveFamily) -> list[CurveFamily]:
@@ -197,8 +164,3 @@ def _lower_families(family: CurveFamily) -> list[CurveFamily]:
         return [b_spline(vertices, degree - 1)]
     _, first = np.unique(interior, return_index=True)
     return [b_spline(vertices, degree, np.delete(interior, k)) for k in first]
-
-
-def _require_count(count: int) -> None:
-    if count < 0:
-        raise CurveError(f"the number of control vertices to add or remove must be 0 or more, not {count}")

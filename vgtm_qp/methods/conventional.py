@@ -1,13 +1,17 @@
-"""The conventional solution, eqs. (25)-(28): the whole truss at once, without limits or clearance."""
+"""The conventional solution, section 3.4: the whole truss at once, without limits or clearance."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg.lapack import dgbsv
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods.banded import BandedSystem
 from vgtm_qp.methods.objectives import DEFAULT_TERMS, Terms, TrussObjective
 from vgtm_qp.methods.pseudoinverse import (
     Inverse,
@@ -22,8 +26,9 @@ from vgtm_qp.methods.resolver import (
     MAX_CORRECTIONS,
     TIP_TOLERANCE,
     MethodResolver,
+    Moved,
     arm_without_curve,
-    pose_displacement,
+    displacement_to,
 )
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Method
@@ -31,53 +36,67 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.path import Path
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_LOWER = np.tril_indices(3)
+
+
+class Linear(NamedTuple):
+    """J d = x for the nodes' displacements, at one configuration.
+
+    Attributes
+    ----------
+    gradient : (M, Q, 3)
+        Of the member lengths.
+    tip : (n_e, 3 K_tip)
+        J_u of eq. (16) at the tip's nodes.
+    x_e, x_g : (n_e,), (n_l,)
+        Displacement of the end effector, and changes of the fixed members' lengths.
+    """
+
+    gradient: Array
+    tip: Array
+    x_e: Array
+    x_g: Array
 
 
 class DenseSolution:
-    """Eq. (28) with dense matrices, as the paper has it."""
+    """The solution with dense matrices, as the paper has it."""
 
     def __init__(self, layout: Layout, method: Method) -> None:
         self._layout, self._truss, self._method = layout, truss_of(layout.arm), method
         self._lengths = np.zeros((self._truss.member_count, layout.node_columns))
-        self._tip, self._present = tip_columns(layout)
+        self._tip, self._present = _tip_columns(layout)
         self.rank: int | None = None
 
-    def displacement(self, gradient: Array, tip: Array, x: Array, terms: Terms) -> Array:
-        """Return the node displacements (3 (N - N_c),), m.
-
-        Parameters
-        ----------
-        gradient : (M, Q, 3)
-            Of the member lengths.
-        tip : (n_e, 3 K_tip)
-            J_u of eq. (16) at the tip's nodes.
-        x : (n_e + n_l,)
-            Displacement of the end effector, then the changes of the fixed members' lengths, eq. (25).
-        terms
-            Null-space terms.
-        """
-        layout, truss, method = self._layout, self._truss, self._method
-        lengths = truss.scatter.dense(gradient, self._lengths)
-        J = np.zeros((len(x), layout.node_columns))
-        J[: len(tip), self._tip] = tip[:, self._present]
-        J[len(tip) :] = lengths[truss.fixed]
+    def displacement(self, system: Linear, terms: Terms) -> Array:
+        """Return the node displacements (3 (N - N_c),), m: eq. (28) with the null-space vector of `terms`."""
+        truss, method = self._truss, self._method
+        lengths = truss.scatter.dense(system.gradient, self._lengths)
+        J = self._jacobian(lengths[truss.fixed], system.tip)
         actuated = lengths[truss.actuators]
         hessian = terms.actuator * actuated.T @ actuated
         hessian[np.diag_indices_from(hessian)] += terms.node
-        if terms.blocks is not None:
-            count = len(terms.blocks)
-            by_node = hessian.reshape(count, 3, count, 3)
-            by_node[np.arange(count), :, np.arange(count)] += terms.blocks
+        count = len(terms.blocks)
+        by_node = hessian.reshape(count, 3, count, 3)
+        by_node[np.arange(count), :, np.arange(count)] += terms.blocks
         objective = Objective(hessian, actuated.T @ terms.actuator_gradient + terms.node_gradient)
         inverse = self._inverse(J, objective)
         self.rank = inverse.rank
-        start = inverse.matrix @ x
+        start = inverse.matrix @ np.concatenate([system.x_e, system.x_g])
         N = projector(inverse, J)
         if method.variant in ("weighted", "damped"):
             return np.asarray(start - N @ np.linalg.solve(hessian, objective.gradient))
         if method.null_space == ():
             return np.asarray(start)
         return np.asarray(start + N @ null_space_vector(N, start, objective))
+
+    def _jacobian(self, fixed: Array, tip: Array) -> Array:
+        """Return J (n_e + n_l, 3 (N - N_c)), eq. (26), of rows of fixed lengths and of the tip at its nodes."""
+        J = np.zeros((len(tip) + len(fixed), fixed.shape[1]))
+        J[: len(tip), self._tip] = tip[:, self._present]
+        J[len(tip) :] = fixed
+        return J
 
     def _inverse(self, J: Array, objective: Objective) -> Inverse:
         method = self._method
@@ -89,80 +108,102 @@ class DenseSolution:
 
 
 class SparseSolution:
-    """Eq. (28) by its KKT system, banded in the order of the bays: the cost grows with the bays, not their cube.
+    """The same by its KKT system, banded in the order of the bays: the cost grows with the bays, not their cube.
 
     With H the Hessian of the null-space terms, J^+ x + (1 - J^+ J) rho_s is the minimiser of those terms under
-    J d = x whichever pseudoinverse is meant, so that Moore-Penrose and weighted are one here.
+    J d = x whichever pseudoinverse is meant, so that Moore-Penrose and weighted are one here. Unknowns are the
+    displacements of nodes and actuators, and the multipliers of the lengths and of the tip.
     """
 
     def __init__(self, layout: Layout, method: Method) -> None:
         truss = truss_of(layout.arm)
-        self._fixed = truss.fixed
-        self._damping = method.damping**2 if method.variant == "damped" else 0.0
-        self._tip, self._present = tip_columns(layout)
-        nodes, actuators, members, tips = (
-            layout.node_columns,
-            len(truss.actuators),
-            truss.member_count,
-            len(layout.tip_rows),
-        )
-        self._parts = np.cumsum([0, nodes, actuators, members, tips])
-        a, y, u = self._parts[1:4]
-        scatter = truss.scatter
-        member, flat, column = scatter.member, scatter.flat, scatter.column
-        self._flat = flat
-        tip_row = np.repeat(np.arange(tips), len(self._tip))
-        tip_column = np.tile(self._tip, tips)
-        index = np.arange(actuators)
-        diagonal = np.arange(self._parts[-1])
-        block = (3 * np.arange(nodes // 3)[:, None] + np.arange(3))[:, :, None]
-        block_row = np.broadcast_to(block, (nodes // 3, 3, 3)).ravel()
-        block_column = np.broadcast_to(np.swapaxes(block, 1, 2), (nodes // 3, 3, 3)).ravel()
-        self._no_blocks = np.zeros(3 * nodes)
-        rows = [
-            block_row,
-            diagonal,
-            y + member,
-            column,
-            a + index,
-            y + truss.actuators,
-            u + tip_row,
-            tip_column,
+        scatter, members, actuators = truss.scatter, truss.member_count, np.arange(len(truss.actuators))
+        self._flat, self._fixed = scatter.flat, truss.fixed
+        self._tip, self._present = _tip_columns(layout)
+        tips = np.arange(len(layout.tip_rows))
+        a = layout.node_columns
+        y = a + len(actuators)
+        u = y + members
+        self._parts = a, y, u
+        nodes = np.arange(0, a, 3)[:, None]
+        # Places of the entries in the order of `displacement`.
+        places = [
+            (np.arange(u + len(tips)), np.arange(u + len(tips))),
+            (nodes + _LOWER[0], nodes + _LOWER[1]),
+            (y + scatter.member, scatter.column),
+            (y + truss.actuators, a + actuators),
+            (np.repeat(u + tips, len(self._tip)), np.tile(self._tip, len(tips))),
         ]
-        columns = [
-            block_column,
-            diagonal,
-            column,
-            y + member,
-            y + truss.actuators,
-            a + index,
-            tip_column,
-            u + tip_row,
-        ]
-        self._system = BandedSystem(np.concatenate(rows), np.concatenate(columns), int(self._parts[-1]))
-        self._damped = np.zeros(members + tips)
-        self._damped[truss.fixed] = self._damped[members:] = -self._damping
-        self.rank: int | None = members - actuators + tips
+        rows, columns = (np.concatenate([np.ravel(place[k]) for place in places]) for k in (0, 1))
+        self._system = BandedSystem(rows, columns)
+        damped = np.zeros(members + len(tips))
+        if method.variant == "damped":
+            damped[truss.fixed] = damped[members:] = -(method.damping**2)
+        self._damped = damped
+        self.rank: int | None = members - len(actuators) + len(tips)
 
-    def displacement(self, gradient: Array, tip: Array, x: Array, terms: Terms) -> Array:
-        """Return the node displacements; parameters as of :meth:`DenseSolution.displacement`."""
-        nodes, a, y, u = (int(part) for part in self._parts[1:])
-        count = a - nodes
-        lengths = gradient.reshape(-1)[self._flat]
-        ends = tip[:, self._present].reshape(-1)
-        ones = np.full(count, -1.0)
-        diagonal = np.concatenate([np.full(nodes, terms.node), np.full(count, terms.actuator), self._damped])
-        blocks = self._no_blocks if terms.blocks is None else terms.blocks.ravel()
-        values = np.concatenate([blocks, diagonal, lengths, lengths, ones, ones, ends, ends])
-        rhs = np.zeros(u)
-        rhs[:nodes], rhs[nodes:a] = -terms.node_gradient, -terms.actuator_gradient
-        rhs[a + self._fixed] = x[len(tip) :]
-        rhs[y:] = x[: len(tip)]
-        return self._system.solve(values, rhs)[:nodes]
+    def displacement(self, system: Linear, terms: Terms) -> Array:
+        """Return the node displacements, as :meth:`DenseSolution.displacement` does."""
+        a, y, u = self._parts
+        values = [
+            np.full(a, terms.node),
+            np.full(y - a, terms.actuator),
+            self._damped,
+            terms.blocks[:, *_LOWER].ravel(),
+            system.gradient.reshape(-1)[self._flat],
+            np.full(y - a, -1.0),
+            system.tip[:, self._present].ravel(),
+        ]
+        lengths = np.zeros(u - y)
+        lengths[self._fixed] = system.x_g
+        rhs = np.concatenate([-terms.node_gradient, -terms.actuator_gradient, lengths, system.x_e])
+        return self._system.solve(np.concatenate(values), rhs)[:a]
+
+
+class BandedSystem:
+    """A symmetric sparse system of constant pattern, ordered to a narrow band, whose values change.
+
+    Parameters
+    ----------
+    rows, columns : (E,) int
+        Place of each entry, which stands in the mirrored place too; entries of one place are added up.
+    """
+
+    def __init__(self, rows: Index, columns: Index) -> None:
+        size = int(max(rows.max(), columns.max())) + 1
+        pattern = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(size, size))
+        self._order = reverse_cuthill_mckee(sparse.csr_array(pattern + pattern.T), symmetric_mode=True)
+        place = np.empty(size, dtype=np.int64)
+        place[self._order] = np.arange(size)
+        i, j = place[rows], place[columns]
+        self._mirrored = np.flatnonzero(i != j)
+        self._width = width = int(np.abs(i - j).max())
+        i, j = np.concatenate([i, j[self._mirrored]]), np.concatenate([j, i[self._mirrored]])
+        self._shape = 3 * width + 1, size
+        self._flat = (2 * width + i - j) * size + j
+
+    def solve(self, values: Array, rhs: Array) -> Array:
+        """Return the solution (size,) for entries `values` (E,) in the order of `rows`, by LU with pivoting.
+
+        Raises
+        ------
+        SolverError
+            The matrix is singular to working precision.
+        """
+        entries = np.concatenate([values, values[self._mirrored]])
+        band = np.bincount(self._flat, weights=entries, minlength=self._shape[0] * self._shape[1])
+        width = self._width
+        factors, _, solution, info = dgbsv(width, width, band.reshape(self._shape), rhs[self._order])
+        pivots = np.abs(factors[2 * width])
+        if info != 0 or not float(pivots.min()) > 1e-14 * float(pivots.max()):
+            raise SolverError("the KKT matrix of eq. (28) is singular to working precision")
+        x = np.empty(len(rhs))
+        x[self._order] = solution
+        return x
 
 
 class ConventionalResolver(MethodResolver):
-    """Moves an arm by eq. (28).
+    """Moves an arm by the conventional solution.
 
     Raises
     ------
@@ -175,67 +216,60 @@ class ConventionalResolver(MethodResolver):
         super().__init__(arm_without_curve(problem), method.step_limit)
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         self._objective = TrussObjective(names, method.weights, self.setup)
-        layout = self.setup.layout
-        sparse = method.algebra == "sparse"
-        self._solution = SparseSolution(layout, method) if sparse else DenseSolution(layout, method)
+        solution = SparseSolution if method.algebra == "sparse" else DenseSolution
+        self._solution = solution(self.setup.layout, method)
         self._correct = method.correct
         self._home_fixed = self.setup.arm.home_quantities[self.setup.truss.fixed]
 
-    def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+    def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         setup, state = self.setup, self.state
-        kinematics, task, free = setup.kinematics, setup.task, setup.truss.free
-        here, goal = path.at(start), path.at(end)
+        kinematics, truss = setup.kinematics, setup.truss
         X = np.array(state.nodes)
-        kinematics.evaluate(X)
-        tip = task.rows(X, kinematics, goal)
-        moved, turned = pose_displacement(here, goal)
-        x_e = [moved[task.axes]]
-        if task.turns:
-            x_e.append(turned if task.turns == "orientation" else kinematics.tip_rotation[:, :2].T @ turned)
-        base_rate = np.zeros(setup.truss.member_count)
+        system = self._linear(X, path, start, end)
+        gradient, x_g = system.gradient, system.x_g
         if setup.base_motion is not None:
             motion = setup.arm.based(X, setup.base_motion.pose(state.time + dt)) - X
-            base_rate = setup.truss.scatter.base_rate(kinematics.gradient, motion)
+            x_g = x_g - truss.scatter.base_rate(gradient, motion)[truss.fixed]
             X += motion
-        x = np.concatenate([*x_e, -base_rate[setup.truss.fixed]])
-        if self._correct:
-            gap = self._home_fixed - kinematics.quantities[setup.truss.fixed]
-            x = np.concatenate([tip.error, gap - base_rate[setup.truss.fixed]])
         terms = self._objective.at(X, kinematics.quantities, state.time)
-        self.spend("kinematics")
-        X[free] += self._solution.displacement(kinematics.gradient, tip.jacobian, x, terms).reshape(-1, 3)
+        self._clock.add("kinematics")
+        X[truss.free] += self._solution.displacement(system._replace(x_g=x_g), terms).reshape(-1, 3)
         self.rank = self._solution.rank
-        self.spend("solve")
+        self._clock.add("solve")
         if self._correct:
             self._newton(X, path, end)
-            self.spend("correction")
-        return X, state.control_vertices, 1.0
+            self._clock.add("correction")
+        return Moved(X, state.control_vertices, state.torsion)
+
+    def _linear(self, X: Array, path: Path, start: float, end: float) -> Linear:
+        """Return the system at nodes `X` (N, 3) whose base rests, J d = x, eqs. (25) and (27).
+
+        The right-hand side is the motion of the goal along the path from `start` to `end`, and none of the fixed
+        lengths; with corrections, what lengths and tip lack of the goal at `end`.
+        """
+        setup = self.setup
+        setup.kinematics.evaluate(X)
+        tip = setup.task.rows(X, setup.kinematics, displacement_to(path.at(end), path.at(start)))
+        missing = self._home_fixed - setup.kinematics.quantities[setup.truss.fixed]
+        if self._correct:
+            return Linear(setup.kinematics.gradient, tip.jacobian, tip.error, missing)
+        return Linear(setup.kinematics.gradient, tip.jacobian, tip.rate, np.zeros_like(missing))
 
     def _newton(self, X: Array, path: Path, end: float) -> None:
         """Correct fixed members and tip in place: Newton's method by the same pseudoinverse, without gradients."""
-        setup, goal = self.setup, path.at(end)
-        kinematics, free = setup.kinematics, setup.truss.free
+        terms = self._objective.without_gradients()
         for _ in range(MAX_CORRECTIONS):
-            kinematics.evaluate(X)
-            tip = setup.task.rows(X, kinematics, goal)
-            gap = self._home_fixed - kinematics.quantities[setup.truss.fixed]
-            worst = float(np.max(np.abs(gap), initial=0.0))
-            if worst <= LENGTH_TOLERANCE and float(np.max(np.abs(tip.error))) <= TIP_TOLERANCE:
+            system = self._linear(X, path, end, end)
+            worst = float(np.max(np.abs(system.x_g), initial=0.0))
+            if worst <= LENGTH_TOLERANCE and float(np.max(np.abs(system.x_e))) <= TIP_TOLERANCE:
                 return
             if not worst < 1e3:
                 break
-            terms = Terms(
-                self._objective.node,
-                self._objective.actuator,
-                np.zeros(len(setup.truss.actuators)),
-                np.zeros(setup.layout.node_columns),
-            )
-            x = np.concatenate([tip.error, gap])
-            X[free] += self._solution.displacement(kinematics.gradient, tip.jacobian, x, terms).reshape(-1, 3)
+            X[self.setup.truss.free] += self._solution.displacement(system, terms).reshape(-1, 3)
         raise SolverError("Newton's method on lengths and tip does not converge")
 
 
-def tip_columns(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _tip_columns(layout: Layout) -> tuple[Index, NDArray[np.bool_]]:
     """Return the columns of the tip's free nodes, and which columns of the tip's Jacobian those are."""
     first = layout.node_column[truss_of(layout.arm).tip]
     present = np.repeat(first >= 0, 3)

@@ -7,18 +7,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.curve import Curve
+from vgtm_qp.curve.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
-from vgtm_qp.methods.condensation import CurveNodes, rotation_vectors
-from vgtm_qp.methods.curve_motion import CURVE_SOLVER, CurveMotion
-from vgtm_qp.methods.resolver import MethodResolver
+from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
+from vgtm_qp.methods.curve_motion import CurveMotion
+from vgtm_qp.methods.resolver import MethodResolver, Moved, displacement_to
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.methods.tracking import Tracker
 from vgtm_qp.problem import Problem
-from vgtm_qp.rows.limits import actuator_box
+from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.state import State
 
 Array = NDArray[np.float64]
 
@@ -52,68 +51,64 @@ class CurveFirstResolver(MethodResolver):
                 'a moving base takes tracking = "coupled" or "none", or the method pseudoinverse'
             )
         self.motion = CurveMotion(problem, setup)
-        self.curve: Curve = self.motion.home
         segments = make_segments(setup.layout, setup.task.turns)
         self.tracker = Tracker(
-            setup.layout,
-            setup.kinematics,
-            segments,
-            setup.arm.home_quantities,
-            parallel=method.tracking == "parallel",
+            setup.layout, setup.kinematics, segments, parallel=method.tracking == "parallel"
         )
-        self._faces = np.array([segment.face for segment in segments])
+        self._s = self.motion.s[[segment.face for segment in segments]]
         self._frames = any(segment.tracks != "position" for segment in segments)
+        self._actuation = Actuation(setup.arm, (), slows_down=False)
         self._correct, self._is_qp = method.correct, method.name == "qp"
-        self.solver = CURVE_SOLVER if self._is_qp else None
+        self.solver = "daqp" if self._is_qp else None
 
-    def _placed(self, state: State) -> None:
-        if state.control_vertices.shape == self.curve.control_vertices.shape:
-            self.curve = replace(self.curve, control_vertices=state.control_vertices)
+    @property
+    def curve(self) -> Curve:
+        """The reference curve in the present state."""
+        vertices, torsion = self.state.control_vertices, self.state.torsion
+        return replace(self.motion.home, control_vertices=vertices, torsion=torsion)
 
-    def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+    def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         if self._is_qp:
             return self._move_safely(path, start, end, dt)
-        state = self.state
-        curve = self.motion.follow(
-            self.curve, path.at(start), path.at(end), state.time, state.nodes, correct=self._correct
-        )
+        state, before = self.state, self.curve
+        goal = displacement_to(path.at(end), path.at(start))
+        curve = self.motion.follow(before, goal, state.time, state.nodes, correct=self._correct)
         nodes = self._nodes(curve)
-        self.spend("solve")
+        self._clock.add("solve")
         if self._correct:
             X = self.tracker.track(state.nodes, nodes)
         else:
-            before = self._nodes(self.curve)
-            turned = rotation_vectors(nodes.frame @ np.swapaxes(before.frame, 1, 2))
-            X = self.tracker.rates(state.nodes, nodes.position - before.position, turned)
-        self.spend("correction")
-        self.curve = curve
-        return X, curve.control_vertices, 1.0
+            old = self._nodes(before)
+            turned = rotation_vectors(nodes.frame @ np.swapaxes(old.frame, 1, 2))
+            X = self.tracker.rates(state.nodes, nodes.position - old.position, turned)
+        self._clock.add("correction")
+        return Moved(X, curve.control_vertices, curve.torsion)
 
-    def _move_safely(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
+    def _move_safely(self, path: Path, start: float, end: float, dt: float) -> Moved:
         """Move by the curve's QP; halve the piece of path until the tracking truss keeps every limit."""
         state, share, reason = self.state, 1.0, ""
         while share >= _SMALLEST:
             goal = start + share * (end - start)
-            piece = path.at(start), path.at(goal)
+            whole = displacement_to(path.at(goal), path.at(start))
             curve, X, progress, time = self.curve, np.array(state.nodes), 0.0, state.time
             for _ in range(_MAX_QPS):
                 try:
                     now = path.at(start + progress * (goal - start))
-                    curve, change, active = self.motion.follow_qp(curve, piece, now, progress, time, X)
+                    now = now._replace(velocity=whole.velocity, spin=whole.spin)
+                    curve, change, active = self.motion.follow_qp(curve, now, progress, time, X)
                     progress = min(max(progress + change, 0.0), 1.0)
                     curve = self.motion.corrected(curve, path.at(start + progress * (goal - start)))
-                    self.spend("solve")
+                    self._clock.add("solve")
                     X = self.tracker.track(state.nodes, self._nodes(curve))
                 except SolverError as error:
                     reason = str(error)
                     break
-                self.spend("correction")
+                self._clock.add("correction")
                 time = state.time + dt
                 reason = self._broken(X, dt)
-                self.spend("acceptance")
+                self._clock.add("acceptance")
                 if not reason and share * progress >= _LEAST_PROGRESS:
-                    self.curve = curve
-                    return X, curve.control_vertices, share * progress
+                    return Moved(X, curve.control_vertices, curve.torsion, share * progress)
                 if not reason or progress < _LEAST_PROGRESS or reason.startswith("stroke"):
                     reason = reason or ", ".join(active) or "no progress along the path"
                     break
@@ -121,29 +116,22 @@ class CurveFirstResolver(MethodResolver):
         raise SolverError(reason)
 
     def _nodes(self, curve: Curve) -> CurveNodes:
-        return self.motion.nodes(curve, self._faces, frames=self._frames)
+        """Return the curve nodes of the segments; their frames are identities where none is tracked."""
+        s = self._s
+        frame = curve.frame(s) if self._frames else np.broadcast_to(np.eye(3), (len(s), 3, 3))
+        return CurveNodes(curve.position(s), frame)
 
     def _broken(self, X: Array, dt: float) -> str:
         """Return which limit the step to node positions `X` would break, empty if none."""
         setup, state = self.setup, self.state
-        truss, monitor = setup.truss, setup.monitor
-        actuators = truss.actuators
-        lower, upper = actuator_box(
-            state.quantities[actuators],
-            state.rates[actuators],
-            truss.stroke[actuators],
-            truss.rate[actuators],
-            truss.acceleration[actuators],
-            dt,
-            state.duration or None,
-        )
+        lower, upper = self._actuation.box(state, dt)
         setup.kinematics.evaluate(X)
-        lengths = setup.kinematics.quantities[actuators]
+        lengths = setup.kinematics.quantities[setup.arm.actuators]
         beyond = np.maximum(lower - lengths, lengths - upper)
         worst = int(np.argmax(beyond))
         if beyond[worst] > _SLACK:
-            return f"stroke or rate: {truss.member_names[actuators[worst]]}, {beyond[worst]:.2g} m beyond"
-        time, points = state.time + dt, setup.arm.points(X)
+            return f"stroke or rate: {self._actuation.names[worst]}, {beyond[worst]:.2g} m beyond"
+        monitor, time, points = setup.monitor, state.time + dt, setup.arm.points(X)
         if not monitor.keeps(points, time, setup.safe - _SLACK, setup.self_safe - _SLACK):
             return "clearance at the end of the step"
         floors = setup.safe - _BETWEEN, max(setup.self_safe - _BETWEEN, 0.0)

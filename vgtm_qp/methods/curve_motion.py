@@ -4,30 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.curve import Curve, degree_of_redundancy
-from vgtm_qp.curve.redundancy import BASE_ROWS
+from vgtm_qp.curve.curve import Curve
+from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
 from vgtm_qp.errors import CurveError, SolverError
-from vgtm_qp.methods.condensation import CurveNodes
 from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
-from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE, pose_displacement
+from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE
 from vgtm_qp.problem import Problem
-from vgtm_qp.rotation import turn_between, vector_from_rotation
+from vgtm_qp.qp.daqp import EQUALITY, ask
+from vgtm_qp.qp.numbers import UNBOUNDED
+from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
 
-CURVE_SOLVER = "daqp"
-"""What solves the QP of the curve alone."""
 DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 
 _SAMPLES = 400
-_UNBOUNDED = 1e30
+"""Pieces of the curve to whose ends nodes are assigned: the nearest point to a few thousandths."""
 _PROGRESS = 1e3
 _MARGIN = 1e-5
 
@@ -74,32 +72,27 @@ class CurveMotion:
         vertices = spec.control_vertices
         second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
         self._bending = np.kron(second.T @ second, np.eye(3))
-        self._across = truss.face_frames[0][:, :2].T
-        self._node_s = _nearest_parameters(self.home, truss.home)
+        self._base_rows = np.zeros((BASE_ROWS, self.home.coordinates))
+        self._base_rows[:3, :3] = np.eye(3)
+        self._base_rows[3:, 3:6] = truss.face_frames[0][:, :2].T
+        s = np.linspace(0.0, 1.0, _SAMPLES + 1)
+        squares = ((self.home.position(s)[None] - truss.home[:, None]) ** 2).sum(axis=2)
+        self._node_s = s[np.argmin(squares, axis=1)]
 
-    def nodes(self, curve: Curve, faces: Array, *, frames: bool) -> CurveNodes:
-        """Return the curve nodes of `faces` (S,); their frames are identities where they are not asked for."""
-        s = self.s[faces]
-        frame = curve.frame(s) if frames else np.broadcast_to(np.eye(3), (len(s), 3, 3))
-        return CurveNodes(curve.position(s), frame)
+    def follow(self, curve: Curve, goal: TipGoal, time: float, X: Array, *, correct: bool) -> Curve:
+        """Return the curve after a step by eq. (38) to a goal, whose rates are the displacement to it.
 
-    def follow(
-        self, curve: Curve, here: TipGoal, goal: TipGoal, time: float, X: Array, *, correct: bool
-    ) -> Curve:
-        """Return the curve after a step by eq. (38), from the pose `here` on the path to `goal`.
-
-        Without `correct` the end moves by the path's own displacement, as in the paper; with it the step ends at
-        the goal exactly. `X` (N, 3) are the truss's nodes, for the obstacle potential alone.
+        Without `correct` the end moves by that displacement, as in the paper; with it the step ends at the goal
+        exactly. `X` (N, 3) are the truss's nodes, for the obstacle potential alone.
 
         Raises
         ------
         SolverError
             The tip's and base's rows are dependent, or the correction does not converge.
         """
-        J = self._rows(curve)
-        moved, turned = pose_displacement(here, goal)
-        x = self._error(curve, goal) if correct else self._tip_vector(curve, moved, turned)
-        x = np.concatenate([x, np.zeros(BASE_ROWS)])
+        error, rate, across = self._missing(curve, goal)
+        J = self._rows(curve, across)
+        x = np.concatenate([error if correct else rate, np.zeros(BASE_ROWS)])
         inverse = moore_penrose(J)
         if inverse.rank < len(J):
             raise SolverError(f"the {len(J)} rows of the curve's tip and base have rank {inverse.rank}")
@@ -119,11 +112,11 @@ class CurveMotion:
             It does not converge.
         """
         for _ in range(MAX_CORRECTIONS):
-            error = self._error(curve, goal)
+            error, _, across = self._missing(curve, goal)
             if float(np.max(np.abs(error), initial=0.0)) <= TIP_TOLERANCE:
                 return curve
             x = np.concatenate([error, np.zeros(BASE_ROWS)])
-            curve = displaced(curve, moore_penrose(self._rows(curve)).matrix @ x)
+            curve = displaced(curve, moore_penrose(self._rows(curve, across)).matrix @ x)
         raise SolverError("Newton's method on the curve's tip does not converge")
 
     def objective(self, curve: Curve, X: Array, time: float) -> Objective:
@@ -153,13 +146,7 @@ class CurveMotion:
         return Objective(hessian, gradient)
 
     def follow_qp(
-        self,
-        curve: Curve,
-        piece: tuple[TipGoal, TipGoal],
-        now: TipGoal,
-        progress: float,
-        time: float,
-        X: Array,
+        self, curve: Curve, now: TipGoal, progress: float, time: float, X: Array
     ) -> tuple[Curve, float, tuple[str, ...]]:
         """Return the curve after one QP with clearance, the change of progress, and the active rows.
 
@@ -169,10 +156,8 @@ class CurveMotion:
 
         Parameters
         ----------
-        piece
-            Start and end of the piece of path.
         now
-            The pose on it at `progress`, 0 to 1.
+            The pose at `progress`, 0 to 1, on a piece of path; its rates are the displacement over the piece.
         time
             At which the obstacles are met, s.
         X : (N, 3)
@@ -184,11 +169,10 @@ class CurveMotion:
             The QP has no solution.
         """
         objective = self.objective(curve, X, time)
-        moved, turned = pose_displacement(*piece)
-        rate = self._tip_vector(curve, moved, turned)
+        error, rate, across = self._missing(curve, now)
         near, distance, names = self._near(curve, X, time)
         size, tips = curve.coordinates, len(rate)
-        J = self._rows(curve)
+        J = self._rows(curve, across)
         A = np.zeros((len(J) + len(near), size + 1))
         A[: len(J), :size] = J
         A[:tips, -1] = -rate
@@ -202,48 +186,34 @@ class CurveMotion:
         if progress == 0.0:
             f, bounds = np.append(objective.gradient, -2.0 * curvature), (0.0, 1.0)
             room = np.minimum(room, 0.0)
-        equal = np.concatenate([self._error(curve, now), np.zeros(BASE_ROWS)])
-        free = np.full(size, _UNBOUNDED)
+        equal = np.concatenate([error, np.zeros(BASE_ROWS)])
+        free = np.full(size, UNBOUNDED)
         lower = np.concatenate([-free, bounds[:1], equal, room])
-        upper = np.concatenate([free, bounds[1:], equal, np.full(len(near), _UNBOUNDED)])
+        upper = np.concatenate([free, bounds[1:], equal, np.full(len(near), UNBOUNDED)])
         sense = np.zeros(len(lower), dtype=np.int32)
-        sense[size + 1 : size + 1 + len(J)] = 5
-        x, _, flag, info = daqp.solve(H, f, A, upper, lower, sense)
-        if flag < 1:
+        sense[size + 1 : size + 1 + len(J)] = EQUALITY
+        try:
+            answer = ask(H, f, A, lower, upper, sense)
+        except InfeasibleStepError:
+            answer = None
+        if answer is None or answer.flag < 1:
             raise SolverError("the QP of the curve has no solution")
-        pressing = np.asarray(info["lam"])[size + 1 + len(J) :] < -1e-9
+        pressing = answer.multipliers[size + 1 + len(J) :] < -1e-9
         active = tuple(names[k] for k in np.flatnonzero(pressing))
-        return displaced(curve, x[:size]), float(x[-1]), active
+        return displaced(curve, answer.x[:size]), float(answer.x[-1]), active
 
-    def _rows(self, curve: Curve) -> Array:
-        """Return the rows of the tip, then those that hold the base: (n_e + 5, D)."""
-        task, size = self._task, curve.coordinates
-        rows = [curve.position_jacobian(1.0)[task.axes]]
-        if task.turns:
-            turning = curve.orientation_jacobian(1.0)
-            rows.append(turning if task.turns == "orientation" else curve.frame(1.0)[:, :2].T @ turning)
-        base = np.zeros((BASE_ROWS, size))
-        base[:3, :3] = np.eye(3)
-        base[3:, 3:6] = self._across
-        return np.concatenate([*rows, base])
+    def _missing(self, curve: Curve, goal: TipGoal) -> tuple[Array, Array, Array]:
+        """Return what x(1) lacks of x_e, eq. (34), and the goal's rates, (n_e,) each; and the turned axes (r, 3)."""
+        rotation = curve.frame(1.0) if self._task.turns else np.eye(3)
+        error, rate, across, _ = self._task.residual(curve.position(1.0), rotation, goal)
+        return error, rate, across
 
-    def _tip_vector(self, curve: Curve, moved: Array, turned: Array) -> Array:
-        task = self._task
-        if not task.turns:
-            return moved[task.axes]
-        turn = turned if task.turns == "orientation" else curve.frame(1.0)[:, :2].T @ turned
-        return np.concatenate([moved[task.axes], turn])
-
-    def _error(self, curve: Curve, goal: TipGoal) -> Array:
-        turned = np.zeros(3)
+    def _rows(self, curve: Curve, across: Array) -> Array:
+        """Return J_s(1) of eq. (37), its turns about the axes `across`, then the rows of the base: (n_e + 5, D)."""
+        rows = [curve.position_jacobian(1.0)[self._task.axes]]
         if self._task.turns:
-            frame = curve.frame(1.0)
-            turned = (
-                vector_from_rotation(goal.rotation @ frame.T)
-                if self._task.turns == "orientation"
-                else turn_between(frame[:, 2], goal.rotation[:, 2])
-            )
-        return self._tip_vector(curve, goal.position - curve.position(1.0), turned)
+            rows.append(across @ curve.orientation_jacobian(1.0))
+        return np.concatenate([*rows, self._base_rows])
 
     def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array, list[str]]:
         """Return rows (R, 3 V) of d distance / d p, distances (R,), m, and names of the members near obstacles."""
@@ -276,10 +246,3 @@ def displaced(curve: Curve, d: Array) -> Curve:
         control_vertices=curve.control_vertices + d[:size].reshape(-1, 3),
         torsion=curve.torsion + d[size:],
     )
-
-
-def _nearest_parameters(curve: Curve, points: Array) -> Array:
-    """Return (N,) parameters of the points of the curve that are nearest to `points`, to a few thousandths."""
-    s = np.linspace(0.0, 1.0, _SAMPLES + 1)
-    squares = ((curve.position(s)[None] - points[:, None]) ** 2).sum(axis=2)
-    return np.asarray(s[np.argmin(squares, axis=1)])

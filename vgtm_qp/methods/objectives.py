@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import nearest
-from vgtm_qp.problem.method import TRUSS_TERMS, Weights
+from vgtm_qp.problem.method import Weights
 from vgtm_qp.step.setup import Setup
 
 Array = NDArray[np.float64]
@@ -24,32 +23,20 @@ _NEAREST = 0.05
 class Terms(NamedTuple):
     """1/2 node |d|^2 + 1/2 actuator |a|^2 + actuator_gradient . a + node_gradient . d + 1/2 d' blocks d, a = J_a d.
 
-    ``blocks`` (N - N_c, 3, 3) couple the coordinates of one node; None stands for zeros.
+    ``blocks`` (N - N_c, 3, 3) couple the coordinates of one node.
     """
 
     node: float
     actuator: float
     actuator_gradient: Array
     node_gradient: Array
-    blocks: Array | None = None
+    blocks: Array
 
 
 class TrussObjective:
-    """Named terms of the null-space vector of eq. (28).
-
-    Raises
-    ------
-    ValueError
-        A term is unknown.
-    """
+    """Named terms of the null-space vector, of ``problem.method.TRUSS_TERMS``."""
 
     def __init__(self, names: tuple[str, ...], weights: Weights, setup: Setup) -> None:
-        for name in names:
-            if name not in TRUSS_TERMS:
-                raise ValueError(
-                    f'no null-space term "{name}"{nearest(name, TRUSS_TERMS)}; choices: {", ".join(TRUSS_TERMS)}'
-                )
-        self.names = names
         self._setup = setup
         self._centring = weights.stroke_centring if "stroke_centring" in names else 0.0
         self._potential = weights.obstacle_potential if "obstacle_potential" in names else 0.0
@@ -57,20 +44,30 @@ class TrussObjective:
         node = weights.node_rate if "node_rate" in names else 0.0
         # Without any term of the displacements themselves, theirs is the norm that J^+ minimises; beside others a
         # trace of it makes the Hessian regular off the null space too, as the weighted inverse needs.
-        self.node = node or (_TRACE * actuator if actuator else 1.0)
-        self.actuator = actuator
+        self._node = node or (_TRACE * actuator if actuator else 1.0)
+        self._actuator = actuator
 
     def at(self, X: Array, lengths: Array, time: float) -> Terms:
         """Return the terms at node positions `X` (N, 3) with member `lengths` (M,)."""
-        setup = self._setup
-        actuators = setup.truss.actuators
+        setup, actuators, free = self._setup, self._setup.truss.actuators, self._setup.truss.free
         centring = self._centring * (lengths[actuators] - setup.arm.home_quantities[actuators])
+        terms = self.without_gradients()._replace(actuator_gradient=centring)
         if not self._potential:
-            return Terms(self.node, self.actuator, centring, np.zeros(setup.layout.node_columns))
+            return terms
         field, blocks = potential_field(setup, X, time)
-        free = setup.truss.free
         gradient = self._potential * field[free].reshape(-1)
-        return Terms(self.node, self.actuator, centring, gradient, self._potential * blocks[free])
+        return terms._replace(node_gradient=gradient, blocks=self._potential * blocks[free])
+
+    def without_gradients(self) -> Terms:
+        """Return the terms that are squares of displacements alone."""
+        truss = self._setup.truss
+        return Terms(
+            self._node,
+            self._actuator,
+            np.zeros(len(truss.actuators)),
+            np.zeros(3 * len(truss.free)),
+            np.zeros((len(truss.free), 3, 3)),
+        )
 
 
 def potential_slope(distance: Array, influence: float) -> Array:

@@ -14,10 +14,25 @@ _OBSTACLES = {
     "method.weights.obstacle_potential": 1e-5,
     "method.weights.stroke_centring": 2e-3,
 }
-_CURVE = {"method.name": "curve-pseudoinverse", "method.null_space": ["curve_rate", "spacing", "smoothness"]}
-_DENSE = {"method.name": "pseudoinverse", "method.algebra": "dense", "method.null_space": ["actuator_rate"]}
-_CORRECT = {"method.correct": True}
-_FAITHFUL = {"method.correct": False}
+_DENSE = {
+    "method.name": "pseudoinverse",
+    "method.algebra": "dense",
+    "method.null_space": ["actuator_rate"],
+    "method.correct": False,
+}
+_SPARSE = {**_DENSE, "method.algebra": "sparse"}
+_CURVE = {
+    "method.name": "curve-pseudoinverse",
+    "method.tracking": "recursive",
+    "method.null_space": ["curve_rate", "spacing", "smoothness"],
+    "method.correct": False,
+}
+_CORRECTED = {"method.correct": True}
+_CURVE_OBSTACLES = {
+    "method.tracking": "parallel",
+    "method.null_space": ["curve_rate", "spacing", "smoothness", "obstacle_potential"],
+    "method.gains.obstacle_potential": 1e-4,
+}
 
 PRESETS: MappingProxyType[str, dict[str, Any]] = MappingProxyType(
     {
@@ -25,35 +40,19 @@ PRESETS: MappingProxyType[str, dict[str, Any]] = MappingProxyType(
         "qp-none": {"method.name": "qp", "method.tracking": "none", "method.hard_tracking": False},
         "qp-recursive": {"method.name": "qp", "method.tracking": "recursive"},
         "qp-parallel": {"method.name": "qp", "method.tracking": "parallel"},
-        "pseudoinverse": {**_DENSE, **_FAITHFUL},
-        "pseudoinverse-plain": {**_DENSE, **_FAITHFUL, "method.null_space": []},
-        "pseudoinverse-weighted": {**_DENSE, **_FAITHFUL, "method.variant": "weighted"},
-        "pseudoinverse-damped": {**_DENSE, **_FAITHFUL, "method.variant": "damped"},
-        "pseudoinverse-truncated": {**_DENSE, **_FAITHFUL, "method.variant": "truncated"},
-        "pseudoinverse-sparse": {**_DENSE, **_FAITHFUL, "method.algebra": "sparse"},
-        "pseudoinverse-corrected": {**_DENSE, **_CORRECT, "method.algebra": "sparse"},
-        "pseudoinverse-obstacles": {
-            **_DENSE,
-            **_CORRECT,
-            **_OBSTACLES,
-            "method.algebra": "sparse",
-        },
-        "curve-pseudoinverse": {**_CURVE, **_FAITHFUL, "method.tracking": "recursive"},
-        "curve-pseudoinverse-plain": {
-            **_CURVE,
-            **_FAITHFUL,
-            "method.tracking": "recursive",
-            "method.null_space": [],
-        },
-        "curve-pseudoinverse-parallel": {**_CURVE, **_FAITHFUL, "method.tracking": "parallel"},
-        "curve-pseudoinverse-corrected": {**_CURVE, **_CORRECT, "method.tracking": "recursive"},
-        "curve-pseudoinverse-obstacles": {
-            **_CURVE,
-            **_CORRECT,
-            "method.tracking": "parallel",
-            "method.null_space": ["curve_rate", "spacing", "smoothness", "obstacle_potential"],
-            "method.gains.obstacle_potential": 1e-4,
-        },
+        "pseudoinverse": _DENSE,
+        "pseudoinverse-plain": {**_DENSE, "method.null_space": []},
+        "pseudoinverse-weighted": {**_DENSE, "method.variant": "weighted"},
+        "pseudoinverse-damped": {**_DENSE, "method.variant": "damped"},
+        "pseudoinverse-truncated": {**_DENSE, "method.variant": "truncated"},
+        "pseudoinverse-sparse": _SPARSE,
+        "pseudoinverse-corrected": {**_SPARSE, **_CORRECTED},
+        "pseudoinverse-obstacles": {**_SPARSE, **_CORRECTED, **_OBSTACLES},
+        "curve-pseudoinverse": _CURVE,
+        "curve-pseudoinverse-plain": {**_CURVE, "method.null_space": []},
+        "curve-pseudoinverse-parallel": {**_CURVE, "method.tracking": "parallel"},
+        "curve-pseudoinverse-corrected": {**_CURVE, **_CORRECTED},
+        "curve-pseudoinverse-obstacles": {**_CURVE, **_CORRECTED, **_CURVE_OBSTACLES},
     }
 )
 """What each name changes. ``-plain`` has no null-space vector; ``-corrected`` and ``-obstacles`` correct the drift."""

@@ -30,9 +30,9 @@ class Objective(NamedTuple):
 
 
 def moore_penrose(J: Array, *, truncation: float = RANK_TOLERANCE) -> Inverse:
-    """Return J^+ (n, m) by singular values; those below `truncation` times the greatest count as zero.
+    """Return J^+ (n, m), eq. (6), by singular values; those below `truncation` times the greatest count as zero.
 
-    Eq. (6), J J^+ = 1, holds at full row rank only; with a `truncation` that is not small the inverse is the
+    J J^+ = 1 holds at full row rank only; with a `truncation` that is not small the inverse is the
     truncated one, which gives up the directions that would take large displacements.
     """
     u, sigma, vt = np.linalg.svd(J, full_matrices=False)
@@ -67,12 +67,12 @@ def weighted(J: Array, weight: Array, *, damping: float = 0.0) -> Inverse:
 
 
 def projector(inverse: Inverse, J: Array) -> Array:
-    """Return the null-space projector 1 - J^+ J, (n, n)."""
+    """Return the null-space projector 1 - J^+ J of eq. (5), (n, n)."""
     return np.asarray(np.eye(J.shape[1]) - inverse.matrix @ J)
 
 
 def null_space_vector(N: Array, start: Array, objective: Objective) -> Array:
-    """Return the vector v for eq. (28) whose image N v minimises `objective` at start + N v.
+    """Return the null-space vector v whose image N v minimises `objective` at start + N v.
 
     ``v = (N'HN + c (1 - N))^-1 N' (-gradient - H start)``; the second term, with c the scale of H, makes the
     matrix regular and, for an orthogonal projector N, leaves N v as it is. So J^+ x + N v is the minimiser of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from vgtm_qp.errors import CurveError, GoalError, SolverError
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal
+from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
@@ -30,6 +31,15 @@ TIP_TOLERANCE = 1e-10
 MAX_CORRECTIONS = 30
 
 
+class Moved(NamedTuple):
+    """Where a step leads: nodes (N, 3), control vertices (V, 3), m, torsion (T,), rad, and progress, 0 to 1."""
+
+    nodes: Array
+    control_vertices: Array
+    torsion: Array
+    progress: float = 1.0
+
+
 class MethodResolver(ABC):
     """Moves an arm step by step, see ``step.mover.Mover``, by one of the other methods.
 
@@ -37,29 +47,21 @@ class MethodResolver(ABC):
     """
 
     draws_vertices = False
-    """Whether control vertices follow goals of their own."""
 
     def __init__(self, setup: Setup, step_limit: float | None) -> None:
         self.setup = setup
-        self._state = setup.home_state()
-        self.phases = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
+        self.state: State = setup.home_state()
         self.rank: int | None = None
-        """Rank of the Jacobian in the last step, None where the method does not reveal it."""
         self.solver: str | None = None
-        """Name of the QP solver, None where the method solves no QP."""
+        self._clock = Phases()
+        self._clock.seconds = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
         self._limit = step_limit
         self._steps = 0
-        self._mark = 0.0
 
     @property
-    def state(self) -> State:
-        """Where the arm is; may be set to another state of this arm."""
-        return self._state
-
-    @state.setter
-    def state(self, state: State) -> None:
-        self._state = state
-        self._placed(state)
+    def phases(self) -> dict[str, float]:
+        """Seconds spent so far in each phase."""
+        return self._clock.seconds
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
@@ -81,30 +83,29 @@ class MethodResolver(ABC):
         """Move along `path` from its value `start` to `end` in one step; a blocked step has its reason."""
         dt = self.setup.dt if dt is None else dt
         self._steps += 1
-        self._mark = perf_counter()
+        self._clock.start()
         try:
-            nodes, vertices, progress = self._move(path, start, end, dt)
-            self._refuse_breakdown(nodes, path, start, end)
+            moved = self._move(path, start, end, dt)
+            self._refuse_breakdown(moved.nodes, path, start, end)
         except (SolverError, CurveError, np.linalg.LinAlgError) as error:
-            reason = f"step {self._steps}: {error}"
-            return _step(StepStatus.BLOCKED, 0.0, self.state, reason)
-        kinematics = self.setup.kinematics
-        kinematics.evaluate(nodes)
+            return Step(StepStatus.BLOCKED, 0.0, self.state, f"step {self._steps}: {error}", 0)
+        kinematics, before = self.setup.kinematics, self.state
+        kinematics.evaluate(moved.nodes)
         lengths = frozen(kinematics.quantities)
-        before = self.state
-        self._state = State(
+        self.state = State(
             time=before.time + dt,
-            q=(q := frozen(nodes)),
+            q=(q := frozen(moved.nodes)),
             nodes=q,
-            control_vertices=frozen(vertices),
+            control_vertices=frozen(moved.control_vertices),
+            torsion=frozen(moved.torsion),
             quantities=lengths,
             rates=frozen((lengths - before.quantities) / dt),
-            motion=frozen(nodes - before.nodes),
+            motion=frozen(q - before.nodes),
             duration=dt,
         )
-        self.spend("kinematics")
-        status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
-        return _step(status, progress, self.state, "")
+        self._clock.add("kinematics")
+        status = StepStatus.REACHED if moved.progress >= 1.0 - 1e-9 else StepStatus.SLOWED
+        return Step(status, moved.progress, self.state, "", 0)
 
     def brake(self, path: Path, start: float, end: float) -> Step | None:  # noqa: ARG002
         """Return None: every state is one of rest."""
@@ -133,18 +134,9 @@ class MethodResolver(ABC):
         """Return None: there is no other attempt."""
         return None
 
-    def spend(self, phase: str) -> None:
-        """Add the time since the last call to `phase`."""
-        now = perf_counter()
-        self.phases[phase] += now - self._mark
-        self._mark = now
-
-    def _placed(self, state: State) -> None:  # noqa: B027
-        """Take over what else there is in a `state` in which the arm was put."""
-
     @abstractmethod
-    def _move(self, path: Path, start: float, end: float, dt: float) -> tuple[Array, Array, float]:
-        """Return node positions, control vertices and progress after the step, or raise SolverError."""
+    def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
+        """Return where the step leads, or raise SolverError."""
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
         truss, lengths = self.setup.truss, self.setup.arm.home_quantities
@@ -173,10 +165,7 @@ def arm_without_curve(problem: Problem) -> Setup:
     return build_arm(problem.replace(changes))
 
 
-def pose_displacement(start: TipGoal, end: TipGoal) -> tuple[Array, Array]:
-    """Return the displacement (3,), m, and the rotation vector (3,), rad, from one pose to another."""
-    return end.position - start.position, vector_from_rotation(end.rotation @ start.rotation.T)
-
-
-def _step(status: StepStatus, progress: float, state: State, reason: str) -> Step:
-    return Step(status, progress, state, reason, 0)
+def displacement_to(goal: TipGoal, start: TipGoal) -> TipGoal:
+    """Return a goal whose rates are the displacement, m, and the rotation vector, rad, to it from the pose `start`."""
+    turned = vector_from_rotation(goal.rotation @ start.rotation.T)
+    return goal._replace(velocity=goal.position - start.position, spin=turned)

@@ -25,6 +25,8 @@ class Segment:
 
     Attributes
     ----------
+    number : int
+        Place among the segments, from the base on.
     face : int
         The end face.
     tracks : str
@@ -39,6 +41,7 @@ class Segment:
         Fixed members whose last node it places.
     """
 
+    number: int
     face: int
     tracks: str
     nodes: Index
@@ -98,7 +101,8 @@ def _segments(layout: Layout, partition: list[tuple[int, str]]) -> list[Segment]
     last_stage = [int(truss.stage[truss.faces[face]].max()) for face, _ in partition]
     last_stage[-1] = int(truss.stage.max())
     latest = truss.stage[truss.member_nodes].max(axis=1)
-    segments, before = [], -1
+    segments: list[Segment] = []
+    before = -1
     for (face, tracks), last in zip(partition, last_stage, strict=True):
         nodes = truss.free[(truss.stage[truss.free] > before) & (truss.stage[truss.free] <= last)]
         members = truss.fixed[(latest[truss.fixed] > before) & (latest[truss.fixed] <= last)]
@@ -106,7 +110,7 @@ def _segments(layout: Layout, partition: list[tuple[int, str]]) -> list[Segment]
         columns = layout.node_column[touched]
         start = int(layout.node_column[nodes].min(initial=layout.node_columns))
         first = int(np.min(columns[columns >= 0], initial=start))
-        segment = Segment(face, tracks, nodes, start, min(first, start), members)
+        segment = Segment(len(segments), face, tracks, nodes, start, min(first, start), members)
         if segment.rows > segment.columns:
             raise CurveError(
                 f"the bays up to face {face} have {segment.columns - len(members)} free motions and cannot track "

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
-from vgtm_qp.compiled import Kernel
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods.condensation import Condensation, CurveNodes, least_norm
+from vgtm_qp.methods.assembly import CurveNodes, SegmentGroup, SegmentKinematics
 from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
-from vgtm_qp.methods.segment_system import SegmentSystem
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
 
 Array = NDArray[np.float64]
+
+THREADED = 2000
+"""Bays from which factorisations are shared out to threads: a few milliseconds of work; for less it does not pay."""
 
 _STILL = 1e-11
 
@@ -31,31 +36,30 @@ class Tracker:
 
     Attributes
     ----------
-    segments : tuple of Segment
+    segments : sequence of Segment
     """
 
     def __init__(
-        self,
-        layout: Layout,
-        kinematics: Kinematics,
-        segments: Sequence[Segment],
-        home_lengths: Array,
-        *,
-        parallel: bool,
+        self, layout: Layout, kinematics: Kinematics, segments: Sequence[Segment], *, parallel: bool
     ) -> None:
-        self.segments = tuple(segments)
+        self.segments = segments
         self._free, self._columns = layout.arm.free, layout.node_columns
-        self._kinematics = kinematics
-        self._furthest = 2.0 * float(home_lengths.max())
-        self._condensation: Condensation | None = None
-        self._systems: list[SegmentSystem] = []
+        self._furthest = 2.0 * float(layout.arm.home_quantities.max())
         if parallel:
-            self._condensation = Condensation(layout, kinematics, self.segments, home_lengths)
-        else:
-            kernels: dict[tuple[int, bool], Kernel] = {}
-            self._systems = [
-                SegmentSystem(layout, segment, home_lengths, kernels) for segment in self.segments
-            ]
+            failure = "tracking: Newton's method on all bays at once {}"
+            self._chains = [_Chain(layout, segments, kinematics, kinematics.evaluate, failure)]
+            return
+        single = SegmentKinematics(truss_of(layout.arm))
+        self._chains = [
+            _Chain(
+                layout,
+                [segment],
+                single,
+                partial(single.evaluate, segment=segment),
+                f"tracking: Newton's method {{}} in the bay below face {segment.face}",
+            )
+            for segment in segments
+        ]
 
     def rates(self, X: Array, moved: Array, turned: Array) -> Array:
         """Return node positions (N, 3), m, after a step that meets eq. (39) to first order from `X`.
@@ -72,20 +76,13 @@ class Tracker:
         SolverError
             A segment is in a singular pose.
         """
-        if self._condensation is not None:
-            self._kinematics.evaluate(X)
-            d = self._condensation.rates(moved, turned)
-        else:
-            d = np.zeros(self._columns)
-            for k, system in enumerate(self._systems):
-                segment = system.segment
-                system.evaluate(X)
-                own, before = system.matrices()
-                rhs = system.displacement(moved[k], turned[k]) - before @ d[segment.first : segment.start]
-                d[segment.start : segment.start + segment.columns] = least_norm(own, rhs)
-        moved_nodes = np.array(X)
-        moved_nodes[self._free] += d.reshape(-1, 3)
-        return moved_nodes
+        step, still = np.zeros(self._columns), np.zeros(self._columns)
+        for chain in self._chains:
+            chain.evaluate(X)
+            chain.solve([group.displacements(moved, turned) for group in chain.groups], still, step)
+        X = np.array(X)
+        X[self._free] += step.reshape(-1, 3)
+        return X
 
     def track(self, X: Array, nodes: CurveNodes) -> Array:
         """Return node positions (N, 3), m, that meet eq. (39) and all fixed lengths, by Newton's method from `X`.
@@ -98,59 +95,107 @@ class Tracker:
         SolverError
             It does not converge; the segment is named.
         """
-        return self._bay_by_bay(X, nodes) if self._condensation is None else self._together(X, nodes)
-
-    def _bay_by_bay(self, start: Array, nodes: CurveNodes) -> Array:
-        X = np.array(start)
-        d = np.zeros(self._columns)
-        for k, system in enumerate(self._systems):
-            segment = system.segment
-            own = segment.nodes
-            # The first step is taken from the old configuration of the bays below too, and passes their motion on.
-            system.evaluate(start)
-            A, before = system.matrices()
-            residual = system.residual(nodes.position[k], nodes.frame[k])
-            step = least_norm(A, residual - before @ d[segment.first : segment.start])
-            for _ in range(MAX_CORRECTIONS):
-                if not float(np.max(np.abs(step))) <= self._furthest:
-                    raise SolverError(
-                        f"tracking: Newton's method diverges in the bay below face {segment.face}"
-                    )
-                X[own] += step.reshape(-1, 3)
-                system.evaluate(X)
-                residual = system.residual(nodes.position[k], nodes.frame[k])
-                small = float(np.max(np.abs(residual))) <= LENGTH_TOLERANCE
-                if small and segment.is_square:
-                    break
-                A, _ = system.matrices()
-                if segment.is_square:
-                    step = least_norm(A, residual)
-                    continue
-                travelled = (X[own] - start[own]).ravel()
-                step = least_norm(A, residual + A @ travelled) - travelled
-                if small and float(np.max(np.abs(step))) <= _STILL:
-                    break
-            else:
-                raise SolverError(
-                    f"tracking: Newton's method does not converge in the bay below face {segment.face}"
-                )
-            d[segment.start : segment.start + segment.columns] = (X[own] - start[own]).ravel()
+        start, X, travelled = X, np.array(X), np.zeros(self._columns)
+        for chain in self._chains:
+            self._converge(chain, start, X, travelled, nodes)
         return X
 
-    def _together(self, start: Array, nodes: CurveNodes) -> Array:
-        assert self._condensation is not None
-        X, free, condensation = np.array(start), self._free, self._condensation
-        for _ in range(MAX_CORRECTIONS):
-            self._kinematics.evaluate(X)
-            residuals = condensation.residuals(X, nodes)
-            small = max(float(np.max(np.abs(residual))) for residual in residuals) <= LENGTH_TOLERANCE
-            if small and condensation.is_square:
-                return X
-            step = condensation.step(residuals, (X[free] - start[free]).ravel())
-            largest = float(np.max(np.abs(step)))
-            if small and largest <= _STILL:
-                return X
+    def _converge(self, chain: _Chain, start: Array, X: Array, travelled: Array, nodes: CurveNodes) -> None:
+        """Bring the nodes that a chain places to where they belong, in `X` and in what they have `travelled`."""
+        # The first step is taken from the old configuration of the bays below too, and passes their motion on.
+        at, step = start, travelled.copy()
+        for _ in range(MAX_CORRECTIONS + 1):
+            chain.evaluate(at)
+            residuals = [group.residuals(at, nodes) for group in chain.groups]
+            is_met = all(float(np.abs(residual).max()) <= LENGTH_TOLERANCE for residual in residuals)
+            is_met = is_met and not step[: chain.own.start].any()
+            if is_met and chain.is_square:
+                return
+            chain.solve(residuals, travelled, step)
+            own = step[chain.own]
+            largest = float(np.abs(own).max())
+            if is_met and largest <= _STILL:
+                return
             if not largest <= self._furthest:
-                raise SolverError("tracking: Newton's method on all bays at once diverges")
-            X[free] += step.reshape(-1, 3)
-        raise SolverError("tracking: Newton's method on all bays at once does not converge")
+                raise SolverError(chain.failure.format("diverges"))
+            travelled[chain.own] += own
+            X[chain.nodes] += own.reshape(-1, 3)
+            at, step = X, np.zeros(self._columns)
+        raise SolverError(chain.failure.format("does not converge"))
+
+
+class _Chain:
+    """Segments that are solved at once, as one block-bidiagonal system.
+
+    Each segment's matrix is factorised with no knowledge of the others; what remains in sequence is, for each
+    segment, the product of a small matrix with the displacement of the nodes that it stands on.
+
+    Attributes
+    ----------
+    groups : list of SegmentGroup
+    evaluate : callable
+        Evaluates the kinematics of all groups at node positions (N, 3).
+    failure : str
+        Says of Newton's method what is put into it.
+    nodes, own
+        The nodes that the segments place, and the slice of their columns.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        segments: Sequence[Segment],
+        kinematics: Kinematics | SegmentKinematics,
+        evaluate: Callable[[Array], None],
+        failure: str,
+    ) -> None:
+        shapes: dict[tuple[int, int, int, str], list[Segment]] = {}
+        for segment in segments:
+            before = segment.start - segment.first
+            shapes.setdefault((segment.rows, segment.columns, before, segment.tracks), []).append(segment)
+        self._segments = segments
+        self.groups = [SegmentGroup(layout, alike, kinematics) for alike in shapes.values()]
+        self.evaluate, self.failure = evaluate, failure
+        self.is_square = all(group.is_square for group in self.groups)
+        self.nodes = np.concatenate([segment.nodes for segment in segments])
+        self.own = slice(segments[0].start, segments[-1].start + segments[-1].columns)
+
+    def solve(self, right: list[Array], travelled: Array, step: Array) -> None:
+        """Overwrite the own columns of `step` with what solves all segments, the columns before them being given."""
+        passed: dict[int, Array] = {}
+        for group, rhs in zip(self.groups, right, strict=True):
+            own, before = group.matrices()
+            total = rhs[:, :, None]
+            if not group.is_square:
+                total = total + own @ travelled[group.columns][:, :, None]
+            answers = _least_norm(own, np.concatenate([total, before], axis=2))
+            step[group.columns] = answers[:, :, 0]
+            if not group.is_square:
+                step[group.columns] -= travelled[group.columns]
+            passed |= zip(group.numbers.tolist(), answers[:, :, 1:], strict=True)
+        for segment in self._segments:
+            if segment.first < segment.start:
+                end = segment.start + segment.columns
+                step[segment.start : end] -= passed[segment.number] @ step[segment.first : segment.start]
+
+
+def _least_norm(A: Array, b: Array) -> Array:
+    """Return the solutions of A x = b, or those of least norm where A (K, r, c) has more columns than rows."""
+    rows, columns = A.shape[1:]
+    try:
+        if rows == columns:
+            return _solve(A, b)
+        At = np.swapaxes(A, 1, 2)
+        return np.asarray(At @ _solve(A @ At, b))
+    except np.linalg.LinAlgError:
+        raise SolverError("tracking: a bay is in a singular pose") from None
+
+
+def _solve(A: Array, b: Array) -> Array:
+    """Solve a stack of systems; many bays are shared out to threads, which LAPACK lets run side by side."""
+    if len(A) < THREADED:
+        return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+    cores = os.cpu_count() or 1
+    pieces = np.array_split(np.arange(len(A)), cores)
+    with ThreadPoolExecutor(cores) as pool:
+        return np.concatenate(list(pool.map(lambda piece: np.linalg.solve(A[piece], b[piece]), pieces)))

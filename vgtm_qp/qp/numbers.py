@@ -125,7 +125,7 @@ class StepNumbers:
     curve: CurveRows | None = None
 
     def curve_rows(self, layout: Layout) -> tuple[Array, Array]:
-        """Return what d_c does to points and turns at the curve's nodes: (3 K, D) and (R K, D), eqs. (32)-(36)."""
+        """Return what d_c does to points and turns at the curve's nodes: (3 K, D) and (R K, D)."""
         if self.curve is not None:
             position, turn = self.curve.position_rows, self.tangent_curve
         else:

@@ -29,7 +29,7 @@ def rotation_matrix(vector: Array) -> Array:
 
 
 def base_poses(problem: Mapping[str, Any], times: Array) -> Array:
-    """Return (T, 6) position, m, and rotation vector, rad, of the base against home at `times` (T,), s, eqs. (7)-(8).
+    """Return (T, 6) position, m, and rotation vector, rad, of the base against home at `times` (T,), s.
 
     A base that moves goes from pose to pose on straight lines and single-axis rotations, from its home pose at time 0
     on, and stays in the last one.

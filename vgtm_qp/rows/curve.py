@@ -28,5 +28,5 @@ def free_columns(rows: Any, normal: Any) -> Any:
 
 
 def weighted_columns(weights: Any, normal: Any, factor: Any) -> Any:
-    """Return (R, q) the derivative of factor (R, 3) @ sum_i w_i p_i by the free coordinates; weights (V,), (35)."""
+    """Return (R, q) the derivative of factor (R, 3) @ sum_i w_i p_i by the free coordinates, eq. (35)."""
     return ca.horzcat(weights[1] * (factor @ normal), ca.kron(weights[2:].T, factor))

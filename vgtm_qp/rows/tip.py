@@ -103,9 +103,10 @@ def turned_axes(rows: Sequence[str], rotation: Any) -> Any:
 
 
 def combined(rows: Sequence[str], position: Any, spin: Any, rotation: Any) -> Any:
-    """Return the rows (n_e, n) made of the tip's velocity and angular velocity (3, n) each: J_u of eq. (16).
+    """Return the rows (n_e, n) of the end effector's rate, eqs. (3), (4) and (16)-(18): J, that is [J_u J_c].
 
-    Goals that move are combined in the same way: x_e-dot.
+    They are made of the tip's velocity and angular velocity (3, n) each by n coordinates. Goals that move are combined
+    in the same way: x_e-dot.
     """
     return ca.vertcat(position[axes(rows), :], turned_axes(rows, rotation) @ spin)
 

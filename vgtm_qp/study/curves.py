@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.tables import markdown_table
-from vgtm_qp.curve import make_family
+from vgtm_qp.curve.families import make_family
 from vgtm_qp.study.arms import furthest
 from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.workers import Row, Task

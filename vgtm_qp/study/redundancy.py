@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.compare import run_method
 from vgtm_qp.comparison.tables import crossed_table
-from vgtm_qp.curve import degree_of_redundancy
+from vgtm_qp.curve.redundancy import degree_of_redundancy
 from vgtm_qp.problem import load_problem
 from vgtm_qp.study.drawing import draw_line, label, panels
 from vgtm_qp.study.workers import Row, Task

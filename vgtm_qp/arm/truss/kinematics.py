@@ -32,9 +32,9 @@ def _unit(vector: ca.SX) -> ca.SX:
 
 
 def member_function(truss: Truss) -> ca.Function:
-    """Return one member as a CasADi function: its nodes' positions and end offsets -> length and gradient.
+    """Return a member as a CasADi function: nodes and end offsets -> length, eq. (12), and gradient, eq. (19).
 
-    Ideal pin joints: (3, 2) positions of the two nodes. Offset joints, eqs. (12)-(13): (3, 6) positions of both
+    Ideal pin joints: (3, 2) positions of the two nodes. Offset joints, eq. (13): (3, 6) positions of both
     joints' triangles and (3, 2) offsets in the joint frames.
     """
     if truss.joints is None:
@@ -84,7 +84,7 @@ class EndKinematics:
         self.jacobian = self._kernel.outputs[1].reshape(-1, 2, 9, 3).transpose(0, 1, 3, 2)
 
     def evaluate(self, X: Array) -> None:
-        """Overwrite ends and Jacobians with those at node positions `X` (N, 3), m."""
+        """Overwrite ends and their Jacobians, eqs. (20)-(21), with those at node positions `X` (N, 3), m."""
         self._kernel.inputs[0][:] = X[self.nodes].reshape(-1)
         self._kernel()
 

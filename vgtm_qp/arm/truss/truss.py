@@ -105,7 +105,7 @@ class Truss:
 
     @cached_property
     def free(self) -> Index:
-        """(N - N_c,) indices of the nodes that are unknowns, in stage order."""
+        """(N - N_c,) indices of the nodes that are unknowns, eqs. (9)-(10), in stage order."""
         free = np.flatnonzero(~self.base)
         return free[np.argsort(self.stage[free], kind="stable")]
 
@@ -116,12 +116,12 @@ class Truss:
 
     @cached_property
     def fixed(self) -> Index:
-        """(n_l,) indices of the fixed members."""
+        """(n_l,) indices of the fixed members, eq. (14)."""
         return np.flatnonzero(~self.actuated)
 
     @cached_property
     def member_nodes(self) -> Index:
-        """(M, Q) nodes that each member's length depends on: two for pin joints, six for offset joints."""
+        """(M, Q) nodes that each length depends on, eq. (15): two for pin joints, six for offset joints."""
         if self.joints is None:
             return self.members
         return self.joints.triangle[self.members].reshape(self.member_count, 6)
