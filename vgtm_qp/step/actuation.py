@@ -1,8 +1,9 @@
-"""The actuators of an arm on its way: their boxes, what binds them, and those that jam."""
+"""The actuators of an arm: their boxes, what limits them, and those that jam."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,27 +12,64 @@ from vgtm_qp.arm.arm import Arm
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.rows.limits import actuator_box, binding
 from vgtm_qp.step.state import State
-from vgtm_qp.step.stops import Limits, StopKind
 
 Array = NDArray[np.float64]
 Box = tuple[Array, Array]
 """Least and greatest values (n_a,) of the actuators after a step."""
 
 _APPROACH, _LEAST_APPROACH = 0.3, 2e-3
-"""Largest share of the room to the end of its stroke that an actuator may use in one step, or this much, m."""
+"""Largest share of the distance to the end of its stroke that an actuator may use in one step, or this much, m."""
 
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 
 
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """The box of the actuators after a step, and what sets each of its sides.
+
+    Attributes
+    ----------
+    lower, upper : (n_a,)
+        The box.
+    names : tuple of str
+    stroke : (n_a, 2)
+    value, way : (n_a,)
+        Values before the step, and how far the greatest rates lead.
+    acceleration, locked : (n_a,)
+        Greatest accelerations, and which actuators cannot move.
+    """
+
+    lower: Array
+    upper: Array
+    names: tuple[str, ...]
+    stroke: Array
+    value: Array
+    way: Array
+    acceleration: Array
+    locked: NDArray[np.bool_]
+
+    def kind(self, k: int, *, upper: bool) -> str:
+        """Return what sets one side of the box of actuator `k`, see ``rows.limits.binding``."""
+        one, way = slice(k, k + 1), self.way if upper else -self.way
+        bound, fastest = (self.upper if upper else self.lower)[one], (self.value + way)[one]
+        return binding(
+            bound, self.stroke[one, int(upper)], fastest, self.acceleration[one], self.locked[one]
+        )[0]
+
+    def name(self, k: int, *, upper: bool) -> str:
+        """Return the name of one side of the box of actuator `k`."""
+        return f"{self.kind(k, upper=upper)}: {self.names[k]}"
+
+
 class Actuation:
-    """Limits, locks and jams of the actuators of one arm; changed by :meth:`lock` alone.
+    """Limits, locks and jams of the actuators of one arm; changed by :meth:`lock` and :meth:`jammed` alone.
 
     Parameters
     ----------
     arm : Arm
     jams
-        Actuators that lock on the way, and when, s.
+        Actuators that lock later than at the start, and the times, s.
     slows_down
         Whether actuators slow down before the ends of their strokes.
 
@@ -39,7 +77,6 @@ class Actuation:
     ----------
     names : tuple of str
         Length n_a.
-    stroke, rate, acceleration : (n_a, 2), (n_a,), (n_a,)
     locked : set of str
         Names of those that are stuck by now.
     starts_at_once : bool
@@ -47,19 +84,19 @@ class Actuation:
     """
 
     def __init__(self, arm: Arm, jams: Iterable[tuple[str, float]], *, slows_down: bool) -> None:
-        self._arm, self._slows_down = arm, slows_down
-        self._actuators = arm.actuators
+        self._arm, self._actuators = arm, arm.actuators
         self.names = tuple(arm.quantity_names[k] for k in arm.actuators)
-        self.stroke, self.rate = arm.stroke[arm.actuators], arm.rate[arm.actuators]
-        self.acceleration = arm.acceleration[arm.actuators]
-        self.starts_at_once = bool(np.isinf(self.acceleration).all())
+        self._stroke, self._rate = arm.stroke[arm.actuators], arm.rate[arm.actuators]
+        self._acceleration = arm.acceleration[arm.actuators]
+        self.starts_at_once = bool(np.isinf(self._acceleration).all())
+        self._slows_down = slows_down and self.starts_at_once
         self.locked: set[str] = set()
         self._held = np.zeros(len(self.names), dtype=bool)
         self._jams = sorted(jams, key=lambda jam: -jam[1])
 
     def values(self, state: State) -> Array:
         """Return (n_a,) the actuators' values in a state."""
-        return np.asarray(state.quantities[self._actuators])
+        return state.quantities.take(self._actuators)
 
     def lock(self, name: str, state: State) -> None:
         """Hold an actuator at its value in `state` from now on.
@@ -75,7 +112,9 @@ class Actuation:
             hint = nearest(name, self.names)
             raise GoalError(f'cannot lock "{name}", which {what}; actuators are {names}{hint}')
         k = self.names.index(name)
-        self.stroke[k] = state.quantities[self._actuators[k]]
+        # Limits of earlier steps keep the arrays that they were made with.
+        self._stroke, self._held = self._stroke.copy(), self._held.copy()
+        self._stroke[k] = self.values(state)[k]
         self._held[k] = True
         self.locked.add(name)
 
@@ -93,48 +132,39 @@ class Actuation:
 
     def box(self, state: State, dt: float) -> Box:
         """Return the least and greatest values of the actuators after a step of `dt`, s, from `state`."""
-        value, rate = state.quantities[self._actuators], state.rates[self._actuators]
-        limits = self.stroke, self.rate, self.acceleration
-        return actuator_box(value, rate, *limits, dt, state.duration or None)
+        limits = self._stroke, self._rate, self._acceleration
+        rates = state.rates.take(self._actuators)
+        return actuator_box(self.values(state), rates, *limits, dt, state.duration or None)
 
-    def slowing(self, state: State, box: Box) -> Box:
-        """Return the part of a box within which actuators slow down before the ends of their strokes."""
-        if not self._slows_down or not self.starts_at_once:
-            return box
-        value = self.values(state)
-        lower, upper = box
-        down, up = _approach(value - self.stroke[:, 0]), _approach(self.stroke[:, 1] - value)
+    def slowing_box(self, state: State, dt: float) -> Box:
+        """Return the part of the box within which actuators slow down before the ends of their strokes."""
+        lower, upper = self.box(state, dt)
+        if not self._slows_down:
+            return lower, upper
+        value, stroke = self.values(state), self._stroke
+        down, up = _approach(value - stroke[:, 0]), _approach(stroke[:, 1] - value)
         slow_lower, slow_upper = np.minimum(value - down, upper), np.maximum(value + up, lower)
         return np.maximum(lower, slow_lower), np.minimum(upper, slow_upper)
 
     def creeping(self, state: State, box: Box, dt: float) -> Box | None:
         """Return the part of a box after which every actuator may rest; None where there is none."""
-        value, reach = self.values(state), (1.0 - 1e-9) * self.acceleration * dt * dt
+        value, reach = self.values(state), (1.0 - 1e-9) * self._acceleration * dt * dt
         lower, upper = np.maximum(box[0], value - reach), np.minimum(box[1], value + reach)
         return (lower, upper) if np.all(lower <= upper) else None
 
-    def limit_name(self, state: State, dt: float, box: Box) -> Callable[[int, bool], str]:
-        """Return what names the limit at the lower (False) or upper side of an actuator's box, by its number."""
-        stroke, held = self.stroke.copy(), self._held.copy()
+    def limits(self, state: State, dt: float, box: Box | None = None) -> Limits:
+        """Return what limits a step of `dt`, s, from `state` with a `box`.
 
-        def name(k: int, upper: bool) -> str:
-            side, one, way = int(upper), slice(k, k + 1), self.rate[k] * dt
-            fastest = state.quantities[self._actuators[one]] + (way if upper else -way)
-            kinds = binding(box[side][one], stroke[one, side], fastest, self.acceleration[one], held[one])
-            return f"{kinds[0]}: {self.names[k]}"
-
-        return name
-
-    def limits(self, state: State, dt: float) -> Limits:
-        """Return the boxes of a step of `dt`, s, from `state`, and what sets each of their sides."""
-        box, value, way = self.box(state, dt), self.values(state), self.rate * dt
-        rest = self.acceleration, self._held | (self.stroke[:, 0] == self.stroke[:, 1])
-        low = binding(box[0], self.stroke[:, 0], value - way, *rest)
-        high = binding(box[1], self.stroke[:, 1], value + way, *rest)
-        return Limits(*box, self.names, [StopKind(kind) for kind in low], [StopKind(kind) for kind in high])
+        Without one it is the whole box, and actuators whose stroke is a point count as locked.
+        """
+        locked = self._held
+        if box is None:
+            box, locked = self.box(state, dt), locked | (self._stroke[:, 0] == self._stroke[:, 1])
+        way = self._rate * dt
+        return Limits(*box, self.names, self._stroke, self.values(state), way, self._acceleration, locked)
 
 
-def _approach(room: Array) -> Array:
-    """Return how far actuators that slow down move in one step with so much room (n_a,) before them."""
-    room = np.maximum(room, 0.0)
-    return np.asarray(np.maximum(_APPROACH * room, np.minimum(room, _LEAST_APPROACH)))
+def _approach(distance: Array) -> Array:
+    """Return how far actuators that slow down move in one step at a `distance` (n_a,) before the end, m."""
+    distance = np.maximum(distance, 0.0)
+    return np.asarray(np.maximum(_APPROACH * distance, np.minimum(distance, _LEAST_APPROACH)))

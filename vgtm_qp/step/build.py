@@ -25,10 +25,10 @@ from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.curve import home_curve
 from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
+from vgtm_qp.step.path import base_motion
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import TipTask
 
@@ -88,20 +88,11 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         dt=step_duration(problem.maneuver),
         minimum_angle=clearance.minimum_angle,
         tip_mode=problem.end_effector.mode,
-        base_motion=BaseMotion(spec.base_motion) if spec.base_motion else None,
+        base_motion=base_motion(spec.base_motion) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
         measure=None if clearance.self_collision else Clearance(arm.bodies, **options),
     )
-
-
-def reshaped(setup: Setup, layout: Layout) -> Setup:
-    """Return the arm with another curve: a layout of :func:`vgtm_qp.step.curve.with_curve`."""
-    engine = setup.engine.drawn(layout) if layout.family is setup.layout.family else None
-    if engine is None:
-        engine = make_engine(setup.solver, layout, setup.kinematics, setup.task)
-        finish_compiling()
-    return replace(setup, layout=layout, engine=engine)
 
 
 def make_engine(

@@ -1,8 +1,8 @@
-"""The curve of a problem as the QP needs it, and the same arm's layout with another curve (section 4.7)."""
+"""The curve of a problem at home, as the QP needs it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,32 +100,6 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         vertex_goals=tuple(sorted(goal.index for goal in spec.control_vertex_goals)),
     )
     return HomeCurve(layout, vertices, torsion, goals)
-
-
-def with_curve(layout: Layout, family: CurveFamily | None, vertex_goals: tuple[int, ...]) -> Layout:
-    """Return the layout with a curve of another family or number of control vertices, some drawn to goals."""
-    if family is None or layout.shape is None or family is layout.family:
-        return replace(layout, vertex_goals=vertex_goals)
-    shape = replace(layout.shape, family=family)
-    s = layout.shape.parameters
-    return replace(
-        layout,
-        curve_weights=family.weights(s),
-        curve_slopes=family.weights(s, 1),
-        shape=shape,
-        vertex_goals=vertex_goals,
-    )
-
-
-def curve_key(layout: Layout) -> tuple[object, ...]:
-    """Return what tells curves of one arm from one another."""
-    family = layout.family
-    knots = (
-        ()
-        if family is None
-        else (family.name, family.degree, family.control_vertices, *family.knots.tolist())
-    )
-    return (*knots, "goals", *layout.vertex_goals)
 
 
 def _distances(start: Array, points: Array) -> Array:

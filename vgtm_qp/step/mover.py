@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.separation import Shortfall
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.state import State
+from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import Step
 from vgtm_qp.step.stops import Stop
 

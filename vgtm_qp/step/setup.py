@@ -13,8 +13,8 @@ from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER
-from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.engine import Engine
+from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
 
@@ -27,37 +27,32 @@ class Setup:
 
     Attributes
     ----------
-    arm : Arm
     kinematics : Kinematics
         Of the arm; overwritten by whoever evaluates it.
     layout, task, engine, monitor
         The QP, the end effector's rows, what solves a step, and what measures clearance.
-    control_vertices : (V, 3)
-        The curve at home, m.
+    control_vertices, torsion : (V, 3), (T,)
+        The curve at home, m and rad.
     safe, self_safe, influence : float
-        Least clearance to obstacles and between members, and the distance from which pairs enter the QP, m.
+        Least clearance to obstacles and between bodies, and the distance from which pairs enter the QP, m.
     margin : float
-        What the QP keeps over the least clearance, m.
+        What the QP keeps over the least clearance, m, for what is not linear in its step.
+    dt : float
+        Duration of a step, s.
     minimum_angle : float
         Least angle between bodies that meet, rad.
     tip_mode : str
         How strictly the end effector follows its path: ``scaled``, ``hard`` or ``elastic``.
-    dt : float
-        Duration of a step, s.
-    torsion : (T,)
-        Torsion coordinates of the curve at home, rad.
     vertex_goals : (V, 3) or None
-        Where the problem draws control vertices, m.
-    solver : str
-        Name of the QP solver.
+        Where the problem draws control vertices, m; NaN for those that it does not.
+    base_motion : Path or None
+        Of the base over time; None where it rests.
     jams : tuple of (str, float)
         Actuators that lock later than at the start, and the times, s.
-    base_motion : BaseMotion or None
-        None where the base rests.
     slow_approach : bool
-        Whether members slow down before they touch, and actuators before the ends of their strokes.
+        Whether bodies slow down before they touch, and actuators before the ends of their strokes.
     measure : Clearance or None
-        What the clearance of a state is measured with where the monitor does not see pairs of members.
+        What the clearance of a state is measured with where the monitor does not see pairs of bodies.
     """
 
     arm: Arm
@@ -77,7 +72,7 @@ class Setup:
     torsion: Array = field(default_factory=lambda: np.zeros(0))
     vertex_goals: Array | None = None
     solver: str = DEFAULT_SOLVER
-    base_motion: BaseMotion | None = None
+    base_motion: Path | None = None
     jams: tuple[tuple[str, float], ...] = ()
     slow_approach: bool = True
     measure: Clearance | None = None
@@ -87,12 +82,14 @@ class Setup:
         """The truss, for what knows trusses alone; TrussError for any other arm."""
         return truss_of(self.arm)
 
+    @property
+    def slows_down(self) -> bool:
+        """Whether pairs and actuators slow down before contacts and ends of strokes: the tip has to be allowed to."""
+        return self.slow_approach and self.tip_mode == "scaled"
+
     def least_clearance(self, q: Array, time: float, among: str = "all") -> float:
         """Return the exact least surface distance at a configuration, m; see ``Clearance.least``."""
-        points = self.arm.points(q)
-        if self.measure is None:
-            return self.monitor.least(points, time, among=among)[0]
-        return self.measure.least(points, time, among=among)[0]
+        return (self.measure or self.monitor).least(self.arm.points(q), time, among=among)[0]
 
     def base_at(self, time: float) -> Pose | None:
         """Return where the base is at `time`, s; None where it rests."""
