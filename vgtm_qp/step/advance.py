@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.step.actuation import Actuation, Box
+from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.braking import ANY_RANK, Brakes, Braking
-from vgtm_qp.step.path import Path
 from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.stops import CANNOT_BRAKE
+from vgtm_qp.step.target import Target
 
 Array = NDArray[np.float64]
 
@@ -29,16 +29,6 @@ _BEYOND = 60.0
 _INSTANT = 1e-9
 
 _OFF_PATH = "the arm could brake after it only off its path"
-
-
-class Piece(NamedTuple):
-    """A piece of path, from its value `start` to `end`, in `dt` seconds; no share below `smallest` is tried."""
-
-    path: Path
-    start: float
-    end: float
-    dt: float
-    smallest: float
 
 
 class Advance(NamedTuple):
@@ -64,39 +54,43 @@ class Advancer:
         """Return how the arm brakes in steps of `dt`, s."""
         return Brakes(self._shaping, self._attempt, self._actuation, dt)
 
-    def first_accepted(self, state: State, piece: Piece, box: Box, worst: int = ANY_RANK) -> Advance:
-        """Return the first attempt at a piece of path or a share of it that is accepted, or else the last.
+    def first_accepted(
+        self, state: State, target: Target, dt: float, smallest: float, worst: int = ANY_RANK
+    ) -> Advance:
+        """Return the first attempt at a target or a share of its piece of path that is accepted, or else the last.
 
         An attempt after which the arm brakes in a better way comes before others. One of a rank beyond the `worst`, as
-        good as the arm could brake now, does not count.
+        good as the arm could brake now, does not count. The step takes `dt`, s, and no share below `smallest` is tried.
         """
         best: Advance | None = None
-        for found in self._attempts(state, piece, box):
+        for found in self._attempts(state, target, dt, smallest):
             if found.step.moved and found.rank <= worst:
                 best, worst = found, found.rank - 1
                 if not found.rank:
                     break
         return best or Advance(_blocked(found.step, state, found.step.reason or _OFF_PATH), None)
 
-    def _attempts(self, state: State, piece: Piece, box: Box) -> Iterator[Advance]:
-        """Yield the attempts at a piece: the whole, halves of it where the tip may be slow, and creeping."""
-        yield self._try(state, piece, box)
-        share, values = 1.0, self._actuation.values(state)
-        while share > piece.smallest and self._tip_mode == "scaled":
+    def _attempts(self, state: State, target: Target, dt: float, smallest: float) -> Iterator[Advance]:
+        """Yield the attempts at a target: the whole, halves of it where the tip may be slow, and creeping."""
+        yield self._try(state, target, dt)
+        share, values, box = 1.0, self._actuation.values(state), (target.lower, target.upper)
+        while share > smallest and self._tip_mode == "scaled":
             share /= 2
             near, far = values - share * _TRUST, values + share * _TRUST
-            within = np.minimum(np.maximum(box[0], near), box[1]), np.maximum(np.minimum(box[1], far), box[0])
-            end = piece.start + share * (piece.end - piece.start)
-            yield self._try(state, piece._replace(end=end), within, share)
+            lower, upper = (
+                np.minimum(np.maximum(box[0], near), box[1]),
+                np.maximum(np.minimum(box[1], far), box[0]),
+            )
+            end = target.start + share * (target.end - target.start)
+            yield self._try(state, replace(target, end=end, lower=lower, upper=upper), dt, share)
         if not self._actuation.starts_at_once:
-            slow = self._actuation.creeping(state, box, piece.dt)
+            slow = self._actuation.creeping(state, box, dt)
             if slow is not None:
-                yield self._try(state, piece, slow)
+                yield self._try(state, replace(target, lower=slow[0], upper=slow[1]), dt)
 
-    def _try(self, state: State, piece: Piece, box: Box, share: float = 1.0) -> Advance:
-        """Return what comes of a step over a piece, a `share` of the one whose progress counts."""
-        path, start, end, dt, _ = piece
-        step = self._attempt.run(state, self._shaping.target(state, dt, path, start, end, box), share)
+    def _try(self, state: State, target: Target, dt: float, share: float = 1.0) -> Advance:
+        """Return what comes of a step towards a target, a `share` of the one whose progress counts."""
+        step = self._attempt.run(state, target, share)
         if not step.moved:
             return Advance(step, None)
         if step.progress < WHOLE and self._tip_mode != "scaled":
@@ -104,11 +98,12 @@ class Advancer:
             return Advance(_blocked(step, state, "the tip cannot stay on time"), None)
         braking: Braking | None = None
         if not self._actuation.starts_at_once:
-            covered = step.progress * (end - start)
-            if start + covered >= path.end - _INSTANT:
+            path, covered = target.path, step.progress * (target.end - target.start)
+            reached = target.start + covered
+            if reached >= path.end - _INSTANT:
                 # The path beyond its end is unknown.
                 path = path.continued(_BEYOND)
-            braking = self.brakes(dt).find(step.state, path, start + covered, 2.0 * covered)
+            braking = self.brakes(dt).find(step.state, path, reached, 2.0 * covered)
             if braking is None:
                 # A step may be too short to rest in what the longer one before it allowed.
                 shorter = dt < (1.0 - 1e-9) * state.duration

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -89,21 +90,20 @@ class Engine(ABC):
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        self._linearisation: Linearisation | None = None
-        self._builder: FullBuilder | None = None
 
     def qp(self, asked: QPInput) -> StepQP:
         """Return the whole QP that an input asks for, every row and column with a name, in arrays of its own."""
-        if self._builder is None:
-            self._builder = FullBuilder(self.layout)
-        return self._builder.build(self._linear.numbers(asked.linear(self.layout), asked.rows))
+        numbers = self._linearisation.numbers(asked.linear(self.layout), asked.rows)
+        return self._builder.build(numbers)
 
-    @property
-    def _linear(self) -> Linearisation:
-        if self._linearisation is None:
-            # To be looked at, not to be run: no compiler is kept waiting.
-            self._linearisation = Linearisation(self.layout, compiled=False)
-        return self._linearisation
+    @cached_property
+    def _builder(self) -> FullBuilder:
+        return FullBuilder(self.layout)
+
+    @cached_property
+    def _linearisation(self) -> Linearisation:
+        # To be looked at, not to be run: no compiler is kept waiting.
+        return Linearisation(self.layout, compiled=False)
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
         """Return where the answer of a QP leads.
@@ -191,9 +191,9 @@ class GeneralEngine(Engine):
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
-        numbers = self._linear.numbers(asked.linear(self.layout), asked.rows)
+        numbers = self._linearisation.numbers(asked.linear(self.layout), asked.rows)
         solution = self._solver.solve(numbers)
-        self._strokes = self._linear.quantities[self.layout.arm.actuators] + solution.actuators
+        self._strokes = self._linearisation.quantities[self.layout.arm.actuators] + solution.actuators
         self._last = numbers, solution
         self._vertices = asked.vertices + solution.vertices
         return solution

@@ -12,7 +12,7 @@ from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.step.actuation import Actuation
-from vgtm_qp.step.advance import Advancer, Piece
+from vgtm_qp.step.advance import Advancer
 from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.braking import ANY_RANK, Braking
 from vgtm_qp.step.build import build_arm
@@ -242,8 +242,8 @@ class Resolver:
         brake, worst = self._known_braking() if whole == 1.0 else None, ANY_RANK
         if brake is not None:
             smallest, worst = max(smallest, _SMALLEST_MOVING), brake.rank
-        piece = Piece(path, start, start + whole * (end - start), dt, smallest)
-        step, braking = self._advancer.first_accepted(state, piece, box, worst)
+        target = self._shaping.target(state, dt, path, start, start + whole * (end - start), box)
+        step, braking = self._advancer.first_accepted(state, target, dt, smallest, worst)
         limits, progress = actuation.limits(state, dt, box), whole * step.progress
         if step.moved:
             self._state, self._braking = step.state, braking
