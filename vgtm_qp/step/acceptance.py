@@ -50,7 +50,15 @@ class Acceptance:
         self._least, self._greatest = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
         self._member, self._tip = _LOOSER * accuracy.member, _LOOSER * accuracy.tip
 
-    def flaw(self, closed: Closed, before: Array, target: Target, goal: TipGoal | None, *curve: Array) -> str:
+    def flaw(
+        self,
+        closed: Closed,
+        before: Array,
+        target: Target,
+        goal: TipGoal | None,
+        vertices: Array,
+        torsion: Array,
+    ) -> str:
         """Return what is wrong with a configuration, or an empty string.
 
         Parameters
@@ -63,13 +71,13 @@ class Acceptance:
             Limits of the actuators, and where the base is now.
         goal
             Of the tip; None for a tip that need not be anywhere.
-        curve
-            Whatever else has to be finite.
+        vertices, torsion
+            The curve (V, 3), m, and (T,), rad.
         """
         arm, q, base = self._arm, closed.q, target.base
         # NaN passes no comparison with `<=`, and is in every norm.
         size = norm(q.reshape(-1))
-        if not size < np.inf or not all(norm(part.reshape(-1)) < np.inf for part in curve):
+        if not size + norm(vertices.reshape(-1)) + norm(torsion) < np.inf:
             return "the new state is not finite"
         rounding = _ROUNDING * size
         X, at = arm.nodes(q), arm.nodes(before if base is None else arm.based(q, base))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,42 +24,38 @@ _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 
 
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """The box of the actuators after a step, and what sets each of its sides.
+class Limits(NamedTuple):
+    """The box of the actuators after a step, `lower` and `upper` (n_a,), and what its sides are made of.
 
     Attributes
     ----------
-    lower, upper : (n_a,)
-        The box.
     names : tuple of str
-    stroke : (n_a, 2)
     value, way : (n_a,)
         Values before the step, and how far the greatest rates lead.
-    acceleration, locked : (n_a,)
-        Greatest accelerations, and which actuators cannot move.
+    stroke, acceleration : (n_a, 2), (n_a,)
+    held : (n_a,) bool
+        Actuators that are locked by now.
     """
 
     lower: Array
     upper: Array
     names: tuple[str, ...]
-    stroke: Array
     value: Array
     way: Array
+    stroke: Array
     acceleration: Array
-    locked: NDArray[np.bool_]
-
-    def kind(self, k: int, *, upper: bool) -> str:
-        """Return what sets one side of the box of actuator `k`, see ``rows.limits.binding``."""
-        one, way = slice(k, k + 1), self.way if upper else -self.way
-        bound, fastest = (self.upper if upper else self.lower)[one], (self.value + way)[one]
-        return binding(
-            bound, self.stroke[one, int(upper)], fastest, self.acceleration[one], self.locked[one]
-        )[0]
+    held: NDArray[np.bool_]
 
     def name(self, k: int, *, upper: bool) -> str:
-        """Return the name of one side of the box of actuator `k`."""
-        return f"{self.kind(k, upper=upper)}: {self.names[k]}"
+        """Return the name of one side of the box of actuator `k`: what sets it, see ``rows.limits.binding``."""
+        one, way = slice(k, k + 1), self.way if upper else -self.way
+        bound, fastest = (self.upper if upper else self.lower)[one], (self.value + way)[one]
+        end, rest = self.stroke[one, int(upper)], (self.acceleration[one], self.held[one])
+        return f"{binding(bound, end, fastest, *rest)[0]}: {self.names[k]}"
+
+    def of_stop(self) -> Limits:
+        """Return the same for what stops an arm: an actuator whose stroke is a point counts as locked."""
+        return self._replace(held=self.held | (self.stroke[:, 0] == self.stroke[:, 1]))
 
 
 class Actuation:
@@ -132,36 +128,28 @@ class Actuation:
 
     def box(self, state: State, dt: float) -> Box:
         """Return the least and greatest values of the actuators after a step of `dt`, s, from `state`."""
-        limits = self._stroke, self._rate, self._acceleration
-        rates = state.rates.take(self._actuators)
-        return actuator_box(self.values(state), rates, *limits, dt, state.duration or None)
+        limits = self.limits(state, dt)
+        return limits.lower, limits.upper
 
-    def slowing_box(self, state: State, dt: float) -> Box:
-        """Return the part of the box within which actuators slow down before the ends of their strokes."""
-        lower, upper = self.box(state, dt)
-        if not self._slows_down:
-            return lower, upper
-        value, stroke = self.values(state), self._stroke
-        down, up = _approach(value - stroke[:, 0]), _approach(stroke[:, 1] - value)
-        slow_lower, slow_upper = np.minimum(value - down, upper), np.maximum(value + up, lower)
-        return np.maximum(lower, slow_lower), np.minimum(upper, slow_upper)
+    def limits(self, state: State, dt: float, *, slowing: bool = False) -> Limits:
+        """Return what limits a step of `dt`, s, from `state`.
+
+        With `slowing`, actuators slow down before the ends of their strokes if they do that at all.
+        """
+        value, rates, stroke = self.values(state), state.rates.take(self._actuators), self._stroke
+        ends = stroke, self._rate, self._acceleration
+        lower, upper = actuator_box(value, rates, *ends, dt, state.duration or None)
+        if slowing and self._slows_down:
+            down, up = _approach(value - stroke[:, 0]), _approach(stroke[:, 1] - value)
+            slow_lower, slow_upper = np.minimum(value - down, upper), np.maximum(value + up, lower)
+            lower, upper = np.maximum(lower, slow_lower), np.minimum(upper, slow_upper)
+        return Limits(lower, upper, self.names, value, self._rate * dt, *ends[::2], self._held)
 
     def creeping(self, state: State, box: Box, dt: float) -> Box | None:
         """Return the part of a box after which every actuator may rest; None where there is none."""
         value, reach = self.values(state), (1.0 - 1e-9) * self._acceleration * dt * dt
         lower, upper = np.maximum(box[0], value - reach), np.minimum(box[1], value + reach)
         return (lower, upper) if np.all(lower <= upper) else None
-
-    def limits(self, state: State, dt: float, box: Box | None = None) -> Limits:
-        """Return what limits a step of `dt`, s, from `state` with a `box`.
-
-        Without one it is the whole box, and actuators whose stroke is a point count as locked.
-        """
-        locked = self._held
-        if box is None:
-            box, locked = self.box(state, dt), locked | (self._stroke[:, 0] == self._stroke[:, 1])
-        way = self._rate * dt
-        return Limits(*box, self.names, self._stroke, self.values(state), way, self._acceleration, locked)
 
 
 def _approach(distance: Array) -> Array:

@@ -109,7 +109,7 @@ class Advancer:
                 shorter = dt < (1.0 - 1e-9) * state.duration
                 why = f"{CANNOT_BRAKE} in {dt:g} s, less than the last step took" if shorter else CANNOT_BRAKE
                 return Advance(_blocked(step, state, why), None)
-        return Advance(step if share == 1.0 else replace(step, progress=share * step.progress), braking)
+        return Advance(step if share == 1.0 else step.over(share, None), braking)
 
 
 def _blocked(step: Step, state: State, reason: str) -> Step:

@@ -22,7 +22,7 @@ from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import Shortfall, State, frozen
-from vgtm_qp.step.step import WHOLE, Step, StepStatus
+from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, explain
 from vgtm_qp.step.task import duration
 
@@ -210,8 +210,8 @@ class Resolver:
         """
         path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
         dt = duration(self.setup.dt if dt is None else dt)
-        box = self._actuation.slowing_box(self.state, dt)
-        target = self._shaping.target(self.state, dt, path, 0.0, 1.0, box)
+        limits = self._actuation.limits(self.state, dt, slowing=True)
+        target = self._shaping.target(self.state, dt, path, 0.0, 1.0, limits[:2])
         return self.setup.engine.qp(self._attempt.first_input(self.state, target))
 
     def tip(self) -> tuple[Array, Array]:
@@ -238,18 +238,16 @@ class Resolver:
             self.lock(name)
         whole = actuation.until_jam(state.time, dt)
         dt *= whole
-        box = actuation.slowing_box(state, dt)
+        limits = actuation.limits(state, dt, slowing=True)
         brake, worst = self._known_braking() if whole == 1.0 else None, ANY_RANK
         if brake is not None:
             smallest, worst = max(smallest, _SMALLEST_MOVING), brake.rank
-        target = self._shaping.target(state, dt, path, start, start + whole * (end - start), box)
+        target = self._shaping.target(state, dt, path, start, start + whole * (end - start), limits[:2])
         step, braking = self._advancer.first_accepted(state, target, dt, smallest, worst)
-        limits, progress = actuation.limits(state, dt, box), whole * step.progress
         if step.moved:
             self._state, self._braking = step.state, braking
-            status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
-            return replace(step, status=status, progress=progress, limits=limits)
-        step = replace(step, limits=limits)
+            return step.over(whole, limits)
+        step = step.over(0.0, limits)
         return step if brake is None else self._brake(brake, path, start, end, step)
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:
@@ -290,7 +288,7 @@ class Resolver:
         default; nothing moves.
         """
         state = state or self.state
-        limits = self._actuation.limits(state, self.setup.dt if dt is None else dt)
+        limits = self._actuation.limits(state, self.setup.dt if dt is None else dt).of_stop()
         goal = path.at(start).over(end - start)
         return explain(self.setup, self._separation, state, goal, limits, last)
 

@@ -78,6 +78,14 @@ class Step:
     def __repr__(self) -> str:
         return f"<Step {self}>"
 
+    def over(self, share: float, limits: Limits | None) -> Step:
+        """Return the same step as one over a piece of path of which it covers a `share`."""
+        status, progress = self.status, share * self.progress
+        if self.moved:
+            status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
+        rest = self.solver_failed, self.braked, self.left_path, self.solution, self.rows, limits, self.failure
+        return Step(status, progress, self.state, self.reason, self.qps, *rest)
+
     @property
     def moved(self) -> bool:
         """Whether the state is another one than before."""
