@@ -140,7 +140,10 @@ class Attempt:
 
         for count in range(1, _MOST_QPS + 1):
             if move is not None:
-                asked = self._correction(state, target, move, q, reach, short, gain, fractions)
+                near = separation.rows(q, target.time, 0.0, reach, short, gain)
+                near = separation.with_rows_between(near, state, q, target.time, fractions)
+                at = q, q, move.vertices, move.torsion
+                asked = QPInput(*at, target, target.goal(move.progress), move.progress, near, False)
             phases.add("distance")
             try:
                 move = self._engine.move(asked, self.accuracy, phases.add)
@@ -185,24 +188,6 @@ class Attempt:
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")
         return blocked("no convergence")
-
-    def _correction(
-        self,
-        state: State,
-        target: Target,
-        move: Move,
-        q: Array,
-        reach: float,
-        short: Shortfall,
-        gain: float,
-        fractions: list[float],
-    ) -> QPInput:
-        """Return what corrects the configuration `q` that a `move` led to, also at `fractions` of the way there."""
-        rows = self.separation.rows(q, target.time, 0.0, reach, short, gain)
-        for more in self.separation.rows_between(state.q, q, state.time, target.time, fractions):
-            rows = rows.joined(more)
-        goal = target.goal(move.progress)
-        return QPInput(q, q, move.vertices, move.torsion, target, goal, move.progress, rows, False)
 
     def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
         """Return what is wrong with where a `move` leads from `state`, found anew; empty where nothing is."""

@@ -21,9 +21,10 @@ from vgtm_qp.step.path import Path
 from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.step.target import Target
 
 Array = NDArray[np.float64]
+Steps = list[tuple[State, float]]
+"""States, and the values of a path there."""
 
 ANY_RANK = 2
 """The greatest rank of braking."""
@@ -44,7 +45,7 @@ _INSTANT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Braking:
-    """Steps that bring an arm to rest from `origin`: states, and the values of `path` there.
+    """Steps on a `path` that bring an arm to rest from `origin`.
 
     Attributes
     ----------
@@ -57,7 +58,7 @@ class Braking:
 
     origin: State
     path: Path
-    steps: list[tuple[State, float]]
+    steps: Steps
     on_path: int
     rank: int = 0
 
@@ -99,64 +100,60 @@ class Brakes:
 
         The tip is at `value` of `path`, and goes on by at most `piece` in each step where it stays on it.
         """
-        setup = self.shaping.setup
+        setup, until = self.shaping.setup, self._until_the_base_rests()
         if setup.tip_mode == "elastic":
-            found = self._let_go(state) or self._yielding(state)
-            return None if found is None else Braking(state, path, [(now, value) for now in found], 0)
-        along = self._along(state, path, value, piece, self._until_the_base_rests())
+            steps = self._let_go(state, value) or self._yielding(state, value)
+            return None if steps is None else Braking(state, path, steps, 0)
+        along = self._along(state, path, value, piece, until)
         if along is not None:
             return Braking(state, path, along, len(along))
         if setup.base_motion is None:
             return None
         along = self._along(state, path, value, piece, -np.inf)
         if along is not None:
-            last, value = along[-1] if along else (state, value)
-            ride = self._let_go(last)
+            ride = self._let_go(*(along[-1] if along else (state, value)))
             if ride is not None:
-                return Braking(state, path, [*along, *((now, value) for now in ride)], len(along), 1)
+                return Braking(state, path, along + ride, len(along), 1)
         return self.letting_go(state, path, value)
 
     def letting_go(self, state: State, path: Path, value: float) -> Braking | None:
         """Return the steps in which every actuator brakes by itself, or None where they were not found."""
-        found = self._let_go(state)
-        return None if found is None else Braking(state, path, [(now, value) for now in found], 0, ANY_RANK)
+        steps = self._let_go(state, value)
+        return None if steps is None else Braking(state, path, steps, 0, ANY_RANK)
 
     def _until_the_base_rests(self) -> float:
         """Return the time from which the base rests, s."""
         base = self.shaping.setup.base_motion
         return -np.inf if base is None else base.end - _INSTANT
 
-    def _target(self, state: State, path: Path, start: float, end: float, box: Box) -> Target:
-        return self.shaping.target(state, self.dt, path, start, end, box)
+    def _done(self, state: State, path: Path, start: float, end: float, box: Box, progress: float) -> Step:
+        """Return the attempt at a piece of path of which the tip has made some `progress` before."""
+        target = self.shaping.target(state, self.dt, path, start, end, box)
+        return self.attempt.run(state, target, progress=progress)
 
-    def _along(
-        self, state: State, path: Path, value: float, piece: float, until: float
-    ) -> list[tuple[State, float]] | None:
-        """Brake on the path, and stay on it until a time, s; return states and the path's values.
+    def _along(self, state: State, path: Path, value: float, piece: float, until: float) -> Steps | None:
+        """Brake on the path, and stay on it until a time, s.
 
         The steps aim at where the tip is, from further along the path: progress along it is what they avoid. That is
         where many limits meet, and corrections may run in circles round such a corner; then they aim at a share of
         what the step before covered.
         """
-        covered, values = 0.5 * piece, []
+        covered = 0.5 * piece
 
-        def step(now: State, limits: Box) -> State | None:
+        def step(now: State, limits: Box) -> tuple[State, float] | None:
             nonlocal covered, value
             gentler = [(value, min(value + share * covered, path.end), 0.0) for share in _GENTLER]
             for start, end, behind in [(min(value + piece, path.end), value, 1.0), *gentler]:
-                target = self._target(now, path, start, end, limits)
-                done = self.attempt.run(now, target, progress=behind)
+                done = self._done(now, path, start, end, limits, behind)
                 if done.moved:
                     reached = start + done.progress * (end - start)
                     covered, value = reached - value, reached
-                    values.append(value)
-                    return done.state
+                    return done.state, value
             return None
 
-        found = self._follow(state, step, until)
-        return None if found is None else list(zip(found, values, strict=True))
+        return self._follow(state, step, until)
 
-    def _yielding(self, state: State) -> list[State] | None:
+    def _yielding(self, state: State, value: float) -> Steps | None:
         """Brake an elastic tip: it is drawn along a line of its own, ever more slowly, and gives way to the limits."""
         arm, kinematics = self.shaping.setup.arm, self.shaping.setup.kinematics
         kinematics.evaluate(state.q)
@@ -165,34 +162,35 @@ class Brakes:
         before = arm.end_effector.position(arm.nodes(state.q - state.motion))
         there = here + 0.5 * count * (here - before)
         line = Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation] * 2))
-        done = 0
+        number = 0
 
-        def step(now: State, limits: Box) -> State | None:
-            nonlocal done
-            start, end = (1.0 - max(1.0 - k / count, 0.0) ** 2 for k in (done, done + 1))
-            done += 1
-            drawn = self.attempt.run(now, self._target(now, line, start, end, limits), progress=1.0)
-            return drawn.state if drawn.moved else None
+        def step(now: State, limits: Box) -> tuple[State, float] | None:
+            nonlocal number
+            start, end = (1.0 - max(1.0 - k / count, 0.0) ** 2 for k in (number, number + 1))
+            number += 1
+            done = self._done(now, line, start, end, limits, 1.0)
+            return (done.state, value) if done.moved else None
 
         return self._follow(state, step, self._until_the_base_rests())
 
-    def _let_go(self, state: State) -> list[State] | None:
+    def _let_go(self, state: State, value: float) -> Steps | None:
         """Brake every actuator by itself, whatever becomes of the tip; None where stations must stay on the curve."""
         setup = self.shaping.setup
         if setup.layout.hard_tracking:
             return None
         closing = Closing(setup.layout, setup.kinematics)
-        return self._follow(
-            state,
-            lambda now, limits: self._released(now, limits, closing),
-            self._until_the_base_rests(),
-        )
+
+        def step(now: State, limits: Box) -> tuple[State, float] | None:
+            then = self._released(now, limits, closing)
+            return None if then is None else (then, value)
+
+        return self._follow(state, step, self._until_the_base_rests())
 
     def _follow(
-        self, state: State, step: Callable[[State, Box], State | None], until: float
-    ) -> list[State] | None:
+        self, state: State, step: Callable[[State, Box], tuple[State, float] | None], until: float
+    ) -> Steps | None:
         """Step on until a time, s, and until the arm may stay; None where a step fails, or they are too many."""
-        found: list[State] = []
+        found: Steps = []
         most = _MOST_STEPS
         for count in range(_MOST_STEPS + _MOST_RIDING):
             limits, values = self.actuation.box(state, self.dt), self.actuation.values(state)
@@ -202,12 +200,11 @@ class Brakes:
                 most = min(_MOST_STEPS, self._count(state, limits) + _SPARE_STEPS)
                 if until > state.time:
                     most += min(int(np.ceil((until - state.time) / self.dt)), _MOST_RIDING)
-            if count >= most:
+            done = step(state, limits) if count < most else None
+            if done is None:
                 return None
-            then = step(state, limits)
-            if then is None:
-                return None
-            found.append(state := then)
+            found.append(done)
+            state = done[0]
         return None
 
     def _count(self, state: State, limits: Box) -> int:
@@ -236,7 +233,7 @@ class Brakes:
         report, found = separation.proof(state, closed.q, then, separation.shortfall_of(state))
         if found is None or not report.certified:
             return None
-        still = self._target(state, _NOWHERE, 0.0, 1.0, limits)
+        still = self.shaping.target(state, self.dt, _NOWHERE, 0.0, 1.0, limits)
         if attempt.acceptance.flaw(closed, state.q, still, None, vertices, state.torsion):
             return None
         return state.next(arm, then, closed, vertices, state.torsion, found)

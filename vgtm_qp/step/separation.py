@@ -179,16 +179,15 @@ class Separation:
             # Slow down by the clearance left when the obstacles have moved: those that only come nearer need no haste.
             rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH)
 
-    def rows_between(
-        self, start: Array, q: Array, start_time: float, time: float, fractions: list[float]
-    ) -> list[ClearanceRows]:
-        """Return the rows at `fractions`, 0 to 1, of the way from `start` to `q`: the end state moves them too."""
-        found = []
+    def with_rows_between(
+        self, rows: ClearanceRows, state: State, q: Array, time: float, fractions: list[float]
+    ) -> ClearanceRows:
+        """Return `rows`, and those at `fractions`, 0 to 1, of the way from a state to `q`: this moves them too."""
         for s in fractions:
-            at, now = start + s * (q - start), start_time + s * (time - start_time)
+            at, now = state.q + s * (q - state.q), state.time + s * (time - state.time)
             contacts = self._monitor.near(self._arm.points(at), now, 1.5 * self._setup.safe)
-            found.append(self._clearance_rows(at, contacts, s))
-        return found
+            rows = rows.joined(self._clearance_rows(at, contacts, s))
+        return rows
 
     def _clearance_rows(self, q: Array, contacts: Contacts, fraction: float = 1.0) -> ClearanceRows:
         """Return the rows of contacts found at a configuration, a `fraction` of the way to the end."""
