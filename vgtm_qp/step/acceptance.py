@@ -34,15 +34,7 @@ _ROUNDING = 64.0 * float(np.finfo(float).eps)
 
 
 class Acceptance:
-    """Holds states of one arm against its quantities, limits and goals.
-
-    Parameters
-    ----------
-    setup
-        Its kinematics is evaluated for a tip that has a direction to keep; overwritten then.
-    accuracy
-        What quantities and tip are settled to.
-    """
+    """Holds states of one arm, settled to an accuracy, against its quantities, limits and goals."""
 
     def __init__(self, setup: Setup, accuracy: Accuracy) -> None:
         self._arm, self._kinematics, self._task = setup.arm, setup.kinematics, setup.task
@@ -59,20 +51,10 @@ class Acceptance:
         vertices: Array,
         torsion: Array,
     ) -> str:
-        """Return what is wrong with a configuration, or an empty string.
+        """Return what is wrong with a configuration and its curve (V, 3), m, and (T,), rad, or an empty string.
 
-        Parameters
-        ----------
-        closed
-            The configuration, and its quantities.
-        before
-            Configuration of the state before.
-        target
-            Limits of the actuators, and where the base is now.
-        goal
-            Of the tip; None for a tip that need not be anywhere.
-        vertices, torsion
-            The curve (V, 3), m, and (T,), rad.
+        `before` is the configuration of the state before; the limits and the base are those of the `target`. `goal` is
+        that of the tip, None for one that need not be anywhere. A tip with a direction overwrites the kinematics.
         """
         arm, q, base = self._arm, closed.q, target.base
         # NaN passes no comparison with `<=`, and is in every norm.
@@ -139,15 +121,7 @@ class TrackingError:
             kernel.inputs[5][:] = layout.curve_slopes.reshape(-1)
 
     def greatest(self, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
-        """Return the greatest gap, m, or turn, rad, that should be zero.
-
-        Parameters
-        ----------
-        q, vertices, torsion
-            Configuration, and the curve's coordinates (V, 3), m, and (T,), rad.
-        base
-            Where the base is; None where it rests.
-        """
+        """Return the greatest gap, m, or turn, rad, at a configuration and its curve (V, 3), m, and (T,), rad."""
         layout, inputs = self._layout, self._kernel.inputs
         tracked, arm, shape = layout.tracked, layout.arm, layout.general
         inputs[0][:] = arm.nodes(q).take(self._nodes, axis=0).reshape(-1)

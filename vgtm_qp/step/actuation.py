@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.arm import Arm
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.rows.limits import actuator_box, binding
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 
 Array = NDArray[np.float64]
@@ -25,16 +24,10 @@ _INSTANT = 1e-9
 
 
 class Limits(NamedTuple):
-    """The box of the actuators after a step, `lower` and `upper` (n_a,), and what its sides are made of.
+    """The box of the actuators after a step, and what its sides are made of.
 
-    Attributes
-    ----------
-    names : tuple of str
-    value, way : (n_a,)
-        Values before the step, and how far the greatest rates lead.
-    stroke, acceleration : (n_a, 2), (n_a,)
-    held : (n_a,) bool
-        Actuators that are locked by now.
+    That is the value (n_a,) before the step, how far the greatest rate leads, the stroke (n_a, 2), the greatest
+    acceleration, and whether the actuator is held where it is.
     """
 
     lower: Array
@@ -61,34 +54,25 @@ class Limits(NamedTuple):
 class Actuation:
     """Limits, locks and jams of the actuators of one arm; changed by :meth:`lock` and :meth:`jammed` alone.
 
-    Parameters
-    ----------
-    arm : Arm
-    jams
-        Actuators that lock later than at the start, and the times, s.
-    slows_down
-        Whether actuators slow down before the ends of their strokes.
-
     Attributes
     ----------
-    names : tuple of str
-        Length n_a.
-    locked : set of str
-        Names of those that are stuck by now.
+    names, locked
+        Names of all actuators (n_a,), and of those that are stuck by now.
     starts_at_once : bool
         Whether no acceleration is limited.
     """
 
-    def __init__(self, arm: Arm, jams: Iterable[tuple[str, float]], *, slows_down: bool) -> None:
+    def __init__(self, setup: Setup) -> None:
+        arm = setup.arm
         self._arm, self._actuators = arm, arm.actuators
         self.names = tuple(arm.quantity_names[k] for k in arm.actuators)
         self._stroke, self._rate = arm.stroke[arm.actuators], arm.rate[arm.actuators]
         self._acceleration = arm.acceleration[arm.actuators]
         self.starts_at_once = bool(np.isinf(self._acceleration).all())
-        self._slows_down = slows_down and self.starts_at_once
+        self._slows_down = setup.slows_down and self.starts_at_once
         self.locked: set[str] = set()
         self._held = np.zeros(len(self.names), dtype=bool)
-        self._jams = sorted(jams, key=lambda jam: -jam[1])
+        self._jams = sorted(setup.jams, key=lambda jam: -jam[1])
 
     def values(self, state: State) -> Array:
         """Return (n_a,) the actuators' values in a state."""

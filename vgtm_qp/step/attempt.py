@@ -14,6 +14,7 @@ from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance, TrackingError
+from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.engine import Accuracy, Move
 from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
@@ -48,7 +49,7 @@ class Phases:
 
     def __init__(self) -> None:
         self.seconds = dict.fromkeys(("distance", "qp", "correction", "acceptance"), 0.0)
-        self._mark = perf_counter()
+        self.start()
 
     def start(self) -> None:
         """Begin to count."""
@@ -62,22 +63,14 @@ class Phases:
 
 
 class Attempt:
-    """Tries one piece of path from one state; keeps the workspaces.
+    """Tries one piece of path from one state; keeps the workspaces."""
 
-    Parameters
-    ----------
-    setup, separation
-        Of one arm.
-    starts_at_once
-        Whether no acceleration of an actuator is limited.
-    """
-
-    def __init__(self, setup: Setup, separation: Separation, *, starts_at_once: bool) -> None:
+    def __init__(self, setup: Setup, separation: Separation, actuation: Actuation) -> None:
         self._arm, self._influence = setup.arm, setup.influence
         self.separation, self.phases = separation, Phases()
         # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
         exact = max(1e-12, 32.0 * _ROUNDING * setup.arm.height)
-        member = 1e-10 if starts_at_once else exact
+        member = 1e-10 if actuation.starts_at_once else exact
         self.accuracy = Accuracy(member, tip=1e-8, start=_SETTLING * setup.arm.height)
         self.acceptance = Acceptance(setup, self.accuracy)
         self.use(setup)

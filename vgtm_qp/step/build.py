@@ -231,20 +231,16 @@ def make_engine(
 
 def _check_supported(problem: Problem) -> None:
     """Refuse, in one message, the parts of the contract that no method here serves."""
-    mistakes = []
+    expected: dict[tuple[str, str], str] = {}
     if problem.arm is not None and problem.arm.urdf is not None:
-        expected = "a list of joints [[arm.joint]]; URDF files are not read by this version"
-        mistakes.append(problem.mistake(("arm", "urdf"), expected))
+        expected["arm", "urdf"] = "a list of joints [[arm.joint]]; URDF files are not read by this version"
     elif problem.truss is not None and problem.truss.module == "plate":
         modules = "octahedral, double-octahedral, hexapod, longeron, tetrahedral or graph"
-        mistakes.append(
-            problem.mistake(("truss", "module"), f"{modules}; plates are not available in this version")
-        )
+        expected["truss", "module"] = f"{modules}; plates are not available in this version"
     if problem.maneuver.kind != "path":
-        mistakes.append(
-            problem.mistake(("maneuver", "kind"), '"path"; deployment is not available in this version')
-        )
-    if mistakes:
+        expected["maneuver", "kind"] = '"path"; deployment is not available in this version'
+    if expected:
+        mistakes = [problem.mistake(place, text) for place, text in expected.items()]
         raise ProblemError(str(problem.source or problem.name), mistakes)
 
 

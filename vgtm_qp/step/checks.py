@@ -104,13 +104,9 @@ def excess_of_freedom(problem: Problem, setup: Setup) -> Iterator[Mistake]:
 
 def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
     """Yield least distance, m, and mistake of each obstacle too near at home, and of the members."""
-    rules = problem.clearance
-    safe = rules.safe
-    self_safe = safe if rules.self_safe is None else rules.self_safe
-    pairs = setup.monitor.near(
-        setup.arm.points(setup.arm.home_configuration), 0.0, reach=safe, self_reach=self_safe
-    )
-    bodies = setup.arm.bodies
+    arm, bodies, rules = setup.arm, setup.arm.bodies, problem.clearance
+    safe, self_safe = rules.safe, rules.safe if rules.self_safe is None else rules.self_safe
+    pairs = setup.monitor.near(arm.points(arm.home_configuration), 0.0, reach=safe, self_reach=self_safe)
     owner = np.where(pairs.is_self, -1, 0)
     owner[~pairs.is_self] = setup.monitor.pieces.obstacle[pairs.other[~pairs.is_self]]
     for index in np.unique(owner):
@@ -120,12 +116,10 @@ def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
         place: Place
         if index < 0:
             place = ("arm", "link_radius") if problem.truss is None else ("truss", "member_radius")
-            needed = self_safe
-            other = bodies.names[int(pairs.other[k])]
-            what = f"{bodies.kind}s {bodies.names[int(pairs.body[k])]} and {other}, which share no node,"
+            first, second = bodies.names[int(pairs.body[k])], bodies.names[int(pairs.other[k])]
+            needed, what = self_safe, f"{bodies.kind}s {first} and {second}, which share no node,"
         else:
-            place, needed = ("obstacle", int(index), "center"), safe
-            what = f"it and {body}"
+            place, needed, what = ("obstacle", int(index), "center"), safe, f"it and {body}"
         found = (
             f"they overlap by {-distance:.3g} m" if distance <= 0.0 else f"they are {distance:.3g} m apart"
         )

@@ -57,19 +57,10 @@ class Accuracy(NamedTuple):
 
 
 class Move(NamedTuple):
-    """Where the answer of one QP leads.
+    """Where the answer of one QP leads: the configuration `q` by the answer alone, the curve and the progress.
 
-    Attributes
-    ----------
-    solution : StepSolution
-    q : configuration
-        By the answer alone.
-    vertices, torsion, progress
-        The curve (V, 3), m, and (T,), rad, and the progress along the path.
-    furthest : float
-        Greatest displacement of a node's coordinate, m.
-    closed : Closed or None
-        The configuration with its quantities closed and its tip at its goal; None where only another QP leads there.
+    `furthest` is the greatest displacement of a node's coordinate, m. `closed` is the configuration with its quantities
+    closed and its tip at its goal, None where only another QP leads there.
     """
 
     solution: StepSolution
@@ -114,13 +105,12 @@ class Engine(ABC):
             The QP has no answer, or none that is good enough; the first two carry it.
         """
         try:
-            try:
-                solution = self._least(asked)
-            finally:
-                spent("qp")
+            solution = self._least(asked)
         except FailedStepError as error:
             error.build = lambda: self.qp(asked)
             raise
+        finally:
+            spent("qp")
         arm, target = self.layout.arm, asked.target
         q = arm.advanced(asked.q, solution.nodes, solution.actuators)
         if target.base is not None:
@@ -184,7 +174,10 @@ class GeneralEngine(Engine):
         self._linearisation = Linearisation(layout, compiled=compiled)
         self._solver, self._task = solver, task
         self._closing = Closing(layout, kinematics)
-        self._on_curve = _holds_stations(layout)
+        # Stations that are held on the curve may determine the configuration with the fixed quantities.
+        is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
+        tracked = layout.tracked.tolist()
+        self._on_curve = is_plain and layout.arm.symbols(Constants()).held(tracked) is not None
         self._last: tuple[StepNumbers, StepSolution] | None = None
         self._vertices: Array = np.zeros((0, 3))
         self._strokes: Array = np.zeros(0)
@@ -272,12 +265,6 @@ class GeneralEngine(Engine):
         return None if gain is None else (every @ gain, gain)
 
 
-def _holds_stations(layout: Layout) -> bool:
-    """Whether stations that are held on the curve determine the configuration with the fixed quantities."""
-    is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
-    return is_plain and layout.arm.symbols(Constants()).held(layout.tracked.tolist()) is not None
-
-
 class FusedEngine(Engine):
     """One compiled call from configuration to QP, for arms whose coordinates can be eliminated one after another."""
 
@@ -301,14 +288,10 @@ class FusedEngine(Engine):
         try:
             self._solver.load(asked.linear(self.layout))
             answer = self._solver.ask(asked.rows)
-        except InfeasibleStepError:
-            # Whether that is for the margin alone is found out where it can be left out.
-            return super().move(asked, accuracy, spent)
-        spent("qp")
-        try:
+            spent("qp")
             end = self._solver.take(answer, near)
-        except EvaluationError:
-            # The answer may still be good, and be settled by other steps.
+        except (InfeasibleStepError, EvaluationError):
+            # There may be an answer without the margin, or one that other steps settle.
             return super().move(asked, accuracy, spent)
         except FailedStepError as error:
             error.build = lambda: self.qp(asked)

@@ -102,10 +102,6 @@ class Path:
             np.concatenate([self.rotations, (rotation_from_vector(on * turn) @ self.rotations[-1])[None]]),
         )
 
-    def length(self) -> float:
-        """Return the length of the path of the position, m."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
-
 
 def base_motion(poses: Sequence[Any]) -> Path:
     """Return the path of the base frame over time, s, through ``[[base_motion]]`` tables in the order of their times.

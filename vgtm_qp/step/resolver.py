@@ -30,8 +30,8 @@ __all__ = ["Resolver", "Step", "StepStatus"]
 
 Array = NDArray[np.float64]
 
-_SMALLEST_MOVING = 0.25
-"""The least share of a piece of path that is tried by an arm that can brake instead."""
+_SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
+"""The least shares of a piece of path that are tried: by any arm, and by one that can brake instead."""
 
 
 class Resolver:
@@ -51,9 +51,9 @@ class Resolver:
     def __init__(self, problem: Problem | Setup) -> None:
         setup = problem if isinstance(problem, Setup) else checked_arm(problem)
         self._separation = Separation(setup)
-        self._actuation = Actuation(setup.arm, setup.jams, slows_down=setup.slows_down)
+        self._actuation = Actuation(setup)
         self._shaping = Shaping(setup)
-        self._attempt = Attempt(setup, self._separation, starts_at_once=self._actuation.starts_at_once)
+        self._attempt = Attempt(setup, self._separation, self._actuation)
         self._advancer = Advancer(self._attempt, self._actuation, self._shaping)
         self._state = setup.home_state()
         self._braking: Braking | None = None
@@ -220,9 +220,7 @@ class Resolver:
         kinematics.evaluate(self.state.q)
         return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
 
-    def follow(
-        self, path: Path, start: float, end: float, *, dt: float | None = None, smallest: float = 1 / 64
-    ) -> Step:
+    def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step; pieces are halved until one is safe.
 
         A step in which an actuator of the problem jams ends at that time, with the share of the path until then.
@@ -239,9 +237,9 @@ class Resolver:
         whole = actuation.until_jam(state.time, dt)
         dt *= whole
         limits = actuation.limits(state, dt, slowing=True)
-        brake, worst = self._known_braking() if whole == 1.0 else None, ANY_RANK
-        if brake is not None:
-            smallest, worst = max(smallest, _SMALLEST_MOVING), brake.rank
+        brake, smallest, worst = None, _SMALLEST, ANY_RANK
+        if whole == 1.0 and (brake := self._known_braking()) is not None:
+            smallest, worst = _SMALLEST_MOVING, brake.rank
         target = self._shaping.target(state, dt, path, start, start + whole * (end - start), limits[:2])
         step, braking = self._advancer.first_accepted(state, target, dt, smallest, worst)
         if step.moved:

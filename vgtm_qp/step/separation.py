@@ -201,12 +201,6 @@ class Separation:
         nodes, coefficients = self._arm.over_nodes(q, contacts.points, coefficients)
         return ClearanceRows(nodes, coefficients, lower, contacts.name)
 
-    def names(self, short: Shortfall) -> tuple[str, ...]:
-        """Return what is too near, nearest first."""
-        return tuple(
-            self._monitor.names.clearance(pair) for pair in sorted(short, key=lambda pair: short[pair])
-        )
-
     def _vectors(self, q: Array) -> tuple[Array, Array]:
         """Return the vectors (K, 3), m, of both bodies of each corner away from the joint where they meet."""
         points, (body, end) = self._monitor.bodies.points, np.moveaxis(self._corners, 2, 0)

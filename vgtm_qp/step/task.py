@@ -75,13 +75,10 @@ class TipTask:
         """Return the greatest error, m or rad."""
         return float(np.abs(self.residual(position, rotation, goal)[0]).max(initial=0.0))
 
-    def rows(self, X: Array, kinematics: Kinematics, goal: TipGoal, spin: Array | None = None) -> TipRows:
-        """Return the rows at nodes `X` (N, 3), at which the kinematics was evaluated, towards `goal`.
-
-        `spin` (3, 3 K_tip) are the tip's angular-velocity rows if they belong to another configuration.
-        """
+    def rows(self, X: Array, kinematics: Kinematics, goal: TipGoal) -> TipRows:
+        """Return the rows at nodes `X` (N, 3), at which the kinematics was evaluated, towards `goal`."""
         error, rate, across, _ = self.residual(self._tip.position(X), kinematics.tip_rotation, goal)
-        return TipRows(self.jacobian(across, kinematics.tip_spin if spin is None else spin), rate, error)
+        return TipRows(self.jacobian(across, kinematics.tip_spin), rate, error)
 
     def jacobian(self, across: Array, spin: Array | None) -> Array:
         """Return (n_e, 3 K_tip) the rows' Jacobian, from `residual`'s combination of the tip's `spin` (3, 3 K_tip)."""
