@@ -153,7 +153,8 @@ class Attempt:
             if solution is None:
                 solution, rows = move.solution, asked.rows
             q = move.q
-            if not move.furthest < _TOO_FAR * self._arm.height or not np.isfinite(q).all():
+            is_finite = move.closed is not None or np.isfinite(q).all()
+            if not move.furthest < _TOO_FAR * self._arm.height or not is_finite:
                 return blocked("singular pose")
             # A pair that one correction pushes away must still be there in the next, or two of them alternate.
             reach = max(reach, move.furthest)
