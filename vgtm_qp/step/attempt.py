@@ -56,7 +56,7 @@ class Phases:
         self._mark = perf_counter()
 
     def add(self, phase: str) -> None:
-        """Give the time since the last call to `phase`."""
+        """Add the time since the last call to `phase`."""
         now = perf_counter()
         self.seconds[phase] += now - self._mark
         self._mark = now
@@ -102,7 +102,7 @@ class Attempt:
     def _first(
         self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
     ) -> tuple[QPInput, float]:
-        """Return that, and from which distance on no pair can become active, m."""
+        """Return the first input, and the distance, m, from which on no pair can become active."""
         q, arm, goal, guess = state.q, self._arm, target.goal(progress), share * state.motion
         reach = self._influence
         if share >= 1.0:
@@ -117,7 +117,7 @@ class Attempt:
     def _run(
         self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
     ) -> Step:
-        """Do it, with pairs that are too `short` of their clearance driven apart by `gain`, m."""
+        """Run it; pairs that are too near at the start, `short`, are driven apart by `gain`, m."""
         phases, separation = self.phases, self.separation
         asked, reach = self._first(state, target, share, progress, short, gain)
         q, fractions = state.q, list[float]()
@@ -191,7 +191,7 @@ class Attempt:
         return self.acceptance.flaw(closed, state.q, target, goal, move.vertices, move.torsion)
 
     def _expected(self, target: Target, goal: TipGoal, guess: Array) -> float:
-        """Return about how far a node moves in the step, m; anything where the arm was at rest."""
+        """Return about how far a node moves in the step, m; the influence if the motion before does not show it."""
         last = self._arm.travel(guess)
         if last == 0.0 or target.base is not None:
             return self._influence

@@ -73,7 +73,7 @@ class Move(NamedTuple):
 
 
 Spent = Callable[[str], None]
-"""Gives the time since the last call to a phase."""
+"""Adds the time since the last call to a phase."""
 
 
 class Engine(ABC):
