@@ -6,6 +6,8 @@ configuration is the only thing used of it here, and quantities and tip are foun
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +40,10 @@ class Acceptance:
 
     def __init__(self, setup: Setup, accuracy: Accuracy) -> None:
         self._arm, self._kinematics, self._task = setup.arm, setup.kinematics, setup.task
-        self._base, self._actuators = np.flatnonzero(setup.arm.base), setup.arm.actuators
+        base, self._actuators = np.flatnonzero(setup.arm.base), setup.arm.actuators
+        # A slice costs less than a choice of rows, and base nodes come first as a rule.
+        is_first = np.array_equal(base, np.arange(len(base)))
+        self._base: slice | NDArray[np.int64] = slice(len(base)) if is_first else base
         self._least, self._greatest = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
         self._member, self._tip = _LOOSER * accuracy.member, _LOOSER * accuracy.tip
 
@@ -59,13 +64,14 @@ class Acceptance:
         arm, q, base = self._arm, closed.q, target.base
         # NaN passes no comparison with `<=`, and is in every norm.
         size = norm(q.reshape(-1))
-        if not size + norm(vertices.reshape(-1)) + norm(torsion) < np.inf:
+        curve = norm(vertices.reshape(-1)) + (norm(torsion) if len(torsion) else 0.0)
+        if not size + curve < math.inf:
             return "the new state is not finite"
         rounding = _ROUNDING * size
         X, at = arm.nodes(q), arm.nodes(before if base is None else arm.based(q, base))
         # A base that rests is left alone by everything, so that it cannot drift either.
         spare = 0.0 if base is None else self._member + rounding
-        off = norm((X.take(self._base, axis=0) - at.take(self._base, axis=0)).reshape(-1))
+        off = norm((X[self._base] - at[self._base]).reshape(-1))
         if not off <= spare:
             return f"the new state has its base {off:.3g} m from where it is"
         values, enough = arm.measured(q), self._member + rounding
