@@ -127,13 +127,13 @@ class TipTask:
 def over_all_nodes(arm: Arm, response: Array) -> Array:
     """Return displacements (3 (N - N_c), n) of the free nodes as those of all nodes, (N, 3, n)."""
     every = np.zeros((len(arm.node_names), 3, response.shape[1]))
-    every[arm.free] = response.reshape(-1, 3, response.shape[1])
+    every[arm.free] = response.reshape(len(arm.free), 3, response.shape[1])
     return every
 
 
 def tip_response(arm: Arm, jacobian: Array, every: Array) -> Array:
     """Return (n_e, n) how the tip's rows, of `jacobian` (n_e, 3 K_tip), change with displacements (N, 3, n)."""
-    return np.asarray(jacobian @ every[arm.end_effector.nodes].reshape(jacobian.shape[1], -1))
+    return np.asarray(jacobian @ every[arm.end_effector.nodes].reshape(jacobian.shape[1], every.shape[2]))
 
 
 def duration(dt: float) -> float:
