@@ -13,7 +13,7 @@ from vgtm_qp.arm.arm import Pose
 from vgtm_qp.errors import GoalError, ProblemError
 from vgtm_qp.problem.truss import BasePose
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.base import BaseMotion
+from vgtm_qp.step.path import base_motion
 from vgtm_qp.step.resolver import Resolver, StepStatus
 
 POSES = (
@@ -34,7 +34,7 @@ def _without_a_compiler(monkeypatch):
 
 def test_a_base_passes_its_poses_and_is_rigid_between():
     truss = modules.octahedral(2)
-    motion = BaseMotion([BasePose(**pose) for pose in POSES])
+    motion = base_motion([BasePose(**pose) for pose in POSES])
 
     def nodes(time):
         return HOME.carry(truss.home, motion.pose(time))
@@ -81,7 +81,7 @@ def test_a_maneuver_on_a_moving_base_is_certified(solver, joint_offset):
     maneuver = vq.solve(problem)
     assert maneuver.status == "solved", maneuver.manifest["blocked_by"]
     assert maneuver.certificate.ok, maneuver.certificate.failures()
-    base, home = BaseMotion(problem.truss.base_motion), modules.octahedral(4).home[:3]
+    base, home = base_motion(problem.truss.base_motion), modules.octahedral(4).home[:3]
     for time, nodes, vertices in zip(maneuver.time, maneuver.nodes, maneuver.control_vertices, strict=True):
         wanted = HOME.carry(home, base.pose(time))
         np.testing.assert_allclose(nodes[:3], wanted, atol=1e-12)

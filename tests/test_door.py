@@ -350,13 +350,13 @@ def test_a_base_may_turn_on_past_half_a_turn_and_past_a_whole_one():
 
 def test_the_base_that_verification_places_turns_on_too():
     from vgtm_qp.result.poses import base_poses
-    from vgtm_qp.step.base import BaseMotion
+    from vgtm_qp.step.path import base_motion
 
     problem = serial_problem({**chain(), "base_motion": TURNING})
     times = np.linspace(0.0, 10.0, 301)
     poses = base_poses(problem.to_dict(), times)
     assert np.abs(np.diff(poses[:, 3:], axis=0)).max() < 0.05
-    motion = BaseMotion(problem.arm.base_motion)
+    motion = base_motion(problem.arm.base_motion)
     for time, pose in zip(times, poses, strict=True):
         np.testing.assert_allclose(
             Rotation.from_rotvec(pose[3:]).as_matrix(), motion.pose(time).rotation, atol=1e-12

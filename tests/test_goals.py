@@ -12,7 +12,7 @@ from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.solvers import make_solver
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.target import Target
 
 
@@ -44,7 +44,7 @@ def one_qp(penalty):
     )
     lengths = arm.truss.home_lengths[arm.truss.actuators]
     target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
-    separation = Separation(arm.arm, arm.monitor, Distances(arm.safe, arm.self_safe, arm.influence))
+    separation = Separation(arm)
     rows = separation.rows(X, 0.0, 1.0, 0.1, {}, 0.0)
     numbers = numbers_at(arm, X, arm.control_vertices, target, 0.0, rows, motion=True)
     return arm, CondensedSolver(arm.layout), numbers

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arms import TRUSSES, arm_problem, central_differences, random_pose
@@ -10,7 +12,7 @@ import vgtm_qp as vq
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.separation import Separation
 from vgtm_qp.study.scenes import random_scene
 
 
@@ -40,8 +42,7 @@ def beside_a_cube(joint_offset=0.1, **more):
 
 
 def separation_of(setup):
-    distances = Distances(setup.safe, setup.self_safe, setup.influence, margin=0.0)
-    return Separation(setup.arm, setup.monitor, distances)
+    return Separation(replace(setup, margin=0.0))
 
 
 def test_clearance_rows_are_the_derivatives_of_the_distances():

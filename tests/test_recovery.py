@@ -15,7 +15,7 @@ import vgtm_qp as vq
 from vgtm_qp.arm.truss.bounds import chord_deviation
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver
-from vgtm_qp.step.separation import Distances, Separation
+from vgtm_qp.step.separation import Separation
 
 
 def beside(gap):
@@ -28,10 +28,10 @@ def beside(gap):
 def test_an_arm_too_near_at_the_start_recovers_monotonically_and_says_so():
     resolver = Resolver(problem(obstacle=[beside(0.03)]))
     setup = resolver.setup
-    kept = Separation(setup.arm, setup.monitor, Distances(setup.safe, setup.self_safe, setup.influence))
+    kept = Separation(setup)
     before = kept.shortfall(resolver.state.q, 0.0)
     assert before
-    assert any("crate" in name for name in kept.names(before))
+    assert any("crate" in setup.monitor.names.clearance(pair) for pair in before)
     short, least = dict(before), min(before.values())
     tip, _ = resolver.tip()
     for k in range(12):

@@ -57,7 +57,7 @@ class CurveFirstResolver(MethodResolver):
         )
         self._s = self.motion.s[[segment.face for segment in segments]]
         self._frames = any(segment.tracks != "position" for segment in segments)
-        self._actuation = Actuation(setup.arm, (), slows_down=False)
+        self._actuation = Actuation(replace(setup, slow_approach=False, jams=()))
         self._correct, self._is_qp = method.correct, method.name == "qp"
         self.solver = "daqp" if self._is_qp else None
 

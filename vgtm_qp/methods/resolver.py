@@ -17,9 +17,8 @@ from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.separation import Shortfall
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.state import State, frozen
+from vgtm_qp.step.state import Shortfall, State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
 

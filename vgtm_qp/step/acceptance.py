@@ -1,19 +1,27 @@
 """A state is held once more against what it must be, by other means than those that made it.
 
 What settles a configuration also measures it. If that measure is wrong for any reason, the state is: so the
-configuration is the only thing taken from it here, and quantities and tip are found from that anew.
+configuration is the only thing used of it here, and quantities and tip are found from that anew.
 """
 
 from __future__ import annotations
 
+import math
+
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.arm import Arm, Kinematics, Pose
+from vgtm_qp.arm.arm import Kinematics, Pose
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.graph import StationSymbols
+from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import beyond, norm
 from vgtm_qp.rows.tip import TipGoal
-from vgtm_qp.step.task import TipTask
+from vgtm_qp.step.engine import Accuracy
+from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.target import Target, base_frame
 
 Array = NDArray[np.float64]
 
@@ -28,63 +36,46 @@ _ROUNDING = 64.0 * float(np.finfo(float).eps)
 
 
 class Acceptance:
-    """Holds states of one arm against its quantities, limits and goals.
+    """Holds states of one arm, settled to an accuracy, against its quantities, limits and goals."""
 
-    Parameters
-    ----------
-    arm, kinematics
-        The latter is evaluated for a tip that has a direction to keep; overwritten then.
-    task
-        The coordinates of the tip.
-    member, tip : float
-        What quantities, and tip, m or rad, are settled to.
-    """
-
-    def __init__(self, arm: Arm, kinematics: Kinematics, task: TipTask, *, member: float, tip: float) -> None:
-        self._arm, self._kinematics, self._task = arm, kinematics, task
-        self._base, self._actuators = np.flatnonzero(arm.base), arm.actuators
-        self._least, self._greatest = arm.home_quantities.copy(), arm.home_quantities.copy()
-        self._member, self._tip = _LOOSER * member, _LOOSER * tip
+    def __init__(self, setup: Setup, accuracy: Accuracy) -> None:
+        self._arm, self._kinematics, self._task = setup.arm, setup.kinematics, setup.task
+        base, self._actuators = np.flatnonzero(setup.arm.base), setup.arm.actuators
+        # A slice costs less than a choice of rows, and base nodes come first as a rule.
+        is_first = np.array_equal(base, np.arange(len(base)))
+        self._base: slice | NDArray[np.int64] = slice(len(base)) if is_first else base
+        self._least, self._greatest = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
+        self._member, self._tip = _LOOSER * accuracy.member, _LOOSER * accuracy.tip
 
     def flaw(
         self,
         closed: Closed,
         before: Array,
-        base: Pose | None,
-        lower: Array,
-        upper: Array,
+        target: Target,
         goal: TipGoal | None,
-        *curve: Array,
+        vertices: Array,
+        torsion: Array,
     ) -> str:
-        """Return what is wrong with a configuration, or an empty string.
+        """Return what is wrong with a configuration and its curve (V, 3), m, and (T,), rad, or an empty string.
 
-        Parameters
-        ----------
-        closed
-            The configuration, and its quantities.
-        before, base
-            Configuration of the state before, and where the base is now; None where it rests.
-        lower, upper
-            (n_a,) least and greatest values of the actuators.
-        goal
-            Of the tip; None for a tip that need not be anywhere.
-        curve
-            Whatever else has to be finite.
+        `before` is the configuration of the state before; the limits and the base are those of the `target`. `goal` is
+        that of the tip, None for one that need not be anywhere. A tip with a direction overwrites the kinematics.
         """
-        arm, q = self._arm, closed.q
+        arm, q, base = self._arm, closed.q, target.base
         # NaN passes no comparison with `<=`, and is in every norm.
         size = norm(q.reshape(-1))
-        if not size < np.inf or not all(norm(part.reshape(-1)) < np.inf for part in curve):
+        curve = norm(vertices.reshape(-1)) + (norm(torsion) if len(torsion) else 0.0)
+        if not size + curve < math.inf:
             return "the new state is not finite"
         rounding = _ROUNDING * size
         X, at = arm.nodes(q), arm.nodes(before if base is None else arm.based(q, base))
         # A base that rests is left alone by everything, so that it cannot drift either.
         spare = 0.0 if base is None else self._member + rounding
-        off = norm((X.take(self._base, axis=0) - at.take(self._base, axis=0)).reshape(-1))
+        off = norm((X[self._base] - at[self._base]).reshape(-1))
         if not off <= spare:
             return f"the new state has its base {off:.3g} m from where it is"
         values, enough = arm.measured(q), self._member + rounding
-        self._least[self._actuators], self._greatest[self._actuators] = lower, upper
+        self._least[self._actuators], self._greatest[self._actuators] = target.lower, target.upper
         out = beyond(values, self._least, self._greatest)
         if not norm(out) <= enough:
             return f"the new state has {self._worst(out)} from the values it may have"
@@ -109,3 +100,47 @@ class Acceptance:
             return norm((goal.position - position)[task.axes])
         self._kinematics.evaluate_quantities(q)
         return task.error(position, self._kinematics.tip_rotation, goal)
+
+
+class TrackingError:
+    """Measures how far stations that are to stay on the curve exactly are from it; for a layout with hard rows.
+
+    A linear row leaves a gap, a step must not.
+    """
+
+    def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
+        self._layout, self._kinematics = layout, kinematics
+        count = len(layout.tracked)
+        self._nodes = layout.arm.stations.nodes[layout.tracked].reshape(-1)
+        station = StationSymbols(layout)
+        nodes, rotation, _, weights, *curve = station.inputs
+        if layout.general is not None:
+            curve = [curve[0], curve[2]]
+        function = ca.Function(
+            "station", [nodes, rotation, weights, *curve], [station.gap, ca.densify(station.turn)]
+        )
+        self._kernel = kernel = Kernel(function.map(count), compiled=False)
+        kernel.inputs[2][:] = layout.arm.stations.weights[layout.tracked].reshape(-1)
+        kernel.inputs[1].reshape(count, 9)[:] = np.eye(3).reshape(-1)
+        if layout.general is None:
+            kernel.inputs[4][:] = layout.curve_weights.reshape(-1)
+            kernel.inputs[5][:] = layout.curve_slopes.reshape(-1)
+
+    def greatest(self, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
+        """Return the greatest gap, m, or turn, rad, at a configuration and its curve (V, 3), m, and (T,), rad."""
+        layout, inputs = self._layout, self._kernel.inputs
+        tracked, arm, shape = layout.tracked, layout.arm, layout.general
+        inputs[0][:] = arm.nodes(q).take(self._nodes, axis=0).reshape(-1)
+        if layout.hard_turns:
+            self._kinematics.evaluate(q)
+            inputs[1][:] = self._kinematics.station_rotation[tracked].transpose(0, 2, 1).reshape(-1)
+        if shape is None:
+            inputs[3].reshape(len(tracked), -1)[:] = vertices.reshape(-1)
+        else:
+            rows = shape.rows(vertices, torsion, base_frame(arm, base))
+            inputs[3][:] = rows.position.reshape(-1)
+            inputs[4][:] = rows.frame.reshape(-1)
+        self._kernel()
+        gap, turn = self._kernel.outputs
+        worst = float(np.abs(gap).max())
+        return max(worst, float(np.abs(turn).max())) if layout.hard_turns else worst

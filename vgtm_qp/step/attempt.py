@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.arm import Arm
 from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
-from vgtm_qp.step.acceptance import Acceptance
-from vgtm_qp.step.engine import Accuracy, Engine, Move
-from vgtm_qp.step.separation import Separation, Shortfall
-from vgtm_qp.step.state import State, sealed
+from vgtm_qp.step.acceptance import Acceptance, TrackingError
+from vgtm_qp.step.actuation import Actuation
+from vgtm_qp.step.engine import Accuracy, Move
+from vgtm_qp.step.separation import RECOVERY, Separation
+from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.state import Shortfall, State
+from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.target import QPInput, Target
-from vgtm_qp.step.tracking import TrackingError
 
 Array = NDArray[np.float64]
 
+_MOST_QPS = 8
+
+_MOST_FRACTIONS = 8
+"""Times between two states for which a QP has rows, at most."""
 
 _MOTION_MARGIN = 2.5
-"""A member may move by so many times what is expected of it before a pair that matters can be missed."""
+"""A body may move by so many times what is expected of it before a pair that matters can be missed."""
 
 _TOO_FAR = 1e3
 """No answer of a QP that moves a node by so many times the arm's length means anything: the pose is singular."""
@@ -33,254 +38,161 @@ _TOO_FAR = 1e3
 _DEVIATION = 0.1
 """An arm whose points may leave their chords by more than this turns too far in one step, m."""
 
+_SETTLING = 5e-3
+"""A tip that is further off than this share of the arm's length after a QP calls for another one."""
 
-@dataclass(frozen=True)
-class Tolerances:
-    """What an accepted state is held against: quantities, tip and, where stations track hard, tracking in m (rad).
-
-    They are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. A tip
-    that is further off than `settling` of the arm's length after a QP calls for another one.
-    """
-
-    member: float = 1e-10
-    stroke: float = 1e-10
-    tip: float = 1e-8
-    settling: float = 5e-3
-    tracking: float = 1e-7
+_ROUNDING = float(np.finfo(float).eps)
 
 
-@dataclass
 class Phases:
     """Seconds spent in each phase of a step."""
 
-    seconds: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(("distance", "qp", "correction", "acceptance"), 0.0)
-    )
-    _mark: float = field(default_factory=perf_counter)
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(("distance", "qp", "correction", "acceptance"), 0.0)
+        self.start()
 
     def start(self) -> None:
         """Begin to count."""
         self._mark = perf_counter()
 
     def add(self, phase: str) -> None:
-        """Give the time since the last call to `phase`."""
+        """Add the time since the last call to `phase`."""
         now = perf_counter()
         self.seconds[phase] += now - self._mark
         self._mark = now
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What came of an attempt.
-
-    Attributes
-    ----------
-    accepted : bool
-    closed : Closed or None
-        The new configuration, valid where accepted.
-    control_vertices : (V, 3)
-        The new curve, m.
-    progress : float
-        How much of the target's piece of path was covered, 0 to 1.
-    reason : str
-        Why it was refused; empty where accepted.
-    solution : StepSolution or None
-        Of the motion QP.
-    rows : ClearanceRows or None
-        Its clearance rows.
-    iterations : int
-        QPs solved.
-    shortfall : Shortfall or None
-        What is still too near in the new configuration; None where that was not looked at.
-    torsion : (T,)
-        The new torsion coordinates, rad.
-    solver_failed : bool
-        Whether it was refused only because the QP solver gave no good answer.
-    time : float
-        At the end of the step, s.
-    failure : FailedStepError or None
-        What refused it where that was a QP without an answer; it carries the QP.
-    """
-
-    accepted: bool
-    closed: Closed | None
-    control_vertices: Array
-    progress: float
-    reason: str
-    solution: StepSolution | None = None
-    rows: ClearanceRows | None = None
-    iterations: int = 0
-    shortfall: Shortfall | None = None
-    torsion: Array = field(default_factory=lambda: np.zeros(0))
-    solver_failed: bool = False
-    time: float = 0.0
-    failure: FailedStepError | None = None
-
-    def state_after(self, arm: Arm, before: State) -> State:
-        """Return the state of an arm that an accepted attempt leads to from the state `before`."""
-        assert self.accepted
-        assert self.closed is not None
-        duration = self.time - before.time
-        return State(
-            time=self.time,
-            q=(q := sealed(self.closed.q)),
-            nodes=sealed(arm.nodes(q)),
-            control_vertices=sealed(self.control_vertices),
-            torsion=sealed(self.torsion),
-            quantities=sealed(self.closed.quantities),
-            rates=sealed((self.closed.quantities - before.quantities) / duration),
-            motion=sealed(q - before.q),
-            duration=duration,
-            shortfall=self.shortfall,
-        )
-
-
 class Attempt:
     """Tries one piece of path from one state; keeps the workspaces."""
 
-    def __init__(
-        self,
-        arm: Arm,
-        engine: Engine,
-        separation: Separation,
-        acceptance: Acceptance,
-        *,
-        tracking: TrackingError | None = None,
-        tolerances: Tolerances | None = None,
-        max_qps: int = 8,
-    ) -> None:
-        self.arm = arm
-        self.engine = engine
-        self.tracking = tracking
-        self.separation = separation
-        self.acceptance = acceptance
-        self.tolerances = tolerances or Tolerances()
-        self.max_qps = max_qps
-        self.phases = Phases()
-        kept = self.tolerances
-        self._accuracy = Accuracy(kept.member, kept.tip, kept.settling * arm.height)
+    def __init__(self, setup: Setup, separation: Separation, actuation: Actuation) -> None:
+        self._arm, self._influence = setup.arm, setup.influence
+        self.separation, self.phases = separation, Phases()
+        # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
+        exact = max(1e-12, 32.0 * _ROUNDING * setup.arm.height)
+        member = 1e-10 if actuation.starts_at_once else exact
+        self.accuracy = Accuracy(member, tip=1e-8, start=_SETTLING * setup.arm.height)
+        self.acceptance = Acceptance(setup, self.accuracy)
+        self.use(setup)
 
-    def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Outcome:
-        """Return the outcome of moving from `state` along the target's piece of path; no state is changed.
+    def use(self, setup: Setup) -> None:
+        """Go on with the curve of another `setup` of the arm."""
+        layout, self._engine = setup.layout, setup.engine
+        self._tracking = TrackingError(layout, setup.kinematics) if layout.hard_tracking else None
 
-        `share` is the length of the piece as a part of the step before: what the motion guessed from it is scaled by.
+    def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Step:
+        """Return what a step from `state` along the target's piece of path does, with its progress on that.
+
+        `share` is the length of the piece as a part of the step before: it scales the motion guessed from that.
         `progress` is how much of the piece lies behind the tip at the start.
         """
         self.phases.start()
-        short = state.shortfall
-        if short is None:
-            short = self.separation.shortfall(state.q, state.time)
+        short = self.separation.shortfall_of(state)
         if short:
-            outcome = self._run(state, target, share, progress, short, self.separation.distances.recovery)
-            if outcome.accepted:
-                return outcome
+            step = self._run(state, target, share, progress, short, RECOVERY)
+            if step.moved:
+                return step
         return self._run(state, target, share, progress, short, 0.0)
 
     def first_input(self, state: State, target: Target) -> QPInput:
         """Return what the first QP of a step from `state` is linearised at."""
-        short = state.shortfall
-        if short is None:
-            short = self.separation.shortfall(state.q, state.time)
-        gain = self.separation.distances.recovery if short else 0.0
-        return self._first(state, target, 1.0, 0.0, short, gain)[0]
+        short = self.separation.shortfall_of(state)
+        return self._first(state, target, 1.0, 0.0, short, RECOVERY if short else 0.0)[0]
 
     def _first(
         self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
     ) -> tuple[QPInput, float]:
-        """Return that, and from which distance on no pair can become active, m."""
-        q, goal, guess = state.q, target.goal(progress), share * state.motion
-        reach = self.separation.distances.influence
+        """Return the first input, and the distance, m, from which on no pair can become active."""
+        q, arm, goal, guess = state.q, self._arm, target.goal(progress), share * state.motion
+        reach = self._influence
         if share >= 1.0:
             reach = _MOTION_MARGIN * self._expected(target, goal, guess)
         rows = self.separation.rows(q, state.time, target.time - state.time, reach, short, gain)
         if target.base is not None:
             # What the base's own motion does to the rows is known.
-            rows = rows.after(self.arm.nodes(self.arm.based(q, target.base)) - self.arm.nodes(q))
+            rows = rows.after(arm.nodes(arm.based(q, target.base)) - arm.nodes(q))
         curve = state.control_vertices, state.torsion
         return QPInput(q, q + 0.5 * guess, *curve, target, goal, progress, rows, True), reach
 
     def _run(
         self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
-    ) -> Outcome:
-        """Do it, with pairs that are too `short` of their clearance driven apart by `gain`, m."""
+    ) -> Step:
+        """Run it; pairs that are too near at the start, `short`, are driven apart by `gain`, m."""
         phases, separation = self.phases, self.separation
         asked, reach = self._first(state, target, share, progress, short, gain)
-        q, vertices, torsion = state.q, state.control_vertices, state.torsion
-        fractions: list[float] = []
-        first: StepSolution | None = None
-        first_rows: ClearanceRows | None = None
-        closed: Closed | None = None
-        after: Shortfall | None = None
+        q, fractions = state.q, list[float]()
+        solution: StepSolution | None = None
+        rows: ClearanceRows | None = None
+        move: Move | None = None
 
-        def outcome(reason: str, count: int) -> Outcome:
-            details = (first, first_rows, count, after, torsion)
-            return Outcome(not reason, closed, vertices, progress, reason, *details, time=target.time)
+        def blocked(
+            reason: str, failure: FailedStepError | None = None, *, solver_failed: bool = False
+        ) -> Step:
+            kept = Step(StepStatus.BLOCKED, 0.0, state, reason, count, solver_failed)
+            return replace(kept, solution=solution, rows=rows, failure=failure)
 
-        for count in range(1, self.max_qps + 1):
-            if count > 1:
-                rows = separation.rows(q, target.time, 0.0, reach, short, gain)
-                for more in separation.rows_between(state.q, q, state.time, target.time, fractions):
-                    rows = rows.joined(more)
-                goal = target.goal(progress)
-                asked = QPInput(q, q, vertices, torsion, target, goal, progress, rows, False)
+        for count in range(1, _MOST_QPS + 1):
+            if move is not None:
+                near = separation.rows(q, target.time, 0.0, reach, short, gain)
+                near = separation.with_rows_between(near, state, q, target.time, fractions)
+                at = q, q, move.vertices, move.torsion
+                asked = QPInput(*at, target, target.goal(move.progress), move.progress, near, False)
             phases.add("distance")
             try:
-                move = self.engine.move(asked, self._accuracy, phases.add)
+                move = self._engine.move(asked, self.accuracy, phases.add)
             except AnswerError as error:
-                return replace(outcome(str(error), count), solver_failed=True, failure=error)
+                return blocked(str(error), error, solver_failed=True)
             except EvaluationError as error:
-                return replace(outcome(str(error), count), solver_failed=True)
+                return blocked(str(error), solver_failed=True)
             except InfeasibleStepError as error:
-                return replace(
-                    outcome("no displacement keeps all limits and clearances", count), failure=error
-                )
+                return blocked("no displacement keeps all limits and clearances", error)
             except SolverError as error:
-                return outcome(str(error), count)
+                return blocked(str(error))
             finally:
                 phases.add("correction")
-            if count == 1:
-                first, first_rows = move.solution, asked.rows
-            q, vertices, torsion, progress = move.q, move.vertices, move.torsion, move.progress
-            if not move.furthest < _TOO_FAR * self.arm.height or not np.isfinite(q).all():
-                return outcome("singular pose", count)
-            # A pair that one correction pushes away must still be there in the next, or two of them take turns.
+            if solution is None:
+                solution, rows = move.solution, asked.rows
+            q = move.q
+            is_finite = move.closed is not None or np.isfinite(q).all()
+            if not move.furthest < _TOO_FAR * self._arm.height or not is_finite:
+                return blocked("singular pose")
+            # A pair that one correction pushes away must still be there in the next, or two of them alternate.
             reach = max(reach, move.furthest)
             if move.closed is None:
                 continue
-            flaw = self._flaw(state, target, move)
+            flaw = self._flaw(state, target, move, move.closed)
             if flaw:
-                return replace(outcome(flaw, count), solver_failed=True)
-            closed, q = move.closed, move.closed.q
-            if self.tracking is not None:
-                gap = self.tracking.greatest(q, vertices, torsion, target.base)
-                if not gap <= self.tolerances.tracking:
+                return blocked(flaw, solver_failed=True)
+            q, curve = move.closed.q, (move.vertices, move.torsion)
+            if self._tracking is not None:
+                gap = self._tracking.greatest(q, *curve, target.base)
+                if not gap <= self.accuracy.tracking:
                     continue
-            report = separation.between(state.q, q, state.time, target.time, short)
-            after = separation.holds(q, target.time, short, proven=report.certified)
+            report, after = separation.proof(state, q, target.time, short)
             phases.add("acceptance")
             if after is None:
                 continue
             if not separation.deviation(state.q, q) < _DEVIATION:
-                return outcome("the arm turns too far in one step", count)
+                return blocked("the arm turns too far in one step")
             if report.certified:
-                return outcome("", count)
+                then = state.next(self._arm, target.time, move.closed, *curve, after)
+                status = StepStatus.REACHED if move.progress >= WHOLE else StepStatus.SLOWED
+                return Step(status, move.progress, then, "", count, solution=solution, rows=rows)
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)
-            if len(fractions) > 8:
-                return outcome("clearance between the states", count)
-        return outcome("no convergence", self.max_qps)
+            if len(fractions) > _MOST_FRACTIONS:
+                return blocked("clearance between the states")
+        return blocked("no convergence")
 
-    def _flaw(self, state: State, target: Target, move: Move) -> str:
+    def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
         """Return what is wrong with where a `move` leads from `state`, found anew; empty where nothing is."""
-        assert move.closed is not None
         # An elastic tip that had to leave its path is where the QP put it.
-        on_path = move.solution.tip_slack <= self.tolerances.tip
+        on_path = move.solution.tip_slack <= self.accuracy.tip
         goal = target.goal(move.progress) if on_path else None
-        box, curve = (target.lower, target.upper), (move.vertices, move.torsion)
-        return self.acceptance.flaw(move.closed, state.q, target.base, *box, goal, *curve)
+        return self.acceptance.flaw(closed, state.q, target, goal, move.vertices, move.torsion)
 
     def _expected(self, target: Target, goal: TipGoal, guess: Array) -> float:
-        """Return about how far a node moves in the step, m; anything where the arm was at rest."""
-        last = self.arm.travel(guess)
+        """Return about how far a node moves in the step, m; the influence if the motion before does not show it."""
+        last = self._arm.travel(guess)
         if last == 0.0 or target.base is not None:
-            return self.separation.distances.influence
+            return self._influence
         return max(last, abs(target.end - target.start) * float(np.abs(goal.velocity).max()))

@@ -2,7 +2,7 @@
 
 A moving arm with limited accelerations cannot stay where it is. It is let into a state only if steps are known that
 bring it from there to rest, each within the limits and clear, so that what lies ahead can never trap it: where no
-other step is found the arm takes the first of those. A tip that is held to its path brakes along it. An elastic tip,
+other step is found the arm does the first of those. A tip that is held to its path brakes along it. An elastic tip,
 and one whose base moves on, may leave it: then every actuator brakes by itself, which strokes always allow.
 """
 
@@ -15,21 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.step.actuation import Actuation, Box
-from vgtm_qp.step.attempt import Attempt, Outcome
+from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import State
-from vgtm_qp.step.target import Target
+from vgtm_qp.step.step import Step, StepStatus
 
 Array = NDArray[np.float64]
+Steps = list[tuple[State, float]]
+"""States, and the values of a path there."""
+
+ANY_RANK = 2
+"""The greatest rank of braking."""
 
 _MOST_STEPS = 60
 _SPARE_STEPS = 4
 """Steps that braking may take, at most, and beyond those that the fastest actuator needs by itself."""
 
 _GENTLER = (0.5, 0.75)
-"""Parts of the way of the step before that a step aims at where braking as hard as possible fails."""
+"""Shares of the displacement of the step before that a step aims at where braking as hard as possible fails."""
 
 _MOST_RIDING = 500
 """Steps, at most, that an arm is followed on a base that moves on."""
@@ -40,7 +45,7 @@ _INSTANT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Braking:
-    """Steps that bring an arm to rest from `origin`: states, and the values of `path` there.
+    """Steps on a `path` that bring an arm to rest from `origin`.
 
     Attributes
     ----------
@@ -53,7 +58,7 @@ class Braking:
 
     origin: State
     path: Path
-    steps: list[tuple[State, float]]
+    steps: Steps
     on_path: int
     rank: int = 0
 
@@ -63,156 +68,144 @@ class Braking:
         steps, on_path = self.steps[1:], max(self.on_path - 1, 0)
         return replace(self, origin=self.steps[0][0], steps=steps, on_path=on_path)
 
+    def first(self, path: Path | None, start: float, end: float, blocked: Step) -> Step:
+        """Return the first step in the place of one that was `blocked`, with its progress on a piece of `path`."""
+        (state, value), on_path = self.steps[0], self.on_path > 0
+        progress = (value - start) / (end - start) if on_path and path is self.path else 0.0
+        return replace(
+            blocked,
+            status=StepStatus.SLOWED,
+            progress=progress,
+            state=state,
+            braked=True,
+            left_path=not on_path,
+        )
+
+    def changed(self, origin: State, change: Callable[[State], State]) -> Braking:
+        """Return the same from another state `origin`, with every other state changed as well."""
+        return replace(self, origin=origin, steps=[(change(state), value) for state, value in self.steps])
+
 
 @dataclass(frozen=True, eq=False)
 class Brakes:
-    """How one arm brakes in steps of `dt`.
+    """How one arm brakes in steps of `dt`, s."""
 
-    Attributes
-    ----------
-    setup : Setup
-    attempt, actuation
-        Of the same arm.
-    target_of
-        From a state, `dt`, path, start, end and box to the target of a step.
-    dt : float
-        Duration of a step, s.
-    """
-
-    setup: Setup
+    shaping: Shaping
     attempt: Attempt
     actuation: Actuation
-    target_of: Callable[[State, float, Path, float, float, Box], Target]
     dt: float
-
-    def target(self, state: State, path: Path, start: float, end: float, box: Box) -> Target:
-        """Return the target of a step from `state`."""
-        return self.target_of(state, self.dt, path, start, end, box)
 
     def find(self, state: State, path: Path, value: float, piece: float) -> Braking | None:
         """Return the steps that bring the arm from `state` to where it may stay, or None where they were not found.
 
         The tip is at `value` of `path`, and goes on by at most `piece` in each step where it stays on it.
         """
-        if self.setup.tip_mode == "elastic":
-            found = self._let_go(state) or self._yielding(state)
-            return None if found is None else Braking(state, path, [(now, value) for now in found], 0)
-        ends = self._until_the_base_rests()
-        along = self._along(state, path, value, piece, ends)
+        setup, until = self.shaping.setup, self._until_the_base_rests()
+        if setup.tip_mode == "elastic":
+            steps = self._let_go(state, value) or self._yielding(state, value)
+            return None if steps is None else Braking(state, path, steps, 0)
+        along = self._along(state, path, value, piece, until)
         if along is not None:
             return Braking(state, path, along, len(along))
-        if self.setup.base_motion is None:
+        if setup.base_motion is None:
             return None
         along = self._along(state, path, value, piece, -np.inf)
         if along is not None:
-            last, value = along[-1] if along else (state, value)
-            ride = self._let_go(last)
+            ride = self._let_go(*(along[-1] if along else (state, value)))
             if ride is not None:
-                return Braking(state, path, [*along, *((now, value) for now in ride)], len(along), 1)
+                return Braking(state, path, along + ride, len(along), 1)
         return self.letting_go(state, path, value)
 
     def letting_go(self, state: State, path: Path, value: float) -> Braking | None:
         """Return the steps in which every actuator brakes by itself, or None where they were not found."""
-        found = self._let_go(state)
-        return None if found is None else Braking(state, path, [(now, value) for now in found], 0, 2)
+        steps = self._let_go(state, value)
+        return None if steps is None else Braking(state, path, steps, 0, ANY_RANK)
 
     def _until_the_base_rests(self) -> float:
         """Return the time from which the base rests, s."""
-        base = self.setup.base_motion
+        base = self.shaping.setup.base_motion
         return -np.inf if base is None else base.end - _INSTANT
 
-    def _along(
-        self, state: State, path: Path, value: float, piece: float, until: float
-    ) -> list[tuple[State, float]] | None:
-        """Brake on the path, and stay on it until a time, s; return states and the path's values.
+    def _done(self, state: State, path: Path, start: float, end: float, box: Box, progress: float) -> Step:
+        """Return the attempt at a piece of path of which the tip has made some `progress` before."""
+        target = self.shaping.target(state, self.dt, path, start, end, box)
+        return self.attempt.run(state, target, progress=progress)
+
+    def _along(self, state: State, path: Path, value: float, piece: float, until: float) -> Steps | None:
+        """Brake on the path, and stay on it until a time, s.
 
         The steps aim at where the tip is, from further along the path: progress along it is what they avoid. That is
-        where many limits meet, and corrections may run in circles round such a corner; then they aim at a part of
+        where many limits meet, and corrections may run in circles round such a corner; then they aim at a share of
         what the step before covered.
         """
         covered = 0.5 * piece
 
-        values: list[float] = []
-
-        def step(now: State, limits: Box) -> Outcome:
+        def step(now: State, limits: Box) -> tuple[State, float] | None:
             nonlocal covered, value
-            ahead = min(value + piece, path.end)
-            outcome = self.attempt.run(now, self.target(now, path, ahead, value, limits), progress=1.0)
-            start, end = ahead, value
-            for share in _GENTLER:
-                if outcome.accepted:
-                    break
-                start, end = value, min(value + share * covered, path.end)
-                outcome = self.attempt.run(now, self.target(now, path, start, end, limits))
-            reached = start + outcome.progress * (end - start)
-            covered, value = reached - value, reached
-            values.append(value)
-            return outcome
+            gentler = [(value, min(value + share * covered, path.end), 0.0) for share in _GENTLER]
+            for start, end, behind in [(min(value + piece, path.end), value, 1.0), *gentler]:
+                done = self._done(now, path, start, end, limits, behind)
+                if done.moved:
+                    reached = start + done.progress * (end - start)
+                    covered, value = reached - value, reached
+                    return done.state, value
+            return None
 
-        found = self._follow(state, step, until)
-        return None if found is None else list(zip(found, values, strict=True))
+        return self._follow(state, step, until)
 
-    def _yielding(self, state: State) -> list[State] | None:
-        """Brake an elastic tip: it is drawn along a way of its own, ever more slowly, and gives way to the limits."""
-        arm, kinematics = self.setup.arm, self.setup.kinematics
+    def _yielding(self, state: State, value: float) -> Steps | None:
+        """Brake an elastic tip: it is drawn along a line of its own, ever more slowly, and gives way to the limits."""
+        arm, kinematics = self.shaping.setup.arm, self.shaping.setup.kinematics
         kinematics.evaluate(state.q)
         here, rotation = arm.end_effector.position(state.nodes), kinematics.tip_rotation.copy()
-        count = max(self._count(state, self._box(state)), 1)
+        count = max(self._count(state, self.actuation.box(state, self.dt)), 1)
         before = arm.end_effector.position(arm.nodes(state.q - state.motion))
         there = here + 0.5 * count * (here - before)
-        way = Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation] * 2))
-        taken = 0
+        line = Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation] * 2))
+        number = 0
 
-        def step(now: State, limits: Box) -> Outcome:
-            nonlocal taken
-            start, end = (1.0 - max(1.0 - k / count, 0.0) ** 2 for k in (taken, taken + 1))
-            taken += 1
-            target = self.target(now, way, start, end, limits)
-            return self.attempt.run(now, target, progress=1.0)
+        def step(now: State, limits: Box) -> tuple[State, float] | None:
+            nonlocal number
+            start, end = (1.0 - max(1.0 - k / count, 0.0) ** 2 for k in (number, number + 1))
+            number += 1
+            done = self._done(now, line, start, end, limits, 1.0)
+            return (done.state, value) if done.moved else None
 
         return self._follow(state, step, self._until_the_base_rests())
 
-    def _let_go(self, state: State) -> list[State] | None:
+    def _let_go(self, state: State, value: float) -> Steps | None:
         """Brake every actuator by itself, whatever becomes of the tip; None where stations must stay on the curve."""
-        if self.setup.layout.hard_tracking:
+        setup = self.shaping.setup
+        if setup.layout.hard_tracking:
             return None
-        closing = Closing(self.setup.layout, self.setup.kinematics)
-        return self._follow(
-            state,
-            lambda now, limits: self._released(now, limits, closing),
-            self._until_the_base_rests(),
-        )
+        closing = Closing(setup.layout, setup.kinematics)
 
-    def _box(self, state: State) -> Box:
-        return self.actuation.box(state, self.dt)
+        def step(now: State, limits: Box) -> tuple[State, float] | None:
+            then = self._released(now, limits, closing)
+            return None if then is None else (then, value)
+
+        return self._follow(state, step, self._until_the_base_rests())
 
     def _follow(
-        self, state: State, step: Callable[[State, Box], Outcome | None], until: float
-    ) -> list[State] | None:
-        """Take steps until a time, s, and until the arm may stay; None where one fails, or they are too many."""
-        found: list[State] = []
+        self, state: State, step: Callable[[State, Box], tuple[State, float] | None], until: float
+    ) -> Steps | None:
+        """Step on until a time, s, and until the arm may stay; None where a step fails, or they are too many."""
+        found: Steps = []
         most = _MOST_STEPS
         for count in range(_MOST_STEPS + _MOST_RIDING):
-            limits = self._box(state)
-            if not self._beyond(state, limits).max() > 0.0 and state.time >= until:
+            limits, values = self.actuation.box(state, self.dt), self.actuation.values(state)
+            if np.all(limits[0] <= values) and np.all(values <= limits[1]) and state.time >= until:
                 return found
             if not count:
                 most = min(_MOST_STEPS, self._count(state, limits) + _SPARE_STEPS)
                 if until > state.time:
                     most += min(int(np.ceil((until - state.time) / self.dt)), _MOST_RIDING)
-            if count >= most:
+            done = step(state, limits) if count < most else None
+            if done is None:
                 return None
-            outcome = step(state, limits)
-            if outcome is None or not outcome.accepted:
-                return None
-            state = outcome.state_after(self.setup.arm, state)
-            found.append(state)
+            found.append(done)
+            state = done[0]
         return None
-
-    def _beyond(self, state: State, limits: Box) -> Array:
-        """Return (n_a,) how far each actuator has to move at least, m."""
-        values = self.actuation.values(state)
-        return np.asarray(np.maximum(np.maximum(limits[0] - values, values - limits[1]), 0.0))
 
     def _count(self, state: State, limits: Box) -> int:
         """Return how many steps the fastest actuator needs by itself.
@@ -223,29 +216,28 @@ class Brakes:
         width = np.maximum(0.5 * (limits[1] - limits[0]), 1e-12)
         return int(np.ceil(min(float((speed / width).max(initial=0.0)), float(_MOST_STEPS))))
 
-    def _released(self, state: State, limits: Box, closing: Closing) -> Outcome | None:
-        """Return the step in which every actuator moves as little as it may; None where that is not clear."""
-        arm, base, separation = self.setup.arm, self.setup.base_motion, self.attempt.separation
+    def _released(self, state: State, limits: Box, closing: Closing) -> State | None:
+        """Return the state after every actuator moves as little as it may; None where that is not clear."""
+        setup, attempt = self.shaping.setup, self.attempt
+        arm, base, separation = setup.arm, setup.base_motion, attempt.separation
         strokes = np.clip(self.actuation.values(state), *limits)
         q, vertices, then = state.q, state.control_vertices, state.time + self.dt
         if base is not None:
             before, after = base.pose(state.time), base.pose(then)
             q = arm.based(arm.carried(q, before, after), after)
             vertices = before.carry(vertices, after)
-        tolerance = self.attempt.tolerances.member
+        tolerance = attempt.accuracy.member
         closed = closing.close(q, strokes, strokes, tolerance, too_far=np.inf)
-        if not closed.error <= tolerance:
+        if not closed.error <= tolerance or not separation.deviation(state.q, closed.q) < np.inf:
             return None
-        short = state.shortfall
-        if short is None:
-            short = separation.shortfall(state.q, state.time)
-        if not separation.deviation(state.q, closed.q) < np.inf:
-            return None
-        report = separation.between(state.q, closed.q, state.time, then, short)
-        found = separation.holds(closed.q, then, short, proven=report.certified)
+        report, found = separation.proof(state, closed.q, then, separation.shortfall_of(state))
         if found is None or not report.certified:
             return None
-        moved = None if base is None else base.pose(then)
-        if self.attempt.acceptance.flaw(closed, state.q, moved, *limits, None, vertices, state.torsion):
+        still = self.shaping.target(state, self.dt, _NOWHERE, 0.0, 1.0, limits)
+        if attempt.acceptance.flaw(closed, state.q, still, None, vertices, state.torsion):
             return None
-        return Outcome(True, closed, vertices, 1.0, "", shortfall=found, torsion=state.torsion, time=then)
+        return state.next(arm, then, closed, vertices, state.torsion, found)
+
+
+_NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
+"""The path of a tip that need not be anywhere."""

@@ -1,10 +1,10 @@
-"""From a problem to an arm that is ready to move: the last place that sees a problem."""
+"""From a problem to an arm that is ready to move, its curve among it: the last place that sees a problem."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,9 @@ from vgtm_qp.arm.arm import Arm, Kinematics
 from vgtm_qp.arm.build import make_arm
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.compiled import finish_compiling
-from vgtm_qp.errors import ProblemError, nearest
+from vgtm_qp.curve.curve import Curve, straight_curve
+from vgtm_qp.curve.families import CurveFamily, make_family
+from vgtm_qp.errors import Mistake, ProblemError, nearest
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
@@ -23,12 +25,12 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
+from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.step.base import BaseMotion
 from vgtm_qp.step.chain_engine import ChainEngine
-from vgtm_qp.step.curve import home_curve
 from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
+from vgtm_qp.step.path import base_motion
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import TipTask
 
@@ -57,30 +59,28 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
     kinematics = arm.kinematics()
     kinematics.evaluate(arm.home_configuration)
     task = TipTask(problem.end_effector.track, arm)
-    curve = home_curve(problem, arm, task)
-    layout = replace(curve.layout, elastic_tip=problem.end_effector.mode == "elastic")
-    clearance = problem.clearance
+    home = home_curve(problem, arm, task)
+    clearance, solver, spec = problem.clearance, problem.method.solver, problem.truss or problem.arm
+    assert spec is not None
     options: dict[str, Any] = {
         "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
         "safe": clearance.safe,
         "influence": clearance.influence,
     }
-    engine = make_engine(problem.method.solver, layout, kinematics, task, compiled=compiled)
+    engine = make_engine(solver, home.layout, kinematics, task, compiled=compiled)
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
-    spec = problem.truss or problem.arm
-    assert spec is not None
     return Setup(
         arm=arm,
         kinematics=kinematics,
-        layout=layout,
+        layout=home.layout,
         task=task,
         engine=engine,
         monitor=monitor,
-        control_vertices=curve.vertices,
-        torsion=curve.torsion,
-        vertex_goals=curve.vertex_goals,
-        solver=problem.method.solver,
+        solver=solver,
+        control_vertices=home.vertices,
+        torsion=home.torsion,
+        vertex_goals=home.vertex_goals,
         safe=clearance.safe,
         self_safe=clearance.between_members,
         influence=clearance.influence,
@@ -88,20 +88,123 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         dt=step_duration(problem.maneuver),
         minimum_angle=clearance.minimum_angle,
         tip_mode=problem.end_effector.mode,
-        base_motion=BaseMotion(spec.base_motion) if spec.base_motion else None,
+        base_motion=base_motion(spec.base_motion) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
         measure=None if clearance.self_collision else Clearance(arm.bodies, **options),
     )
 
 
-def reshaped(setup: Setup, layout: Layout) -> Setup:
-    """Return the arm with another curve: a layout of :func:`vgtm_qp.step.curve.with_curve`."""
-    engine = setup.engine.drawn(layout) if layout.family is setup.layout.family else None
-    if engine is None:
-        engine = make_engine(setup.solver, layout, setup.kinematics, setup.task)
-        finish_compiling()
-    return replace(setup, layout=layout, engine=engine)
+class HomeCurve(NamedTuple):
+    """The QP's layout, control vertices (V, 3), m, torsion (T,), rad, and goals (V, 3) of control vertices, m."""
+
+    layout: Layout
+    vertices: Array
+    torsion: Array
+    vertex_goals: Array | None
+
+
+def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
+    """Return the QP's layout and the curve at home; both without a curve where no station tracks one.
+
+    Raises
+    ------
+    ProblemError
+        Stations are to keep on the curve exactly what the arm cannot.
+    """
+    method, stations, spec = problem.method, arm.stations, problem.curve
+    elastic = problem.end_effector.mode == "elastic"
+    if method.tracking == "none" or not len(stations) or spec is None:
+        tables = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
+        layout = Layout(arm, *tables, task.row_names, method.weights, elastic_tip=elastic)
+        return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
+    mistakes = list(_beyond_the_arm(problem, arm, task))
+    if mistakes:
+        raise ProblemError(str(problem.source or problem.name), mistakes)
+    options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
+    family = make_family(spec.family, spec.control_vertices, **options)
+    stride = stations.stride if method.hard_tracking else 1
+    tracked = np.arange(len(stations) - 1, stride - 1, -stride)[::-1]
+    centres = stations.centres(arm.home)
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
+    fractions = travelled[tracked] / travelled[-1]
+    s, vertices = _fitted(family, fractions, centres[0], centres[tracked])
+    torsion = np.zeros(spec.torsion_vertices)
+    tracks_roll = bool(torsion.size) or (method.hard_tracking and "orientation" in method.hard_coordinates)
+    roll = None
+    if tracks_roll:
+        frames = Curve(family, vertices, torsion, stations.frames[0]).frame(s)
+        turn = np.swapaxes(frames, 1, 2) @ stations.frames[tracked]
+        roll = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+    by_arc_length = spec.nodes == "arc-length"
+    spacing = np.linalg.norm(np.diff(centres[[0, *tracked]], axis=0), axis=1)
+    shape = CurveShape(
+        family,
+        fractions if by_arc_length else s,
+        by_arc_length=by_arc_length,
+        torsion=torsion.size,
+        roll=roll,
+        tracks_roll=tracks_roll,
+        spacing=spacing if method.weights.spacing else None,
+    )
+    goals = None
+    if spec.control_vertex_goals:
+        goals = np.full(vertices.shape, np.nan)
+        for goal in spec.control_vertex_goals:
+            goals[goal.index] = goal.position
+    layout = Layout(
+        arm,
+        family.weights(s),
+        family.weights(s, 1),
+        tracked,
+        task.row_names,
+        method.weights,
+        hard_tracking=method.hard_tracking,
+        hard_turns=method.hard_tracking and len(method.hard_coordinates) > 1,
+        elastic_tip=elastic,
+        shape=shape,
+        vertex_goals=tuple(sorted(goal.index for goal in spec.control_vertex_goals)),
+    )
+    return HomeCurve(layout, vertices, torsion, goals)
+
+
+def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) -> tuple[Array, Array]:
+    """Return s_k (K,) and control vertices (V, 3) at home: on the straight axis, or fitted to the faces of a bent arm.
+
+    `fractions` (K,) of the length from `start` (3,) through the `points` (K, 3) belong to these.
+    """
+    end, length = points[-1], float(np.linalg.norm(points[-1] - start))
+    straight = straight_curve(family, start, end)
+    off = points - start - fractions[:, None] * (end - start)
+    if np.abs(off).max() <= 1e-9 * length:
+        # Families without linear precision run along the axis at a speed of their own.
+        even = np.abs(straight.position(fractions) - points).max() <= 1e-12 * length
+        return fractions if even else straight.arc_parameter(fractions), straight.control_vertices
+    weights = family.weights(fractions)
+    second = np.diff(np.eye(family.control_vertices), n=2, axis=0)
+    system = np.vstack([weights[:, 1:], 1e-3 * second[:, 1:]])
+    known = np.vstack([points - np.outer(weights[:, 0], start), -1e-3 * np.outer(second[:, 0], start)])
+    return fractions, np.vstack([start, np.linalg.lstsq(system, known, rcond=None)[0]])
+
+
+def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mistake]:
+    """Yield what stations are to keep on the curve although the arm has not the motions for it."""
+    method, curve = problem.method, problem.curve
+    if not method.hard_tracking or curve is None:
+        return
+    wanted = list(method.hard_coordinates)
+    if len(wanted) == 2 and curve.torsion_vertices:
+        wanted.append("orientation")
+    stations = arm.stations
+    missing = ", ".join(name for name in wanted if name not in stations.trackable)
+    if missing:
+        which = f"every {stations.word}" if stations.stride == 1 else f"every second {stations.word}"
+        can = ", ".join(stations.trackable) or "nothing"
+        text = f"what {which} of this {arm.kind} arm can keep, {can}; it cannot keep {missing}"
+        yield problem.mistake(("method", "hard_coordinates"), text)
+    if "orientation" in wanted and task.turns == "orientation" and not curve.torsion_vertices:
+        text = "1 or more: the tip is asked for roll, and faces keep the roll of the curve, which has none of its own"
+        yield problem.mistake(("curve", "torsion_vertices"), text)
 
 
 def make_engine(
@@ -114,40 +217,30 @@ def make_engine(
     SolverError
         There is no such solver, or it is not installed.
     """
-    is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
-    is_default = solver == DEFAULT_SOLVER
+    is_short, is_default = len(layout.arm.actuators) < STAGED_ACTUATORS, solver == DEFAULT_SOLVER
     if layout.elastic_tip and is_default and not is_short:
         warnings.warn(_CONDENSED_ALL_THE_SAME, stacklevel=2)
-    if is_default and compiled and not layout.elastic_tip:
-        if is_short and _can_eliminate(layout.arm):
-            return FusedEngine(layout)
-        chosen = make_solver(solver, layout)
-        if isinstance(chosen, (StagedSolver, TrackedSolver)) and ChainEngine.serves(chosen):
-            return ChainEngine(chosen, kinematics, task)
-        return GeneralEngine(layout, kinematics, task, chosen)
-    return GeneralEngine(layout, kinematics, task, make_solver(solver, layout), compiled=compiled)
-
-
-def _can_eliminate(arm: Arm) -> bool:
-    return arm.symbols(Constants()).can_eliminate
+    is_quick = is_default and compiled and not layout.elastic_tip
+    if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
+        return FusedEngine(layout)
+    chosen = make_solver(solver, layout)
+    if is_quick and isinstance(chosen, (StagedSolver, TrackedSolver)) and ChainEngine.serves(chosen):
+        return ChainEngine(chosen, kinematics, task)
+    return GeneralEngine(layout, kinematics, task, chosen, compiled=compiled)
 
 
 def _check_supported(problem: Problem) -> None:
     """Refuse, in one message, the parts of the contract that no method here serves."""
-    mistakes = []
+    expected: dict[tuple[str, str], str] = {}
     if problem.arm is not None and problem.arm.urdf is not None:
-        expected = "a list of joints [[arm.joint]]; URDF files are not read by this version"
-        mistakes.append(problem.mistake(("arm", "urdf"), expected))
+        expected["arm", "urdf"] = "a list of joints [[arm.joint]]; URDF files are not read by this version"
     elif problem.truss is not None and problem.truss.module == "plate":
         modules = "octahedral, double-octahedral, hexapod, longeron, tetrahedral or graph"
-        mistakes.append(
-            problem.mistake(("truss", "module"), f"{modules}; plates are not available in this version")
-        )
+        expected["truss", "module"] = f"{modules}; plates are not available in this version"
     if problem.maneuver.kind != "path":
-        mistakes.append(
-            problem.mistake(("maneuver", "kind"), '"path"; deployment is not available in this version')
-        )
-    if mistakes:
+        expected["maneuver", "kind"] = '"path"; deployment is not available in this version'
+    if expected:
+        mistakes = [problem.mistake(place, text) for place, text in expected.items()]
         raise ProblemError(str(problem.source or problem.name), mistakes)
 
 

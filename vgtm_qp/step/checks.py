@@ -1,7 +1,8 @@
-"""What is wrong with a problem although each value is right: told from the home pose, before any step."""
+"""What is wrong with a problem although each value is right, as the home pose shows before any step."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,19 +10,38 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import rank
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
-from vgtm_qp.errors import Mistake
+from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.problem.table import Place, shown
 from vgtm_qp.rows.tip import TipGoal
+from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.task import over_all_nodes, tip_response
 
 Array = NDArray[np.float64]
 
 _POINT = 1e-6
-"""Length of the member that stands for a point, m; distances are told to no more digits."""
+"""Length of the member that stands for a point, m; distances are printed to no more digits."""
+
+
+def checked_arm(problem: Problem) -> Setup:
+    """Return the arm of a problem, ready to move; warn of a curve with more freedom than the arm.
+
+    Raises
+    ------
+    ProblemError
+        The end effector is asked for coordinates that no actuator can start to change.
+    """
+    setup = build_arm(problem)
+    mistakes = list(unreachable_tip(problem, setup))
+    if mistakes:
+        raise ProblemError(str(problem.source or problem.name), mistakes)
+    for excess in excess_of_freedom(problem, setup):
+        warnings.warn(f"{excess.key} = {excess.value}: {excess.expected}", stacklevel=3)
+    return setup
 
 
 def check_problem(problem: Problem, setup: Setup) -> list[Mistake]:
@@ -48,10 +68,7 @@ def unreachable_tip(problem: Problem, setup: Setup) -> Iterator[Mistake]:
     goal = TipGoal(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
     kinematics.evaluate(arm.home_configuration)
     jacobian = task.rows(arm.home, kinematics, goal).jacobian
-    moved, _ = kinematics.motion().response()
-    every = np.zeros((len(arm.node_names), 3, len(arm.actuators)))
-    every[arm.free] = moved.reshape(len(arm.free), 3, len(arm.actuators))
-    response = jacobian @ every[arm.end_effector.nodes].reshape(jacobian.shape[1], len(arm.actuators))
+    response = tip_response(arm, jacobian, over_all_nodes(arm, kinematics.motion().response()[0]))
     response[len(task.axes) :] *= arm.height
     values = np.linalg.svd(response, compute_uv=False)
     reached = rank(values)
@@ -71,9 +88,9 @@ def find_warnings(problem: Problem, setup: Setup) -> list[Mistake]:
     its centre is in.
     """
     certain = {mistake.key for mistake in check_problem(problem, setup)}
-    warnings = [mistake for distance, mistake in _at_home(problem, setup) if distance > 0.0]
+    near = [mistake for distance, mistake in _at_home(problem, setup) if distance > 0.0]
     doubtful = [mistake for mistake in _inside_obstacles(problem, setup, 0.0) if mistake.key not in certain]
-    return [*warnings, *doubtful, *excess_of_freedom(problem, setup)]
+    return [*near, *doubtful, *excess_of_freedom(problem, setup)]
 
 
 def excess_of_freedom(problem: Problem, setup: Setup) -> Iterator[Mistake]:
@@ -87,13 +104,9 @@ def excess_of_freedom(problem: Problem, setup: Setup) -> Iterator[Mistake]:
 
 def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
     """Yield least distance, m, and mistake of each obstacle too near at home, and of the members."""
-    rules = problem.clearance
-    safe = rules.safe
-    self_safe = safe if rules.self_safe is None else rules.self_safe
-    pairs = setup.monitor.near(
-        setup.arm.points(setup.arm.home_configuration), 0.0, reach=safe, self_reach=self_safe
-    )
-    bodies = setup.arm.bodies
+    arm, bodies, rules = setup.arm, setup.arm.bodies, problem.clearance
+    safe, self_safe = rules.safe, rules.safe if rules.self_safe is None else rules.self_safe
+    pairs = setup.monitor.near(arm.points(arm.home_configuration), 0.0, reach=safe, self_reach=self_safe)
     owner = np.where(pairs.is_self, -1, 0)
     owner[~pairs.is_self] = setup.monitor.pieces.obstacle[pairs.other[~pairs.is_self]]
     for index in np.unique(owner):
@@ -103,12 +116,10 @@ def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
         place: Place
         if index < 0:
             place = ("arm", "link_radius") if problem.truss is None else ("truss", "member_radius")
-            needed = self_safe
-            other = bodies.names[int(pairs.other[k])]
-            what = f"{bodies.kind}s {bodies.names[int(pairs.body[k])]} and {other}, which share no node,"
+            first, second = bodies.names[int(pairs.body[k])], bodies.names[int(pairs.other[k])]
+            needed, what = self_safe, f"{bodies.kind}s {first} and {second}, which share no node,"
         else:
-            place, needed = ("obstacle", int(index), "center"), safe
-            what = f"it and {body}"
+            place, needed, what = ("obstacle", int(index), "center"), safe, f"it and {body}"
         found = (
             f"they overlap by {-distance:.3g} m" if distance <= 0.0 else f"they are {distance:.3g} m apart"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,14 +39,7 @@ def within(values: Array, lower: Array, upper: Array, spare: float) -> bool:
 
 
 class Closing:
-    """Closes configurations of one arm.
-
-    Parameters
-    ----------
-    layout : Layout
-    kinematics : Kinematics
-        Overwritten by each call.
-    """
+    """Closes configurations of one arm; each call overwrites the `kinematics`."""
 
     def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
         self._layout, self._arm, self._kinematics = layout, layout.arm, kinematics
@@ -76,10 +69,10 @@ class Closing:
             wanted[self._actuators] = np.clip(kinematics.quantities[self._actuators], lower, upper)
             return np.asarray(wanted - kinematics.quantities)
 
-        def corrected(q: Array, error: Array) -> Array:
-            return self._arm.corrected(q, error, lambda: self._lengths.solve(kinematics.gradient, error))
+        def solve(error: Array) -> Array:
+            return self._lengths.solve(kinematics.gradient, error)
 
-        return self._newton(q, missing, corrected, tolerance, too_far)
+        return self._newton(q, missing, solve, tolerance, too_far)
 
     def close_on_curve(
         self, q: Array, points: Array, lower: Array, upper: Array, tolerance: float
@@ -95,13 +88,10 @@ class Closing:
             gap = points - arm.stations.centres(arm.nodes(q))[tracked]
             return np.concatenate([home - kinematics.quantities[self._fixed], gap.reshape(-1)])
 
-        def corrected(q: Array, error: Array) -> Array:
-            gap = error[fixed:].reshape(-1, 3)
-            return arm.corrected(
-                q, error, lambda: self._stations.solve(kinematics.gradient, error[:fixed], gap)
-            )
+        def solve(error: Array) -> Array:
+            return self._stations.solve(kinematics.gradient, error[:fixed], error[fixed:].reshape(-1, 3))
 
-        closed = self._newton(q, missing, corrected, tolerance, _TOO_FAR)
+        closed = self._newton(q, missing, solve, tolerance, _TOO_FAR)
         values = closed.quantities[self._actuators]
         held = closed.error < np.inf and within(values, lower, upper, enough_length(q, tolerance))
         return closed if held else None
@@ -110,11 +100,12 @@ class Closing:
         self,
         q: Array,
         missing: Callable[[Array], Array],
-        corrected: Callable[[Array, Array], Array],
+        solve: Callable[[Array], Array],
         tolerance: float,
         too_far: float,
     ) -> Closed:
-        kinematics, enough, worst = self._kinematics, enough_length(q, tolerance), np.inf
+        arm, kinematics = self._arm, self._kinematics
+        enough, worst = enough_length(q, tolerance), np.inf
         for _ in range(_MOST_STEPS):
             kinematics.evaluate_quantities(q)
             error = missing(q)
@@ -122,9 +113,9 @@ class Closing:
             if worst <= enough or not worst < too_far:
                 break
             try:
-                q = corrected(q, error)
+                q = arm.corrected(q, error, partial(solve, error))
             except SolverError:
                 worst = np.inf
                 break
-        position = self._arm.end_effector.position(self._arm.nodes(q))
+        position = arm.end_effector.position(arm.nodes(q))
         return Closed(q, kinematics.quantities.copy(), worst, position, kinematics.tip_rotation.copy())

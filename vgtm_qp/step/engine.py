@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +30,7 @@ from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.target import QPInput, Target
-from vgtm_qp.step.task import TipTask
+from vgtm_qp.step.task import TipTask, over_all_nodes, tip_response
 
 Array = NDArray[np.float64]
 
@@ -44,29 +43,24 @@ _ON_PATH = 1e-6
 """Solvers leave slacks of this size, m or rad, where the answer's are zero."""
 
 
-@dataclass(frozen=True)
-class Accuracy:
-    """How exactly quantities, and the tip, m or rad, are settled, and from how far off the tip may be brought there."""
+class Accuracy(NamedTuple):
+    """How exactly quantities, the tip, and stations that track hard are settled, m or rad.
+
+    These are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. A tip
+    that is further off than `start` after a QP calls for another one.
+    """
 
     member: float
     tip: float
     start: float
+    tracking: float = 1e-7
 
 
 class Move(NamedTuple):
-    """Where the answer of one QP leads.
+    """Where the answer of one QP leads: the configuration `q` by the answer alone, the curve and the progress.
 
-    Attributes
-    ----------
-    solution : StepSolution
-    q : configuration
-        By the answer.
-    vertices, torsion, progress
-        The curve (V, 3), m, and (T,), rad, and the progress along the path.
-    furthest : float
-        Greatest displacement of a node's coordinate, m.
-    closed : Closed or None
-        The configuration with its quantities closed and its tip at its goal; None where only another QP leads there.
+    `furthest` is the greatest displacement of a node's coordinate, m. `closed` is the configuration with its quantities
+    closed and its tip at its goal, None where only another QP leads there.
     """
 
     solution: StepSolution
@@ -79,7 +73,7 @@ class Move(NamedTuple):
 
 
 Spent = Callable[[str], None]
-"""Gives the time since the last call to a phase."""
+"""Adds the time since the last call to a phase."""
 
 
 class Engine(ABC):
@@ -87,21 +81,20 @@ class Engine(ABC):
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        self._linearisation: Linearisation | None = None
-        self._builder: FullBuilder | None = None
 
     def qp(self, asked: QPInput) -> StepQP:
         """Return the whole QP that an input asks for, every row and column with a name, in arrays of its own."""
-        if self._builder is None:
-            self._builder = FullBuilder(self.layout)
-        return self._builder.build(self._linear.numbers(asked.linear(self.layout), asked.rows))
+        numbers = self._linearisation.numbers(asked.linear(self.layout), asked.rows)
+        return self._builder.build(numbers)
 
-    @property
-    def _linear(self) -> Linearisation:
-        if self._linearisation is None:
-            # To be looked at, not to be run: no compiler is kept waiting.
-            self._linearisation = Linearisation(self.layout, compiled=False)
-        return self._linearisation
+    @cached_property
+    def _builder(self) -> FullBuilder:
+        return FullBuilder(self.layout)
+
+    @cached_property
+    def _linearisation(self) -> Linearisation:
+        # To be looked at, not to be run: no compiler is kept waiting.
+        return Linearisation(self.layout, compiled=False)
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
         """Return where the answer of a QP leads.
@@ -112,13 +105,12 @@ class Engine(ABC):
             The QP has no answer, or none that is good enough; the first two carry it.
         """
         try:
-            try:
-                solution = self._least(asked)
-            finally:
-                spent("qp")
+            solution = self._least(asked)
         except FailedStepError as error:
             error.build = lambda: self.qp(asked)
             raise
+        finally:
+            spent("qp")
         arm, target = self.layout.arm, asked.target
         q = arm.advanced(asked.q, solution.nodes, solution.actuators)
         if target.base is not None:
@@ -166,47 +158,6 @@ def enough_tip_error(q: Array, tolerance: float) -> float:
     return max(_SETTLED * tolerance, 1e3 * _ROUNDING * float(np.abs(q).max()))
 
 
-def settle_strokes(
-    closed: Closed,
-    actuators: NDArray[np.int64],
-    close: Callable[[Array, Array, Array], Closed],
-    tip_error: Callable[[Closed], Array],
-    find_gain: Callable[[], Array | None],
-    bounds: tuple[Array, Array],
-    accuracy: Accuracy,
-) -> Closed | None:
-    """Return a configuration near `closed` with the tip at its goal; None where another QP is due.
-
-    Parameters
-    ----------
-    close
-        Closes the quantities near a configuration, with actuators between bounds (n_a,).
-    tip_error
-        (n_e,) goal minus value, m or rad.
-    find_gain
-        Asked at most once: (n_a, n_e) changes of the actuators per tip error, or None.
-    bounds
-        Least and greatest values (n_a,) of the actuators.
-    """
-    gain: Array | None = None
-    wanted = closed.quantities[actuators]
-    enough = enough_tip_error(closed.q, accuracy.tip)
-    for step in range(MOST_STEPS + 1):
-        error = tip_error(closed)
-        off = float(np.abs(error).max())
-        if not (closed.error <= accuracy.member and off <= accuracy.start):
-            return None
-        if step == MOST_STEPS or off <= enough:
-            break
-        gain = find_gain() if gain is None else gain
-        if gain is None:
-            break
-        wanted = wanted + gain @ error
-        strokes = np.clip(wanted, *bounds)
-        closed = close(closed.q, strokes, strokes)
-    return closed if off <= accuracy.tip else None
-
-
 class GeneralEngine(Engine):
     """One compiled linearisation, and a solver by name."""
 
@@ -223,24 +174,26 @@ class GeneralEngine(Engine):
         self._linearisation = Linearisation(layout, compiled=compiled)
         self._solver, self._task = solver, task
         self._closing = Closing(layout, kinematics)
-        self._on_curve = _holds_stations(layout)
+        # Stations that are held on the curve may determine the configuration with the fixed quantities.
+        is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
+        tracked = layout.tracked.tolist()
+        self._on_curve = is_plain and layout.arm.symbols(Constants()).held(tracked) is not None
         self._last: tuple[StepNumbers, StepSolution] | None = None
         self._vertices: Array = np.zeros((0, 3))
         self._strokes: Array = np.zeros(0)
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
-        numbers = self._linear.numbers(asked.linear(self.layout), asked.rows)
+        numbers = self._linearisation.numbers(asked.linear(self.layout), asked.rows)
         solution = self._solver.solve(numbers)
-        self._strokes = self._linear.quantities[self.layout.arm.actuators] + solution.actuators
+        self._strokes = self._linearisation.quantities[self.layout.arm.actuators] + solution.actuators
         self._last = numbers, solution
         self._vertices = asked.vertices + solution.vertices
         return solution
 
     def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`; an elastic tip that had to leave its path is not moved."""
-        if not self.layout.elastic_tip or self._last is None:
-            return self._settled(q, target, goal, accuracy)
+        assert self._last is not None
         slack = self._last[1].tip_slack
         closed = self._settled(q, target, goal, accuracy) if slack <= _ON_PATH else None
         if closed is not None or slack <= accuracy.tip:
@@ -249,74 +202,67 @@ class GeneralEngine(Engine):
         return closed if closed.error <= accuracy.member else None
 
     def _settled(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
-        bounds = target.lower, target.upper
+        """Return the configuration near `q` with the tip at `goal`, by Newton steps whose Jacobian is kept.
 
-        def tip_error(closed: Closed) -> Array:
-            return self._task.residual(closed.tip_position, closed.tip_rotation, goal)[0]
-
-        def close(q: Array, lower: Array, upper: Array) -> Closed:
-            return self._closing.close(q, lower, upper, accuracy.member)
-
+        Where the solver knows how actuators move the tip, these go where its answer said, and on from there. Otherwise
+        they go with the least motion of the nodes that moves the tip.
+        """
+        arm, bounds = self.layout.arm, (target.lower, target.upper)
         if self._on_curve:
             points = self.layout.curve_weights @ self._vertices
             on_curve = self._closing.close_on_curve(q, points, *bounds, accuracy.member)
             if on_curve is not None and on_curve.error <= accuracy.member:
-                return on_curve if float(np.abs(tip_error(on_curve)).max()) <= accuracy.tip else None
-        assert self._last is not None
-        numbers, solution = self._last
-        at_bound = held(solution.actuators, numbers.lower, numbers.upper)
-        if self._solver.knows_gain:
-            strokes = np.clip(self._strokes, *bounds)
-            first = close(q, strokes, strokes)
-            actuators, find_gain = self.layout.arm.actuators, partial(self._solver.gain, at_bound)
-            return settle_strokes(first, actuators, close, tip_error, find_gain, bounds, accuracy)
-        return self._settled_by_motion(q, goal, bounds, accuracy, ~at_bound)
-
-    def _settled_by_motion(
-        self,
-        q: Array,
-        goal: TipGoal,
-        bounds: tuple[Array, Array],
-        accuracy: Accuracy,
-        free: NDArray[np.bool_],
-    ) -> Closed | None:
-        """Return the configuration that the least motion brings to the goal, `free` (n_a,) actuators moving."""
-        gain = self._gain(free)
-        for step in range(SETTLING_STEPS + 1):
-            closed = self._closing.close(q, *bounds, accuracy.member)
+                off = self._task.error(on_curve.tip_position, on_curve.tip_rotation, goal)
+                return on_curve if off <= accuracy.tip else None
+        by_strokes, gain, box = self._solver.knows_gain, None, bounds
+        most = MOST_STEPS if by_strokes else SETTLING_STEPS
+        strokes = np.clip(self._strokes, *bounds)
+        for step in range(most + 1):
+            if by_strokes:
+                box = (np.clip(strokes, *bounds),) * 2
+            closed = self._closing.close(q, *box, accuracy.member)
             error = self._task.residual(closed.tip_position, closed.tip_rotation, goal)[0]
             off = float(np.abs(error).max())
             if not (closed.error <= accuracy.member and off <= accuracy.start):
                 return None
-            if gain is None or step == SETTLING_STEPS or off <= _SETTLED * accuracy.tip:
+            if step == most or off <= enough_tip_error(closed.q, accuracy.tip):
                 break
-            nodes, strokes = gain
-            q = self.layout.arm.advanced(closed.q, nodes @ error, strokes @ error)
+            gain = self._gain() if gain is None else gain
+            if gain is None:
+                break
+            nodes, per_error = gain
+            strokes, q = strokes + per_error @ error, closed.q
+            if nodes is not None:
+                q = arm.advanced(q, nodes @ error, per_error @ error)
         return closed if off <= accuracy.tip else None
 
-    def _gain(self, free: NDArray[np.bool_]) -> tuple[Array, Array] | None:
-        """Return what settles the tip after the last QP, (N, 3, n_e) and (n_a, n_e); None where another QP has to."""
-        layout, arm, weights = self.layout, self.layout.arm, self.layout.weights
-        if layout.hard_tracking or self._last is None:
+    def _gain(self) -> tuple[Array | None, Array] | None:
+        """Return displacements per tip error after the last QP; None where another QP has to settle the tip.
+
+        Those of the nodes (N, 3, n_e), None where the solver knows no more than the actuators', and those (n_a, n_e).
+        """
+        assert self._last is not None
+        layout, arm, weights, (numbers, solution) = (
+            self.layout,
+            self.layout.arm,
+            self.layout.weights,
+            self._last,
+        )
+        at_bound = held(solution.actuators, numbers.lower, numbers.upper)
+        if self._solver.knows_gain:
+            gain = self._solver.gain(at_bound)
+            return None if gain is None else (None, gain)
+        if layout.hard_tracking:
             return None
-        numbers, _ = self._last
         try:
             response, _ = numbers.motion.response()
         except SolverError:
             return None
-        every = np.zeros((len(arm.node_names), 3, response.shape[1]))
-        every[arm.free] = response.reshape(-1, 3, response.shape[1])
-        tip = numbers.tip_jacobian @ every[arm.end_effector.nodes].reshape(-1, response.shape[1])
-        gain = settling_gain(
-            response, tip, free, weights.node_rate, weights.actuator_rate + weights.stroke_centring
-        )
+        every = over_all_nodes(arm, response)
+        tip = tip_response(arm, numbers.tip_jacobian, every)
+        stiffness = weights.actuator_rate + weights.stroke_centring
+        gain = settling_gain(response, tip, ~at_bound, weights.node_rate, stiffness)
         return None if gain is None else (every @ gain, gain)
-
-
-def _holds_stations(layout: Layout) -> bool:
-    """Whether stations that are held on the curve determine the configuration with the fixed quantities."""
-    is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
-    return is_plain and layout.arm.symbols(Constants()).held(layout.tracked.tolist()) is not None
 
 
 class FusedEngine(Engine):
@@ -332,36 +278,27 @@ class FusedEngine(Engine):
         return FusedEngine(layout, self._solver.drawn(layout))
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
-        """See :class:`Engine`: by one call after the QP, where that serves.
+        """See :class:`Engine`; one compiled call after the QP settles its answer, if that applies.
 
         It does not where the path turns within the step, the base moves, or too many rows are near.
         """
-        near, target = len(asked.rows), asked.target
+        near, target = len(asked.rows.lower), asked.target
         if near > NEAR or target.base is not None or not target.path.is_straight(target.start, target.end):
             return super().move(asked, accuracy, spent)
         try:
             self._solver.load(asked.linear(self.layout))
             answer = self._solver.ask(asked.rows)
-        except InfeasibleStepError:
-            # Whether that is for the margin alone is found out where it can be left out.
-            return super().move(asked, accuracy, spent)
-        spent("qp")
-        try:
-            taken = self._solver.take(answer, near)
-        except EvaluationError:
-            # The answer may still be good, and be settled by other steps.
+            spent("qp")
+            end = self._solver.take(answer, near)
+        except (InfeasibleStepError, EvaluationError):
+            # There may be an answer without the margin, or one that other steps settle.
             return super().move(asked, accuracy, spent)
         except FailedStepError as error:
             error.build = lambda: self.qp(asked)
             raise
-        is_settled = (
-            taken.closed.error <= accuracy.member
-            and taken.before <= accuracy.start
-            and taken.after <= accuracy.tip
-        )
-        torsion = asked.torsion + taken.solution.torsion if len(asked.torsion) else asked.torsion
-        closed = taken.closed if is_settled else None
-        return Move(taken.solution, taken.q, taken.vertices, torsion, taken.progress, taken.moved, closed)
+        torsion = asked.torsion + end.solution.torsion if len(asked.torsion) else asked.torsion
+        closed = _if_settled(end.closed, end.before, end.after, accuracy)
+        return Move(end.solution, end.q, end.vertices, torsion, end.progress, end.moved, closed)
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
@@ -372,9 +309,13 @@ class FusedEngine(Engine):
 
     def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
-        closed, before, after = self._solver.settle(
-            q, self._vertices, target.lower, target.upper, goal.position, goal.rotation
-        )
-        if closed.error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip:
-            return closed
-        return None
+        bounds = target.lower, target.upper
+        found = self._solver.settle(q, self._vertices, *bounds, goal.position, goal.rotation)
+        return _if_settled(*found, accuracy)
+
+
+def _if_settled(closed: Closed, before: float, after: float, accuracy: Accuracy) -> Closed | None:
+    """Return a configuration whose tip was off by so much, m or rad, `before` and `after` it was settled; or None."""
+    if closed.error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip:
+        return closed
+    return None

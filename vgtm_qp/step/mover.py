@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.separation import Shortfall
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.state import State
+from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import Step
 from vgtm_qp.step.stops import Stop
 
@@ -24,10 +23,8 @@ class Mover(Protocol):
 
     Attributes
     ----------
-    setup : Setup
-        What was built for the problem.
-    state : State
-        Where the arm is; may be set to another state of this arm.
+    setup, state
+        What was built for the problem, and where the arm is; the latter may be set to another state of this arm.
     phases : dict of str to float
         Seconds spent so far in each phase.
     solver : str or None
@@ -59,15 +56,12 @@ class Mover(Protocol):
 
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
-        ...
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's."""
-        ...
 
     def brake(self, path: Path, start: float, end: float) -> Step | None:
-        """Take the next of the steps that bring the arm to rest; None where it may stay as it is, and nothing moves."""
-        ...
+        """Do the next of the steps that bring the arm to rest; None where it may stay as it is, and nothing moves."""
 
     def explain(
         self,
@@ -83,15 +77,12 @@ class Mover(Protocol):
 
         Worth asking after a `last` step that was blocked, hardly moved or braked.
         """
-        ...
 
     def too_near(self, state: State) -> Shortfall:
         """Return the pairs below their clearance in a state that the method drives apart, with their distances, m."""
-        ...
 
     def again(self, problem: Problem) -> Mover | None:
         """Return what tries a maneuver once more from home, for a problem that resolves the redundancy differently.
 
         None where the method leaves no choice.
         """
-        ...

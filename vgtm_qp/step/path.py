@@ -1,14 +1,17 @@
-"""The wanted motion of the end effector: poses joined by straight lines and single-axis rotations."""
+"""Paths of the end effector and of the base: poses joined by straight lines and single-axis rotations."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.arm import Pose
 from vgtm_qp.errors import GoalError
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal
@@ -78,6 +81,11 @@ class Path:
             position = self.positions[k] + along * self._velocity[k]
         return TipGoal(position, rotation, self._velocity[k], self._spin[k])
 
+    def pose(self, value: float) -> Pose:
+        """Return the pose at `value` alone; of a base: where it is at that time, s."""
+        point = self.at(value)
+        return Pose(point.position, point.rotation)
+
     def is_straight(self, start: float, end: float) -> bool:
         """Whether the rates are the same all the way between two values."""
         low, high = (start, end) if start < end else (end, start)
@@ -94,6 +102,14 @@ class Path:
             np.concatenate([self.rotations, (rotation_from_vector(on * turn) @ self.rotations[-1])[None]]),
         )
 
-    def length(self) -> float:
-        """Return the length of the path of the position, m."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+def base_motion(poses: Sequence[Any]) -> Path:
+    """Return the path of the base frame over time, s, through ``[[base_motion]]`` tables in the order of their times.
+
+    The base is in its home pose at time 0 and stays in the last pose that it reaches.
+    """
+    return Path(
+        np.array([0.0, *(pose.time for pose in poses)]),
+        np.array([np.zeros(3), *(pose.position for pose in poses)], dtype=float),
+        np.stack([np.eye(3), *(rotation_from_vector(pose.rotation_vector) for pose in poses)]),
+    )

@@ -2,45 +2,36 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vgtm_qp.errors import GoalError, ProblemError
+from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
-from vgtm_qp.step.acceptance import Acceptance
-from vgtm_qp.step.actuation import Actuation, Box
-from vgtm_qp.step.advance import ANY_RANK, Advance, Advancer, Piece
-from vgtm_qp.step.attempt import Attempt, Tolerances
-from vgtm_qp.step.braking import Brakes, Braking
+from vgtm_qp.step.actuation import Actuation
+from vgtm_qp.step.advance import Advancer
+from vgtm_qp.step.attempt import Attempt
+from vgtm_qp.step.braking import ANY_RANK, Braking
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.checks import excess_of_freedom, unreachable_tip
-from vgtm_qp.step.goals import duration, path_to
+from vgtm_qp.step.checks import checked_arm
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.separation import Distances, Separation, Shortfall
+from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.shaping import Shaping
-from vgtm_qp.step.state import State, frozen
+from vgtm_qp.step.state import Shortfall, State, frozen
 from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.step.stops import BASE_MOVES_ON, Stop, explain
-from vgtm_qp.step.target import Target
-from vgtm_qp.step.tracking import TrackingError
+from vgtm_qp.step.stops import Stop, explain
+from vgtm_qp.step.task import duration
 
 __all__ = ["Resolver", "Step", "StepStatus"]
 
 Array = NDArray[np.float64]
 
-_APPROACH = 0.4
-"""Largest share of the room to its least clearance that a pair may use in one step."""
-
-_SMALLEST_MOVING = 0.25
-"""The least share of a piece of path that is tried by an arm that can brake instead."""
-
-_ROUNDING = float(np.finfo(float).eps)
+_SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
+"""The least shares of a piece of path that are tried: by any arm, and by one that can brake instead."""
 
 
 class Resolver:
@@ -58,38 +49,12 @@ class Resolver:
     """Whether control vertices follow goals of their own."""
 
     def __init__(self, problem: Problem | Setup) -> None:
-        setup = problem if isinstance(problem, Setup) else build_arm(problem)
-        if isinstance(problem, Problem):
-            mistakes = list(unreachable_tip(problem, setup))
-            if mistakes:
-                raise ProblemError(str(problem.source or problem.name), mistakes)
-            for excess in excess_of_freedom(problem, setup):
-                warnings.warn(f"{excess.key} = {excess.value}: {excess.expected}", stacklevel=2)
-        # Only a tip that may be late lets pairs and actuators slow down before contacts and strokes.
-        slows_down = setup.slow_approach and setup.tip_mode == "scaled"
-        distances = Distances(
-            setup.safe,
-            setup.self_safe,
-            setup.influence,
-            setup.margin,
-            setup.minimum_angle,
-            approach=_APPROACH if slows_down else 1.0,
-        )
-        self._separation = Separation(setup.arm, setup.monitor, distances)
-        self._actuation = Actuation(setup.arm, setup.jams, slows_down=slows_down)
+        setup = problem if isinstance(problem, Setup) else checked_arm(problem)
+        self._separation = Separation(setup)
+        self._actuation = Actuation(setup)
         self._shaping = Shaping(setup)
-        # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
-        exact = max(1e-12, 32.0 * _ROUNDING * setup.arm.height)
-        kept = Tolerances(member=1e-10 if self._actuation.starts_at_once else exact)
-        self._attempt = Attempt(
-            setup.arm,
-            setup.engine,
-            self._separation,
-            Acceptance(setup.arm, setup.kinematics, setup.task, member=kept.member, tip=kept.tip),
-            tracking=_tracking_error(setup),
-            tolerances=kept,
-        )
-        self._advancer = Advancer(self._attempt, self._actuation, self._brakes, self._target, setup.tip_mode)
+        self._attempt = Attempt(setup, self._separation, self._actuation)
+        self._advancer = Advancer(self._attempt, self._actuation, self._shaping)
         self._state = setup.home_state()
         self._braking: Braking | None = None
 
@@ -139,11 +104,11 @@ class Resolver:
             No actuator has that name.
         """
         self._actuation.lock(name, self.state)
-        before, self._braking = self._braking, None
-        if before is not None and before.origin is self.state and before.steps:
+        before, self._braking = self._known_braking(), None
+        if before is not None:
             # What jams stops at once, as it will; the others brake, each by itself.
-            brakes = self._brakes(before.steps[0][0].duration)
-            self._braking = brakes.letting_go(self.state, before.path, before.steps[0][1])
+            state, value = before.steps[0]
+            self._braking = self._advancer.brakes(state.duration).letting_go(self.state, before.path, value)
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
@@ -153,7 +118,7 @@ class Resolver:
     @control_vertex_goals.setter
     def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
         self._shaping.draw(goals)
-        self._use_curve()
+        self._attempt.use(self.setup)
 
     def set_control_vertex_goal(self, index: int, position: ArrayLike | None) -> None:
         """Draw a control vertex to a place in the null space of the tip's motion; None lets it go.
@@ -188,23 +153,17 @@ class Resolver:
         CurveError
             So few control vertices cannot keep both ends and the base tangent.
         """
-        state, braking, family = self.state, self._braking, self.setup.layout.family
+        state, braking, family = self.state, self._known_braking(), self.setup.layout.family
         more = count - len(state.control_vertices)
         change = self._shaping.change(state, more)
-        self._use_curve()
+        self._attempt.use(self.setup)
         if more:
             self.state = replace(state, control_vertices=frozen(change.curve.control_vertices))
-            if braking is not None and braking.origin is state and family is not None:
-                steps = [
-                    (self._shaping.with_vertices(then, family, more), value) for then, value in braking.steps
-                ]
-                self._braking = replace(braking, origin=self.state, steps=steps)
+            if braking is not None and family is not None:
+                self._braking = braking.changed(
+                    self.state, lambda then: self._shaping.with_vertices(then, family, more)
+                )
         return change.change
-
-    def _use_curve(self) -> None:
-        """Go on with the present curve's engine."""
-        self._attempt.engine = self.setup.engine
-        self._attempt.tracking = _tracking_error(self.setup)
 
     def step(
         self,
@@ -233,7 +192,7 @@ class Resolver:
             The goal is not three finite numbers, names a coordinate that is not tracked or the direction twice, or
             `dt` is not a positive number; the state is unchanged.
         """
-        path = path_to(self.setup.task, self.tip(), position, pointing, rotation_vector)
+        path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
         return self.follow(path, 0.0, 1.0, dt=dt)
 
     def build(
@@ -247,22 +206,12 @@ class Resolver:
         """Return the QP that a step to a goal starts with, to read, to print or to solve elsewhere; nothing moves.
 
         Every row and column has a name, a kind and a unit. It is the QP that the step solves, whatever smaller one
-        with the same answer the solver is given.
-
-        Parameters
-        ----------
-        position, pointing, rotation_vector, dt
-            As :meth:`step` takes them.
-
-        Raises
-        ------
-        GoalError
-            As :meth:`step` raises it.
+        with the same answer the solver is given. Parameters and errors are those of :meth:`step`.
         """
-        path = path_to(self.setup.task, self.tip(), position, pointing, rotation_vector)
-        seconds = duration(self.setup.dt if dt is None else dt)
-        box = self._actuation.slowing(self.state, self._actuation.box(self.state, seconds))
-        target = self._target(self.state, seconds, path, 0.0, 1.0, box)
+        path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
+        dt = duration(self.setup.dt if dt is None else dt)
+        limits = self._actuation.limits(self.state, dt, slowing=True)
+        target = self._shaping.target(self.state, dt, path, 0.0, 1.0, limits[:2])
         return self.setup.engine.qp(self._attempt.first_input(self.state, target))
 
     def tip(self) -> tuple[Array, Array]:
@@ -271,12 +220,10 @@ class Resolver:
         kinematics.evaluate(self.state.q)
         return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
 
-    def follow(
-        self, path: Path, start: float, end: float, *, dt: float | None = None, smallest: float = 1 / 64
-    ) -> Step:
+    def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step; pieces are halved until one is safe.
 
-        A step in which an actuator of the problem jams ends at that time, with the part of the way until then.
+        A step in which an actuator of the problem jams ends at that time, with the share of the path until then.
 
         Raises
         ------
@@ -284,77 +231,44 @@ class Resolver:
             `dt` is not a positive number; the state is unchanged.
         """
         dt = duration(self.setup.dt if dt is None else dt)
-        for name in self._actuation.jammed(self.state.time):
+        state, actuation = self._state, self._actuation
+        for name in actuation.jammed(state.time):
             self.lock(name)
-        whole = self._actuation.until_jam(self.state.time, dt)
+        whole = actuation.until_jam(state.time, dt)
         dt *= whole
-        state = self.state
-        box = self._actuation.slowing(state, self._actuation.box(state, dt))
-        braking = self._braking if self._braking is not None and self._braking.origin is state else None
-        brake = braking if braking is not None and braking.steps and whole == 1.0 else None
-        if brake is not None:
-            smallest = max(smallest, _SMALLEST_MOVING)
-        piece = Piece(path, start, start + whole * (end - start), dt, smallest)
-        found = self._advancer.first_accepted(state, piece, box, ANY_RANK if brake is None else brake.rank)
-        if found.outcome.accepted:
-            self._state = found.outcome.state_after(self.setup.arm, state)
-            after = found.braking
-            self._braking = None if after is None else replace(after, origin=self.state)
-            return self._told(found, box, dt, state, whole * found.share * found.outcome.progress)
-        if brake is not None:
-            step = self._told(found, box, dt, state, 0.0)
-            return self._brake(brake, path, start, end, step)
-        return self._told(found, box, dt, state, 0.0)
-
-    def _told(self, found: Advance, box: Box, dt: float, before: State, progress: float) -> Step:
-        """Return the step that an advance from the state `before` was."""
-        outcome = found.outcome
-        status = StepStatus.REACHED if progress >= 1.0 - 1e-9 else StepStatus.SLOWED
-        return Step(
-            status=status if outcome.accepted else StepStatus.BLOCKED,
-            progress=progress,
-            state=self.state,
-            reason="" if outcome.accepted else outcome.reason,
-            qps=outcome.iterations,
-            solver_failed=outcome.solver_failed,
-            _limit_name=self._actuation.limit_name(before, dt, box),
-            _solution=outcome.solution,
-            _rows=outcome.rows,
-            _failure=outcome.failure,
-        )
+        limits = actuation.limits(state, dt, slowing=True)
+        brake, smallest, worst = None, _SMALLEST, ANY_RANK
+        if whole == 1.0 and (brake := self._known_braking()) is not None:
+            smallest, worst = _SMALLEST_MOVING, brake.rank
+        target = self._shaping.target(state, dt, path, start, start + whole * (end - start), limits[:2])
+        step, braking = self._advancer.first_accepted(state, target, dt, smallest, worst)
+        if step.moved:
+            self._state, self._braking = step.state, braking
+            return step.over(whole, limits)
+        step = step.over(0.0, limits)
+        return step if brake is None else self._brake(brake, path, start, end, step)
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:
-        """Take the next of the steps that bring a moving arm with limited accelerations to rest.
+        """Do the next of the steps that bring a moving arm with limited accelerations to rest.
 
-        They were known before the last step was taken, each within the limits and clear. None where the arm may stay
+        They were known before the last step was done, each within the limits and clear. None where the arm may stay
         as it is; nothing moves then. Progress is counted from `start` to `end` of a `path` that it brakes on.
         """
-        braking = self._braking
-        if braking is None or braking.origin is not self.state or not braking.steps:
+        braking = self._known_braking()
+        if braking is None:
             return None
-        return self._brake(braking, path, start, end, Step(StepStatus.SLOWED, 0.0, self.state, "", 0))
+        return self._brake(braking, path, start, end, Step(StepStatus.BLOCKED, 0.0, self.state, "", 0))
 
-    def _brake(self, braking: Braking, path: Path | None, start: float, end: float, step: Step) -> Step:
-        """Take the first step of `braking` and return it, in the place of a `step` that was not found."""
-        self.state, value = braking.steps[0]
-        self._braking = braking.rest
-        on_path = braking.on_path > 0
-        progress = (value - start) / (end - start) if on_path and path is braking.path else 0.0
-        return replace(
-            step,
-            status=StepStatus.SLOWED,
-            progress=progress,
-            state=self.state,
-            braked=True,
-            left_path=not on_path,
-        )
+    def _known_braking(self) -> Braking | None:
+        """Return the steps that bring the arm to rest from where it is; None if it may stay there."""
+        braking = self._braking
+        return braking if braking is not None and braking.origin is self._state and braking.steps else None
 
-    def _brakes(self, dt: float) -> Brakes:
-        return Brakes(self.setup, self._attempt, self._actuation, self._target, dt)
-
-    def _target(self, state: State, dt: float, path: Path, start: float, end: float, box: Box) -> Target:
-        then = state.time + dt
-        return Target(path, start, end, *box, then, self.setup.base_at(then), self._shaping.places)
+    def _brake(self, braking: Braking, path: Path | None, start: float, end: float, blocked: Step) -> Step:
+        """Do the first step of `braking` and return it, in the place of one that was not found."""
+        step = braking.first(path, start, end, blocked)
+        self.state, self._braking = step.state, braking.rest
+        return step
 
     def explain(
         self,
@@ -371,16 +285,10 @@ class Resolver:
         Worth asking after a `last` step that was blocked, hardly moved or braked. The state is the present one by
         default; nothing moves.
         """
-        dt, state = self.setup.dt if dt is None else dt, state or self.state
-        reason, pressing, failed = ("", {}, False)
-        if last is not None:
-            reason, pressing, failed = last.reason, last.multipliers, last.solver_failed
-            if last.left_path:
-                reason, failed = BASE_MOVES_ON, False
-        limits = self._actuation.limits(state, dt)
-        return explain(
-            self.setup, self._separation, state, path, start, end, limits, reason, pressing, failed
-        )
+        state = state or self.state
+        limits = self._actuation.limits(state, self.setup.dt if dt is None else dt).of_stop()
+        goal = path.at(start).over(end - start)
+        return explain(self.setup, self._separation, state, goal, limits, last)
 
     def too_near(self, state: State) -> Shortfall:
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
@@ -390,7 +298,3 @@ class Resolver:
         """Return what tries a maneuver once more from home, for a problem that resolves the redundancy differently."""
         # A kernel takes longer to compile than a maneuver to solve without it.
         return Resolver(build_arm(problem, compiled=False))
-
-
-def _tracking_error(setup: Setup) -> TrackingError | None:
-    return TrackingError(setup.layout, setup.kinematics) if setup.layout.hard_tracking else None

@@ -6,23 +6,28 @@ A pair that is already nearer than it may be does not stop the arm: it may not c
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.arm import Arm
-from vgtm_qp.geometry.clearance import BetweenReport, Clearance, Contacts, Pair
+from vgtm_qp.geometry.clearance import BetweenReport, Contacts, Pair
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.angles import angle_gradients, angles, corners
 from vgtm_qp.rows.clearance import clearance_rows, slowed
+from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.state import Shortfall, State
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
-Shortfall = Mapping[Pair, float]
-"""Pairs that are nearer than they may be, with their distances, m."""
+RECOVERY = 0.01
+"""A pair that is too near at the start of a step is driven apart by so much in it, m."""
+
+_ROUNDING = 1e-10
+"""Clearances that are less by this are kept, m."""
+
+_APPROACH = 0.4
+"""Largest share of its remaining clearance that a pair may use in one step."""
 
 _BINDING = 0.002
 """FCL is asked about pairs that are nearer than this to their floor, m, too."""
@@ -43,101 +48,79 @@ That is half of the published tolerance.
 """
 
 
-@dataclass(frozen=True)
-class Distances:
-    """What is kept: surface to surface from obstacles and between bodies, m, and angles between bodies, rad.
-
-    The QP keeps `margin` more, m, for what is not linear in its step; pairs further than `influence`, m, are not
-    in it. A pair that is too near at the start of a step is driven apart by up to `recovery`, m, in one step. A pair
-    may use the share `approach` of its remaining clearance in one step: where that is 1, bodies come at full speed
-    and stop dead, which is a jump in the rates of all actuators.
-    """
-
-    safe: float
-    self_safe: float
-    influence: float
-    margin: float = 2e-4
-    minimum_angle: float = 0.0
-    recovery: float = 0.01
-    approach: float = 1.0
-    rounding: float = 1e-10
-
-
 class Separation:
     """Rows, checks and proofs of clearance for the steps of one arm.
 
-    Parameters
-    ----------
-    arm
-        Whose configurations are meant.
-    monitor
-        Of the arm's bodies and the obstacles.
-    distances
-        What is kept.
+    Where the `setup` slows down, a pair may use a share of its remaining clearance in one step: otherwise bodies come
+    at full speed and stop dead, which is a jump in the rates of all actuators.
     """
 
-    def __init__(self, arm: Arm, monitor: Clearance, distances: Distances) -> None:
-        self._arm = arm
-        self.monitor = monitor
-        self.distances = distances
-        meeting = monitor.bodies.joints if distances.minimum_angle > 0.0 else np.zeros((0, 2), dtype=np.int64)
-        self._corners = corners(meeting)
+    def __init__(self, setup: Setup) -> None:
+        self._setup, self._arm, self._monitor = setup, setup.arm, setup.monitor
+        self._approach = _APPROACH if setup.slows_down else 1.0
+        self._floors = setup.safe - _ROUNDING, setup.self_safe - _ROUNDING
+        meeting = setup.monitor.bodies.joints
+        self._corners = corners(meeting if setup.minimum_angle > 0.0 else meeting[:0])
 
     def shortfall(self, q: Array, time: float) -> Shortfall:
         """Return the pairs that are too near at a configuration; empty as a rule."""
-        kept, points = self.distances, self._arm.points(q)
-        floors = kept.safe - kept.rounding, kept.self_safe - kept.rounding
-        if self.monitor.keeps(points, time, *floors):
+        points, (floor, self_floor) = self._arm.points(q), self._floors
+        if self._monitor.keeps(points, time, floor, self_floor):
             return {}
-        contacts = self.monitor.near(points, time, floors[0], self_reach=floors[1], fcl_reach=0.0)
+        contacts = self._monitor.near(points, time, floor, self_reach=self_floor, fcl_reach=0.0)
         found: dict[Pair, float] = {}
         for k in range(len(contacts)):
             pair = contacts.pair(k)
             found[pair] = min(found.get(pair, np.inf), float(contacts.distance[k]))
         return found
 
-    def holds(self, q: Array, time: float, before: Shortfall, *, proven: bool = False) -> Shortfall | None:
-        """Return what is too near at `q`, or None where a pair is that was not `before`, or comes nearer.
+    def shortfall_of(self, state: State) -> Shortfall:
+        """Return the pairs that are too near in a state."""
+        return self.shortfall(state.q, state.time) if state.shortfall is None else state.shortfall
 
-        `proven` is whether :meth:`between` was certified for the motion that ends at `q`. Its proof holds at `q` too,
-        but not where points leave their chords: bodies may then come a little nearer on the way than at its end.
+    def proof(
+        self, state: State, q: Array, time: float, before: Shortfall
+    ) -> tuple[BetweenReport, Shortfall | None]:
+        """Return the proof of :meth:`between` for the motion to `q`, and what is too near there.
+
+        The latter is None where a pair is that was not `before`, or comes nearer. A proof of the motion holds at its
+        end too, but not where points leave their chords: bodies may then come a little nearer before it than there.
         """
+        report = self.between(state.q, q, state.time, time, before)
         if not self._angles_hold(q):
-            return None
-        if proven and not before and not self._arm.leaves_chords:
-            return {}
+            return report, None
+        if report.certified and not before and not self._arm.leaves_chords:
+            return report, {}
         after = self.shortfall(q, time)
-        if all(
-            distance >= before.get(pair, np.inf) - self.distances.rounding for pair, distance in after.items()
-        ):
-            return after
-        return None
+        if all(distance >= before.get(pair, np.inf) - _ROUNDING for pair, distance in after.items()):
+            return report, after
+        return report, None
 
     def between(
         self, start: Array, end: Array, start_time: float, end_time: float, before: Shortfall
     ) -> BetweenReport:
         """Return the proof that no surfaces come nearer on the way than they may, or than the nearest are already."""
-        kept = self.distances
-        floor, self_floor = (
-            min([least, *(distance for pair, distance in before.items() if pair.is_self == is_self)])
-            for least, is_self in ((kept.safe, False), (kept.self_safe, True))
-        )
-        points = self._arm.points
+        floor, self_floor = self._setup.safe, self._setup.self_safe
+        for pair, distance in before.items():
+            if pair.is_self:
+                self_floor = min(self_floor, distance)
+            else:
+                floor = min(floor, distance)
+        points, between = self._arm.points, self._monitor.between
         if not self._arm.leaves_chords:
-            floors = floor - kept.rounding, max(self_floor - kept.rounding, 0.0)
-            return self.monitor.between(points(start), points(end), start_time, end_time, *floors)
+            floors = floor - _ROUNDING, max(self_floor - _ROUNDING, 0.0)
+            return between(points(start), points(end), start_time, end_time, *floors)
         deviation = self.deviation(start, end)
         # Cut in k pieces, the points leave their chords by 1 / k^2 of that.
-        pieces = (
-            min(math.ceil(math.sqrt(max(deviation / _BETWEEN, 1.0))), _MOST_PIECES) if deviation < 1.0 else 1
-        )
+        needed = math.ceil(math.sqrt(max(deviation / _BETWEEN, 1.0))) if deviation < 1.0 else 1
+        pieces, lowest = min(needed, _MOST_PIECES), np.inf
         spare = deviation / pieces**2 - _BETWEEN
-        floors, lowest = (floor + spare, max(self_floor + spare, 0.0)), np.inf
+        floors = floor + spare, max(self_floor + spare, 0.0)
         for k in range(pieces):
             here, there = (points(start + share * (end - start)) for share in (k / pieces, (k + 1) / pieces))
             lapse = (end_time - start_time) / pieces
             since = start_time + k * lapse
-            report = self.monitor.between(here, there, since, since + lapse, *floors)
+            report = between(here, there, since, since + lapse, *floors)
             lowest = min(lowest, report.clearance)
             if not report.certified:
                 break
@@ -164,11 +147,11 @@ class Separation:
         short, gain
             Pairs that were too near at the start of the step, and how far they are driven apart in it, m.
         """
-        kept, motion = self.distances, duration > 0.0
-        reach += self.monitor.pieces.fastest * duration
+        kept, motion, monitor = self._setup, duration > 0.0, self._monitor
+        reach += monitor.pieces.fastest * duration
         limits = min(kept.influence, kept.safe + reach), min(kept.influence, kept.self_safe + 2.0 * reach)
         fcl_reach = kept.safe + _BINDING if motion else 0.0
-        contacts = self.monitor.near(
+        contacts = monitor.near(
             self._arm.points(q), time, limits[0], self_reach=limits[1], fcl_reach=fcl_reach, tracked=not short
         )
         rows = self._clearance_rows(q, contacts)
@@ -180,64 +163,47 @@ class Separation:
         self, rows: ClearanceRows, contacts: Contacts, duration: float, short: Shortfall, gain: float
     ) -> None:
         """Let pairs come nearer no faster than they may: overwrites ``rows.lower``; arguments as of :meth:`rows`."""
-        kept, motion = self.distances, duration > 0.0
+        kept, motion = self._setup, duration > 0.0
         if motion:
             np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
         if short:
-            self._recover(rows, contacts, short, gain)
-        if motion and self.monitor.pieces.moving:
-            rows.lower += contacts.normal_speed * duration
+            # Those that were too near are driven apart by the gain, as far as they are short.
+            floor = np.where(contacts.is_self, kept.self_safe, kept.safe)
+            for k in np.flatnonzero(contacts.distance < floor).tolist():
+                before = short.get(contacts.pair(k))
+                if before is not None:
+                    rows.lower[k] = min(before + gain, floor[k]) - contacts.distance[k]
         if motion:
+            if self._monitor.pieces.moving:
+                rows.lower += contacts.normal_speed * duration
             # Slow down by the clearance left when the obstacles have moved: those that only come nearer need no haste.
-            rows.lower = slowed(rows.lower, kept.approach, _LEAST_APPROACH)
+            rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH)
 
-    def _recover(self, rows: ClearanceRows, contacts: Contacts, short: Shortfall, gain: float) -> None:
-        """Drive pairs that were too near apart by `gain`, m, as far as they are short: overwrites ``rows.lower``."""
-        floor = np.where(contacts.is_self, self.distances.self_safe, self.distances.safe)
-        for k in np.flatnonzero(contacts.distance < floor).tolist():
-            before = short.get(contacts.pair(k))
-            if before is not None:
-                rows.lower[k] = min(before + gain, floor[k]) - contacts.distance[k]
-
-    def rows_between(
-        self, start: Array, q: Array, start_time: float, time: float, fractions: list[float]
-    ) -> list[ClearanceRows]:
-        """Return the rows at `fractions`, 0 to 1, of the way from `start` to `q`: the end state moves them too."""
-        found = []
+    def with_rows_between(
+        self, rows: ClearanceRows, state: State, q: Array, time: float, fractions: list[float]
+    ) -> ClearanceRows:
+        """Return `rows`, and those at `fractions`, 0 to 1, of the way from a state to `q`: this moves them too."""
         for s in fractions:
-            at = start + s * (q - start)
-            now = start_time + s * (time - start_time)
-            contacts = self.monitor.near(self._arm.points(at), now, 1.5 * self.distances.safe)
-            found.append(self._clearance_rows(at, contacts, s))
-        return found
+            at, now = state.q + s * (q - state.q), state.time + s * (time - state.time)
+            contacts = self._monitor.near(self._arm.points(at), now, 1.5 * self._setup.safe)
+            rows = rows.joined(self._clearance_rows(at, contacts, s))
+        return rows
 
     def _clearance_rows(self, q: Array, contacts: Contacts, fraction: float = 1.0) -> ClearanceRows:
         """Return the rows of contacts found at a configuration, a `fraction` of the way to the end."""
-        kept = self.distances
         if not len(contacts):
             return ClearanceRows(name=contacts.name)
+        kept = self._setup
+        pairs = contacts.distance, contacts.normal, contacts.weights, contacts.is_self
         coefficients, lower = clearance_rows(
-            contacts.distance,
-            contacts.normal,
-            contacts.weights,
-            contacts.is_self,
-            kept.safe,
-            kept.self_safe,
-            margin=kept.margin,
-            fraction=fraction,
+            *pairs, kept.safe, kept.self_safe, margin=kept.margin, fraction=fraction
         )
         nodes, coefficients = self._arm.over_nodes(q, contacts.points, coefficients)
         return ClearanceRows(nodes, coefficients, lower, contacts.name)
 
-    def names(self, short: Shortfall) -> tuple[str, ...]:
-        """Return what is too near, nearest first."""
-        return tuple(
-            self.monitor.names.clearance(pair) for pair, _ in sorted(short.items(), key=lambda item: item[1])
-        )
-
     def _vectors(self, q: Array) -> tuple[Array, Array]:
         """Return the vectors (K, 3), m, of both bodies of each corner away from the joint where they meet."""
-        points, (body, end) = self.monitor.bodies.points, np.moveaxis(self._corners, 2, 0)
+        points, (body, end) = self._monitor.bodies.points, np.moveaxis(self._corners, 2, 0)
         vectors = self._arm.points(q)
         vectors = vectors[points[body, 1 - end]] - vectors[points[body, end]]
         return vectors[:, 0], vectors[:, 1]
@@ -245,15 +211,14 @@ class Separation:
     def _angles_hold(self, q: Array) -> bool:
         if not len(self._corners):
             return True
-        least = self.distances.minimum_angle - self.distances.rounding
-        return bool(np.all(angles(*self._vectors(q)) >= least))
+        return bool(np.all(angles(*self._vectors(q)) >= self._setup.minimum_angle - _ROUNDING))
 
     def _angle_rows(self, q: Array, *, motion: bool) -> ClearanceRows:
         """Return the rows of the angles that are near the least one at a configuration.
 
         Where points are not the nodes, the nodes of the joints stand for them: the rows are then approximate.
         """
-        kept, bodies = self.distances, self.monitor.bodies
+        kept, bodies = self._setup, self._monitor.bodies
         first, second = self._vectors(q)
         angle = angles(first, second)
         chosen = np.flatnonzero(angle < kept.minimum_angle + _NEAR_ANGLE)

@@ -8,19 +8,22 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.arm import Arm
 from vgtm_qp.geometry.clearance import Pair
+from vgtm_qp.qp.fused import Closed
 
 Array = NDArray[np.float64]
+
+Shortfall = Mapping[Pair, float]
+"""Pairs that are nearer than they may be, with their distances, m."""
 
 
 def frozen(array: Array) -> Array:
     """Return a read-only contiguous copy of `array`."""
-    copy = np.array(array, dtype=float, order="C")
-    copy.setflags(write=False)
-    return copy
+    return _sealed(np.array(array, dtype=float, order="C"))
 
 
-def sealed(array: Array) -> Array:
+def _sealed(array: Array) -> Array:
     """Return `array` itself, read-only from now on: for one that nobody else writes to."""
     array.setflags(write=False)
     return array
@@ -50,8 +53,8 @@ class State:
         Displacement over that step: the guess for the next one, at whose middle it is linearised.
     duration : float
         Duration of that step, s; 0 at home, where the arm rests.
-    shortfall : mapping or None
-        Pairs that are nearer than they may be, with their distances, m; None where that is not known yet.
+    shortfall : Shortfall or None
+        Pairs that are too near; None where that is not known yet.
     """
 
     time: float
@@ -63,4 +66,22 @@ class State:
     motion: Array
     duration: float = 0.0
     torsion: Array = field(default_factory=lambda: frozen(np.zeros(0)))
-    shortfall: Mapping[Pair, float] | None = None
+    shortfall: Shortfall | None = None
+
+    def next(
+        self, arm: Arm, time: float, closed: Closed, vertices: Array, torsion: Array, shortfall: Shortfall
+    ) -> State:
+        """Return the state of `arm` after a step that ends at `time`, s; all arrays are read-only from now on."""
+        duration, q, quantities = time - self.time, _sealed(closed.q), _sealed(closed.quantities)
+        return State(
+            time=time,
+            q=q,
+            nodes=_sealed(arm.nodes(q)),
+            control_vertices=_sealed(vertices),
+            torsion=_sealed(torsion),
+            quantities=quantities,
+            rates=_sealed((quantities - self.quantities) / duration),
+            motion=_sealed(q - self.q),
+            duration=duration,
+            shortfall=shortfall,
+        )

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 
@@ -12,7 +11,11 @@ import numpy as np
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
 from vgtm_qp.qp.residual import FailedStepError
+from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.state import State
+
+WHOLE = 1.0 - 1e-9
+"""Progress from which on a goal counts as met."""
 
 
 class StepStatus(StrEnum):
@@ -30,10 +33,10 @@ class Step:
     Attributes
     ----------
     status : StepStatus
-        ``reached``: the goal was met; ``slowed``: the arm moved on along the way to it, as far as the rows allow;
+        ``reached``: the goal was met; ``slowed``: the arm moved on along its path to it, as far as the rows allow;
         ``blocked``: no safe motion was found and the state is unchanged.
     progress : float
-        The part of the way that was covered, 0 to 1.
+        Share of the path that was covered, 0 to 1.
     state : State
         The state after the step.
     reason : str
@@ -46,7 +49,11 @@ class Step:
         Whether no other step was found than to brake on the path that the arm was on before: limited accelerations
         do not let it leave that at once.
     left_path : bool
-        Whether the tip left the path in that: it is elastic, or its base moves on whatever happens.
+        Whether the tip left the path while braking: it is elastic, or its base moves on whatever happens.
+    solution, rows, limits
+        The answer of the QP that moved the arm, its clearance rows, and the limits of its actuators; or None.
+    failure : FailedStepError or None
+        What blocked it if that was a QP without an answer.
     """
 
     status: StepStatus
@@ -57,10 +64,10 @@ class Step:
     solver_failed: bool = False
     braked: bool = False
     left_path: bool = False
-    _limit_name: Callable[[int, bool], str] = field(default=lambda k, upper: "")  # noqa: ARG005
-    _solution: StepSolution | None = None
-    _rows: ClearanceRows | None = None
-    _failure: FailedStepError | None = None
+    solution: StepSolution | None = None
+    rows: ClearanceRows | None = None
+    limits: Limits | None = None
+    failure: FailedStepError | None = None
 
     def __str__(self) -> str:
         """Return one line: how it ended, how far and when, and what held the arm back where something did."""
@@ -71,26 +78,38 @@ class Step:
     def __repr__(self) -> str:
         return f"<Step {self}>"
 
+    def over(self, share: float, limits: Limits | None) -> Step:
+        """Return the same step as one over a piece of path of which it covers a `share`."""
+        status, progress = self.status, share * self.progress
+        if self.moved:
+            status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
+        rest = self.solver_failed, self.braked, self.left_path, self.solution, self.rows, limits, self.failure
+        return Step(status, progress, self.state, self.reason, self.qps, *rest)
+
+    @property
+    def moved(self) -> bool:
+        """Whether the state is another one than before."""
+        return self.status is not StepStatus.BLOCKED
+
     @cached_property
     def multipliers(self) -> dict[str, float]:
         """Multipliers of the rows that were active in the QP that moved the arm, by name, the greatest first."""
-        if self._solution is None or self._rows is None:
+        if self.solution is None or self.rows is None or self.limits is None:
             return {}
         found: dict[str, float] = {}
-        pressing = self._solution.clearance_multipliers
+        pressing = self.solution.clearance_multipliers
         for k in np.flatnonzero(pressing > 1e-9):
-            name = self._rows.name(int(k))
+            name = self.rows.name(int(k))
             found[name] = max(found.get(name, 0.0), float(pressing[k]))
-        pull = self._solution.actuator_multipliers
-        strokes = np.abs(pull)
-        for k in np.flatnonzero(strokes > 1e-9):
-            found[self._limit_name(int(k), bool(pull[k] > 0.0))] = float(strokes[k])
+        pull = self.solution.actuator_multipliers
+        for k in np.flatnonzero(np.abs(pull) > 1e-9):
+            found[self.limits.name(int(k), upper=bool(pull[k] > 0.0))] = float(abs(pull[k]))
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     @property
     def failed_qp(self) -> StepQP | None:
         """The last QP, where the step was blocked because it had no answer: every row and column with a name."""
-        return None if self._failure is None else self._failure.qp
+        return None if self.failure is None else self.failure.qp
 
     @property
     def active(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Why an arm stops: the smallest set of rows that together leave it no way along its path, found at the state itself.
+"""Why an arm stops: the smallest set of rows that together hold it back on its path, found at the state itself.
 
 To first order the arm can cover the share alpha of a piece of path that is the greatest one with
 
@@ -11,7 +11,7 @@ way is left to first order: close to a fold of its motion the curvature takes wh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -22,11 +22,13 @@ from scipy.optimize import linprog
 
 from vgtm_qp.arm.arm import Arm
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.path import Path
+from vgtm_qp.rows.tip import TipGoal
+from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
+from vgtm_qp.step.step import Step
+from vgtm_qp.step.task import over_all_nodes, tip_response
 
 Array = NDArray[np.float64]
 
@@ -41,7 +43,7 @@ _SINGULAR = 0.1
 _PRESSES = 1e-7
 
 CANNOT_BRAKE = "the arm could not brake after it"
-"""The reason of a step that is refused since no way was found to come to rest after it."""
+"""The reason of a step that is refused since no steps were found that bring the arm to rest after it."""
 BASE_MOVES_ON = "its base moves on, and the tip cannot stay on its path with accelerations as limited"
 """The reason of a step in which the tip leaves its path."""
 
@@ -72,10 +74,9 @@ class Stop:
     kind : StopKind
         ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
         where the tip cannot start in that direction whatever the limits, or the fixed quantities do not determine the
-        nodes; ``out of reach`` where the arm is stretched
-        towards a goal further away; ``nonlinear`` where no row forbids the step to first order, and ``acceleration``
-        if it is one after which the arm could not brake; ``solver`` where none does and the QP solver gave no good
-        answer.
+        nodes; ``out of reach`` where the arm is stretched towards a goal further away; ``nonlinear`` where no row
+        forbids the step to first order, and ``acceleration`` if it is one after which the arm could not brake;
+        ``solver`` where none does and the QP solver gave no good answer.
     multipliers : dict
         Rows of the set, the most decisive first, and the share of the way that each costs per metre (radian).
     obstacles : tuple of str
@@ -98,15 +99,9 @@ class Stop:
         return tuple(self.multipliers) or (str(self if self.kind is StopKind.SOLVER else self.kind),)
 
     def __str__(self) -> str:
-        parts = [
-            str(self.kind),
-            ", ".join(self.multipliers),
-            self.reason
-            if self.kind in (StopKind.NONLINEAR, StopKind.SOLVER)
-            or self.reason.startswith((CANNOT_BRAKE, BASE_MOVES_ON))
-            else "",
-        ]
-        return ": ".join(part for part in parts if part)
+        is_unclear = self.kind in (StopKind.NONLINEAR, StopKind.SOLVER)
+        reason = self.reason if is_unclear or _is_braking(self.reason) else ""
+        return ": ".join(part for part in (str(self.kind), ", ".join(self.multipliers), reason) if part)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data."""
@@ -118,75 +113,65 @@ class Stop:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Boxes of the actuators' lengths (n_a,) at the end of a step, m, and what each side is called."""
-
-    lower: Array
-    upper: Array
-    names: Sequence[str]
-    low_kind: Sequence[StopKind]
-    high_kind: Sequence[StopKind]
-
-
 def explain(
     setup: Setup,
     separation: Separation,
     state: State,
-    path: Path,
-    start: float,
-    end: float,
+    goal: TipGoal,
     limits: Limits,
-    reason: str,
-    pressing: Mapping[str, float],
-    solver_failed: bool = False,
+    last: Step | None = None,
 ) -> Stop:
-    """Return why the arm does not get on from `state` along `path` from its value `start` towards `end`.
+    """Return why the arm does not get on from `state` towards a goal, with rates over a whole piece of path.
 
-    Where no rows forbid it to first order, what was `pressing` on the last step is told, and the `reason` it gave.
+    Where no rows forbid it to first order, the answer is what the `last` step was held by, and its reason.
     """
+    reason, pressing, solver_failed = "", dict[str, float](), False
+    if last is not None:
+        reason, pressing, solver_failed = last.reason, last.multipliers, last.solver_failed
+        if last.left_path:
+            reason, solver_failed = BASE_MOVES_ON, False
     try:
-        program = _Program(setup, separation, state, path, start, end, limits)
+        program = _Program(setup, separation, state, goal, limits)
     except SolverError:
         return Stop(StopKind.SINGULAR, reason=reason)
     share, costs = program.solve(np.ones(program.count, dtype=bool))
     if solver_failed and share > _BLOCKED:
         return Stop(StopKind.SOLVER, reason=reason)
     bar = min(max(_BLOCKED, _FREER * share), 0.5 * (1.0 + share))
-    kept = np.zeros(program.count, dtype=bool)
-    kept[np.flatnonzero(costs > _PRESSES)] = True
+    kept = costs > _PRESSES
+    is_outward = _is_outward(setup.arm, state, goal)
     if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= bar:
-        kind = StopKind.OUT_OF_REACH if _outward(setup.arm, state, path, start) else StopKind.SINGULAR
         if share <= _SINGULAR:
-            return Stop(kind, reason=reason)
-        kinds = [_kind(setup, name) for name in pressing]
-        other = (
-            StopKind.ACCELERATION if reason.startswith((CANNOT_BRAKE, BASE_MOVES_ON)) else StopKind.NONLINEAR
-        )
-        kind = next((kind for kind in StopKind if kind in kinds), other)
-        return Stop(kind, pressing, _obstacles(setup, pressing), reason)
+            return Stop(StopKind.OUT_OF_REACH if is_outward else StopKind.SINGULAR, reason=reason)
+        other = StopKind.ACCELERATION if _is_braking(reason) else StopKind.NONLINEAR
+        kinds = {_kind(setup, name) for name in pressing}
+        return Stop(_first(kinds, other), pressing, _obstacles(setup, pressing), reason)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
         kept[k] = False
         if program.solve(kept)[0] > bar:
             kept[k] = True
     _, costs = program.solve(kept)
-    chosen = sorted(np.flatnonzero(kept).tolist(), key=lambda k: -costs[k])
-    kinds = [program.kind(k) for k in chosen]
-    kind = next(kind for kind in StopKind if kind in kinds)
-    if (
-        set(kinds) == {StopKind.STROKE}
-        and len(chosen) >= setup.arm.segments
-        and _outward(setup.arm, state, path, start)
-    ):
-        kind = StopKind.OUT_OF_REACH
     multipliers: dict[str, float] = {}
-    away = np.zeros(3)
-    for k in chosen:
-        name = program.name(k)
-        multipliers[name] = max(multipliers.get(name, 0.0), float(costs[k]))
-        if program.kind(k) is StopKind.OBSTACLE:
-            away += float(costs[k]) * program.normal(k)
+    kinds, away = set(), np.zeros(3)
+    for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: -costs[k]):
+        name, cost = program.name(k), float(costs[k])
+        multipliers[name] = max(multipliers.get(name, 0.0), cost)
+        kinds.add(kind := _kind(setup, name))
+        if kind is StopKind.OBSTACLE:
+            away += cost * program.normal(k)
+    is_stretched = kinds == {StopKind.STROKE} and np.count_nonzero(kept) >= setup.arm.segments and is_outward
+    kind = StopKind.OUT_OF_REACH if is_stretched else _first(kinds, StopKind.NONLINEAR)
     return Stop(kind, multipliers, _obstacles(setup, multipliers), reason, tuple(away.tolist()))
+
+
+def _is_braking(reason: str) -> bool:
+    """Return whether a step was refused, or left its path, for what the arm could do after it."""
+    return reason.startswith((CANNOT_BRAKE, BASE_MOVES_ON))
+
+
+def _first(kinds: Iterable[StopKind], other: StopKind) -> StopKind:
+    """Return the most telling of some kinds, the `other` one without any."""
+    return next((kind for kind in StopKind if kind in kinds), other)
 
 
 def _obstacles(setup: Setup, names: Iterable[str]) -> tuple[str, ...]:
@@ -213,36 +198,20 @@ class _Program:
     """
 
     def __init__(
-        self,
-        setup: Setup,
-        separation: Separation,
-        state: State,
-        path: Path,
-        start: float,
-        end: float,
-        limits: Limits,
+        self, setup: Setup, separation: Separation, state: State, goal: TipGoal, limits: Limits
     ) -> None:
-        arm, kinematics, self._setup = setup.arm, setup.kinematics, setup
+        arm, kinematics = setup.arm, setup.kinematics
         kinematics.evaluate(state.q)
-        response, _ = kinematics.motion().response()
-        count = len(arm.actuators)
-        padded = np.zeros((len(arm.node_names), 3, count))
-        padded[arm.free] = response.reshape(-1, 3, count)
-
-        tip = setup.task.rows(state.nodes, kinematics, path.at(start))
-        rate = tip.rate * (end - start)
-        length = float(np.linalg.norm(rate))
+        every = over_all_nodes(arm, kinematics.motion().response()[0])
+        tip = setup.task.rows(state.nodes, kinematics, goal)
+        length = float(np.linalg.norm(tip.rate))
         # Within the trust the arm covers about so much of the way.
         self._unit = min(1.0, _TRUST / length) if length > 0.0 else 1.0
-        jacobian_tip = np.einsum(
-            "rkc,kcn->rn", tip.jacobian.reshape(len(rate), -1, 3), padded[arm.end_effector.nodes]
-        )
-        self._equal = np.column_stack([jacobian_tip, -rate * self._unit])
-
-        self._rows: ClearanceRows = separation.rows(state.q, state.time, 0.0, 2.0 * _TRUST, {}, 0.0)
-        near = np.einsum("rsc,rscn->rn", self._rows.coefficients, padded[self._rows.nodes])
+        self._equal = np.column_stack([tip_response(arm, tip.jacobian, every), -tip.rate * self._unit])
+        self._rows = separation.rows(state.q, state.time, 0.0, 2.0 * _TRUST, {}, 0.0)
+        near = np.einsum("rsc,rscn->rn", self._rows.coefficients, every[self._rows.nodes])
         self._near = np.column_stack([-near, np.zeros(len(near))])
-        self._near_bound = np.maximum(-(self._rows.lower - separation.distances.margin), 0.0)
+        self._near_bound = np.maximum(setup.margin - self._rows.lower, 0.0)
         now = state.quantities[arm.actuators]
         self._low = np.minimum(limits.lower - now, 0.0)
         self._high = np.maximum(limits.upper - now, 0.0)
@@ -270,10 +239,8 @@ class _Program:
         if answer.status != 0:
             return 0.0, multipliers
         multipliers[rows] = -answer.ineqlin.marginals
-        lower = np.where(low > -_TRUST, answer.lower.marginals[:-1], 0.0)
-        upper = np.where(high < _TRUST, -answer.upper.marginals[:-1], 0.0)
-        multipliers[near : near + actuators] = lower
-        multipliers[near + actuators :] = upper
+        multipliers[near : near + actuators] = np.where(low > -_TRUST, answer.lower.marginals[:-1], 0.0)
+        multipliers[near + actuators :] = np.where(high < _TRUST, -answer.upper.marginals[:-1], 0.0)
         return float(answer.x[-1]), np.maximum(multipliers, 0.0) * self._unit
 
     def name(self, k: int) -> str:
@@ -281,24 +248,15 @@ class _Program:
         near, actuators = len(self._rows), len(self._low)
         if k < near:
             return self._rows.name(k)
-        return f"{self.kind(k)}: {self._limits.names[(k - near) % actuators]}"
+        return self._limits.name((k - near) % actuators, upper=k >= near + actuators)
 
     def normal(self, k: int) -> Array:
         """Return (3,) the direction in which the arm as a whole leaves the obstacle of row `k`."""
         return np.asarray(self._rows.coefficients[k].sum(axis=0))
 
-    def kind(self, k: int) -> StopKind:
-        """Return what row `k` is about."""
-        near, actuators = len(self._rows), len(self._low)
-        if k >= near:
-            side = self._limits.low_kind if k < near + actuators else self._limits.high_kind
-            return side[(k - near) % actuators]
-        return _kind(self._setup, self._rows.name(k))
 
-
-def _outward(arm: Arm, state: State, path: Path, start: float) -> bool:
-    """Return whether the path leads away from the base at `start`, within about 60 degrees."""
-    point = path.at(start)
-    way = point.position - state.nodes[arm.base].mean(axis=0)
-    speed = float(np.linalg.norm(point.velocity))
-    return speed > 0.0 and float(way @ point.velocity) > 0.5 * speed * float(np.linalg.norm(way))
+def _is_outward(arm: Arm, state: State, goal: TipGoal) -> bool:
+    """Return whether the path to the goal leads away from the base, within about 60 degrees."""
+    way = goal.position - state.nodes[arm.base].mean(axis=0)
+    speed = float(np.linalg.norm(goal.velocity))
+    return speed > 0.0 and float(way @ goal.velocity) > 0.5 * speed * float(np.linalg.norm(way))

@@ -24,9 +24,8 @@ class Target:
 
     Attributes
     ----------
-    path : Path
-    start, end : float
-        Values of the path variable between which the step moves; progress alpha runs from 0 to 1 over them.
+    path, start, end
+        The path, and its values between which the step moves; progress alpha runs from 0 to 1 over them.
     lower, upper : (n_a,)
         Values of the actuators allowed at the end of the step.
     time : float
@@ -54,20 +53,9 @@ class Target:
 class QPInput(NamedTuple):
     """What the QP of a step is linearised at and asked for.
 
-    Attributes
-    ----------
-    q, at : configurations
-        Where residuals and where Jacobians are taken; the same for a correction.
-    vertices, torsion : (V, 3), (T,)
-        The curve, m and rad.
-    target : Target
-    goal : TipGoal
-        The tip's, at `progress`.
-    progress : float
-        How much of the target's piece of path lies behind the tip, 0 to 1.
-    rows : ClearanceRows
-    motion : bool
-        Whether it moves the arm; a correction returns to the constraints on the shortest way.
+    Residuals are those at `q` and Jacobians those `at` another configuration, the same for a correction. The curve is
+    (V, 3), m, and (T,), rad. The `goal` is that of the target at a `progress` of 0 to 1, which the tip has made. A QP
+    of `motion` moves the arm; a correction returns to the constraints by the least displacement.
     """
 
     q: Array

@@ -1,19 +1,27 @@
-"""The end effector's coordinates that a problem tracks, at numbers: eqs. (11) and (16)."""
+"""The end effector's coordinates that a problem tracks, at numbers, and the paths to goals for them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.arm.arm import Arm, Kinematics
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError
+from vgtm_qp.rotation import rotation_from_vector, turn_between
 from vgtm_qp.rows.tip import TipGoal, axes, row_names, tip_function
+from vgtm_qp.step.path import Path
 
 Array = NDArray[np.float64]
+
+_UNCHANGED = "the state of the arm is unchanged"
+
+_SHORTEST, _LONGEST = 1e-8, 1e8
+"""Durations of a step, s: shorter ones are lost in the rounding of the time and of the rates."""
 
 
 class TipRows(NamedTuple):
@@ -51,8 +59,8 @@ class TipTask:
     ) -> tuple[Array, Array, Array, float]:
         """Return error (n_e,) goal minus value, rate (n_e,) along the path, turned axes (r, 3) and weight of progress.
 
-        The rows of the axes times the tip's angular velocity are the tracked turns. `motion` is whether errors that
-        are not worth closing count as zero.
+        The rows of the axes times the tip's angular velocity are the tracked turns. With `motion`, errors that are
+        not worth closing are zero.
         """
         inputs = self._rows.inputs
         inputs[0][:], inputs[1][:] = position, rotation.T.reshape(-1)
@@ -67,16 +75,86 @@ class TipTask:
         """Return the greatest error, m or rad."""
         return float(np.abs(self.residual(position, rotation, goal)[0]).max(initial=0.0))
 
-    def rows(self, X: Array, kinematics: Kinematics, goal: TipGoal, spin: Array | None = None) -> TipRows:
-        """Return the rows at nodes `X` (N, 3), at which the kinematics was evaluated, towards `goal`.
-
-        `spin` (3, 3 K_tip) are the tip's angular-velocity rows if they are to be taken elsewhere.
-        """
+    def rows(self, X: Array, kinematics: Kinematics, goal: TipGoal) -> TipRows:
+        """Return the rows at nodes `X` (N, 3), at which the kinematics was evaluated, towards `goal`."""
         error, rate, across, _ = self.residual(self._tip.position(X), kinematics.tip_rotation, goal)
-        return TipRows(self.jacobian(across, kinematics.tip_spin if spin is None else spin), rate, error)
+        return TipRows(self.jacobian(across, kinematics.tip_spin), rate, error)
 
     def jacobian(self, across: Array, spin: Array | None) -> Array:
         """Return (n_e, 3 K_tip) the rows' Jacobian, from `residual`'s combination of the tip's `spin` (3, 3 K_tip)."""
         if spin is None or not len(across):
             return np.asarray(self._position_jacobian)
         return np.concatenate([self._position_jacobian, across @ spin])
+
+    def path_to(
+        self,
+        tip: tuple[Array, Array],
+        position: ArrayLike | None,
+        pointing: ArrayLike | None,
+        rotation_vector: ArrayLike | None,
+    ) -> Path:
+        """Return the straight path from the tip's pose, (3,) and (3, 3), to a goal.
+
+        Raises
+        ------
+        GoalError
+            The goal is not three finite numbers, or is for coordinates that no row of the QP steers, or two for one.
+        """
+        steered = {
+            "position": (position, bool(len(self.axes))),
+            "pointing": (pointing, bool(self.turns)),
+            "rotation_vector": (rotation_vector, bool(self.turns)),
+        }
+        for name, (value, is_tracked) in steered.items():
+            if value is not None and not is_tracked:
+                raise GoalError(f"{name} is not tracked, only {', '.join(self.track)}; {_UNCHANGED}")
+        if pointing is not None and rotation_vector is not None:
+            raise GoalError(f"give pointing or rotation_vector, not both; {_UNCHANGED}")
+        here, rotation = tip
+        there = here if position is None else vector(position, "position")
+        turned = rotation
+        if pointing is not None:
+            wanted = vector(pointing, "pointing")
+            norm = float(np.linalg.norm(wanted))
+            if norm < 1e-9:
+                raise GoalError(f"pointing must not be the zero vector; {_UNCHANGED}")
+            turned = rotation_from_vector(turn_between(rotation[:, 2], wanted / norm)) @ rotation
+        elif rotation_vector is not None:
+            turned = rotation_from_vector(vector(rotation_vector, "rotation_vector"))
+        return Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation, turned]))
+
+
+def over_all_nodes(arm: Arm, response: Array) -> Array:
+    """Return displacements (3 (N - N_c), n) of the free nodes as those of all nodes, (N, 3, n)."""
+    every = np.zeros((len(arm.node_names), 3, response.shape[1]))
+    every[arm.free] = response.reshape(len(arm.free), 3, response.shape[1])
+    return every
+
+
+def tip_response(arm: Arm, jacobian: Array, every: Array) -> Array:
+    """Return (n_e, n) how the tip's rows, of `jacobian` (n_e, 3 K_tip), change with displacements (N, 3, n)."""
+    return np.asarray(jacobian @ every[arm.end_effector.nodes].reshape(jacobian.shape[1], every.shape[2]))
+
+
+def duration(dt: float) -> float:
+    """Return a step's duration, s; raise GoalError where it is not a positive number."""
+    try:
+        seconds = float(dt)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not _SHORTEST <= seconds <= _LONGEST:
+        raise GoalError(
+            f"dt must be a positive number of seconds, from {_SHORTEST:g} to {_LONGEST:g}, not {dt!r}; {_UNCHANGED}"
+        )
+    return seconds
+
+
+def vector(value: ArrayLike, name: str) -> Array:
+    """Return three finite numbers; raise GoalError where they are not."""
+    try:
+        numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != (3,) or not np.all(np.isfinite(numbers)):
+        raise GoalError(f"{name} must be three finite numbers, not {value!r}; {_UNCHANGED}")
+    return numbers
