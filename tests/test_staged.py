@@ -406,19 +406,17 @@ def test_memory_is_linear_in_the_bays():
 
 
 @pytest.mark.parametrize("joint_offset", [0.0, 0.02])
-@pytest.mark.parametrize("path", ["chain", "sparse", "dense"])
+@pytest.mark.parametrize("is_wide", [False, True])
 @pytest.mark.parametrize("name", [*MODULES, "graph"])
-def test_lengths_by_every_path(name, path, joint_offset, monkeypatch):
-    if path != "dense":
-        monkeypatch.setattr(lengths_module, "_DENSE", 0)
-    if path == "sparse":
-        monkeypatch.setattr(lengths_module, "find_chain", lambda _: None)
+def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, monkeypatch):
+    if is_wide:
+        monkeypatch.setattr(lengths_module, "_WIDEST", 0)
     truss = mast() if name == "graph" else MODULES[name](joint_offset=joint_offset)
     case = Case(truss, vertices=0)
     rng, kinematics = np.random.default_rng(1), case.kinematics
     kinematics.evaluate(random_pose(truss, rng, 0.02))
     error = rng.normal(size=truss.member_count)
-    solver = LengthSolver(case.layout, case.layout.arm.bays)
+    solver = LengthSolver(case.layout.arm.bays)
     step = solver.solve(kinematics.gradient, error)
     np.testing.assert_allclose(kinematics.motion().jacobian() @ step.ravel(), error, atol=1e-10)
     broken = kinematics.gradient.copy()

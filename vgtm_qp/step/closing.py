@@ -55,7 +55,7 @@ class Closing:
     @cached_property
     def _lengths(self) -> LengthSolver:
         assert self._arm.bays is not None
-        return LengthSolver(self._layout, self._arm.bays)
+        return LengthSolver(self._arm.bays)
 
     @cached_property
     def _stations(self) -> StationSolver:
@@ -89,17 +89,14 @@ class Closing:
         None where an actuator would leave its bounds (n_a,), or the pose is singular.
         """
         arm, kinematics, tracked = self._arm, self._kinematics, self._layout.tracked
-        home, fixed = arm.home_quantities[self._fixed], int(self._fixed.sum())
+        home = arm.home_quantities[self._fixed]
 
         def missing(q: Array) -> Array:
             gap = points - arm.stations.centres(arm.nodes(q))[tracked]
             return np.concatenate([home - kinematics.quantities[self._fixed], gap.reshape(-1)])
 
         def corrected(q: Array, error: Array) -> Array:
-            gap = error[fixed:].reshape(-1, 3)
-            return arm.corrected(
-                q, error, lambda: self._stations.solve(kinematics.gradient, error[:fixed], gap)
-            )
+            return arm.corrected(q, error, lambda: self._stations.solve(kinematics.gradient, error))
 
         closed = self._newton(q, missing, corrected, tolerance, _TOO_FAR)
         values = closed.quantities[self._actuators]
