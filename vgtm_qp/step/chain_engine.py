@@ -21,8 +21,7 @@ from vgtm_qp.qp.long.closing import MOST_STEPS, TOO_FAR
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.long.values import PeriodValues
-from vgtm_qp.qp.long.working_set import RowNumbers
-from vgtm_qp.qp.numbers import StepSolution
+from vgtm_qp.qp.numbers import RowNumbers, StepSolution
 from vgtm_qp.qp.settle import held
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 from vgtm_qp.step.closing import Closing, enough_length, within
@@ -60,7 +59,7 @@ class ChainEngine(Engine):
         layout, arm = self.layout, self.layout.arm
         home_lengths, tip = arm.home_quantities, arm.end_effector
         self._solver, self._task, self._data = solver, task, solver.data
-        self._values = PeriodValues(solver.chain, solver.data, home_lengths)
+        self._values = PeriodValues(solver.chain, solver.data)
         self._home_lengths = home_lengths
         frames = range(2) if tip.has_frame else ()
         self._tip_frames = [_Frame(arm.home[tip.nodes], tip.frame) for _ in frames]
@@ -87,7 +86,7 @@ class ChainEngine(Engine):
     @staticmethod
     def serves(solver: StagedSolver | TrackedSolver) -> bool:
         """Whether the arm with that solver is one whose bays are all alike, with a base face that does not bend."""
-        if solver.chain.window is None:
+        if solver.chain.member_places is None:
             return False
         layout, arm = solver.layout, solver.layout.arm
         return not arm.base[arm.end_effector.nodes].any() and (
@@ -105,9 +104,9 @@ class ChainEngine(Engine):
             self._hold_base(base, vertices)
             if motion:
                 pull = self._polygon @ vertices + layout.goal_pull(vertices, target.vertex_goals)
-                self._data.pull(pull)
+                self._data.vertex_gradient = pull
             else:
-                self._data.pull(np.zeros_like(vertices))
+                self._data.vertex_gradient = np.zeros_like(vertices)
         self._values.fill(X, Y, vertices, moved, motion=motion)
         rotation, spin = np.eye(3), None
         if self._task.turns is not None:
@@ -130,7 +129,6 @@ class ChainEngine(Engine):
             actuator_gradient=weights.stroke_centring * (length - self._home_lengths[actuators])
             if motion
             else np.zeros_like(length),
-            member_rows=self._values.member_rows,
         )
         solution = self._solver.solve_filled(numbers)
         self._answer = solution.actuators, numbers.lower, numbers.upper
@@ -144,7 +142,10 @@ class ChainEngine(Engine):
         first = base[stations.nodes[0]]
         axes = self._base_frame.at(first)[0][:, :2].T
         centre = stations.weights[0] @ first
-        self._data.hold_base(centre - vertices[0], axes, -axes @ (vertices[1] - vertices[0]))
+        offset = np.zeros_like(vertices)
+        offset[:2] = centre - vertices[0]
+        offset[1] -= axes @ (vertices[1] - vertices[0]) @ axes
+        self._data.hold_base(offset, np.cross(*axes))
 
     def settle(self, X: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         """See ``engine.Engine``."""

@@ -5,8 +5,6 @@ What is left after a QP is small, so that such steps converge fast, and each cos
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +30,11 @@ class ChainClosing:
         Of the members in the configuration that the last call returned, m.
     """
 
-    def __init__(self, chain: Chain, function: ca.Function, kept: Sequence[Array]) -> None:
-        if chain.window is None:
-            raise ValueError("the periods of this chain are not alike")
+    def __init__(self, chain: Chain, function: ca.Function, head: Array, gains: Array) -> None:
         self._base = chain.window[0, : len(chain.carried)]
-        self._sweep = Sweep(function, chain.periods)
-        for k, array in enumerate(kept):
-            self._sweep.bind_input(1 + k, array)
-        first = 1 + len(kept)
-        self._positions = self._sweep.inputs[first]
-        self.aims = tuple(array.reshape(chain.periods, -1) for array in self._sweep.inputs[first + 1 :])
+        self._sweep = Sweep(function, chain.periods, head, gains)
+        self._positions = self._sweep.inputs[3]
+        self.aims = tuple(array.reshape(chain.periods, -1) for array in self._sweep.inputs[4:])
         self.lengths = self._sweep.outputs[2].reshape(chain.periods, -1)
 
     def start(self, base: Array) -> None:
@@ -54,7 +47,7 @@ class ChainClosing:
         """Return the positions after one step from `X` (n m, 3), and the greatest error there was before it, m."""
         self._positions[:] = X.reshape(-1)
         self._sweep()
-        return self._sweep.outputs[1].reshape(-1, 3), float(self._sweep.carry[-1, -1])
+        return self._sweep.outputs[1].reshape(-1, 3), float(np.abs(self._sweep.outputs[3]).max())
 
     def run(self, X: Array, enough: float) -> tuple[Array, float]:
         """Return positions (n m, 3) near `X` with errors no more than `enough` where that works, and the greatest."""

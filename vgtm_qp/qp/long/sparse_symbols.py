@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import casadi as ca
 import numpy as np
@@ -59,6 +59,19 @@ def offsets(sizes: Iterable[int]) -> list[int]:
     return [0, *np.cumsum(list(sizes)).tolist()]
 
 
-def symbols_of(pattern: NDArray[np.bool_], values: ca.SX) -> ca.SX:
-    """Return a matrix of that sparsity with the nonzeros `values`, column by column."""
-    return ca.SX(ca.sparsify(ca.DM(pattern.astype(float))).sparsity(), values)
+def sparsity_of(pattern: NDArray[np.bool_]) -> ca.Sparsity:
+    """Return the sparsity of that pattern."""
+    return ca.sparsify(ca.DM(pattern.astype(float))).sparsity()
+
+
+def symbols_like(sparsities: Sequence[ca.Sparsity], name: str) -> tuple[ca.SX, list[ca.SX]]:
+    """Return one vector of symbols, and matrices of those sparsities that it fills column by column."""
+    ends = offsets(sparsity.nnz() for sparsity in sparsities)
+    vector = ca.SX.sym(name, ends[-1])
+    pieces = ca.vertsplit(vector, ends)
+    return vector, [ca.SX(sparsity, piece) for sparsity, piece in zip(sparsities, pieces, strict=True)]
+
+
+def dense_function(name: str, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX]) -> ca.Function:
+    """Return the function of these `outputs`, dense."""
+    return ca.Function(name, inputs, [ca.densify(output) for output in outputs])
