@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.frames import frame_constants, frame_function
+from vgtm_qp.arm.frames import fitted_frame, frame_constants, turning
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.chain_data import ChainData
@@ -38,14 +38,13 @@ def period_values(chain: Chain) -> ca.Function:
     jacobian = ca.jacobian(member_lengths(chain, Y), ca.vec(Y))
     head = [nonzeros(ca.project(jacobian, sparsity_of(chain.pattern))), fixed * (home - lengths)]
     tail = [motion * layout.weights.stroke_centring * ((1.0 - fixed) * (lengths - home))[soft]]
-    frame, turns, leans, gaps, tilts, products = frame_function(3), [], [], [], [], []
+    turns, leans, gaps, tilts, products = [], [], [], [], []
     for k, places in enumerate(chain.face_places.tolist()):
-        constants = *ca.vertsplit(angles[6 * k : 6 * k + 6], 3), alignment[:, 3 * k : 3 * k + 3]
-        rotation, _ = frame(X[:, places], *constants)
-        _, spin = frame(Y[:, places], *constants)
+        polar, nodes = ca.vertsplit(angles[6 * k : 6 * k + 6], 3), Y[:, places]
+        rotation = fitted_frame(X[:, places], *polar) @ alignment[:, 3 * k : 3 * k + 3]
         point, moved, slope, slope_moved = ca.vertsplit(curve[12 * k : 12 * k + 12], 3)
         tilt, c, lean = tracking.slope_rows(rotation, slope)
-        turns.append(ca.vec((c @ spin).T))
+        turns.append(ca.vec(turning(fitted_frame(nodes, *polar), nodes, c).T))
         leans.append(ca.vec(lean.T))
         products.append(ca.vec(lean.T @ lean))
         centre = X[:, places] @ ca.DM(chain.face_weights[k])
