@@ -10,7 +10,6 @@ from scipy.sparse.linalg import splu
 
 from vgtm_qp.arm.arm import Bays
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.layout import Layout
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -22,47 +21,45 @@ _SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
 
 class LengthSolver:
-    """Solves J d_rho = error with the length Jacobian J."""
+    """Solves J d_rho = error with the length Jacobian J.
 
-    def __init__(self, bays: Bays) -> None:
-        scatter = bays.scatter
-        self._flat = scatter.flat
-        self._system = _Banded(scatter.member, scatter.column, scatter.shape[1])
+    Along an arm the nonzeros come near the diagonal where rows follow the last of their columns.
 
-    def solve(self, gradient: Array, error: Array) -> Array:
-        """Return displacements of the free nodes (N - N_c, 3), m, that change the lengths by `error` (M,), m.
+    Parameters
+    ----------
+    bays : Bays
+    members : (m,) int, optional
+        Whose lengths change as wanted; all by default.
+    stations : (K, 3) int, (K, 3), optional
+        Nodes and weights of stations that move as wanted, too.
+    """
 
-        Parameters
-        ----------
-        gradient : (M, Q, 3)
-            d length / d (positions of ``Bays.member_nodes``).
-
-        Raises
-        ------
-        SolverError
-            The truss is in a singular pose.
-        """
-        return self._system.solve(gradient.reshape(-1)[self._flat], error)
-
-
-class StationSolver:
-    """Newton's step on fixed lengths and places of the stations, where they determine the nodes."""
-
-    def __init__(self, layout: Layout, bays: Bays) -> None:
-        stations, scatter = layout.arm.stations, bays.scatter
-        fixed = np.flatnonzero(~bays.actuated)
+    def __init__(
+        self, bays: Bays, members: Index | None = None, stations: tuple[Index, Array] | None = None
+    ) -> None:
+        scatter, size = bays.scatter, bays.scatter.shape[1]
+        members = np.arange(bays.member_count) if members is None else members
         row = np.full(bays.member_count, -1, dtype=np.int64)
-        row[fixed] = np.arange(len(fixed))
+        row[members] = np.arange(len(members))
         kept = np.flatnonzero(row[scatter.member] >= 0)
-        self._flat = scatter.flat[kept]
-        nodes = stations.nodes[layout.tracked]
-        face, corner = np.nonzero(layout.node_column[nodes] >= 0)
-        axis = np.arange(3)
-        first = layout.node_column[nodes[face, corner]]
-        rows = [row[scatter.member[kept]], (len(fixed) + 3 * face[:, None] + axis).ravel()]
-        columns = [scatter.column[kept], (first[:, None] + axis).ravel()]
-        self._system = _Banded(np.concatenate(rows), np.concatenate(columns), layout.node_columns)
-        self._weights = np.repeat(stations.weights[layout.tracked[face], corner], 3)
+        self._flat, self._weights = scatter.flat[kept], np.zeros(0)
+        rows, columns = row[scatter.member[kept]], scatter.column[kept]
+        if stations is not None:
+            place = np.full(bays.node_count, -1, dtype=np.int64)
+            place[bays.free] = np.arange(len(bays.free))
+            face, corner = np.nonzero(place[stations[0]] >= 0)
+            node, axis = place[stations[0][face, corner]], np.arange(3)
+            rows = np.concatenate([rows, (len(members) + 3 * face[:, None] + axis).ravel()])
+            columns = np.concatenate([columns, (3 * node[:, None] + axis).ravel()])
+            self._weights = np.repeat(stations[1][face, corner], 3)
+        last = np.zeros(size, dtype=np.int64)
+        np.maximum.at(last, rows, columns)
+        self._order = np.argsort(last, kind="stable")
+        rows = np.argsort(self._order)[rows]
+        self._below, self._above = int((rows - columns).max()), int((columns - rows).max())
+        self._width, self._size = self._below + self._above + 1, size
+        self._entry = (self._above + rows - columns) * size + columns
+        self._places = rows, columns
 
     def solve(self, gradient: Array, error: Array) -> Array:
         """Return displacements of the free nodes (N - N_c, 3), m.
@@ -71,36 +68,19 @@ class StationSolver:
         ----------
         gradient : (M, Q, 3)
             d length / d (positions of ``Bays.member_nodes``).
-        error : (n_l + 3 K,)
-            Wanted changes of the fixed members' lengths, then displacements of the tracked stations, m.
+        error : (m + 3 K,)
+            Wanted changes of the lengths, then displacements of the stations, m.
 
         Raises
         ------
         SolverError
             The truss is in a pose where these do not determine the nodes.
         """
-        return self._system.solve(np.concatenate([gradient.reshape(-1)[self._flat], self._weights]), error)
-
-
-class _Banded:
-    """Square systems whose nonzeros come near the diagonal where rows follow their last column, as along an arm."""
-
-    def __init__(self, rows: Index, columns: Index, size: int) -> None:
-        last = np.zeros(size, dtype=np.int64)
-        np.maximum.at(last, rows, columns)
-        self._order = np.argsort(last, kind="stable")
-        place = np.argsort(self._order)[rows]
-        self._below, self._above = int((place - columns).max()), int((columns - place).max())
-        self._width, self._size = self._below + self._above + 1, size
-        self._entry = (self._above + place - columns) * size + columns
-        self._sparse = place, columns
-
-    def solve(self, values: Array, known: Array) -> Array:
-        """Return the solution (size / 3, 3) for nonzeros (E,), which add up where several stand in one place."""
-        size, known = self._size, known[self._order]
+        values = np.concatenate([gradient.reshape(-1)[self._flat], self._weights])
+        size, known = self._size, error[self._order]
         try:
             if self._width > _WIDEST:
-                step = splu(sparse.csc_matrix((values, self._sparse), shape=(size, size))).solve(known)
+                step = splu(sparse.csc_matrix((values, self._places), shape=(size, size))).solve(known)
             else:
                 band = np.bincount(self._entry, values, self._width * size).reshape(self._width, size)
                 step = solve_banded((self._below, self._above), band, known, overwrite_ab=True)

@@ -6,10 +6,6 @@ sweeps read them, and lengths are closed with what the QP has factorised.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import cached_property
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +37,7 @@ class ChainEngine(Engine):
     def __init__(self, solver: StagedSolver | TrackedSolver, kinematics: Kinematics, task: TipTask) -> None:
         super().__init__(solver.layout)
         arm, chain = self.layout.arm, solver.chain
-        self._solver, self._task, self._data, self._kinematics = solver, task, solver.data, kinematics
+        self._solver, self._task, self._data = solver, task, solver.data
         self._values = PeriodValues(chain, solver.data)
         self._ends = _end_kernel(self.layout)
         self._closing = solver.closing()
@@ -55,7 +51,7 @@ class ChainEngine(Engine):
         self._answer = (self._strokes, self._strokes, self._strokes)
         self._vertices: Array = np.zeros((self.layout.vertices, 3))
         self._curve_weights = self.layout.curve_weights[chain.faces.reshape(-1)]
-        self._aim(self._strokes)
+        self._any_closing = Closing(self.layout, kinematics)
 
     @staticmethod
     def serves(solver: StagedSolver | TrackedSolver) -> bool:
@@ -114,80 +110,53 @@ class ChainEngine(Engine):
         return solution
 
     def settle(self, X: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
-        """See ``engine.Engine``."""
-        bounds = target.lower, target.upper
+        """See ``engine.Engine``: each step corrects the lengths, and by the actuators what it leaves of the tip.
+
+        The actuated lengths are those of the QP's answer and what brings the tip to its goal; with faces that are held
+        on the curve they follow from that, as far as bounds allow it.
+        """
+        closing, solver, bounds = self._closing, self._solver, (target.lower, target.upper)
 
         def tip_error(position: Array, rotation: Array) -> Array:
             return self._task.residual(position, rotation, goal)[0]
 
-        if isinstance(self._solver, StagedSolver):
-            return self._by_strokes(X, *bounds, tip_error, self._solver, accuracy)
-        closed = self._on_curve(X, *bounds, accuracy.member)
-        if not closed.error <= accuracy.member:
+        enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)
+        closing.start(X)
+        wanted = np.clip(self._strokes, *bounds)
+        self._aim(wanted)
+        own: Array = X.take(self._nodes, axis=0)
+        gain, steers, off = None, solver.knows_gain, np.inf
+        closer, worst = closing.step(own)
+        for _ in range(MOST_STEPS):
+            if (worst <= enough and not (steers and off > enough_tip)) or not worst < TOO_FAR:
+                break
+            own = closer.copy()
+            if solver.knows_gain:
+                error = tip_error(*self._tip_of(own))
+                off = float(np.abs(error).max())
+                if off > accuracy.start:
+                    return None
+                if steers and off > enough_tip:
+                    gain = solver.gain(held(*self._answer)) if gain is None else gain
+                    steers = gain is not None
+                if gain is not None and off > enough_tip:
+                    wanted = wanted + gain @ error
+                    self._aim(np.clip(wanted, *bounds))
+            closer, worst = closing.step(own)
+        closed = self._closed(X, own, worst)
+        strokes = closed.quantities[self.layout.arm.actuators]
+        if not (solver.knows_gain or (worst <= accuracy.member and within(strokes, *bounds, enough))):
             closed = self._any_closing.close(X, *bounds, accuracy.member)
         is_there = float(np.abs(tip_error(closed.tip_position, closed.tip_rotation)).max()) <= accuracy.tip
         return closed if is_there and closed.error <= accuracy.member else None
 
-    @cached_property
-    def _any_closing(self) -> Closing:
-        return Closing(self.layout, self._kinematics)
-
-    def _by_strokes(
-        self,
-        X: Array,
-        lower: Array,
-        upper: Array,
-        tip_error: Callable[[Array, Array], Array],
-        solver: StagedSolver,
-        accuracy: Accuracy,
-    ) -> Closed | None:
-        """Return what ``engine.settle_strokes`` does: each step corrects the lengths, and what it leaves of the tip.
-
-        The actuated lengths are those of the QP's answer and what brings the tip to its goal, between bounds (n_a,).
-        """
-        closing = self._closing
-        enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)
-        closing.start(X)
-        wanted = np.clip(self._strokes, lower, upper)
-        self._aim(wanted)
-        own: Array = X.take(self._nodes, axis=0)
-        gain, is_given_up = None, False
-        closer, worst = closing.step(own)
-        off = np.inf
-        for _ in range(MOST_STEPS):
-            settled = off <= enough_tip or is_given_up
-            if (worst <= enough and settled) or not worst < TOO_FAR:
-                break
-            own = closer.copy()
-            error = tip_error(*self._tip_of(own))
-            off = float(np.abs(error).max())
-            if off > accuracy.start:
-                return None
-            if off > enough_tip and not is_given_up:
-                gain = solver.gain(held(*self._answer)) if gain is None else gain
-                is_given_up = gain is None
-            if gain is not None and off > enough_tip:
-                wanted = wanted + gain @ error
-                self._aim(np.clip(wanted, lower, upper))
-            closer, worst = closing.step(own)
-        closed = self._closed(X, own, worst)
-        is_there = float(np.abs(tip_error(closed.tip_position, closed.tip_rotation)).max()) <= accuracy.tip
-        return closed if is_there and worst <= accuracy.member else None
-
     def _aim(self, strokes: Array) -> None:
-        """Let actuated members aim at `strokes` (n_a,), m, and the others at their home lengths."""
+        """Let actuated members aim at `strokes` (n_a,), m, the others at home lengths, and held faces at the curve."""
+        lengths, *points = self._closing.aims
         self._aims[self.layout.arm.actuators] = strokes
-        np.take(self._aims, self._members, out=self._closing.aims[0].reshape(-1), mode="clip")
-
-    def _on_curve(self, X: Array, lower: Array, upper: Array, tolerance: float) -> Closed:
-        """Return the configuration near `X` with the faces on the curve; of infinite error where actuators cannot."""
-        closing, enough = self._closing, enough_length(X, tolerance)
-        closing.start(X)
-        np.matmul(self._curve_weights, self._vertices, out=closing.aims[1].reshape(-1, 3))
-        own, worst = closing.run(X.take(self._nodes, axis=0), enough)
-        closed = self._closed(X, own, worst)
-        actuated = closed.quantities[self.layout.arm.actuators]
-        return closed if within(actuated, lower, upper, enough) else replace(closed, error=np.inf)
+        np.take(self._aims, self._members, out=lengths.reshape(-1), mode="clip")
+        for faces in points:
+            np.matmul(self._curve_weights, self._vertices, out=faces.reshape(-1, 3))
 
     def _closed(self, X: Array, own: Array, worst: float) -> Closed:
         """Return the configuration whose free nodes are at `own`, in the order of the chain; base nodes as in `X`."""

@@ -12,7 +12,7 @@ from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.lengths import LengthSolver, StationSolver
+from vgtm_qp.qp.lengths import LengthSolver
 
 Array = NDArray[np.float64]
 
@@ -58,9 +58,11 @@ class Closing:
         return LengthSolver(self._arm.bays)
 
     @cached_property
-    def _stations(self) -> StationSolver:
+    def _stations(self) -> LengthSolver:
         assert self._arm.bays is not None
-        return StationSolver(self._layout, self._arm.bays)
+        stations, tracked = self._arm.stations, self._layout.tracked
+        held = stations.nodes[tracked], stations.weights[tracked]
+        return LengthSolver(self._arm.bays, np.flatnonzero(self._fixed), held)
 
     def close(
         self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float = _TOO_FAR

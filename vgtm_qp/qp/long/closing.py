@@ -48,12 +48,3 @@ class ChainClosing:
         self._positions[:] = X.reshape(-1)
         self._sweep()
         return self._sweep.outputs[1].reshape(-1, 3), float(np.abs(self._sweep.outputs[3]).max())
-
-    def run(self, X: Array, enough: float) -> tuple[Array, float]:
-        """Return positions (n m, 3) near `X` with errors no more than `enough` where that works, and the greatest."""
-        for _ in range(MOST_STEPS):
-            closer, worst = self.step(X)
-            if worst <= enough or not worst < TOO_FAR:
-                break
-            X = closer.copy()
-        return X, worst
