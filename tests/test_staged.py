@@ -451,8 +451,8 @@ def test_long_regular_arms_are_solved_along_the_chain():
     hard = Case(modules.octahedral(20), hard_tracking=True).layout
     assert isinstance(make_solver("daqp", hard), TrackedSolver)
     legs = Case(modules.hexapod(10), hard_tracking=True).layout
-    assert not prefers_staged(legs)
     assert chain_solver(legs) is None
+    assert isinstance(make_solver("daqp", legs), CondensedSolver)
     every = Case(modules.octahedral(7)).layout
     irregular = replace(every, tracked=every.tracked[:3], curve_weights=every.curve_weights[:3])
     assert chain_solver(irregular) is None

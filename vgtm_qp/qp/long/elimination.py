@@ -8,6 +8,7 @@ motions, which are eliminated.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -27,6 +28,9 @@ from vgtm_qp.qp.long.sparse_symbols import (
     symmetric,
 )
 from vgtm_qp.rows import curve as curve_rows
+
+NewtonStep = Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ca.SX]]
+"""From displacements before (3w,), positions (3w + 3m,) and lengths (3m,) to displacements (3w + 3m,) and errors."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +56,10 @@ class Inputs:
     head, tail, table : vector
         What all sweeps read, what the factorisation alone reads, and what depends on the curve's base alone.
     jacobian : (3m, 3w + 3m), rhs : (3m,), actuator_gradient : (soft,)
-    weights, slopes : (V, f)
-        Of the control vertices.
-    tangent_face, tangent_curve : lists of (2, 9), (2, 3)
-    gap, tilt : lists of (3,), (2,)
-        Gap and angles as they are where no unknown moves.
+    weights, slopes : lists of (V,)
+        Of the control vertices, by face.
+    tangent_face, tangent_curve, gap, tilt : lists of (2, 9), (2, 3), (3,), (2,)
+        Gap and angles are as they are where no unknown moves.
     normal : (3,)
         The direction of the second control vertex.
     sizes : dict of dicts
@@ -65,40 +68,42 @@ class Inputs:
 
     def __init__(self, chain: Chain) -> None:
         faces, vertices = chain.faces.shape[1], chain.layout.vertices
-        self.sizes = {
-            "head": {"jacobian": int(chain.pattern.sum()), "rhs": chain.own, "tangent_face": 18 * faces},
-            "tail": {
-                "actuator_gradient": int(chain.soft.sum()),
-                "tangent_curve": 6 * faces,
-                "gap": 3 * faces,
-                "tilt": 2 * faces,
+        # Number of matrices, and their rows and columns; each is stored row by row.
+        shapes = {
+            "head": {
+                "jacobian": (1, int(chain.pattern.sum()), 1),
+                "rhs": (1, chain.own, 1),
+                "tangent_face": (faces, 2, 9),
             },
-            "table": {"weights": faces * vertices, "slopes": faces * vertices, "normal": 3},
+            "tail": {
+                "actuator_gradient": (1, int(chain.soft.sum()), 1),
+                "tangent_curve": (faces, 2, 3),
+                "gap": (faces, 3, 1),
+                "tilt": (faces, 2, 1),
+            },
+            "table": {"weights": (faces, vertices, 1), "slopes": (faces, vertices, 1), "normal": (1, 3, 1)},
         }
-        parts: dict[str, ca.SX] = {}
-        vectors = []
-        for name, sizes in self.sizes.items():
-            vectors.append(ca.SX.sym(name, sum(sizes.values())))
-            parts |= dict(zip(sizes, ca.vertsplit(vectors[-1], offsets(sizes.values())), strict=True))
+        self.sizes = {
+            name: {part: int(np.prod(shape)) for part, shape in parts.items()}
+            for name, parts in shapes.items()
+        }
+        vectors, found = [], {}
+        for name, parts in shapes.items():
+            ends = offsets(self.sizes[name].values())
+            vectors.append(ca.SX.sym(name, ends[-1]))
+            for (part, (count, rows, columns)), piece in zip(
+                parts.items(), ca.vertsplit(vectors[-1], ends), strict=True
+            ):
+                blocks = ca.vertsplit(piece, offsets([rows * columns] * count))
+                found[part] = [ca.reshape(block, columns, rows).T for block in blocks]
         self.head, self.tail, self.table = vectors
-        self.jacobian = ca.SX(sparsity_of(chain.pattern), parts["jacobian"])
-        self.rhs, self.actuator_gradient = parts["rhs"], parts["actuator_gradient"]
-        self.normal = parts["normal"]
-        self.weights, self.slopes = (
-            ca.reshape(parts[name], vertices, faces) for name in ("weights", "slopes")
+        self.jacobian = ca.SX(sparsity_of(chain.pattern), found["jacobian"][0])
+        self.rhs, self.actuator_gradient, self.normal = (
+            found[part][0] for part in ("rhs", "actuator_gradient", "normal")
         )
-        self.tangent_face, self.tangent_curve, self.gap, self.tilt = (
-            [
-                ca.reshape(parts[name][size * rows * k : size * rows * (k + 1)], size, rows).T
-                for k in range(faces)
-            ]
-            for name, rows, size in (
-                ("tangent_face", 2, 9),
-                ("tangent_curve", 2, 3),
-                ("gap", 3, 1),
-                ("tilt", 2, 1),
-            )
-        )
+        self.tangent_face, self.tangent_curve = found["tangent_face"], found["tangent_curve"]
+        self.gap, self.tilt = found["gap"], found["tilt"]
+        self.weights, self.slopes = found["weights"], found["slopes"]
 
 
 class Elimination:
@@ -154,8 +159,8 @@ class Elimination:
     def curve_columns(self, k: int) -> tuple[ca.SX, ca.SX]:
         """Return the (3, 3V - 5) and (2, 3V - 5) derivatives of face `k`'s point on the curve, and of its angles."""
         inputs = self.inputs
-        point = curve_rows.weighted_columns(inputs.weights[:, k], inputs.normal, ca.SX.eye(3))
-        turned = curve_rows.weighted_columns(inputs.slopes[:, k], inputs.normal, inputs.tangent_curve[k])
+        point = curve_rows.weighted_columns(inputs.weights[k], inputs.normal, ca.SX.eye(3))
+        turned = curve_rows.weighted_columns(inputs.slopes[k], inputs.normal, inputs.tangent_curve[k])
         return point, turned
 
     def hard_rhs(self, stage: Stage) -> ca.SX:
@@ -298,21 +303,35 @@ class Elimination:
         return u
 
     def close(self) -> ca.Function:
-        """Return (carry, head, gains, X, aim) -> (carry, X, lengths, error): one step towards lengths `aim` (3m,).
-
-        Newton's with the Jacobian in `head`. The carry holds the live nodes' positions and their displacements; X (3m,)
-        are the positions of a period's own nodes.
-        """
+        """Return :meth:`newton` towards the lengths `aim` (3m,)."""
         vector, gains = self._gains()
-        at = Positions(self)
-        aim = ca.SX.sym("aim", self.chain.own)
-        error = aim - at.lengths
-        J, u = self.inputs.jacobian, at.moved
-        for stage, (free, G, _, _, S) in zip(self.stages, gains, strict=True):
-            placed = G @ (error[stage.hard] + self.transfer(stage) @ u)
-            missing = error[stage.soft] - J[stage.soft, stage.before] @ u - J[stage.soft, stage.own] @ placed
-            u = ca.vertcat(u, placed + free @ (S @ missing))
-        return at.function("close", [self.inputs.head, vector], [aim], u, error)
+        aim, J = ca.SX.sym("aim", self.chain.own), self.inputs.jacobian
+
+        def step(u: ca.SX, _: ca.SX, lengths: ca.SX) -> tuple[ca.SX, ca.SX]:
+            error = aim - lengths
+            for stage, (free, G, _, _, S) in zip(self.stages, gains, strict=True):
+                placed = G @ (error[stage.hard] + self.transfer(stage) @ u)
+                missing = (
+                    error[stage.soft] - J[stage.soft, stage.before] @ u - J[stage.soft, stage.own] @ placed
+                )
+                u = ca.vertcat(u, placed + free @ (S @ missing))
+            return u, error
+
+        return self.newton("close", vector, [aim], step)
+
+    def newton(self, name: str, gains: ca.SX, aims: list[ca.SX], step: NewtonStep) -> ca.Function:
+        """Return (carry, head, gains, X, *aims) -> (carry, X, lengths, error): one Newton step of a period.
+
+        The carry holds the live nodes' positions and their displacements; X (3m,) are the positions of a period's own
+        nodes, and the lengths (3m,) and the error those before the step.
+        """
+        carry, own = ca.SX.sym("carry", 2 * self.chain.before), ca.SX.sym("X", self.chain.own)
+        before, moved = ca.vertsplit(carry, offsets([self.chain.before] * 2))
+        X = ca.vertcat(before, own)
+        lengths = member_lengths(self.chain, ca.reshape(X, 3, self.size // 3))
+        u, error = step(moved, X, lengths)
+        outputs = [ca.vertcat(X[self.live], u[self.live]), (X + u)[self.chain.before :], lengths, error]
+        return dense_function(name, [carry, self.inputs.head, gains, own, *aims], outputs)
 
     def changes(self) -> ca.Function:
         """Return (carry, head, u (3m,)) -> (carry, J u - rhs, centres and angles of the faces) of displacements u."""
@@ -325,37 +344,6 @@ class Elimination:
         """Return the (5f, 3w + 3m) rows of the centres and the angles of a period's faces."""
         rows = [(self.centre_row(k), self.tangent_row(k)) for k in range(self.chain.faces.shape[1])]
         return ca.vertcat(ca.SX(0, self.size), *[row for pair in rows for row in pair])
-
-
-class Positions:
-    """Where the nodes of a period are, as symbols: the live ones of the period before, then its own.
-
-    Attributes
-    ----------
-    points : (3, w + m)
-    moved : (3w,)
-        Displacements of the former in the step that is being taken.
-    lengths : (3m,)
-    """
-
-    def __init__(self, elimination: Elimination) -> None:
-        chain = self._chain = elimination.chain
-        self._live = elimination.live
-        self._carry = ca.SX.sym("carry", 2 * chain.before)
-        before, self.moved = ca.vertsplit(self._carry, offsets([chain.before, chain.before]))
-        self._own = ca.SX.sym("X", chain.own)
-        self._all = ca.vertcat(before, self._own)
-        self.points = ca.reshape(self._all, 3, elimination.size // 3)
-        self.lengths = member_lengths(chain, self.points)
-
-    def function(
-        self, name: str, before: list[ca.SX], after: list[ca.SX], u: ca.SX, error: ca.SX
-    ) -> ca.Function:
-        """Return (carry, *before, X, *after) -> (carry, X, lengths, error) of a step `u` (3w + 3m,) on an `error`."""
-        X = self._all + u
-        carry = ca.vertcat(self._all[self._live], u[self._live])
-        outputs = [carry, X[self._chain.before :], self.lengths, error]
-        return dense_function(name, [self._carry, *before, self._own, *after], outputs)
 
 
 def member_lengths(chain: Chain, points: ca.SX) -> ca.SX:

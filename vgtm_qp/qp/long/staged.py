@@ -12,10 +12,9 @@ from scipy.linalg.lapack import dtrtrs
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
-from vgtm_qp.qp.long.closing import ChainClosing
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.solver import SINGULAR, ChainSolver
-from vgtm_qp.qp.long.sweep import Sweep
+from vgtm_qp.qp.long.sweep import ChainClosing, Sweep
 from vgtm_qp.qp.long.working_set import BLOCK, Moved
 from vgtm_qp.qp.settle import WORST_CONDITION
 

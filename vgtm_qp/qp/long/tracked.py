@@ -13,11 +13,10 @@ from scipy.linalg.lapack import dtrtrs
 
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
-from vgtm_qp.qp.long.closing import ChainClosing
-from vgtm_qp.qp.long.elimination import Elimination, Positions
+from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.solver import SINGULAR, ChainSolver
 from vgtm_qp.qp.long.sparse_symbols import dense_function, nonzeros, small_inverse, symbols_like
-from vgtm_qp.qp.long.sweep import Sweep
+from vgtm_qp.qp.long.sweep import ChainClosing, Sweep
 from vgtm_qp.qp.long.working_set import Moved
 
 Array = NDArray[np.float64]
@@ -81,19 +80,20 @@ class Following:
         return dense_function("following", [before, inputs.head, inputs.tail, inputs.table], outputs)
 
     def hold(self) -> ca.Function:
-        """Return (carry, head, gains, X, aim, curve) -> (carry, X, lengths, error): one step to lengths and faces.
+        """Return ``Elimination.newton`` towards lengths `aim` (3m,) and points `curve` (3f,) of the faces' centres.
 
-        As ``Elimination.close``, but that fixed members are aimed at their lengths `aim` (3m,) and the faces' centres
-        at their points (3f,) of the curve; actuated members take the lengths that follow.
+        Only fixed members are aimed at their lengths; actuated members take the lengths that follow.
         """
         elimination = self._elimination
         vector, gains = symbols_like([part.sparsity() for part in self._gains], "gains")
-        at, aim = Positions(elimination), ca.SX.sym("aim", elimination.chain.own)
-        curve = ca.SX.sym("curve", 3 * len(self._faces))
-        rhs = [aim[stage.hard] - at.lengths[stage.hard] for stage in elimination.stages]
-        gap = curve - self._centre @ ca.vec(at.points)
-        u = self._placed(at.moved, rhs, gains, gap)
-        return at.function("hold", [elimination.inputs.head, vector], [aim, curve], u, ca.vertcat(*rhs, gap))
+        aim, curve = ca.SX.sym("aim", elimination.chain.own), ca.SX.sym("curve", 3 * len(self._faces))
+
+        def step(moved: ca.SX, X: ca.SX, lengths: ca.SX) -> tuple[ca.SX, ca.SX]:
+            rhs = [aim[stage.hard] - lengths[stage.hard] for stage in elimination.stages]
+            gap = curve - self._centre @ X
+            return self._placed(moved, rhs, gains, gap), ca.vertcat(*rhs, gap)
+
+        return elimination.newton("hold", vector, [aim, curve], step)
 
 
 class TrackedSolver(ChainSolver):
