@@ -13,10 +13,9 @@ from vgtm_qp.arm.truss import modules
 from vgtm_qp.arm.truss.build import lock_members
 from vgtm_qp.bench.scenes import make_scenes
 from vgtm_qp.qp.long.chain import find_chain
-from vgtm_qp.qp.long.chain_data import ChainData
+from vgtm_qp.qp.long.chain_data import ChainData, PeriodValues
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.select import chain_solver
-from vgtm_qp.qp.long.values import PeriodValues
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import Accuracy, GeneralEngine
 from vgtm_qp.step.path import Path

@@ -15,10 +15,10 @@ from vgtm_qp.arm.symbols import Bound, Constants, Frames
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.long.chain_data import PeriodValues
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.sweep import MOST_STEPS, TOO_FAR
 from vgtm_qp.qp.long.tracked import TrackedSolver
-from vgtm_qp.qp.long.values import PeriodValues
 from vgtm_qp.qp.numbers import RowNumbers, StepSolution
 from vgtm_qp.qp.settle import held
 from vgtm_qp.rows.curve import base_offset

@@ -31,13 +31,10 @@ class Chain:
 
     Attributes
     ----------
-    layout : Layout
     bays : Bays
-        Of its arm.
-    nodes : (n, m) int
-        The nodes of each period in stage order.
-    members : (n, 3m) int
-        The members of each period by the stage they belong to.
+        Of the arm of `layout`.
+    nodes, members : (n, m) int, (n, 3m) int
+        Of each period by the stage they belong to.
     stage_sizes : tuple of int
         Nodes of each of the p stages.
     node_period, node_place : (N,) int
@@ -56,11 +53,10 @@ class Chain:
         Fixed members that stand where other periods have an actuated one.
     faces : (n, f) int
         Positions in ``layout.tracked`` of the faces that each period completes.
-    face_places : (f, 3) int
-        Places of those faces' nodes, in rising order.
+    face_places, face_weights : (f, 3) int, (f, 3)
+        Places of those faces' nodes, in rising order, and their weights.
     face_order : (n, f, 3) int
         Which of a face's nodes stand at those places.
-    face_weights : (f, 3)
     """
 
     layout: Layout

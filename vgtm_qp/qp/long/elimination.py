@@ -35,12 +35,19 @@ NewtonStep = Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ca.SX]]
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a period: its own coordinates, those before, the rows of its fixed and its actuated members."""
+    """One stage of a period: its own coordinates, those before, the rows of its fixed and its actuated members.
+
+    T says how the fixed members follow the nodes before, and rhs what they lack; G and N are those of the file's head.
+    """
 
     own: list[int]
     before: list[int]
     hard: list[int]
     soft: list[int]
+    T: ca.SX
+    rhs: ca.SX
+    G: ca.SX
+    N: ca.SX
 
     @property
     def freedom(self) -> int:
@@ -113,8 +120,6 @@ class Elimination:
     ----------
     chain : Chain
     stages : list of Stage
-    split : list of (G, N)
-        Of each stage.
     soft : list of int
         Places of the actuated members.
     live : list of int
@@ -133,13 +138,16 @@ class Elimination:
         self.live = [chain.before + 3 * place + axis for place in chain.carried.tolist() for axis in range(3)]
         self.curve = chain.layout.free_curve
         self.stages: list[Stage] = []
-        starts = offsets(3 * count for count in chain.stage_sizes)
-        for start, end in pairwise(starts):
-            own = list(range(chain.before + start, chain.before + end))
-            kinds = [[i for i in range(start, end) if chain.soft[i] == soft] for soft in (False, True)]
-            self.stages.append(Stage(own, list(range(own[0])), *kinds))
+        J, rhs = self.inputs.jacobian, self.inputs.rhs
+        for start, end in pairwise(offsets(3 * count for count in chain.stage_sizes)):
+            own, before = (
+                list(range(chain.before + start, chain.before + end)),
+                list(range(chain.before + start)),
+            )
+            hard, soft = ([i for i in range(start, end) if chain.soft[i] == kind] for kind in (False, True))
+            split = range_and_null(J[hard, own])
+            self.stages.append(Stage(own, before, hard, soft, -J[hard, before], rhs[hard], *split))
         self.freedom = sum(stage.freedom for stage in self.stages)
-        self.split = [range_and_null(self.inputs.jacobian[stage.hard, stage.own]) for stage in self.stages]
         self._gain_parts: list[ca.SX] = []
 
     def centre_row(self, k: int) -> ca.SX:
@@ -162,14 +170,6 @@ class Elimination:
         point = curve_rows.weighted_columns(inputs.weights[k], inputs.normal, ca.SX.eye(3))
         turned = curve_rows.weighted_columns(inputs.slopes[k], inputs.normal, inputs.tangent_curve[k])
         return point, turned
-
-    def hard_rhs(self, stage: Stage) -> ca.SX:
-        """Return the right-hand side of a stage's fixed members."""
-        return self.inputs.rhs[stage.hard]
-
-    def transfer(self, stage: Stage) -> ca.SX:
-        """Return T, how a stage's fixed members follow the nodes before it."""
-        return -self.inputs.jacobian[stage.hard, stage.before]
 
     def factor(self) -> ca.Function:
         """Return (carry, head, tail, table) -> (carry, gains, Y): one period of the recursion.
@@ -202,9 +202,9 @@ class Elimination:
         H = ca.sparsify(H)
         gains: list[ca.SX] = []
         outer: list[ca.SX] = []
-        for stage, (G, N) in reversed(list(zip(self.stages, self.split, strict=True))):
-            T, u, before = self.transfer(stage), stage.own, stage.before
-            placed = G @ self.hard_rhs(stage)
+        for stage in reversed(self.stages):
+            G, N, T, u, before = stage.G, stage.N, stage.T, stage.own, stage.before
+            placed = G @ stage.rhs
             Huu, Hub = ca.sparsify(H[u, u]), ca.sparsify(H[u, before])
             HG = Huu @ G
             total = ca.horzcat(V[u, :-1], V[u, -1] + Huu @ placed)
@@ -268,7 +268,7 @@ class Elimination:
         for stage, (free, G, W, Wb, _) in reversed(list(zip(self.stages, gains, strict=True))):
             Vu = V[stage.own, :]
             Z = free.T @ Vu
-            V = V[stage.before, :] + self.transfer(stage).T @ (G.T @ Vu - W.T @ Z) - Wb.T @ Z
+            V = V[stage.before, :] + stage.T.T @ (G.T @ Vu - W.T @ Z) - Wb.T @ Z
             outer = [Z, *outer]
         return V, ca.vertcat(*outer)
 
@@ -276,7 +276,7 @@ class Elimination:
         """Return (carry, head, gains, z) -> (carry, u, J u - rhs, centres and angles of the faces)."""
         vector, gains = self._gains()
         carry, z = ca.SX.sym("carry", len(self.live)), ca.SX.sym("z", self.freedom)
-        u = self._moved(carry, z, gains, [self.hard_rhs(stage) for stage in self.stages])
+        u = self._moved(carry, z, gains, [stage.rhs for stage in self.stages])
         changed = self.inputs.jacobian @ u - self.inputs.rhs
         outputs = [u[self.live], u[self.chain.before :], changed, self._face_rows() @ u]
         return dense_function("forward", [carry, self.inputs.head, vector, z], outputs)
@@ -298,7 +298,7 @@ class Elimination:
         """Return displacements (3w + 3m, c) behind those `u` (3w, c) before, for free motions `z` (freedom, c)."""
         motions = ca.vertsplit(z, offsets(stage.freedom for stage in self.stages))
         for stage, (free, G, W, Wb, _), motion, wanted in zip(self.stages, gains, motions, rhs, strict=True):
-            followed = self.transfer(stage) @ u
+            followed = stage.T @ u
             u = ca.vertcat(u, G @ (wanted + followed) - free @ (motion + W @ followed + Wb @ u))
         return u
 
@@ -310,7 +310,7 @@ class Elimination:
         def step(u: ca.SX, _: ca.SX, lengths: ca.SX) -> tuple[ca.SX, ca.SX]:
             error = aim - lengths
             for stage, (free, G, _, _, S) in zip(self.stages, gains, strict=True):
-                placed = G @ (error[stage.hard] + self.transfer(stage) @ u)
+                placed = G @ (error[stage.hard] + stage.T @ u)
                 missing = (
                     error[stage.soft] - J[stage.soft, stage.before] @ u - J[stage.soft, stage.own] @ placed
                 )

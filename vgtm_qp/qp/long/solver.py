@@ -11,7 +11,7 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain_data import ChainData
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import ChainClosing
-from vgtm_qp.qp.long.working_set import Answer, Moved, RowTable, solve_rows
+from vgtm_qp.qp.long.working_set import Answer, Key, Moved, RowTable, solve_rows
 from vgtm_qp.qp.numbers import RowNumbers, StepNumbers, StepSolution, beyond, norm
 from vgtm_qp.qp.residual import refuse_large, relative
 
@@ -47,7 +47,7 @@ class ChainSolver(ABC):
         self._strokes_at, self._held_at = at[chain.bays.actuators], at[chain.locked]
         soft = np.cumsum(np.tile(chain.soft, chain.periods)) - 1
         self._among_soft = soft[self._strokes_at]
-        self._active: set[tuple[object, ...]] = set()
+        self._active: set[Key] = set()
         self._last: tuple[RowTable, Answer] | None = None
 
     def solve(self, numbers: StepNumbers) -> StepSolution:

@@ -33,20 +33,20 @@ class Following:
     def __init__(self, elimination: Elimination) -> None:
         self._elimination, chain = elimination, elimination.chain
         motions = ca.SX(len(elimination.live), 0)
-        for stage, (G, N) in zip(elimination.stages, elimination.split, strict=True):
+        for stage in elimination.stages:
             free = ca.SX(motions.shape[0], stage.freedom)
-            followed = G @ (elimination.transfer(stage) @ motions)
-            motions = ca.vertcat(ca.horzcat(motions, free), ca.horzcat(followed, N))
+            followed = stage.G @ (stage.T @ motions)
+            motions = ca.vertcat(ca.horzcat(motions, free), ca.horzcat(followed, stage.N))
         self._faces = range(chain.faces.shape[1])
         self._centre = ca.vertcat(*[elimination.centre_row(k) for k in self._faces])
         inverse = small_inverse(self._centre @ motions)
-        self._gains = [*(G for G, _ in elimination.split), ca.sparsify(motions @ inverse)]
+        self._gains = [*(stage.G for stage in elimination.stages), ca.sparsify(motions @ inverse)]
 
     def _placed(self, before: ca.SX, rhs: list[ca.SX], gains: list[ca.SX], gap: ca.SX) -> ca.SX:
         """Return (3w + 3m, c) displacements behind those `before` (3w, c), for each stage's `rhs` and for `gap`."""
         moved = before
         for stage, G, wanted in zip(self._elimination.stages, gains[:-1], rhs, strict=True):
-            moved = ca.vertcat(moved, G @ (self._elimination.transfer(stage) @ moved + wanted))
+            moved = ca.vertcat(moved, G @ (stage.T @ moved + wanted))
         return moved + gains[-1] @ (gap - self._centre @ moved)
 
     def response(self) -> ca.Function:
@@ -59,10 +59,7 @@ class Following:
         elimination, inputs = self._elimination, self._elimination.inputs
         columns = elimination.curve + 1
         before = ca.SX.sym("carry", columns, len(elimination.live))
-        rhs = [
-            ca.horzcat(ca.SX(len(stage.hard), columns - 1), elimination.hard_rhs(stage))
-            for stage in elimination.stages
-        ]
+        rhs = [ca.horzcat(ca.SX(len(stage.hard), columns - 1), stage.rhs) for stage in elimination.stages]
         on_curve = [elimination.curve_columns(k) for k in self._faces]
         gap = ca.vertcat(*[ca.horzcat(on_curve[k][0], -inputs.gap[k]) for k in self._faces])
         moved = self._placed(before.T, rhs, self._gains, gap)

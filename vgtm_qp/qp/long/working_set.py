@@ -32,6 +32,9 @@ _REFINEMENTS = 4
 MemberRows = Callable[[Index], tuple[Index, Array]]
 """Nodes (R, Q) and coefficients (R, Q, 3) of the lengths of members (R,); base nodes may have any coefficients."""
 
+Key = int | bytes
+"""Of a row; the nodes of a clearance row."""
+
 Moved = Callable[[Index], Array]
 """Displacements (..., 3), m, of nodes (...,)."""
 
@@ -71,10 +74,6 @@ class RowTable:
         near = np.einsum("rsc,rsc->r", clearance.coefficients, moved(clearance.nodes))
         return np.concatenate([tip - numbers.tip_rate * progress, held, [progress], strokes, near])
 
-    def violation(self, values: Array) -> Array:
-        """Return (total,) how far the values are out of their bounds; not positive where they are not."""
-        return np.asarray(np.maximum(self.lower - values, values - self.upper))
-
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
         """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
         numbers, clearance, tip_nodes = self.numbers, self.numbers.clearance, self._arm.end_effector.nodes
@@ -109,17 +108,15 @@ class RowTable:
         np.add.at(forces, clearance.nodes[active], pressing)
         return forces
 
-    def key(self, row: int) -> tuple[object, ...]:
+    def key(self, row: int) -> Key:
         """Return what names the row in the next QP, where clearance rows may be others."""
-        if row < self.clearance.start:
-            return (row,)
-        return ("clearance", self.numbers.clearance.nodes[row - self.clearance.start].tobytes())
+        near = row - self.clearance.start
+        return row if near < 0 else self.numbers.clearance.nodes[near].tobytes()
 
-    def remembered(self, keys: set[tuple[object, ...]]) -> list[int]:
-        """Return the inequality rows that `keys` name."""
-        found = [key[0] for key in keys if len(key) == 1]
-        rows = [row for row in found if isinstance(row, int) and self.equal <= row < self.clearance.start]
-        if len(found) < len(keys):
+    def remembered(self, keys: set[Key]) -> list[int]:
+        """Return the rows that `keys` name."""
+        rows = [key for key in keys if isinstance(key, int)]
+        if len(rows) < len(keys):
             rows += [k for k in range(self.clearance.start, len(self.lower)) if self.key(k) in keys]
         return sorted(rows)
 
@@ -214,7 +211,7 @@ def solve_rows(
     size: int,
     find_columns: Callable[[Index], Array],
     find_values: Callable[[Array], Array],
-    remembered: set[tuple[object, ...]],
+    remembered: set[Key],
 ) -> Answer:
     """Return the answer of a QP with the rows of `table`; `remembered` are keys of those active before.
 
@@ -243,7 +240,7 @@ def solve_rows(
     new = [*range(table.equal), *table.remembered(remembered)]
     values = find_values(np.zeros(size))
     while True:
-        violation = table.violation(values)
+        violation = np.maximum(table.lower - values, values - table.upper)
         violated = np.flatnonzero(violation > _VIOLATED)
         known = {*rows, *new}
         outside = np.array([k for k in violated.tolist() if k not in known], dtype=np.int64)
