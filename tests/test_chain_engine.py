@@ -13,10 +13,9 @@ from steps import assert_same_answer, make_step, pressing
 from vgtm_qp.arm.truss.build import lock_members
 from vgtm_qp.bench.scenes import make_scenes
 from vgtm_qp.qp.long.chain import find_chain
-from vgtm_qp.qp.long.chain_data import ChainData
+from vgtm_qp.qp.long.chain_data import ChainData, PeriodValues
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.select import chain_solver
-from vgtm_qp.qp.long.values import PeriodValues
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import Accuracy, GeneralEngine
 from vgtm_qp.step.path import Path
@@ -137,8 +136,8 @@ def test_the_rows_of_a_period_are_derivatives(name, reverse):
     layout, kinematics, *_ = engines(name)
     chain, arm = find_chain(layout), layout.arm
     elimination = Elimination(chain)
-    data = ChainData(chain, elimination.inputs.sizes, reverse=reverse)
-    values = PeriodValues(chain, data, arm.home_quantities)
+    data = ChainData(chain, elimination.inputs.sizes, is_reversed=reverse)
+    values = PeriodValues(chain, data)
     rng = np.random.default_rng(3)
     X, _, points, _, _ = make_step(layout, kinematics, rng)
     moved = rng.normal(size=X.shape)
@@ -161,9 +160,9 @@ def test_the_rows_of_a_period_are_derivatives(name, reverse):
     kinematics.evaluate(X)
     np.testing.assert_allclose(values.lengths, kinematics.quantities, atol=1e-14)
     members = np.arange(len(arm.quantity_names))
-    nodes, rows = values.member_rows(members)
+    nodes, rows = data.member_rows(members)
     np.testing.assert_allclose(np.einsum("rqc,rqc->r", rows, moved[nodes]), change[0], atol=1e-8)
-    faces = moved[chain.window[data.order]][:, chain.face_places].reshape(len(data.faces), 9)
+    faces = moved[data.window][:, chain.face_places].reshape(len(data.faces), 9)
     centres = np.einsum("f,kfc->kc", chain.face_weights[0], faces.reshape(-1, 3, 3))
     np.testing.assert_allclose(change[1].reshape(-1, 3), centres, atol=1e-8)
     turns = part(data.head, "head", "tangent_face").reshape(-1, 2, 9)

@@ -316,14 +316,8 @@ def test_a_wrong_answer_is_refused(hard, monkeypatch):
     with pytest.raises(SolverError):
         solver.solve(numbers)
     monkeypatch.undo()
-    unchanged = type(solver).point
-    monkeypatch.setattr(
-        type(solver),
-        "point",
-        lambda self, values: replace(
-            unchanged(self, values), nodes=unchanged(self, values).nodes * (1 + 1e-4)
-        ),
-    )
+    unchanged = type(solver)._nodes
+    monkeypatch.setattr(type(solver), "_nodes", lambda self: unchanged(self) * (1 + 1e-4))
     with pytest.raises(SolverError, match="residual"):
         solver.solve(numbers)
 
@@ -333,11 +327,12 @@ def test_a_wrong_answer_is_refused(hard, monkeypatch):
 def test_the_periods_hold_the_whole_length_jacobian(name, joint_offset):
     case = Case(MODULES[name](joint_offset=joint_offset))
     chain = find_chain(case.layout)
-    layout, truss = case.layout, case.truss
-    case.kinematics.evaluate(random_pose(truss, np.random.default_rng(0)))
-    gradient = case.kinematics.gradient
-    values = (chain.gather @ gradient.reshape(-1)).reshape(chain.periods, -1)
-    pattern, rebuilt = chain.coordinate_pattern, np.zeros((layout.node_columns, layout.node_columns))
+    layout = case.layout
+    numbers = random_numbers(case, np.random.default_rng(0))
+    data = StagedSolver(chain).data
+    data.fill(numbers)
+    values = data.part["jacobian"][::-1]
+    pattern, rebuilt = chain.pattern, np.zeros((layout.node_columns, layout.node_columns))
     for period in range(chain.periods):
         block = np.zeros(pattern.shape)
         block.T[pattern.T] = values[period]
@@ -346,7 +341,7 @@ def test_the_periods_hold_the_whole_length_jacobian(name, joint_offset):
             layout.node_column[np.concatenate([before, chain.nodes[period]])][:, None] + np.arange(3)
         ).ravel()
         rebuilt[np.ix_(chain.members[period], columns)] = block[:, block.shape[1] - len(columns) :]
-    np.testing.assert_allclose(rebuilt, case.kinematics.motion().jacobian(), atol=1e-15)
+    np.testing.assert_allclose(rebuilt, numbers.motion.jacobian(), atol=1e-15)
 
 
 @given(st.integers(0, 10**6))
@@ -406,19 +401,17 @@ def test_memory_is_linear_in_the_bays():
 
 
 @pytest.mark.parametrize("joint_offset", [0.0, 0.02])
-@pytest.mark.parametrize("path", ["chain", "sparse", "dense"])
+@pytest.mark.parametrize("is_wide", [False, True])
 @pytest.mark.parametrize("name", [*MODULES, "graph"])
-def test_lengths_by_every_path(name, path, joint_offset, monkeypatch):
-    if path != "dense":
-        monkeypatch.setattr(lengths_module, "_DENSE", 0)
-    if path == "sparse":
-        monkeypatch.setattr(lengths_module, "find_chain", lambda _: None)
+def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, monkeypatch):
+    if is_wide:
+        monkeypatch.setattr(lengths_module, "_WIDEST", 0)
     truss = mast() if name == "graph" else MODULES[name](joint_offset=joint_offset)
     case = Case(truss, vertices=0)
     rng, kinematics = np.random.default_rng(1), case.kinematics
     kinematics.evaluate(random_pose(truss, rng, 0.02))
     error = rng.normal(size=truss.member_count)
-    solver = LengthSolver(case.layout, case.layout.arm.bays)
+    solver = LengthSolver(case.layout.arm.bays)
     step = solver.solve(kinematics.gradient, error)
     np.testing.assert_allclose(kinematics.motion().jacobian() @ step.ravel(), error, atol=1e-10)
     broken = kinematics.gradient.copy()
@@ -458,8 +451,8 @@ def test_long_regular_arms_are_solved_along_the_chain():
     hard = Case(modules.octahedral(20), hard_tracking=True).layout
     assert isinstance(make_solver("daqp", hard), TrackedSolver)
     legs = Case(modules.hexapod(10), hard_tracking=True).layout
-    assert not prefers_staged(legs)
     assert chain_solver(legs) is None
+    assert isinstance(make_solver("daqp", legs), CondensedSolver)
     every = Case(modules.octahedral(7)).layout
     irregular = replace(every, tracked=every.tracked[:3], curve_weights=every.curve_weights[:3])
     assert chain_solver(irregular) is None

@@ -62,7 +62,34 @@ class ClearanceRows:
 
 
 @dataclass
-class StepNumbers:
+class RowNumbers:
+    """Numbers of the rows with bounds of one QP, and of its progress; see :class:`StepNumbers`.
+
+    Attributes
+    ----------
+    lower, upper, actuator_gradient : (n_a,)
+        Box on d_a and the objective's gradient there.
+    tip_jacobian : (n_e, 3 K_tip)
+    tip_rate, tip_rhs : (n_e,)
+    progress_lower, progress_upper, progress_gradient, progress_curvature : float
+    clearance : ClearanceRows
+    """
+
+    lower: Array
+    upper: Array
+    actuator_gradient: Array
+    tip_jacobian: Array
+    tip_rate: Array
+    tip_rhs: Array
+    progress_lower: float
+    progress_upper: float
+    progress_gradient: float
+    progress_curvature: float
+    clearance: ClearanceRows
+
+
+@dataclass
+class StepNumbers(RowNumbers):
     """Numbers of one QP at one configuration; displacements d over the step are the unknowns.
 
     With W and W' the curve weights, and d_c = (d_p, torsion) the D = 3 V + T coordinates of the curve::
@@ -81,11 +108,6 @@ class StepNumbers:
     ----------
     motion : MotionRows
         How the free nodes move with the actuators.
-    lower, upper, actuator_gradient : (n_a,)
-        Box on d_a and the objective's gradient there.
-    tip_jacobian : (n_e, 3 K_tip)
-    tip_rate, tip_rhs : (n_e,)
-    progress_lower, progress_upper, progress_gradient, progress_curvature : float
     position_rhs : (K, 3)
     tangent_face : (K, R, 9)
     tangent_curve : (K, 2, 3)
@@ -95,23 +117,12 @@ class StepNumbers:
     base_displacement : (3,)
     base_axes : (2, 3)
     base_rhs : (2,)
-    clearance : ClearanceRows
     spacing_rhs : (S,)
     curve : CurveRows or None
         In the place of the curve's tables, where ``Layout.general`` is given.
     """
 
     motion: MotionRows
-    lower: Array
-    upper: Array
-    actuator_gradient: Array
-    tip_jacobian: Array
-    tip_rate: Array
-    tip_rhs: Array
-    progress_lower: float
-    progress_upper: float
-    progress_gradient: float
-    progress_curvature: float
     position_rhs: Array
     tangent_face: Array
     tangent_curve: Array
@@ -120,7 +131,6 @@ class StepNumbers:
     base_displacement: Array
     base_axes: Array
     base_rhs: Array
-    clearance: ClearanceRows
     spacing_rhs: Array = field(default_factory=lambda: np.zeros(0))
     curve: CurveRows | None = None
 

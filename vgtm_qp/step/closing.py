@@ -12,7 +12,7 @@ from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.fused import Closed
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.lengths import LengthSolver, StationSolver
+from vgtm_qp.qp.lengths import LengthSolver
 
 Array = NDArray[np.float64]
 
@@ -48,12 +48,14 @@ class Closing:
     @cached_property
     def _lengths(self) -> LengthSolver:
         assert self._arm.bays is not None
-        return LengthSolver(self._layout, self._arm.bays)
+        return LengthSolver(self._arm.bays)
 
     @cached_property
-    def _stations(self) -> StationSolver:
+    def _stations(self) -> LengthSolver:
         assert self._arm.bays is not None
-        return StationSolver(self._layout, self._arm.bays)
+        stations, tracked = self._arm.stations, self._layout.tracked
+        held = stations.nodes[tracked], stations.weights[tracked]
+        return LengthSolver(self._arm.bays, np.flatnonzero(self._fixed), held)
 
     def close(
         self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float = _TOO_FAR
@@ -82,14 +84,14 @@ class Closing:
         None where an actuator would leave its bounds (n_a,), or the pose is singular.
         """
         arm, kinematics, tracked = self._arm, self._kinematics, self._layout.tracked
-        home, fixed = arm.home_quantities[self._fixed], int(self._fixed.sum())
+        home = arm.home_quantities[self._fixed]
 
         def missing(q: Array) -> Array:
             gap = points - arm.stations.centres(arm.nodes(q))[tracked]
             return np.concatenate([home - kinematics.quantities[self._fixed], gap.reshape(-1)])
 
         def solve(error: Array) -> Array:
-            return self._stations.solve(kinematics.gradient, error[:fixed], error[fixed:].reshape(-1, 3))
+            return self._stations.solve(kinematics.gradient, error)
 
         closed = self._newton(q, missing, solve, tolerance, _TOO_FAR)
         values = closed.quantities[self._actuators]

@@ -22,7 +22,7 @@ from vgtm_qp.qp.fused import Closed, FusedSolver
 from vgtm_qp.qp.fused_settle import NEAR
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
-from vgtm_qp.qp.long.closing import MOST_STEPS
+from vgtm_qp.qp.long.sweep import MOST_STEPS
 from vgtm_qp.qp.numbers import StepNumbers, StepSolution
 from vgtm_qp.qp.residual import FailedStepError, InfeasibleStepError
 from vgtm_qp.qp.settle import LEFT, SETTLING_STEPS, held, settling_gain

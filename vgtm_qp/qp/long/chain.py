@@ -8,7 +8,6 @@ from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from vgtm_qp.arm.arm import Bays
 from vgtm_qp.qp.layout import Layout
@@ -32,34 +31,32 @@ class Chain:
 
     Attributes
     ----------
-    layout : Layout
     bays : Bays
-        Of its arm.
-    nodes : (n, m) int
-        The nodes of each period in stage order.
-    members : (n, 3m) int
-        The members of each period by the stage they belong to.
+        Of the arm of `layout`.
+    nodes, members : (n, m) int, (n, 3m) int
+        Of each period by the stage they belong to.
     stage_sizes : tuple of int
         Nodes of each of the p stages.
+    node_period, node_place : (N,) int
+        The period of each node, negative for base nodes, and its place in there, 0 to m - 1.
     carried : (w,) int
         Which of a period's nodes the next period uses.
-    pattern : (3m, w + m) bool
-        Which nodes a member's length depends on, in any of the periods.
+    window : (n, w + m) int
+        The node at each place; before the first period base nodes where all periods are alike, else any.
+    pattern : (3m, 3w + 3m) bool
+        Which coordinates a member's length depends on, in any of the periods.
+    member_places : (3m, 2) int or None
+        The places that a period's members join; None where the periods are not alike.
     soft : (3m,) bool
         The places of actuated members.
-    faces : (n, f) int
-        Positions in ``layout.tracked`` of the faces that each period completes.
-    face_places : (f, 3) int
-        Places of those faces' nodes.
-    face_order : (n, f, 3) int
-        Which of a face's nodes stand at those places.
-    face_weights : (f, 3)
     locked : (l,) int
         Fixed members that stand where other periods have an actuated one.
-    window : (n, w + m) int or None
-        The node at each place, base nodes included, where every place means the same in all periods; else None.
-    member_places : (3m, 2) int
-        The places that a period's members join; empty without a window.
+    faces : (n, f) int
+        Positions in ``layout.tracked`` of the faces that each period completes.
+    face_places, face_weights : (f, 3) int, (f, 3)
+        Places of those faces' nodes, in rising order, and their weights.
+    face_order : (n, f, 3) int
+        Which of a face's nodes stand at those places.
     """
 
     layout: Layout
@@ -67,16 +64,18 @@ class Chain:
     nodes: Index
     members: Index
     stage_sizes: tuple[int, ...]
+    node_period: Index
+    node_place: Index
     carried: Index
+    window: Index
     pattern: Mask
+    member_places: Index | None
     soft: Mask
+    locked: Index
     faces: Index
     face_places: Index
     face_order: Index
     face_weights: Array
-    locked: Index
-    window: Index | None
-    member_places: Index
 
     @property
     def periods(self) -> int:
@@ -94,52 +93,27 @@ class Chain:
         return 3 * len(self.carried)
 
     @cached_property
-    def node_period(self) -> Index:
-        """(N,) the period of each node; -1 for base nodes."""
-        period = np.full(self.bays.node_count, -1, dtype=np.int64)
-        period[self.nodes] = np.arange(self.periods)[:, None]
-        return period
+    def entry(self) -> Index:
+        """(3m, 3w + 3m) the place of each coordinate among a period's nonzeros, column by column; -1 elsewhere."""
+        entry = np.full(self.pattern.shape, -1, dtype=np.int64)
+        entry.T[self.pattern.T] = np.arange(int(self.pattern.sum()))
+        return entry
 
     @cached_property
-    def node_place(self) -> Index:
-        """(N,) the place of each node within its period, 0 to m - 1."""
-        place = np.zeros(self.bays.node_count, dtype=np.int64)
-        place[self.nodes] = np.arange(self.nodes.shape[1])
-        return place
-
-    @cached_property
-    def coordinate_pattern(self) -> Mask:
-        """(3m, 3w + 3m) the pattern of a period's rows of the length Jacobian."""
-        return np.repeat(self.pattern, 3, axis=1)
-
-    @cached_property
-    def gather(self) -> sparse.csr_matrix:
-        """The matrix that takes all members' gradients to the Jacobian's nonzeros, period by period."""
-        bays, pattern = self.bays, self.coordinate_pattern
-        number = np.full(pattern.shape, -1, dtype=np.int64)
-        number.T[pattern.T] = np.arange(int(pattern.sum()))
-        member, flat, column = bays.scatter.member, bays.scatter.flat, bays.scatter.column
-        row = np.empty(bays.member_count, dtype=np.int64)
-        period = np.empty_like(row)
-        row[self.members] = np.arange(self.members.shape[1])
-        period[self.members] = np.arange(self.periods)[:, None]
-        node = bays.free[column // 3]
-        place = _places(self.node_period[node], self.node_place[node], period[member], self.carried)
-        entry = period[member] * int(pattern.sum()) + number[row[member], 3 * place + column % 3]
-        shape = (
-            self.periods * int(pattern.sum()),
-            bays.member_nodes.size * 3,
-        )
-        return sparse.csr_matrix((np.ones(len(entry)), (entry, flat)), shape=shape)
+    def gathered(self) -> Index:
+        """(E,) where the entries of ``LengthScatter`` stand among the nonzeros of all periods."""
+        scatter = self.bays.scatter
+        period, row = np.divmod(np.argsort(self.members.reshape(-1))[scatter.member], self.own)
+        node = self.bays.free[scatter.column // 3]
+        place = _places(self.node_period[node], self.node_place[node], period, self.carried)
+        found = period * int(self.pattern.sum()) + self.entry[row, 3 * place + scatter.column % 3]
+        return np.asarray(found)
 
     @property
     def is_square(self) -> bool:
         """Whether a period's fixed members and its faces' positions determine its nodes, given the curve."""
-        return (
-            self.faces.shape[1] > 0
-            and int(self.soft.sum()) == 3 * self.faces.shape[1]
-            and not len(self.locked)
-        )
+        faces = self.faces.shape[1]
+        return faces > 0 and int(self.soft.sum()) == 3 * faces and not len(self.locked)
 
 
 @lru_cache(maxsize=4)
@@ -162,180 +136,138 @@ def _places(period: Index, place: Index, here: Index, carried: Index) -> Index:
     return np.where(period == here, len(carried) + place, np.where(period == here - 1, position[place], -1))
 
 
-def _repeats(counts: Index, length: int) -> bool:
-    """Whether `counts` per stage repeat after `length` stages and none is zero."""
-    return bool(counts.min() > 0 and (counts.reshape(-1, length) == counts[:length]).all())
-
-
 def _chain(layout: Layout, bays: Bays, stages: int, length: int) -> Chain | None:
+    """Return the chain of periods of `length` stages, None where the arm is none."""
     periods = stages // length
-    node_counts = np.bincount(bays.stage[bays.free], minlength=stages)
+    counts = np.bincount(bays.stage[bays.free], minlength=stages)
     member_stage = bays.stage[bays.member_nodes].max(axis=1)
-    if not len(member_stage) or member_stage.min() < 0 or not _repeats(node_counts, length):
+    if not len(member_stage) or member_stage.min() < 0 or len(bays.free) > _MOST_NODES * periods:
         return None
-    if (np.bincount(member_stage, minlength=stages) != 3 * node_counts).any():
+    repeats = counts.min() > 0 and (counts.reshape(-1, length) == counts[:length]).all()
+    if not repeats or (np.bincount(member_stage, minlength=stages) != 3 * counts).any():
         return None
-    if len(bays.free) > _MOST_NODES * periods:
-        return None
+    sizes = tuple(counts[:length].tolist())
     nodes = bays.free.reshape(periods, -1)
     members = np.argsort(member_stage, kind="stable").reshape(periods, -1)
-    sizes = tuple(node_counts[:length].tolist())
-    alike = _alike(bays, nodes, members, sizes) if bays.joints is None else None
-    if alike is not None:
-        chain = _of_ordered(layout, bays, alike.nodes, alike.members, sizes, alike)
-        if chain is not None:
-            return chain
-    return _of_ordered(layout, bays, nodes, members, sizes, None)
+    orders = [_alike(bays, nodes, members, sizes), (np.zeros(0, dtype=np.int64), nodes, members)]
+    found = (_of_ordered(layout, bays, sizes, *order) for order in orders if order is not None)
+    return next((chain for chain in found if chain is not None), None)
 
 
-@dataclass(frozen=True, eq=False)
-class _Alike:
-    """Nodes (n, m) and members (n, 3m) in the order in which all periods are alike.
+def _alike(
+    bays: Bays, nodes: Index, members: Index, sizes: tuple[int, ...]
+) -> tuple[Index, Index, Index] | None:
+    """Return base nodes, nodes (n, m) and members (n, 3m) in the order in which all periods are alike, if any.
 
-    `base` are the nodes before the first one; `pairs` (3m, 2) what the members join: places among the nodes of the
-    period before, then from m on among a period's own.
-    """
-
-    nodes: Index
-    members: Index
-    base: Index
-    pairs: list[tuple[int, int]]
-
-
-def _alike(bays: Bays, nodes: Index, members: Index, sizes: tuple[int, ...]) -> _Alike | None:
-    """Return the order in which all periods of a chain of pin-jointed members are alike; None where there is none.
-
-    Nodes of a stage are told apart by what they hang on, so that a bay that is the mirror image of the one before
-    comes in another order of its nodes.
+    Base nodes are those of a period before the first one. Nodes of a stage are told apart by what they hang on, so that
+    a bay that is the mirror image of the one before comes in another order of its nodes.
     """
     base = np.flatnonzero(bays.base).tolist()
-    if len(nodes) < 2 or len(base) > min(int(nodes.shape[1]), _MOST_BASE_NODES):
+    if bays.joints is not None or len(nodes) < 2 or len(base) > _MOST_BASE_NODES:
         return None
-    ends = bays.member_nodes.tolist()
+    if len(base) != nodes.shape[1]:
+        return None
+    hung = list(zip(nodes.tolist(), members.tolist(), bays.member_nodes[members].tolist(), strict=True))
     for order in permutations(base):
-        before: list[int] | None = list(order)
-        wanted: list[tuple[int, int]] | None = None
-        ordered, listed = [before], []
-        for names, own in zip(nodes.tolist(), members.tolist(), strict=True):
-            assert before is not None
-            before, found, pairs = _ordered_period(
-                before, names, {member: ends[member] for member in own}, sizes
-            )
-            wanted = pairs if wanted is None else wanted
-            if before is None or pairs != wanted:
+        before, first = list(order), None
+        ordered, listed = [], []
+        for names, own, ends in hung:
+            before, found, joined = _ordered_period(before, names, own, ends, sizes)
+            first = joined if first is None else first
+            if not joined or joined != first:
                 break
             ordered.append(before)
             listed.append(found)
         else:
-            assert wanted is not None
-            return _Alike(np.array(ordered[1:]), np.array(listed), np.array(ordered[0]), wanted)
+            return np.array(order, dtype=np.int64), np.array(ordered), np.array(listed)
     return None
 
 
 def _ordered_period(
-    before: list[int], names: list[int], ends: dict[int, list[int]], sizes: tuple[int, ...]
-) -> tuple[list[int] | None, list[int], list[tuple[int, int]]]:
-    """Return a period's nodes and members in order and the places that those join; None where they go further back.
+    before: list[int], names: list[int], members: list[int], ends: list[list[int]], sizes: tuple[int, ...]
+) -> tuple[list[int], list[int], list[tuple[int, int]]]:
+    """Return a period's nodes and members in order and the places that these join; nothing where those go further back.
 
-    Places are those of the nodes `before`, then from len(names) on the period's own.
+    Places of nodes `before` are negative, and a period's own count from zero.
     """
-    own = len(names)
-    place = {node: k for k, node in enumerate(before)}
-    hangs: dict[int, list[int]] = {node: [] for node in names}
-    for first, second in ends.values():
-        for here, there in ((first, second), (second, first)):
-            if here in hangs:
-                hangs[here].append(there)
-    order: list[int] = []
+    place = dict(zip(before, range(-len(before), 0), strict=True))
+    hangs: dict[int, list[int]] = {node: [] for node in (*before, *names)}
+    for first, second in ends:
+        if first not in hangs or second not in hangs:
+            return [], [], []
+        hangs[first].append(second)
+        hangs[second].append(first)
+    done = 0
     for count in sizes:
-        stage = names[len(order) : len(order) + count]
         keys = {
-            node: (sorted(place[other] for other in hangs[node] if other in place), node) for node in stage
+            node: (sorted(place[other] for other in hangs[node] if other in place), node)
+            for node in names[done : done + count]
         }
-        for node in sorted(stage, key=keys.__getitem__):
-            place[node] = own + len(order)
-            order.append(node)
-    if any(node not in place for pair in ends.values() for node in pair):
-        return None, [], []
-    joined = {member: sorted(place[node] for node in pair) for member, pair in ends.items()}
-    listed = sorted(ends, key=lambda member: (joined[member][1], joined[member][0]))
-    return order, listed, [(joined[member][0], joined[member][1]) for member in listed]
+        place |= {node: done + k for k, node in enumerate(sorted(keys, key=keys.__getitem__))}
+        done += count
+    joined = {
+        member: (max(place[a], place[b]), min(place[a], place[b]))
+        for member, (a, b) in zip(members, ends, strict=True)
+    }
+    listed = sorted(members, key=joined.__getitem__)
+    return sorted(names, key=place.__getitem__), listed, [joined[member] for member in listed]
 
 
 def _of_ordered(
-    layout: Layout, bays: Bays, nodes: Index, members: Index, sizes: tuple[int, ...], alike: _Alike | None
+    layout: Layout, bays: Bays, sizes: tuple[int, ...], base: Index, nodes: Index, members: Index
 ) -> Chain | None:
-    """Return the chain of these periods, None where they are none."""
-    stations, periods = layout.arm.stations, len(nodes)
-    period = np.full(bays.node_count, -2, dtype=np.int64)
-    place = np.zeros(bays.node_count, dtype=np.int64)
-    period[nodes], place[nodes] = np.arange(periods)[:, None], np.arange(nodes.shape[1])
+    """Return the chain of these periods behind the nodes `base`, None where they are none."""
+    stations, (periods, own) = layout.arm.stations, nodes.shape
+    period, place = np.full(bays.node_count, -2, dtype=np.int64), np.zeros(bays.node_count, dtype=np.int64)
+    period[base], place[base] = -1, np.arange(len(base))
+    period[nodes], place[nodes] = np.arange(periods)[:, None], np.arange(own)
     here = np.arange(periods)[:, None, None]
-    used = bays.member_nodes[members]
-    face_used, faces = np.zeros((periods, 0, 3), dtype=np.int64), np.zeros((periods, 0), dtype=np.int64)
-    if len(layout.tracked):
-        face_nodes = stations.nodes[layout.tracked]
-        completed = period[face_nodes].max(axis=1)
-        order = np.argsort(completed, kind="stable")
-        if (
-            len(order) % periods
-            or (completed[order] != np.repeat(np.arange(periods), len(order) // periods)).any()
-        ):
-            return None
-        faces = order.reshape(periods, -1)
-        face_used = face_nodes[faces]
-    face_order = np.broadcast_to(np.arange(3), face_used.shape)
-    if alike is not None:
-        rank = place[face_used] + np.where(period[face_used] == here, nodes.shape[1], 0)
-        face_order = np.argsort(rank, axis=2)
-        face_used = np.take_along_axis(face_used, face_order, axis=2)
+    completed = period[stations.nodes[layout.tracked]].max(axis=1, initial=-2)
+    order = np.argsort(completed, kind="stable")
+    count = len(order) // periods
+    if not np.array_equal(completed[order], np.repeat(np.arange(periods), count)):
+        return None
+    faces = order.reshape(periods, count)
+    face_used, used = stations.nodes[layout.tracked[faces]], bays.member_nodes[members]
+    face_order = np.argsort(place[face_used] + np.where(period[face_used] == here, own, 0), axis=2)
+    face_used = np.take_along_axis(face_used, face_order, axis=2)
+    carried: set[int] = set()
     for nodes_used in (used, face_used):
         if ((period[nodes_used] >= 0) & (period[nodes_used] < here - 1)).any():
             return None
-    carried = np.unique(
-        np.concatenate(
-            [place[nodes_used][period[nodes_used] == here - 1] for nodes_used in (used, face_used)]
-        )
-    )
-    face_places = _places(period[face_used], place[face_used], here, carried)
+        carried |= set(place[nodes_used][period[nodes_used] == here - 1].tolist())
+    handed = np.array(sorted(carried), dtype=np.int64)
+    places = np.sort(_places(period[used], place[used], here, handed), axis=2)
+    face_places = _places(period[face_used], place[face_used], here, handed)
     weights = np.take_along_axis(stations.weights[layout.tracked[faces]], face_order, axis=2)
-    if (
-        (face_places != face_places[:1]).any()
-        or (face_places < 0).any()
-        or np.ptp(weights, axis=0).max(initial=0.0) > 0
-    ):
+    if (face_places != face_places[0]).any() or (face_places < 0).any() or (weights != weights[0]).any():
         return None
-    places = _places(period[used], place[used], here, carried)
-    pattern = np.zeros((members.shape[1], len(carried) + nodes.shape[1]), dtype=bool)
-    _, row, _ = np.nonzero(places >= 0)
-    pattern[row, places[places >= 0]] = True
+    pattern = np.zeros((3 * own, len(handed) + own), dtype=bool)
+    pattern[np.nonzero(places >= 0)[1], places[places >= 0]] = True
     actuated = bays.actuated[members]
     soft = actuated.mean(axis=0) > 0.5
     locked = members[~actuated & soft]
     if (actuated & ~soft).any() or len(locked) > _MOST_LOCKED:
         return None
-    window, member_places = None, np.zeros((0, 2), dtype=np.int64)
-    if alike is not None and carried.max(initial=-1) < len(alike.base):
-        before = np.concatenate([alike.base[carried][None], nodes[:-1][:, carried]])
-        window = np.concatenate([before, nodes], axis=1)
-        number = np.full(2 * nodes.shape[1], -1, dtype=np.int64)
-        number[carried] = np.arange(len(carried))
-        number[nodes.shape[1] :] = len(carried) + np.arange(nodes.shape[1])
-        member_places = number[np.array(alike.pairs)]
+    before = np.vstack([np.zeros_like(nodes[:1]), nodes[:-1]])
+    before[0, : len(base)] = base
+    is_alike = (places >= 0).all() and (places == places[0]).all()
     return Chain(
         layout=layout,
         bays=bays,
         nodes=nodes,
         members=members,
         stage_sizes=sizes,
-        carried=carried,
-        pattern=pattern,
+        node_period=period,
+        node_place=place,
+        carried=handed,
+        window=np.hstack([before[:, handed], nodes]),
+        pattern=np.repeat(pattern, 3, axis=1),
+        member_places=places[0] if is_alike else None,
         soft=soft,
+        locked=locked,
         faces=faces,
         face_places=face_places[0],
         face_order=face_order,
         face_weights=weights[0],
-        locked=locked,
-        window=window,
-        member_places=member_places,
     )

@@ -1,17 +1,28 @@
-"""The numbers of a step laid out period by period, as the eliminations along a chain read them."""
+"""The numbers of a step laid out period by period, as the eliminations along a chain read them.
+
+They are those of a QP's numbers, or are found from the positions of the nodes: every period by one mapped, compiled
+function.
+"""
 
 from __future__ import annotations
 
 from typing import cast
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import LengthRowsLike
+from vgtm_qp.arm.frames import fitted_frame, frame_constants, turning
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
+from vgtm_qp.qp.long.elimination import member_lengths
+from vgtm_qp.qp.long.sparse_symbols import dense_function, nonzeros, sparsity_of
 from vgtm_qp.qp.numbers import StepNumbers
+from vgtm_qp.rows import tracking
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 
 class ChainData:
@@ -20,119 +31,108 @@ class ChainData:
     Attributes
     ----------
     head, tail, table : (n, ...)
-        In the order of ``elimination.Inputs``; periods from the base to the tip, or the other way where `reverse`.
+        In the order of ``elimination.Inputs``; periods from the base to the tip, or the other way where `is_reversed`.
+    part : dict
+        Their parts by name.
     lean : (n, 9f)
         Products t t' of the rows t of ``tangent_curve``, summed over the two angles of a face.
-    order : slice
-        From periods along the chain to rows.
+    window, members, face_order : (n, w + m), (n, 3m), (n, f, 3) int
+        Those of the chain, by row.
+    at : (M,) int
+        Places of the members in `members`.
     faces : (K,) int
         Positions in ``layout.tracked`` of the faces by row.
+    weights, slopes : (K, V)
+        Of the control vertices at those faces.
     offset : (V, 3)
         Displacements of the control vertices where the free coordinates are zero, m.
     normal : (3,)
         The direction in which the second control vertex moves.
     """
 
-    def __init__(self, chain: Chain, sizes: dict[str, dict[str, int]], *, reverse: bool = False) -> None:
-        self.chain = chain
-        layout, periods = chain.layout, chain.periods
-        self.order, self.is_reversed = slice(None, None, -1 if reverse else 1), reverse
-        self._part: dict[str, Array] = {}
+    def __init__(self, chain: Chain, sizes: dict[str, dict[str, int]], *, is_reversed: bool = False) -> None:
+        self._chain, self.is_reversed = chain, is_reversed
+        layout, order = chain.layout, slice(None, None, -1 if is_reversed else 1)
+        self.part: dict[str, Array] = {}
         arrays = []
         for parts in sizes.values():
             ends = np.cumsum(list(parts.values())).tolist()
-            arrays.append(np.zeros((periods, ends[-1])))
+            arrays.append(np.zeros((chain.periods, ends[-1])))
             for (name, size), end in zip(parts.items(), ends, strict=True):
-                self._part[name] = arrays[-1][:, end - size : end]
+                self.part[name] = arrays[-1][:, end - size : end]
         self.head, self.tail, self.table = arrays
-        self.faces = chain.faces[self.order].reshape(-1)
-        self.lean: Array = np.zeros((periods, 9 * chain.faces.shape[1]))
-        self._order = chain.face_order[self.order].reshape(-1, 1, 3, 1)
-        self._weights, self._slopes = layout.curve_weights[self.faces], layout.curve_slopes[self.faces]
-        self._slope_products = (self._slopes[:, :, None] * self._slopes[:, None, :]).reshape(
+        self.lean: Array = np.zeros((chain.periods, 9 * chain.faces.shape[1]))
+        self.window, self.members = chain.window[order], chain.members[order]
+        self.at = np.argsort(self.members.reshape(-1))
+        self.faces, self.face_order = chain.faces[order].reshape(-1), chain.face_order[order]
+        self.weights, self.slopes = layout.curve_weights[self.faces], layout.curve_slopes[self.faces]
+        self.part["weights"][:] = self.weights.reshape(self.part["weights"].shape)
+        self.part["slopes"][:] = self.slopes.reshape(self.part["slopes"].shape)
+        self._slope_products = (self.slopes[:, :, None] * self.slopes[:, None, :]).reshape(
             len(self.faces), layout.vertices**2
         )
-        self._members = chain.members[self.order]
-        self._soft = self._members[:, chain.soft]
-        self._actuator = np.zeros(chain.bays.member_count)
+        self._soft = self.members[:, chain.soft]
         self.offset, self.normal = np.zeros((layout.vertices, 3)), np.zeros(3)
-        self._vertex_gradient = np.zeros((layout.vertices, 3))
-        if len(self.faces):
-            self._part["weights"][:] = self._weights[:, 1:].reshape(periods, -1)
-            self._part["slopes"][:] = self._slopes[:, 1:].reshape(periods, -1)
-        weights = layout.weights
+        self.vertex_gradient = np.zeros((layout.vertices, 3))
         self._polygon = layout.vertex_hessian
-        self._tracking = 0.0 if layout.hard_tracking else weights.tracking
-        along = self._polygon + self._tracking * self._weights.T @ self._weights
+        self._tracking = 0.0 if layout.hard_tracking else layout.weights.tracking
+        along = self._polygon + self._tracking * self.weights.T @ self.weights
         self._hessian, self._polygon_hessian = np.kron(along, np.eye(3)), np.kron(self._polygon, np.eye(3))
         # What the free coordinates of the curve do to the vertices' coordinates: the second vertex slides on a line.
-        self._free = np.eye(3 * layout.vertices)[:, 5:] if layout.vertices else np.zeros((0, 0))
+        self._free = np.eye(3 * layout.vertices)[:, 5:]
         self._free[:6] = 0.0
 
     def fill(self, numbers: StepNumbers) -> None:
         """Overwrite everything with the values of `numbers`."""
-        chain, part, periods = self.chain, self._part, self.chain.periods
-        rows = cast(LengthRowsLike, numbers.motion)
-        jacobian = (chain.gather @ rows.gradient.reshape(-1)).reshape(periods, -1)
-        part["jacobian"][:] = jacobian[self.order]
-        part["rhs"][:] = rows.rhs[self._members]
-        self._actuator[chain.bays.actuators] = numbers.actuator_gradient
-        part["actuator_gradient"][:] = self._actuator[self._soft]
-        if not chain.layout.vertices:
+        chain, part = self._chain, self.part
+        rows, scatter = cast(LengthRowsLike, numbers.motion), chain.bays.scatter
+        jacobian = part["jacobian"]
+        gradient = rows.gradient.reshape(-1)[scatter.flat]
+        found = np.bincount(chain.gathered, gradient, jacobian.size).reshape(jacobian.shape)
+        jacobian[:] = found[::-1] if self.is_reversed else found
+        part["rhs"][:] = rows.rhs[self.members]
+        actuator = np.zeros(chain.bays.member_count)
+        actuator[chain.bays.actuators] = numbers.actuator_gradient
+        part["actuator_gradient"][:] = actuator[self._soft]
+        if not len(self.offset):
             return
-        self.hold_base(numbers.base_displacement, numbers.base_axes, numbers.base_rhs)
-        self._vertex_gradient = numbers.vertex_gradient
+        axes = numbers.base_axes
+        self.offset[:2] = numbers.base_displacement
+        self.offset[1] += numbers.base_rhs @ axes
+        self.hold_base(self.offset, np.cross(*axes))
+        self.vertex_gradient = numbers.vertex_gradient
         turns = numbers.tangent_face[self.faces].reshape(-1, 2, 3, 3)
-        part["tangent_face"][:] = np.take_along_axis(turns, self._order, axis=2).reshape(periods, -1)
+        order = self.face_order.reshape(-1, 1, 3, 1)
         lean = numbers.tangent_curve[self.faces]
-        part["tangent_curve"][:] = lean.reshape(periods, -1)
-        gap = numbers.position_rhs[self.faces] - self._weights @ self.offset
+        gap = numbers.position_rhs[self.faces] - self.weights @ self.offset
         tilt = numbers.tangent_rhs[self.faces]
-        tilt = tilt + np.einsum("kac,kc->ka", lean, self._slopes @ self.offset)
-        part["gap"][:], part["tilt"][:] = gap.reshape(periods, -1), tilt.reshape(periods, -1)
-        self.lean[:] = np.einsum("kac,kad->kcd", lean, lean).reshape(periods, -1)
+        tilt = tilt + np.einsum("kac,kc->ka", lean, self.slopes @ self.offset)
+        filled = {
+            "tangent_face": np.take_along_axis(turns, order, axis=2),
+            "tangent_curve": lean,
+            "gap": gap,
+            "tilt": tilt,
+        }
+        for name, values in filled.items():
+            part[name][:] = values.reshape(part[name].shape)
+        self.lean[:] = np.einsum("kac,kad->kcd", lean, lean).reshape(self.lean.shape)
 
-    def hold_base(self, displacement: Array, axes: Array, turn: Array) -> None:
-        """Set what the base makes of the curve: see ``base_displacement``, ``base_axes`` and ``base_rhs`` of a QP."""
-        self.offset[0] = displacement
-        self.offset[1] = displacement + turn @ axes
-        self.offset[2:] = 0.0
-        first, second = axes.tolist()
-        for c in range(3):
-            a, b = (c + 1) % 3, (c + 2) % 3
-            self.normal[c] = first[a] * second[b] - first[b] * second[a]
-        self._free[3:6, 0] = self.normal
-        if len(self.faces):
-            self._part["normal"][:] = self.normal
+    def hold_base(self, offset: Array, normal: Array) -> None:
+        """Set what the base makes of the curve: `offset` (V, 3) and `normal` (3,)."""
+        self.offset[:], self.normal[:] = offset, normal
+        self._free[3:6, 0] = normal
+        self.part["normal"][:] = normal
 
-    def pull(self, vertex_gradient: Array) -> None:
-        """Set the gradient (V, 3) of the objectives in the control vertices."""
-        self._vertex_gradient = vertex_gradient
-
-    @property
-    def actuator_gradient(self) -> Array:
-        """(n, soft) the objective's gradient in the actuated lengths."""
-        return self._part["actuator_gradient"]
-
-    def _misfit(self, vertices: Array) -> tuple[Array, Array]:
-        """Return gap (K, 3) and tilt (K, 2) where the vertices are displaced so and the faces are not."""
-        moved = vertices - self.offset
-        lean = self._part["tangent_curve"].reshape(-1, 2, 3)
-        gap = self._part["gap"].reshape(-1, 3) - self._weights @ moved
-        tilt = self._part["tilt"].reshape(-1, 2)
-        return gap, tilt + np.einsum("kac,kc->ka", lean, self._slopes @ moved)
+    def member_rows(self, members: Index) -> tuple[Index, Array]:
+        """Return nodes (R, w + m) and the gradient (R, w + m, 3) of the lengths of `members` (R,)."""
+        period, row = np.divmod(self.at[members], self.members.shape[1])
+        entry = self._chain.entry.reshape(self.members.shape[1], -1, 3)[row]
+        values = self.part["jacobian"][period[:, None, None], entry]
+        return self.window[period], np.where(entry >= 0, values, 0.0)
 
     def vertices(self, free: Array) -> Array:
         """Return (V, 3) the displacements of the control vertices for free coordinates (3V - 5,)."""
-        vertices = self.offset.copy()
-        if len(vertices):
-            vertices[1] += free[0] * self.normal
-            vertices[2:] += free[1:].reshape(-1, 3)
-        return vertices
-
-    def _reduced(self, gradient: Array) -> Array:
-        """Return (3V - 5,) the gradient in the free coordinates of one in the vertices (V, 3)."""
-        return np.asarray(gradient.reshape(-1) @ self._free)
+        return self.offset + (self._free @ free).reshape(-1, 3)
 
     def polygon_terms(self) -> tuple[Array, Array]:
         """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the vertices alone."""
@@ -140,26 +140,140 @@ class ChainData:
 
     def polygon_gradient(self, vertices: Array) -> Array:
         """Return (3V - 5,) the gradient of those terms where the vertices are displaced so."""
-        return self._reduced(self._polygon @ vertices + self._vertex_gradient)
+        gradient = self._polygon @ vertices + self.vertex_gradient
+        return np.asarray(gradient.reshape(-1) @ self._free)
 
     def curve_terms(self) -> tuple[Array, Array]:
         """Return Hessian and gradient of all terms in the curve's coordinates while the faces stay."""
         count = len(self.offset)
-        weight = self.chain.layout.weights.tangent
-        leaning = weight * (self._slope_products.T @ self.lean.reshape(-1, 9))
+        leaning = self._slope_products.T @ self.lean.reshape(-1, 9)
         leaning = leaning.reshape(count, count, 3, 3).transpose(0, 2, 1, 3).reshape(3 * count, 3 * count)
-        hessian = self._free.T @ (self._hessian + leaning) @ self._free
-        gap, tilt = self._part["gap"].reshape(-1, 3), self._part["tilt"].reshape(-1, 2)
-        return hessian, self.curve_gradient(self.offset, gap, tilt)
+        hessian = self._hessian + self._chain.layout.weights.tangent * leaning
+        gap, tilt = self.part["gap"].reshape(-1, 3), self.part["tilt"].reshape(-1, 2)
+        return self._free.T @ hessian @ self._free, self.curve_gradient(self.offset, gap, tilt)
 
     def curve_gradient(self, vertices: Array, gap: Array, tilt: Array) -> Array:
         """Return (3V - 5,) the objective's gradient in the curve's coordinates, given all gaps and angles."""
-        gradient = self._polygon @ vertices + self._vertex_gradient - self._tracking * self._weights.T @ gap
-        lean = self._part["tangent_curve"].reshape(-1, 2, 3)
+        lean = self.part["tangent_curve"].reshape(-1, 2, 3)
         angles = tilt[:, :1] * lean[:, 0] + tilt[:, 1:] * lean[:, 1]
-        return self._reduced(gradient + self.chain.layout.weights.tangent * self._slopes.T @ angles)
+        gradient = self._chain.layout.weights.tangent * self.slopes.T @ angles
+        gradient -= self._tracking * self.weights.T @ gap
+        return self.polygon_gradient(vertices) + gradient.reshape(-1) @ self._free
 
     def misfit(self, vertices: Array, faces: Array) -> tuple[Array, Array]:
         """Return gap (K, 3) and tilt (K, 2) for displaced vertices and the faces' own parts (K, 5)."""
-        gap, tilt = self._misfit(vertices)
+        moved = vertices - self.offset
+        lean = self.part["tangent_curve"].reshape(-1, 2, 3)
+        gap = self.part["gap"].reshape(-1, 3) - self.weights @ moved
+        tilt = self.part["tilt"].reshape(-1, 2) + np.einsum("kac,kc->ka", lean, self.slopes @ moved)
         return gap + faces[:, :3], tilt + faces[:, 3:]
+
+
+class PeriodValues:
+    """Fills :class:`ChainData` from the positions of the nodes.
+
+    Attributes
+    ----------
+    lengths : (M,)
+        Of the members at the configuration evaluated last, m.
+    """
+
+    def __init__(self, chain: Chain, data: ChainData) -> None:
+        layout, bays = chain.layout, chain.bays
+        self._chain, self._data = chain, data
+        self._kernel = Kernel(period_values(chain).map(chain.periods))
+        for k, array in enumerate((data.head, data.tail, data.lean)):
+            self._kernel.bind_output(k, array)
+        inputs = [array.reshape(chain.periods, -1) for array in self._kernel.inputs]
+        self._X, self._Y = (array.reshape(-1, 3) for array in inputs[:2])
+        self._curve, self._switches = inputs[6].reshape(-1, 2, 6), inputs[7]
+        inputs[2][:], inputs[3][:] = layout.arm.home_quantities[data.members], ~bays.actuated[data.members]
+        for array, constants in zip(inputs[4:6], _frame_constants(chain, data), strict=True):
+            array[:] = constants.reshape(array.shape)
+        # What the first period's members hang on does not move by itself.
+        self._first = -1 if data.is_reversed else 0
+        self._base_row, self._base_column = np.nonzero(chain.pattern[:, : chain.before])
+        self._of_base = chain.entry[self._base_row, self._base_column]
+        self.lengths = np.zeros(bays.member_count)
+
+    def fill(self, X: Array, Y: Array, vertices: Array, moved: Array | None, *, motion: bool) -> None:
+        """Overwrite the QP's numbers with those at `X` (N, 3), with Jacobians at `Y` (N, 3), m.
+
+        What the base makes of the curve is in the data already. `moved` (N, 3) are displacements of the base nodes, m,
+        None where they rest.
+        """
+        chain, data = self._chain, self._data
+        window = data.window.reshape(-1)
+        np.take(X, window, axis=0, out=self._X, mode="clip")
+        np.take(Y, window, axis=0, out=self._Y, mode="clip")
+        self._switches[:] = motion, motion or chain.layout.hard_tracking
+        if len(data.faces):
+            both = np.hstack([vertices, data.offset])
+            np.matmul(data.weights, both, out=self._curve[:, 0])
+            np.matmul(data.slopes, both, out=self._curve[:, 1])
+        self._kernel()
+        np.take(self._kernel.outputs[3], data.at, out=self.lengths, mode="clip")
+        first = data.part["jacobian"][self._first]
+        if moved is not None:
+            shift = moved[chain.window[0]].reshape(-1)[self._base_column]
+            np.subtract.at(data.part["rhs"][self._first], self._base_row, first[self._of_base] * shift)
+        first[self._of_base] = 0.0
+
+
+def period_values(chain: Chain) -> ca.Function:
+    """Return one period's numbers as a function of where its nodes are.
+
+    Arguments: X, Y (3, w + m), where residuals and where Jacobians are evaluated; home (3m), lengths, and fixed (3m),
+    1 where a member keeps it; angles (6f), polar angles' cosines and sines of each face; alignment (3, 3f); curve
+    (12f), for each face its point, the point's displacement with the base, the slope and that slope's displacement;
+    switches (2), motion and gap.
+
+    Results: ``head`` and ``tail`` of ``elimination.Inputs``, ``ChainData.lean`` and the lengths (3m) at X.
+    """
+    layout, faces = chain.layout, chain.faces.shape[1]
+    X, Y = (ca.SX.sym(name, 3, chain.window.shape[1]) for name in "XY")
+    home, fixed = ca.SX.sym("home", chain.own), ca.SX.sym("fixed", chain.own)
+    angles, alignment = ca.SX.sym("angles", 6 * faces), ca.SX.sym("alignment", 3, 3 * faces)
+    curve, switches = ca.SX.sym("curve", 12 * faces), ca.SX.sym("switches", 2)
+    motion, gap_on = switches[0], switches[1]
+
+    lengths, soft = member_lengths(chain, X), np.flatnonzero(chain.soft).tolist()
+    jacobian = ca.jacobian(member_lengths(chain, Y), ca.vec(Y))
+    head = [nonzeros(ca.project(jacobian, sparsity_of(chain.pattern))), fixed * (home - lengths)]
+    tail = [motion * layout.weights.stroke_centring * ((1.0 - fixed) * (lengths - home))[soft]]
+    turns, leans, gaps, tilts, products = [], [], [], [], []
+    for k, places in enumerate(chain.face_places.tolist()):
+        polar, nodes = ca.vertsplit(angles[6 * k : 6 * k + 6], 3), Y[:, places]
+        rotation = fitted_frame(X[:, places], *polar) @ alignment[:, 3 * k : 3 * k + 3]
+        point, moved, slope, slope_moved = ca.vertsplit(curve[12 * k : 12 * k + 12], 3)
+        tilt, c, lean = tracking.slope_rows(rotation, slope)
+        turns.append(ca.vec(turning(fitted_frame(nodes, *polar), nodes, c).T))
+        leans.append(ca.vec(lean.T))
+        products.append(ca.vec(lean.T @ lean))
+        centre = X[:, places] @ ca.DM(chain.face_weights[k])
+        gaps.append(gap_on * tracking.gap(centre, point) - moved)
+        tilts.append(motion * tilt + lean @ slope_moved)
+    outputs = [
+        ca.vertcat(*head, *turns),
+        ca.vertcat(*tail, *leans, *gaps, *tilts),
+        ca.vertcat(*products),
+        lengths,
+    ]
+    return dense_function("values", [X, Y, home, fixed, angles, alignment, curve, switches], outputs)
+
+
+def _frame_constants(chain: Chain, data: ChainData) -> tuple[Array, Array]:
+    """Return angles (K, 6) and alignments (K, 3, 3), columns first, of the faces in the order of `data`.
+
+    A face whose nodes are named the other way round has y- and z-axis of its fitted frame reversed.
+    """
+    arm, angles, alignments = chain.layout.arm, [], []
+    for face, order in zip(
+        chain.layout.tracked[data.faces].tolist(), data.face_order.reshape(-1, 3), strict=True
+    ):
+        home, frame = arm.home[arm.stations.nodes[face]], arm.stations.frames[face]
+        cosines, sines, alignment = frame_constants(home, frame)
+        sense = 1.0 if (np.roll(order, -int(order.argmin())) == np.arange(3)).all() else -1.0
+        angles.append(np.concatenate([cosines[order], sense * sines[order]]))
+        alignments.append((np.array([1.0, sense, sense])[:, None] * alignment).T)
+    return np.array(angles), np.array(alignments)

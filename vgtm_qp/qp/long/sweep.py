@@ -7,14 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
+from vgtm_qp.qp.long.chain import Chain
 
 Array = NDArray[np.float64]
+
+MOST_STEPS = 12
+TOO_FAR = 1e-2
+"""Lengths that are further off than this, m, are not worth trying."""
 
 
 class Sweep(Kernel):
     """A period's function run along the chain: its first argument is its first result for the period before.
 
-    CasADi maps a function in order and the two share memory, shifted by one period: the map is a recursion.
+    CasADi maps a function in order and the two share memory, shifted by one period: the map is a recursion. Arrays
+    given are what the arguments after the first one are read from.
 
     Attributes
     ----------
@@ -22,10 +28,43 @@ class Sweep(Kernel):
         What was handed over; row 0 is the start.
     """
 
-    def __init__(self, function: ca.Function, periods: int) -> None:
+    def __init__(self, function: ca.Function, periods: int, *arguments: Array) -> None:
         super().__init__(function.map(periods))
         size = function.nnz_in(0)
         self.carry: Array = np.zeros((periods + 1, size))
         flat = self.carry.reshape(-1)
-        self.bind_input(0, flat[: periods * size])
+        for k, array in enumerate((flat[: periods * size], *arguments)):
+            self.bind_input(k, array)
         self.bind_output(0, flat[size:])
+
+
+class ChainClosing(Sweep):
+    """Brings members to their lengths by Newton steps with the Jacobian that a QP has factorised.
+
+    What is left after a QP is small, so that such steps converge fast, and each costs one substitution. The function
+    is one of ``Elimination.newton``.
+
+    Attributes
+    ----------
+    aims : tuple of (n, ...) arrays
+        Arguments behind the positions: what a step aims at.
+    lengths : (n, 3m)
+        Of the members in the configuration that the last step started from, m.
+    """
+
+    def __init__(self, chain: Chain, function: ca.Function, head: Array, gains: Array) -> None:
+        super().__init__(function, chain.periods, head, gains)
+        self._base = chain.window[0, : len(chain.carried)]
+        self.aims = tuple(array.reshape(chain.periods, -1) for array in self.inputs[4:])
+        self.lengths = self.outputs[2].reshape(chain.periods, -1)
+
+    def start(self, base: Array) -> None:
+        """Let base nodes stand at their rows of `base` (N, 3), m."""
+        self.carry[0] = 0.0
+        self.carry[0, : 3 * len(self._base)] = base[self._base].reshape(-1)
+
+    def step(self, X: Array) -> tuple[Array, float]:
+        """Return the positions after one step from `X` (n m, 3), and the greatest error there was before it, m."""
+        self.inputs[3][:] = X.reshape(-1)
+        self()
+        return self.outputs[1].reshape(-1, 3), float(np.abs(self.outputs[3]).max())

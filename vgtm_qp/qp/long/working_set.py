@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
-from vgtm_qp.arm.arm import Bays, LengthRowsLike
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp import daqp
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import UNBOUNDED, RowNumbers
 from vgtm_qp.qp.residual import InfeasibleStepError
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+BLOCK = 8
+"""Rows that enter the dual QP at once, at least."""
 
 _NO_ROW = 1e-11
 _DEPENDENT = 1e-14
@@ -31,98 +32,37 @@ _REFINEMENTS = 4
 MemberRows = Callable[[Index], tuple[Index, Array]]
 """Nodes (R, Q) and coefficients (R, Q, 3) of the lengths of members (R,); base nodes may have any coefficients."""
 
+Key = int | bytes
+"""Of a row; the nodes of a clearance row."""
+
 Moved = Callable[[Index], Array]
 """Displacements (..., 3), m, of nodes (...,)."""
 
 
-@dataclass(frozen=True, eq=False)
-class RowNumbers:
-    """What the rows with bounds, and the progress, need of a QP; see :class:`StepNumbers`."""
-
-    lower: Array
-    upper: Array
-    tip_jacobian: Array
-    tip_rate: Array
-    tip_rhs: Array
-    progress_lower: float
-    progress_upper: float
-    progress_gradient: float
-    progress_curvature: float
-    clearance: ClearanceRows
-    actuator_gradient: Array
-    member_rows: MemberRows
-
-    @classmethod
-    def of(cls, bays: Bays, numbers: StepNumbers) -> RowNumbers:
-        """Return those of `numbers`."""
-        rows = cast(LengthRowsLike, numbers.motion)
-        return cls(
-            lower=numbers.lower,
-            upper=numbers.upper,
-            tip_jacobian=numbers.tip_jacobian,
-            tip_rate=numbers.tip_rate,
-            tip_rhs=numbers.tip_rhs,
-            progress_lower=numbers.progress_lower,
-            progress_upper=numbers.progress_upper,
-            progress_gradient=numbers.progress_gradient,
-            progress_curvature=numbers.progress_curvature,
-            clearance=numbers.clearance,
-            actuator_gradient=numbers.actuator_gradient,
-            member_rows=lambda members: (bays.member_nodes[members], rows.gradient[members]),
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class RowTable:
     """All rows with bounds of one QP: tip, locked members, progress, actuators, clearance, in this order.
 
     Attributes
     ----------
-    layout : Layout
     numbers : RowNumbers
-    locked : (l,) int
-        Fixed members that are held by a row of their own.
-    lower, upper : (total,)
+    locked, actuators, clearance : slice
+        The first are fixed members that are held by a row of their own.
     equal : int
-        Number of equalities, which come first.
-    actuators, clearance : slice
-        Where the actuators' bounds and the clearance rows are.
+        Number of equalities, which come first; the progress is the next row.
+    lower, upper : (total,)
     """
 
-    layout: Layout
-    numbers: RowNumbers
-    locked: Index
-    lower: Array
-    upper: Array
-    equal: int
-    actuators: slice
-    clearance: slice
-
-    @classmethod
-    def of(cls, layout: Layout, numbers: RowNumbers, locked: Index) -> RowTable:
-        """Return the table of `numbers`."""
-        held = np.zeros(len(locked))
-        clearance = numbers.clearance.lower
-        lower = [numbers.tip_rhs, held, np.array([numbers.progress_lower]), numbers.lower, clearance]
-        upper = [
-            numbers.tip_rhs,
-            held,
-            np.array([numbers.progress_upper]),
-            numbers.upper,
-            np.full(len(clearance), UNBOUNDED),
-        ]
-        equal = len(numbers.tip_rhs) + len(locked)
-        first_clearance = equal + 1 + len(numbers.lower)
-        return cls(
-            layout,
-            numbers,
-            locked,
-            np.concatenate(lower),
-            np.concatenate(upper),
-            equal,
-            slice(equal + 1, first_clearance),
-            slice(first_clearance, first_clearance + len(clearance)),
-        )
+    def __init__(self, layout: Layout, numbers: RowNumbers, locked: Index, member_rows: MemberRows) -> None:
+        self.numbers, self._arm, self._member_rows = numbers, layout.arm, member_rows
+        self._tip, near, held = len(numbers.tip_rhs), len(numbers.clearance), np.zeros(len(locked))
+        self.equal = self._tip + len(locked)
+        self.locked = slice(self._tip, self.equal)
+        self.actuators = slice(self.equal + 1, self.equal + 1 + len(numbers.lower))
+        self.clearance = slice(self.actuators.stop, self.actuators.stop + near)
+        known, lower, free = [numbers.tip_rhs, held], numbers.clearance.lower, np.full(near, UNBOUNDED)
+        self.lower = np.concatenate([*known, [numbers.progress_lower], numbers.lower, lower])
+        self.upper = np.concatenate([*known, [numbers.progress_upper], numbers.upper, free])
+        self._members = np.concatenate([locked, [-1], layout.arm.actuators])
 
     def values(self, moved: Moved, strokes: Array, held: Array, progress: float) -> Array:
         """Return (total,) row values at displacements of the nodes.
@@ -130,76 +70,53 @@ class RowTable:
         `strokes` (n_a,) and `held` (l,) are the changes of the actuated and of the locked members' lengths.
         """
         numbers, clearance = self.numbers, self.numbers.clearance
-        tip = moved(self.layout.arm.end_effector.nodes).reshape(-1)
-        return np.concatenate(
-            [
-                numbers.tip_jacobian @ tip - numbers.tip_rate * progress,
-                held,
-                [progress],
-                strokes,
-                np.einsum("rsc,rsc->r", clearance.coefficients, moved(clearance.nodes)),
-            ]
-        )
-
-    def violation(self, values: Array) -> Array:
-        """Return (total,) how far the values are out of their bounds; not positive where they are not."""
-        return np.maximum(self.lower - values, values - self.upper)
+        tip = numbers.tip_jacobian @ moved(self._arm.end_effector.nodes).reshape(-1)
+        near = np.einsum("rsc,rsc->r", clearance.coefficients, moved(clearance.nodes))
+        return np.concatenate([tip - numbers.tip_rate * progress, held, [progress], strokes, near])
 
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
         """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
-        numbers, tip_nodes = self.numbers, self.layout.arm.end_effector.nodes
-        tip = len(numbers.tip_rhs)
-        if rows.max() < tip + (not len(self.locked)):
-            every = np.vstack([numbers.tip_jacobian, np.zeros_like(numbers.tip_jacobian[:1])])
-            on_tip = every[rows].reshape(len(rows), -1, 3)
-            return np.tile(tip_nodes, (len(rows), 1)), on_tip, np.append(-numbers.tip_rate, 1.0)[rows]
-        is_stroke = (rows >= self.actuators.start) & (rows < self.clearance.start)
-        is_held = (rows >= tip) & (rows < self.equal)
-        members = np.empty(len(rows), dtype=np.int64)
-        members[is_stroke] = self.layout.arm.actuators[rows[is_stroke] - self.actuators.start]
-        members[is_held] = self.locked[rows[is_held] - tip]
-        along = np.flatnonzero(is_stroke | is_held)
-        member_nodes, gradients = numbers.member_rows(members[along])
-        width = max(len(tip_nodes), member_nodes.shape[1], numbers.clearance.nodes.shape[1])
+        numbers, clearance, tip_nodes = self.numbers, self.numbers.clearance, self._arm.end_effector.nodes
+        progress = (rows == self.equal).astype(float)
+        at_tip = np.flatnonzero(rows < self._tip)
+        progress[at_tip] = -numbers.tip_rate[rows[at_tip]]
+        on_tip = numbers.tip_jacobian[rows[at_tip]].reshape(len(at_tip), len(tip_nodes), 3)
+        parts = [(at_tip, tip_nodes[None], on_tip)]
+        is_near = rows >= self.clearance.start
+        at_members = np.flatnonzero((rows >= self._tip) & (rows != self.equal) & ~is_near)
+        if len(at_members):
+            parts.append((at_members, *self._member_rows(self._members[rows[at_members] - self._tip])))
+        if is_near.any():
+            at_near = np.flatnonzero(is_near)
+            near = rows[at_near] - self.clearance.start
+            parts.append((at_near, clearance.nodes[near], clearance.coefficients[near]))
+        width = max(named.shape[1] for _, named, _ in parts)
         nodes, coefficients = np.zeros((len(rows), width), dtype=np.int64), np.zeros((len(rows), width, 3))
-        progress = np.zeros(len(rows))
-
-        def put(where: Index, named: Index, values: Array) -> None:
-            nodes[where, : named.shape[-1]] = named
-            coefficients[where, : named.shape[-1]] = values
-
-        put(along, member_nodes, gradients)
-        where = np.flatnonzero(rows < tip)
-        put(where, tip_nodes, numbers.tip_jacobian[rows[where]].reshape(len(where), len(tip_nodes), 3))
-        progress[where] = -numbers.tip_rate[rows[where]]
-        progress[rows == self.equal] = 1.0
-        where = np.flatnonzero(rows >= self.clearance.start)
-        near = rows[where] - self.clearance.start
-        put(where, numbers.clearance.nodes[near], numbers.clearance.coefficients[near])
+        for where, named, values in parts:
+            nodes[where, : named.shape[1]] = named
+            coefficients[where, : named.shape[1]] = values
         return nodes, coefficients, progress
 
     def nodal_forces(self, multipliers: Array) -> Array:
         """Return (N, 3) the tip's and clearance rows' multipliers (total,) times their coefficients."""
-        numbers, arm = self.numbers, self.layout.arm
-        forces = np.zeros((len(arm.node_names), 3))
-        tip = multipliers[: len(numbers.tip_rhs)] @ numbers.tip_jacobian
-        np.add.at(forces, arm.end_effector.nodes, tip.reshape(-1, 3))
+        numbers, clearance = self.numbers, self.numbers.clearance
+        forces = np.zeros((len(self._arm.node_names), 3))
+        tip = multipliers[: self._tip] @ numbers.tip_jacobian
+        np.add.at(forces, self._arm.end_effector.nodes, tip.reshape(-1, 3))
         active = np.flatnonzero(multipliers[self.clearance])
-        pressing = multipliers[self.clearance][active, None, None] * numbers.clearance.coefficients[active]
-        np.add.at(forces, numbers.clearance.nodes[active], pressing)
+        pressing = multipliers[self.clearance][active, None, None] * clearance.coefficients[active]
+        np.add.at(forces, clearance.nodes[active], pressing)
         return forces
 
-    def key(self, row: int) -> tuple[object, ...]:
+    def key(self, row: int) -> Key:
         """Return what names the row in the next QP, where clearance rows may be others."""
-        if row < self.clearance.start:
-            return (row,)
-        return ("clearance", self.numbers.clearance.nodes[row - self.clearance.start].tobytes())
+        near = row - self.clearance.start
+        return row if near < 0 else self.numbers.clearance.nodes[near].tobytes()
 
-    def remembered(self, keys: set[tuple[object, ...]]) -> list[int]:
-        """Return the inequality rows that `keys` name."""
-        found = [key[0] for key in keys if len(key) == 1]
-        rows = [row for row in found if isinstance(row, int) and self.equal <= row < self.clearance.start]
-        if len(found) < len(keys):
+    def remembered(self, keys: set[Key]) -> list[int]:
+        """Return the rows that `keys` name."""
+        rows = [key for key in keys if isinstance(key, int)]
+        if len(rows) < len(keys):
             rows += [k for k in range(self.clearance.start, len(self.lower)) if self.key(k) in keys]
         return sorted(rows)
 
@@ -267,91 +184,47 @@ def dual_solution(
     return multipliers, answer.iterations
 
 
-@dataclass(frozen=True, eq=False)
-class Point:
-    """A primal point of the QP and its row values.
+class Answer(NamedTuple):
+    """The dual answer of a QP, and its rows where the Lagrangian is least.
 
     Attributes
     ----------
-    nodes : (N, 3)
-    vertices : (V, 3)
-    progress : float
-    values : (total,)
-    """
-
-    nodes: Array
-    vertices: Array
-    progress: float
-    values: Array
-
-
-class Eliminated(Protocol):
-    """A QP whose unknowns are eliminated: H = L L' for some L that only it knows."""
-
-    def columns(self, table: RowTable, rows: Index) -> Array:
-        """Return (size, len(rows)) L^-1 A' of the given rows A."""
-        ...
-
-    def values(self, table: RowTable, combined: Array) -> Array:
-        """Return (total,) the row values where the Lagrangian is least, given columns times multipliers (size,)."""
-        ...
-
-    def point(self, values: Array) -> Point:
-        """Return the point whose `values` were asked for last."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """The primal and dual answer of a QP.
-
-    Attributes
-    ----------
-    table : RowTable
-    point : Point
-    multipliers : (total,)
-        Positive at upper and negative at lower bounds.
-    iterations : int
-        Of the dual QPs.
+    values, multipliers : (total,)
+        Multipliers are positive at upper and negative at lower bounds.
     rows : list of int
         Those that were in the dual QP, equalities first.
-    columns, gram : (size, R), (R, R)
-        Their columns, and what these are multiplied with each other.
+    columns : (size, R)
+        Their columns.
+    iterations : int
+        Of the dual QPs.
     """
 
-    table: RowTable
-    point: Point
+    values: Array
     multipliers: Array
-    iterations: int
     rows: list[int]
     columns: Array
-    gram: Array
-
-    @property
-    def active(self) -> set[tuple[object, ...]]:
-        """Keys of the active inequalities."""
-        return {self.table.key(k) for k in np.flatnonzero(self.multipliers).tolist() if k >= self.table.equal}
-
-    def solution(self) -> StepSolution:
-        """Return the answer in the arm's terms."""
-        table, point = self.table, self.point
-        return StepSolution(
-            nodes=point.nodes,
-            actuators=point.values[table.actuators].copy(),
-            vertices=point.vertices,
-            progress=point.progress,
-            actuator_multipliers=self.multipliers[table.actuators].copy(),
-            clearance_multipliers=-self.multipliers[table.clearance],
-            iterations=self.iterations,
-        )
+    iterations: int
 
 
 def solve_rows(
-    problem: Eliminated, size: int, table: RowTable, remembered: set[tuple[object, ...]], block: int = 8
+    table: RowTable,
+    size: int,
+    find_columns: Callable[[Index], Array],
+    find_values: Callable[[Array], Array],
+    remembered: set[Key],
 ) -> Answer:
     """Return the answer of a QP with the rows of `table`; `remembered` are keys of those active before.
 
     Rows enter the dual QP when they are violated, the worst first, and stay: so it ends.
+
+    Parameters
+    ----------
+    size
+        Of L, where H = L L' is the Hessian.
+    find_columns
+        Gives L^-1 A' (size, R) of rows A.
+    find_values
+        Gives the row values (total,) where the Lagrangian is least, from columns times multipliers (size,).
 
     Raises
     ------
@@ -361,20 +234,19 @@ def solve_rows(
         A dual QP was not solved, or rounding kept a row out of its bounds.
     """
     rows: list[int] = []
-    columns = np.zeros((size, 0))
-    gram = np.zeros((0, 0))
+    columns, gram = np.zeros((size, 0)), np.zeros((0, 0))
     multipliers = np.zeros(0)
     iterations, refined = 0, 0
     new = [*range(table.equal), *table.remembered(remembered)]
-    values = problem.values(table, np.zeros(size))
+    values = find_values(np.zeros(size))
     while True:
-        violation = table.violation(values)
+        violation = np.maximum(table.lower - values, values - table.upper)
         violated = np.flatnonzero(violation > _VIOLATED)
         known = {*rows, *new}
         outside = np.array([k for k in violated.tolist() if k not in known], dtype=np.int64)
-        room = block * max(1, len(outside) // (4 * block))
+        room = BLOCK * max(1, len(outside) // (4 * BLOCK))
         if not rows:
-            room = max(0, -len(new) % block)
+            room = max(0, -len(new) % BLOCK)
         new += outside[np.argsort(-violation[outside])][:room].tolist()
         if not new:
             if not len(violated):
@@ -383,13 +255,10 @@ def solve_rows(
             if refined > _REFINEMENTS:
                 raise SolverError(f"rounding left a row {violation.max():.1e} m or rad out of its bounds")
         else:
-            added = problem.columns(table, np.array(new, dtype=np.int64))
+            added = find_columns(np.array(new, dtype=np.int64))
             columns = np.hstack([columns, added])
-            grown = np.empty((columns.shape[1],) * 2)
-            grown[: len(gram), : len(gram)] = gram
-            grown[:, len(gram) :] = columns.T @ added
-            grown[len(gram) :] = grown[:, len(gram) :].T
-            gram = grown
+            grown = columns.T @ added
+            gram = np.vstack([np.hstack([gram, grown[: len(rows)]]), grown.T])
             rows += new
             multipliers = np.concatenate([multipliers, np.zeros(len(new))])
             new = []
@@ -402,7 +271,7 @@ def solve_rows(
             index < table.equal,
         )
         iterations += count
-        values = problem.values(table, columns @ multipliers)
+        values = find_values(columns @ multipliers)
     every = np.zeros(len(table.lower))
     every[rows] = multipliers
-    return Answer(table, problem.point(values), every, iterations, rows, columns, gram)
+    return Answer(values, every, rows, columns, iterations)

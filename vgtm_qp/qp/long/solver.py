@@ -1,0 +1,150 @@
+"""The step's QP of a long arm, exactly and at a cost linear in its bays; the eliminations along them differ."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.long.chain_data import ChainData
+from vgtm_qp.qp.long.elimination import Elimination
+from vgtm_qp.qp.long.sweep import ChainClosing
+from vgtm_qp.qp.long.working_set import Answer, Key, Moved, RowTable, solve_rows
+from vgtm_qp.qp.numbers import RowNumbers, StepNumbers, StepSolution, beyond, norm
+from vgtm_qp.qp.residual import refuse_large, relative
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
+
+
+class ChainSolver(ABC):
+    """Solves the QP of a step with its unknowns eliminated: its Hessian is L L' for an L that a subclass knows.
+
+    Rows with bounds meet in a small dense QP of their own. The progress is the last of the unknowns, and no other
+    term of the objective knows it.
+
+    Attributes
+    ----------
+    layout : Layout
+    chain : Chain
+    data : ChainData
+        The numbers of the QP except those of ``RowNumbers``.
+    """
+
+    knows_gain = False
+
+    def __init__(self, elimination: Elimination, size: int, *, is_reversed: bool) -> None:
+        chain = self.chain = elimination.chain
+        self.layout = chain.layout
+        self.data = ChainData(chain, elimination.inputs.sizes, is_reversed=is_reversed)
+        self._size, self._curve = size, elimination.curve
+        self._free = np.zeros(self._curve)
+        at = np.argsort(chain.members.reshape(-1))
+        self._strokes_at, self._held_at = at[chain.bays.actuators], at[chain.locked]
+        soft = np.cumsum(np.tile(chain.soft, chain.periods)) - 1
+        self._among_soft = soft[self._strokes_at]
+        self._active: set[Key] = set()
+        self._last: tuple[RowTable, Answer] | None = None
+
+    def solve(self, numbers: StepNumbers) -> StepSolution:
+        """Solve one QP.
+
+        Raises
+        ------
+        InfeasibleStepError
+            The hard rows contradict one another.
+        SolverError
+            The QP is singular, or the answer failed the residual check.
+        """
+        self.data.fill(numbers)
+        return self.solve_filled(numbers)
+
+    def solve_filled(self, numbers: RowNumbers) -> StepSolution:
+        """Solve the QP whose other numbers were written to `data`; see :meth:`solve`."""
+        self._last = None
+        self._eliminate()
+        if not numbers.progress_curvature > 0.0:
+            raise SolverError(SINGULAR)
+        table = RowTable(self.layout, numbers, self.chain.locked, self.data.member_rows)
+        scale = 1.0 / np.sqrt(numbers.progress_curvature)
+        progress = 0.0
+
+        def columns(rows: Index) -> Array:
+            nodes, coefficients, along = table.coefficients(rows)
+            return np.vstack([self._columns(nodes, coefficients), scale * along])
+
+        def values(combined: Array) -> Array:
+            nonlocal progress
+            progress = -scale * (scale * numbers.progress_gradient + float(combined[-1]))
+            return table.values(*self._least(combined[:-1]), progress)
+
+        answer = solve_rows(table, self._size + 1, columns, values, self._active)
+        nodes, vertices = self._nodes(), self.data.vertices(self._free)
+        self._check(table, answer, nodes, vertices)
+        self._last, (found, multipliers) = (table, answer), answer[:2]
+        self._active = {table.key(k) for k in np.flatnonzero(multipliers).tolist() if k >= table.equal}
+        return StepSolution(
+            nodes=nodes,
+            actuators=found[table.actuators].copy(),
+            vertices=vertices,
+            progress=progress,
+            actuator_multipliers=multipliers[table.actuators].copy(),
+            clearance_multipliers=-multipliers[table.clearance],
+            iterations=answer.iterations,
+        )
+
+    def gain(self, held: NDArray[np.bool_]) -> Array | None:  # noqa: ARG002
+        """See ``solvers.StepSolver``."""
+        return None
+
+    def _check(self, table: RowTable, answer: Answer, nodes: Array, vertices: Array) -> None:
+        """Refuse an answer whose primal or dual residual is too large."""
+        weights, values, multipliers = self.layout.weights, answer.values, answer.multipliers
+        nodal = weights.node_rate * nodes + table.nodal_forces(multipliers)
+        strokes = values[table.actuators]
+        forces = np.zeros(self.chain.bays.member_count)
+        forces[self._strokes_at] = (
+            (weights.actuator_rate + weights.stroke_centring) * strokes
+            + table.numbers.actuator_gradient
+            + multipliers[table.actuators]
+        )
+        forces[self._held_at] = multipliers[table.locked]
+        left, dual = self._residuals(nodes, vertices, strokes, nodal, forces.reshape(self.chain.periods, -1))
+        primal = norm(np.concatenate([left, beyond(values, table.lower, table.upper)]))
+        refuse_large(primal, relative(norm(dual), forces, multipliers), "the elimination")
+
+    @abstractmethod
+    def closing(self) -> ChainClosing:
+        """Return what brings members to their lengths with what the QP solved last has factorised."""
+
+    @abstractmethod
+    def _eliminate(self) -> None:
+        """Factorise the Hessian that `data` make; raise SolverError where it is singular."""
+
+    @abstractmethod
+    def _columns(self, nodes: Index, coefficients: Array) -> Array:
+        """Return (size, R) L^-1 A' of rows A: nodes (R, Q), coefficients (R, Q, 3)."""
+
+    @abstractmethod
+    def _least(self, combined: Array) -> tuple[Moved, Array, Array]:
+        """Go where the Lagrangian is least, given columns times multipliers (size,).
+
+        Return the nodes' displacements there and the changes of actuated (n_a,) and locked (l,) members.
+        """
+
+    @abstractmethod
+    def _nodes(self) -> Array:
+        """Return (N, 3) the nodes' displacements where the Lagrangian is least, m."""
+
+    @abstractmethod
+    def _residuals(
+        self, nodes: Array, vertices: Array, strokes: Array, nodal: Array, forces: Array
+    ) -> tuple[Array, Array]:
+        """Return what is left of the equalities, m, and of stationarity.
+
+        Given are displacements (N, 3), (V, 3), (n_a,), and gradients by nodes (N, 3) and members (n, 3m).
+        """
