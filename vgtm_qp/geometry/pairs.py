@@ -92,30 +92,6 @@ class Contacts:
         return Contacts(**{column: getattr(self, column)[rows] for column in _COLUMNS}, names=self.names)
 
 
-def no_contacts(names: PairNames) -> Contacts:
-    """Return no rows."""
-    index, number = np.zeros(0, dtype=np.int64), np.zeros(0)
-    return Contacts(
-        distance=number,
-        normal=np.zeros((0, 3)),
-        points=np.zeros((0, 4), dtype=np.int64),
-        weights=np.zeros((0, 4)),
-        is_self=np.zeros(0, dtype=bool),
-        normal_speed=number,
-        body=index,
-        other=index,
-        names=names,
-    )
-
-
-def join(parts: list[Contacts], none: Contacts) -> Contacts:
-    """Return all rows of `parts`, one after the other, or `none` where there is no part."""
-    if len(parts) <= 1:
-        return parts[0] if parts else none
-    columns = {column: np.concatenate([getattr(part, column) for part in parts]) for column in _COLUMNS}
-    return Contacts(**columns, names=none.names)
-
-
 @dataclass(frozen=True, eq=False)
 class BetweenReport:
     """What was proven about a motion from one state to the next.

@@ -32,7 +32,9 @@ class Obstacle:
     shape : str
         ``"box"``, ``"sphere"``, ``"cylinder"`` or ``"triangle"`` (a mesh).
     pieces : (P, 15)
-        Parameters of each piece at time 0, see :func:`vgtm_qp.geometry.exact.parameters_of`.
+        Of each piece at time 0: center (3), rotation (9, row-major, columns are its axes) and half sizes of a box (3),
+        radius of a sphere, or radius and half height of a cylinder (third axis), then zeros; or of a triangle the
+        vertices (9), counter-clockwise seen from outside, then zeros.
     velocity : (3,)
         m/s.
     solid : bool
@@ -52,10 +54,7 @@ class Obstacle:
             corners = pieces[:, :9].reshape(-1, 3, 3)
             centers = corners.mean(axis=1)
             return centers, np.asarray(np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1))
-        if self.shape == "sphere":
-            return pieces[:, :3], pieces[:, 3]
-        sizes = pieces[:, 12:15] if self.shape == "box" else pieces[:, 12:14]
-        return pieces[:, :3], np.asarray(np.linalg.norm(sizes, axis=1))
+        return pieces[:, :3], np.asarray(np.linalg.norm(pieces[:, 12:], axis=1))
 
 
 def box(
@@ -87,10 +86,7 @@ def box(
 
 def sphere(name: str, center: ArrayLike, radius: float, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> Obstacle:
     """Return a sphere; `center` and `radius` in m. Raises as `box`."""
-    piece = np.zeros((1, WIDTH))
-    piece[0, :3] = _vector(name, "center", center)
-    piece[0, 3] = _positive(name, np.array([radius]))[0]
-    return Obstacle(name, "sphere", piece, _vector(name, "velocity", velocity))
+    return _placed(name, "sphere", center, None, np.array([radius]), velocity)
 
 
 def cylinder(
