@@ -143,7 +143,9 @@ def test_bounds_of_what_bends_never_exceed_the_distances(seed, rods, refreshed):
         check_bounds(candidates, candidates.motion(before, 0.0), every_distance(monitor, before))
         check_bounds(candidates, candidates.motion(before, 0.0, state, 0.0), every_distance(monitor, state))
         if refreshed:
-            candidates.refresh(state, 0.0)
+            for group in candidates.groups:
+                candidates.count_unneeded(group, 10**6)
+            candidates.refresh_where_due(state, 0.0)
             check_bounds(candidates, candidates.motion(state, 0.0), every_distance(monitor, state))
         before = state
 

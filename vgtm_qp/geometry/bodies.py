@@ -53,17 +53,8 @@ def capsules(
 ) -> Bodies:
     """Return capsules (B) between `points` (B, 2).
 
-    Parameters
-    ----------
-    points : (B, 2) int
-    radius : float or (B,)
-        m.
-    names
-        By default ``"0"``, ``"1"``...
-    joints : (B, 2) int, optional
-        By default the points: bodies that share a point are neighbours.
-    kind
-        What a body is called in the names of rows.
+    The radius, m, may be one for all. Names are by default ``"0"``, ``"1"``..., and the joints (B, 2) the points:
+    bodies that share a point are neighbours.
     """
     span = np.asarray(points, dtype=np.int64).reshape(-1, 2)
     return Bodies(

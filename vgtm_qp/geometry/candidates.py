@@ -118,28 +118,16 @@ class Candidates:
         self_horizon = max(self_reach, self._self_influence) + self._influence + 2.0 * travel
         if len(bodies) * (len(bodies) + len(pieces)) <= _FEW_PAIRS:
             # A list of all pairs never needs another broad phase, which would cost more than the far pairs in it.
-            horizon = self_horizon = 2.0 * self.extent(X, time) + horizon + self_horizon
+            horizon = self_horizon = FAR
         if not self._lists:
-            self._start(X, time, self_horizon)
+            self._lists = _PairList(X, time), _PairList(X, time), _PairList(X, time)
+            if self._scene.has_self:
+                self.renew_bodies(X, time, self_horizon)
         elif not far_self >= self_reach:
             self._follow_bodies(X, time, self_reach, travel, self_horizon)
         if not far >= reach:
             self._renew_pieces(X, time, horizon)
         return self.motion(X, time, end, end_time)
-
-    def extent(self, X: Array, time: float) -> float:
-        """Return a length that no distance exceeds, m."""
-        pieces = self._scene.pieces
-        points = np.vstack([X, pieces.center + time * pieces.velocity])
-        return float(np.linalg.norm(np.ptp(points, axis=0)))
-
-    def _start(self, X: Array, time: float, horizon: float) -> None:
-        self._lists = _PairList(X, time), _PairList(X, time), _PairList(X, time)
-        self._seen, self._bent = X, 0.0
-        self._is_bending = np.zeros(0, dtype=bool)
-        self._bending_points = np.zeros(0, dtype=np.int64)
-        if self._scene.has_self:
-            self.renew_bodies(X, time, horizon)
 
     def _renew_pieces(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of a body and a piece that are nearer than `horizon`, m, at `X`, the new reference."""
@@ -158,6 +146,7 @@ class Candidates:
         # Twice as far, so that parts may come somewhat nearer before their bodies have to be listed.
         self._parts = Parts(bodies, X, 2.0 * horizon)
         self._is_bending = np.zeros(len(self._parts.near), dtype=bool)
+        self._bending_points = np.zeros(0, dtype=np.int64)
         self._lists[_BENDING].renew([], X, time, np.inf)
         pairs = _near_bodies(X, bodies, np.arange(len(bodies)), horizon)
         self._lists[_RIGID].renew([Group(self._scene, "segment", *pairs, place=_RIGID)], X, time, horizon)
@@ -210,17 +199,14 @@ class Candidates:
         self._lists[group.place].unneeded += count
 
     def refresh_where_due(self, X: Array, time: float) -> None:
-        """Move the references of those lists whose unneeded evaluations have cost as much as that does."""
+        """Move the references of those lists to `X` whose unneeded evaluations have cost as much as that does.
+
+        There is no broad phase: the horizons shrink by the displacement of the bodies.
+        """
         for place, pairs in enumerate(self._lists):
             # For rigid parts, how the arm has bent has to be computed as well.
             if pairs.unneeded > len(pairs) + (len(self._scene.bodies) if place == _RIGID else 0):
                 self._refresh(place, X.copy(), time)
-
-    def refresh(self, X: Array, time: float) -> None:
-        """Move all references to `X` without a broad phase: the horizons shrink by the displacement of the bodies."""
-        X = X.copy()
-        for place in range(3 if self._scene.has_self else 1):
-            self._refresh(place, X, time)
 
     def _refresh(self, place: int, X: Array, time: float) -> None:
         pairs = self._lists[place]

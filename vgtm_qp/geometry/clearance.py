@@ -42,11 +42,6 @@ class Clearance:
         Surface distance to keep, and that from which a pair is near, m.
     self_collision : bool
         Whether pairs of bodies that are not neighbours count.
-    self_influence : float or None
-        The same as `influence` for two bodies; by default at most twice `safe` and the largest radius
-        together.
-    fcl_reach : float or None
-        Pairs nearer than this are asked of FCL too; by default 2.5 `safe`.
     watch : bool
         Whether small scenes at rest are watched; the answers are the same.
     """
@@ -59,17 +54,13 @@ class Clearance:
         safe: float,
         influence: float,
         self_collision: bool = True,
-        self_influence: float | None = None,
-        fcl_reach: float | None = None,
         watch: bool = True,
     ) -> None:
         self.scene = Scene(bodies, obstacles, has_self=self_collision)
         self.bodies, self.obstacles, self.self_collision = bodies, self.scene.obstacles, self_collision
         self.pieces, self.names, self.fcl = self.scene.pieces, self.scene.names, self.scene.fcl
         self.safe, self.influence = safe, influence
-        widest = 2.0 * (safe + float(bodies.radius.max(initial=0.0)))
-        self.self_influence = min(influence, widest) if self_influence is None else self_influence
-        self.fcl_reach = 2.5 * safe if fcl_reach is None else fcl_reach
+        self.self_influence = min(influence, 2.0 * (safe + float(bodies.radius.max(initial=0.0))))
         self.is_watched = watch and can_be_watched(self.scene)
         self.scene.prepare(watched=self.is_watched)
         self._watch = Watch(self.scene) if self.is_watched else None
@@ -98,16 +89,16 @@ class Clearance:
         time : float
             s.
         reach, self_reach : float or None
-            m; by default `influence` and the lesser of `reach` and `self_influence`.
+            m; by default `influence`, and for two bodies no more than twice `safe` and the largest radius together.
         fcl_reach : float or None
-            Pairs nearer than this, m, are asked of python-fcl too, and each answer is checked; by default that of
-            this object. Zero asks for none.
+            Pairs nearer than this, m, are asked of python-fcl too, and each answer is checked; by default 2.5 `safe`.
+            Zero asks for none.
         tracked : bool
             Whether `X` is a state of a motion, which :meth:`between` is asked to go on from. A watched scene is then
             evaluated from state to state. Positions that are only tried would make the watch go there and back.
         """
         reach = self.influence if reach is None else reach
-        fcl_reach = self.fcl_reach if fcl_reach is None else fcl_reach
+        fcl_reach = 2.5 * self.safe if fcl_reach is None else fcl_reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
         if tracked and self._watch is not None:
             watched = self._watch.near(X, reach, self_reach, fcl_reach)
@@ -169,9 +160,8 @@ class Clearance:
                     if row >= 0:
                         pair = Pair(int(group.body[row]), int(group.other[row]), group.is_self)
             far, far_self = candidates.beyond(motion)
-            extent = candidates.extent(X, time) if best > min(far, far_self) else 0.0
-            search = False in wanted and len(self.pieces) > 0 and far < min(best, extent)
-            search_self = True in wanted and far_self < min(best, extent)
+            search = False in wanted and far < min(best, FAR)
+            search_self = True in wanted and far_self < min(best, FAR)
             if not (search or search_self):
                 candidates.refresh_where_due(X, time)
                 return best, pair
@@ -234,7 +224,7 @@ class Clearance:
             rows = np.flatnonzero(open_)
             if len(rows):
                 result = sweep_group(group, rows, start, end, start_time, end_time, least)
-                lowest = min(lowest, result.proven, result.worst)
+                lowest = min(lowest, result.lowest)
                 if len(result.rows):
                     parts.append((group.numbers[result.rows], result.contacts))
                     fractions.append(result.fraction)

@@ -21,9 +21,6 @@ WIDTH = 15
 CONTACT = 8
 """Numbers that describe a contact."""
 
-KNOWN = WIDTH + 4
-"""Numbers that describe a pair before a motion, see :func:`follow_function`."""
-
 SECOND_CONTACT = 0.2
 """Two contacts of a body with one piece are apart by at least this fraction of the body's length."""
 
@@ -107,7 +104,7 @@ def follow_function(shape: str) -> ca.Function:
     :func:`_turning_gap`. Where axis and piece intersect, the distance is minus the radius and the other numbers mean
     nothing.
     """
-    both, known = ca.SX.sym("ends", 24), ca.SX.sym("known", KNOWN)
+    both, known = ca.SX.sym("ends", 24), ca.SX.sym("known", WIDTH + 4)
     states = both[:12], both[12:]
     piece, radius, normal = known[:WIDTH], known[WIDTH], known[WIDTH + 1 :]
     bodies = [state[:6] for state in states]

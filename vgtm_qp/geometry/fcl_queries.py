@@ -41,21 +41,16 @@ class FclQueries:
         self.asked = self.replaced = 0
         self._pieces = pieces
         self._objects: dict[int, Any] = {}
-        self._body: Any = None
-
-    def _start(self) -> None:
-        import fcl
-
-        self._fcl = fcl
-        self._capsule = fcl.Capsule(0.0, 1.0)
-        self._body = fcl.CollisionObject(self._capsule, fcl.Transform())
-        self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
 
     def _object(self, piece: int) -> Any:
-        if self._body is None:
-            self._start()
         if piece not in self._objects:
-            fcl, shape, row = self._fcl, self._pieces.shape[piece], self._pieces.parameters[piece]
+            import fcl
+
+            if not self._objects:
+                self._fcl, self._capsule = fcl, fcl.Capsule(0.0, 1.0)
+                self._body = fcl.CollisionObject(self._capsule, fcl.Transform())
+                self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
+            shape, row = self._pieces.shape[piece], self._pieces.parameters[piece]
             if shape == "sphere":
                 geometry = fcl.Sphere(row[12])
             elif shape == "box":

@@ -174,20 +174,11 @@ def _segment_box(ends: Any, piece: Any, *, apart: bool = False) -> tuple[Symboli
 def _solid_contacts(
     u: Any, turn: Any, excess: Callable[[Any], Any], t_outside: Any, depth: Any | None, breaks: list[Any]
 ) -> tuple[SymbolicContact, SymbolicContact]:
-    """Return the contacts of a segment along `u`, (3,), given in the frame of a solid piece.
+    """Return the contacts of a segment along `u`, (3,), in the frame of a solid piece, which `turn` leads out of.
 
-    Parameters
-    ----------
-    turn : (3, 3)
-        From that frame to the base.
-    excess
-        From a parameter to the vector from the piece to that point of the segment; zero inside.
-    t_outside
-        Parameter of the nearest point where the two do not intersect.
-    depth : (5,) or None
-        Depth, parameter and exit normal where they do; None where that is not wanted.
-    breaks
-        Parameters where a contact interval may end.
+    `excess` is the vector from the piece to the segment at a parameter, zero inside; `t_outside` the parameter of the
+    nearest point where the two do not intersect; `depth` the depth, parameter and exit normal (5,) where they do, or
+    None where that is not wanted. A contact interval may end at the parameters `breaks`.
     """
     gap = excess(t_outside)
     outside = norm(gap)

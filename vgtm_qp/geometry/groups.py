@@ -25,6 +25,9 @@ Found = tuple[Index, Array]
 _FIRST = 16
 """The least distance is searched for among so many pairs first: those that were nearest at the reference."""
 
+_RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
+"""From the shifts of both ends of two bodies to that of one middle from the other, and half the turns of both."""
+
 _WATCHED = ((follow_function, (1, 128)), (distance_function, (1,)), (sweep_function, (1,)))
 """What is evaluated in a watched scene, and for how many pairs at once,"""
 _LISTED = ((distance_function, (1, 64, 1024)), (sweep_function, (1, 64)))
@@ -99,16 +102,14 @@ class Displacement(NamedTuple):
 
     Attributes
     ----------
-    states : tuple of (P, 3)
-        Positions, or those at both ends of the path, m.
-    reference : (P, 3)
-        m.
+    states, reference : tuple of (P, 3), (P, 3)
+        Positions of one state, or at both ends of the path, m; and those of the reference.
     moved : (P,)
-        How far each point is from its reference, at most, m; for pairs of a body and a piece.
+        How far each point is from its reference, at most, m.
     greatest : float
         By how much the distance of a pair has changed since the reference at most, m.
     elapsed : float
-        s since the reference, in which obstacles move.
+        Since the reference, s, in which obstacles move.
     """
 
     states: tuple[Array, ...]
@@ -178,8 +179,7 @@ class Group:
         """
         displacement = motion[self.place]
         # Only near the head of the sorted list can the motion have mattered.
-        few = len(self) <= 64 and not self.is_self
-        count = len(self) if few else int(np.searchsorted(self.distance, limit + displacement.greatest))
+        count = int(np.searchsorted(self.distance, limit + displacement.greatest))
         if self.is_self:
             bound = self.distance[:count] - self._nearer(displacement, count)
         else:
@@ -194,20 +194,10 @@ class Group:
         That is no more than a point of one has moved relative to a point of the other: no more than their middles
         have, and both have turned about those. On a straight path it is greatest at an end.
         """
-        nearer = np.zeros(count)
-        if count:
-            points = self.points[:count]
-            reference = displacement.reference.take(points, axis=0)
-            for state in displacement.states:
-                shift = state.take(points, axis=0) - reference
-                between = 0.5 * (shift[:, 0] + shift[:, 1] - shift[:, 2] - shift[:, 3])
-                vectors = np.stack(
-                    [between, 0.5 * (shift[:, 1] - shift[:, 0]), 0.5 * (shift[:, 3] - shift[:, 2])], axis=1
-                )
-                np.maximum(
-                    nearer, np.sqrt(np.einsum("ksc,ksc->ks", vectors, vectors)).sum(axis=1), out=nearer
-                )
-        return nearer
+        points = self.points[:count]
+        reference = displacement.reference.take(points, axis=0)
+        shifts = (state.take(points, axis=0) - reference for state in displacement.states)
+        return np.asarray(np.max([np.linalg.norm(_RELATIVE @ x, axis=2).sum(axis=1) for x in shifts], axis=0))
 
     def at(self, X: Array, time: float, rows: Index) -> Array:
         """Return some pairs as the functions of :mod:`vgtm_qp.geometry.exact` take them, (k, 7 + width)."""

@@ -47,15 +47,6 @@ class Obstacle:
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     solid: bool = True
 
-    def bounding_spheres(self) -> tuple[Array, Array]:
-        """Return centers (P, 3) at time 0 and radii (P,) of spheres that hold the pieces, m."""
-        pieces = self.pieces
-        if self.shape == "triangle":
-            corners = pieces[:, :9].reshape(-1, 3, 3)
-            centers = corners.mean(axis=1)
-            return centers, np.asarray(np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1))
-        return pieces[:, :3], np.asarray(np.linalg.norm(pieces[:, 12:], axis=1))
-
 
 def box(
     name: str,
@@ -131,7 +122,13 @@ def mesh(
         vertices, triangles = np.asarray(source[0], dtype=float), np.asarray(source[1], dtype=np.int64)
         surface = trimesh.Trimesh(vertices, triangles, process=True)
     else:
-        surface = _read(name, Path(source))
+        path = Path(source)
+        if path.suffix.lower() not in _MESH_FORMATS:
+            raise GeometryError(f'obstacle "{name}": {path.name} is not one of {", ".join(_MESH_FORMATS)}')
+        try:
+            surface = trimesh.load_mesh(path)
+        except Exception as error:  # a reader of foreign files raises anything
+            raise GeometryError(f'obstacle "{name}": cannot read {path}: {error}') from None
     if len(surface.faces) == 0:
         raise GeometryError(f'obstacle "{name}": the mesh holds no triangle')
     solid = bool(surface.is_watertight)
@@ -145,17 +142,6 @@ def mesh(
     pieces = np.zeros((len(corners), WIDTH))
     pieces[:, :9] = corners.reshape(-1, 9)
     return Obstacle(name, "triangle", pieces, _vector(name, "velocity", velocity), solid)
-
-
-def _read(name: str, path: Path) -> object:
-    import trimesh
-
-    if path.suffix.lower() not in _MESH_FORMATS:
-        raise GeometryError(f'obstacle "{name}": {path.name} is not one of {", ".join(_MESH_FORMATS)}')
-    try:
-        return trimesh.load_mesh(path)
-    except Exception as error:  # a reader of foreign files raises anything
-        raise GeometryError(f'obstacle "{name}": cannot read {path}: {error}') from None
 
 
 def _placed(
@@ -199,17 +185,12 @@ class ObstaclePieces:
 
     Attributes
     ----------
-    parameters : (P, 15)
-        At time 0.
-    shape : (P,) str
-    obstacle : (P,) int
-        Index of the obstacle each belongs to.
-    velocity : (P, 3)
-    speed : (P,)
-    fastest : float
-        Greatest speed, m/s.
-    center, radius : (P, 3), (P,)
-        Bounding spheres at time 0.
+    parameters, center, radius : (P, 15), (P, 3), (P,)
+        At time 0, with their bounding spheres, m.
+    shape, obstacle : (P,) str, (P,) int
+        The latter is the index of the obstacle each belongs to.
+    velocity, speed, fastest : (P, 3), (P,), float
+        m/s; the last one is the greatest speed.
     """
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
@@ -219,14 +200,19 @@ class ObstaclePieces:
         self.obstacle = np.repeat(np.arange(len(obstacles)), counts)
         self.velocity = np.repeat(np.reshape([o.velocity for o in obstacles], (-1, 3)), counts, axis=0)
         self.speed = np.asarray(np.linalg.norm(self.velocity, axis=1))
-        spheres = [o.bounding_spheres() for o in obstacles]
-        self.center = np.vstack([np.zeros((0, 3)), *(s[0] for s in spheres)])
-        self.radius = np.concatenate([np.zeros(0), *(s[1] for s in spheres)])
         self.fastest = float(self.speed.max(initial=0.0))
         self.moving = self.fastest > 0.0
+        triangles = self.shape == "triangle"
+        corners = self.parameters[triangles, :9].reshape(-1, 3, 3)
+        self.center, self.radius = (
+            self.parameters[:, :3].copy(),
+            np.linalg.norm(self.parameters[:, 12:], axis=1),
+        )
+        self.center[triangles] = corners.mean(axis=1)
+        spread = np.linalg.norm(corners - self.center[triangles, None], axis=2)
+        self.radius[triangles] = spread.max(axis=1, initial=0.0)
         self._shift = np.zeros_like(self.parameters)
         self._shift[:, :3] = self.velocity
-        triangles = self.shape == "triangle"
         self._shift[triangles, :9] = np.tile(self.velocity[triangles], 3)
         self._now: tuple[float, Array] = (0.0, self.parameters)
 

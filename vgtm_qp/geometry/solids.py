@@ -12,39 +12,27 @@ Array = NDArray[np.float64]
 _ROWS = 200_000
 
 
-class _Mesh:
-    """Closed triangles (T, 3, 3)."""
-
-    def __init__(self, triangles: Array) -> None:
-        self._triangles = triangles
-        self._low, self._high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-
-    def contains(self, points: Array) -> NDArray[np.bool_]:
-        """Return which of `points` (K, 3) are inside."""
-        inside = ((points >= self._low) & (points <= self._high)).all(axis=1)
-        rows = np.flatnonzero(inside)
-        if len(rows):
-            inside[rows] = winding_number(points[rows], self._triangles) > 0.5
-        return np.asarray(inside)
-
-
 class Solids:
     """The closed meshes of a scene, which may move."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._meshes = {
-            k: _Mesh(obstacle.pieces[:, :9].reshape(-1, 3, 3))
+        meshes = {
+            k: obstacle.pieces[:, :9].reshape(-1, 3, 3)
             for k, obstacle in enumerate(scene.obstacles)
             if obstacle.shape == "triangle" and obstacle.solid
         }
+        self._meshes = [(k, t, t.min(axis=(0, 1)), t.max(axis=(0, 1))) for k, t in meshes.items()]
 
     def enclosed(self, X: Array, time: float) -> list[Found]:
         """Return the bodies with an end inside a closed mesh, at minus their distance to its surface."""
         bodies, pieces = self._scene.bodies, self._scene.pieces
         parts: list[Found] = []
-        for obstacle, mesh in self._meshes.items():
-            inside = mesh.contains(X - time * self._scene.obstacles[obstacle].velocity)
+        for obstacle, triangles, low, high in self._meshes:
+            points = X - time * self._scene.obstacles[obstacle].velocity
+            inside = ((points >= low) & (points <= high)).all(axis=1)
+            if inside.any():
+                inside[inside] = winding_number(points[inside], triangles) > 0.5
             body = np.flatnonzero(inside[bodies.points].any(axis=1))
             if not len(body):
                 continue

@@ -23,23 +23,20 @@ class SweepResult(NamedTuple):
 
     Attributes
     ----------
-    proven : float
-        Least lower bound of the pairs that were certified, m.
+    lowest : float
+        Least lower bound of the pairs that were certified, or least distance found of the others, m.
     rows : (F,) int
         Rows of the group that were not certified.
     fraction : (F,)
         Where on the motion each of those was found nearest, 0 < s <= 1.
     contacts : (F, CONTACT)
         Their contacts there.
-    worst : float
-        Least distance found of the pairs that were not certified, m.
     """
 
-    proven: float
+    lowest: float
     rows: Index
     fraction: Array
     contacts: Array
-    worst: float = np.inf
 
 
 class _Sweep:
@@ -110,9 +107,9 @@ def sweep_group(
         left, right = np.concatenate([left[split], middle]), np.concatenate([middle, right[split]])
         k = np.concatenate([k[split], k[split]])
     chosen = np.flatnonzero(failed)
-    kept = float(proven[~failed].min(initial=np.inf))
+    lowest = float(np.where(failed, worst, proven).min())
     if not len(chosen):
-        return SweepResult(kept, rows[:0], left[:0], np.zeros((0, CONTACT)))
+        return SweepResult(lowest, rows[:0], left[:0], np.zeros((0, CONTACT)))
     fraction = sweep.nearest(chosen, worst[chosen], fraction[chosen])
     contacts = group.evaluate(sweep.at(chosen, fraction))[:, 0]
-    return SweepResult(kept, rows[chosen], fraction, contacts, float(worst[chosen].min()))
+    return SweepResult(lowest, rows[chosen], fraction, contacts)

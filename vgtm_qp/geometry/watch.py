@@ -56,7 +56,7 @@ class _WatchedGroup:
         self._follow = group.scene.batch(follow_function, group.shape)
         self._near = np.zeros(0, dtype=np.int64)
         """Pairs that were evaluated in the present state,"""
-        self._contacts = np.zeros((0, CONTACT))
+        self.contacts = np.zeros((0, CONTACT))
         """and their contacts, two for each."""
         self._is_close = False
         """Whether one of them was nearer than the limit."""
@@ -80,30 +80,25 @@ class _WatchedGroup:
         ends = places.take(self._places.take(near, axis=0), axis=0).reshape(size, 24)
         found = self._follow(ends, self._known.take(near, axis=0))
         self._is_close = bool(found[:, 0].min() < limit)
-        self._contacts = found[:, :-1].reshape(2 * size, CONTACT)
+        self.contacts = found[:, :-1].reshape(2 * size, CONTACT)
         self._known[near, WIDTH + 1 :] = found[:, 5:CONTACT]
         lower[near] = found[:, 0]
         # The bound from the motion alone holds as well.
         self.lowest = float(np.maximum(found[:, -1], lowest).min())
 
-    @property
-    def is_evaluated(self) -> bool:
-        """Whether some pair was evaluated in the present state."""
-        return len(self._near) > 0
-
     def skip(self) -> None:
         """Record that no pair can be near in the present state."""
-        self._near, self._contacts = self._near[:0], self._contacts[:0]
+        self._near, self.contacts = self._near[:0], self.contacts[:0]
         self._is_close, self.lowest = False, np.inf
 
     def near(self, X: Array, limit: float, fcl_reach: float) -> Found:
         """Return the contacts nearer than `limit`, m, in the present state `X`."""
-        rows = (self._contacts[:, 0] < limit).nonzero()[0]
-        found, pairs = self._contacts.take(rows, axis=0), self._near.take(rows >> 1)
+        rows = (self.contacts[:, 0] < limit).nonzero()[0]
+        found, pairs = self.contacts.take(rows, axis=0), self._near.take(rows >> 1)
         if self.group.asks_fcl and fcl_reach > 0.0:
             asked = (found[:, 0] < fcl_reach).nonzero()[0].tolist()
             # Where there is a second contact, the nearest point is not unique.
-            unique = [k for k in asked if rows[k] % 2 == 0 and self._contacts[rows[k] + 1, 0] >= FAR]
+            unique = [k for k in asked if rows[k] % 2 == 0 and self.contacts[rows[k] + 1, 0] >= FAR]
             self.group.ask_fcl(X, 0.0, pairs, found, unique)
         return self.group.numbers.take(pairs, axis=0), found
 
@@ -137,7 +132,7 @@ class Watch:
             [
                 pairs.near(X, limits[pairs.group.is_self], fcl_reach)
                 for pairs in self._groups
-                if pairs.is_evaluated
+                if len(pairs.contacts)
             ]
         )
         return found if not len(found) or found.distance.min() > 0.0 else None
