@@ -6,11 +6,9 @@ from collections.abc import Iterable
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Compiling, Kernel
-
-Array = NDArray[np.float64]
+from vgtm_qp.geometry.bodies import Array
 
 _CAPACITIES = (16, 128, 1024)
 

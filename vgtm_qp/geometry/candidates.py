@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vgtm_qp.geometry.bodies import Bodies
+from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
 from vgtm_qp.geometry.formulas import FAR, FURTHEST
 from vgtm_qp.geometry.groups import Displacement, Group, Scene
-from vgtm_qp.geometry.parts import Parts
+from vgtm_qp.geometry.parts import BODIES, Parts
 from vgtm_qp.geometry.shapes import GeometryError
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 Motion = tuple[Displacement, Displacement, Displacement]
 """Displacements from the references of the three lists."""
@@ -275,7 +271,9 @@ def _near_pieces(X: Array, scene: Scene, time: float, horizon: float) -> tuple[I
     pieces, radius = scene.pieces, scene.bodies.radius
     centers = pieces.center + time * pieces.velocity
     middle, half, longest = _axes(X, scene.bodies.points, radius)
-    found = cKDTree(middle).query_ball_point(centers, pieces.radius + longest + horizon)
+    tree = cKDTree(middle, leafsize=BODIES)
+    # In the order of the tree, which pairs at equal distances keep.
+    found = tree.query_ball_point(centers, pieces.radius + longest + horizon, return_sorted=False)
     piece = np.repeat(np.arange(len(pieces)), [len(bodies) for bodies in found])
     body = np.concatenate([np.zeros(0), *found]).astype(np.int64)
     apart = middle[body] - centers[piece]
@@ -308,7 +306,7 @@ def _axes(X: Array, points: Index, radius: Array) -> tuple[Array, Array, float]:
     return ends.mean(axis=1), half, float(np.max(np.linalg.norm(half, axis=1) + radius))
 
 
-def _inseparable(apart: Array, span: Array, room: Array) -> NDArray[np.bool_]:
+def _inseparable(apart: Array, span: Array, room: Array) -> Mask:
     """Return which pairs may be nearer than their `room` (K,) from one center line to the other, m.
 
     `apart` (K, 3) is from center to center, and `span` (K,) how far both reach along it, times its length: that may be

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vgtm_qp.geometry.bodies import Bodies
+from vgtm_qp.geometry.bodies import Array, Bodies, Index
 from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.formulas import FAR
 from vgtm_qp.geometry.groups import Found, Group, Scene
@@ -19,8 +18,6 @@ from vgtm_qp.geometry.watch import Watch, can_be_watched
 
 __all__ = ["BetweenReport", "Clearance", "Contacts", "Pair"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _AMONG = {"all": (False, True), "obstacles": (False,), "members": (True,)}
 

@@ -7,17 +7,13 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.bodies import Bodies
+from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
 from vgtm_qp.geometry.exact import CONTACT, distance_function, follow_function, sweep_function
 from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.pairs import Contacts, PairNames
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 Found = tuple[Index, Array]
 """Contacts (R, ``CONTACT``) and before them the ``Group.numbers`` (R, 7) of their pairs."""
@@ -168,7 +164,7 @@ class Group:
         order = order[: np.searchsorted(distance[order], horizon)]
         self._set(self.body[order], self.other[order], distance[order])
 
-    def select(self, kept: NDArray[np.bool_]) -> None:
+    def select(self, kept: Mask) -> None:
         """Drop the pairs that are not `kept`, (C,)."""
         self._set(self.body[kept], self.other[kept], self.distance[kept])
 

@@ -6,13 +6,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vgtm_qp.geometry.bodies import Bodies
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
 
 _COLUMNS = ("distance", "normal", "points", "weights", "is_self", "normal_speed", "body", "other")
 

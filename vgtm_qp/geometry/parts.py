@@ -7,16 +7,11 @@ the arm has not bent there.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vgtm_qp.geometry.bodies import Bodies
+from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
-_BODIES = 32
+BODIES = 32
 """A part has no more bodies than that: some three bays of a truss."""
 
 
@@ -41,10 +36,10 @@ class Parts:
 
     def __init__(self, bodies: Bodies, X: Array, horizon: float) -> None:
         # The tree's order has bodies side by side that are near each other.
-        order = cKDTree(X[bodies.points].mean(axis=1), leafsize=_BODIES).indices
+        order = cKDTree(X[bodies.points].mean(axis=1), leafsize=BODIES).indices
         self._of = np.empty(len(order), dtype=np.int64)
-        self._of[order] = np.arange(len(order)) // _BODIES
-        every = np.arange(-(-len(order) // _BODIES))
+        self._of[order] = np.arange(len(order)) // BODIES
+        every = np.arange(-(-len(order) // BODIES))
         self._thickness = np.zeros(len(every))
         np.maximum.at(self._thickness, self._of, bodies.radius)
         # A point is in each part that one of its bodies is in, once.

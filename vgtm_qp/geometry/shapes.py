@@ -8,12 +8,11 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vgtm_qp.errors import VgtmError
+from vgtm_qp.geometry.bodies import Array
 from vgtm_qp.geometry.exact import WIDTH
-
-Array = NDArray[np.float64]
 
 _MESH_FORMATS = (".stl", ".obj", ".ply", ".off")
 

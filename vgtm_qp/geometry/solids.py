@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.geometry.bodies import Array
 from vgtm_qp.geometry.groups import Found, Group, Scene
-
-Array = NDArray[np.float64]
 
 _ROWS = 200_000
 

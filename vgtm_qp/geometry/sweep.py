@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.geometry.bodies import Array, Index
 from vgtm_qp.geometry.exact import CONTACT, sweep_function
 from vgtm_qp.geometry.groups import Group
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _DEPTH = 12
 _PIECES = 16

@@ -8,22 +8,17 @@ in every state, and all of them are covered in a dozen array operations.
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Kernel
+from vgtm_qp.geometry.bodies import Array, Index
 from vgtm_qp.geometry.candidates import every_pair
 from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
 from vgtm_qp.geometry.formulas import FAR, FURTHEST
 from vgtm_qp.geometry.groups import Found, Group, Scene
 from vgtm_qp.geometry.pairs import Contacts
 from vgtm_qp.geometry.shapes import GeometryError
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _MOST_PAIRS = 8000
 """Scenes at rest with no more pairs can be watched."""
@@ -46,9 +41,9 @@ def can_be_watched(scene: Scene) -> bool:
 class _WatchedGroup:
     """The pairs of one shape, with bounds and contacts of the last evaluation."""
 
-    def __init__(self, group: Group, points: int) -> None:
+    def __init__(self, group: Group, points: int, lower: Array) -> None:
         count = len(group)
-        self.group = group
+        self.group, self._lower = group, lower
         piece = np.zeros((count, WIDTH)) if group.is_self else group.scene.pieces.parameters[group.other]
         normal = np.tile([0.0, 0.0, 1.0], (count, 1))
         self._known = np.concatenate([piece, group.radius[:, None], normal], axis=1)
@@ -59,37 +54,35 @@ class _WatchedGroup:
         self.contacts = np.zeros((0, CONTACT))
         """and their contacts, two for each."""
         self._is_close = False
-        """Whether one of them was nearer than the limit."""
+        """Whether one of them was nearer than the limit,"""
+        self.overlaps = False
+        """and whether surfaces of one overlap."""
         self.lowest = np.inf
         """Least lower bound of their distances on the way there, m."""
 
-    def evaluate(self, places: Array, lower: Array, limit: float) -> None:
-        """Evaluate the pairs that may be nearer than `limit`, m, in the present state.
+    def evaluate(self, places: Array, limit: float) -> None:
+        """Evaluate the pairs that may be nearer than `limit`, m, in the present state, and overwrite their bounds.
 
-        Parameters
-        ----------
-        places : (2 P, 3)
-            Positions of the points in the state before and in the present one, m.
-        lower : (C,)
-            Bounds of the distances, m; those of the pairs that are evaluated are overwritten.
+        `places` (2 P, 3) are the positions of the points in the state before and in the present one, m.
         """
         reach = limit if self._is_close else max(limit, _NEXT * limit)
         # A negated comparison is true for NaN.
-        self._near = near = (~(lower >= reach)).nonzero()[0]
-        size, lowest = len(near), lower.take(near)
+        self._near = near = (~(self._lower >= reach)).nonzero()[0]
+        size, lowest = len(near), self._lower.take(near)
         ends = places.take(self._places.take(near, axis=0), axis=0).reshape(size, 24)
         found = self._follow(ends, self._known.take(near, axis=0))
-        self._is_close = bool(found[:, 0].min() < limit)
+        least = float(found[:, 0].min())
+        self._is_close, self.overlaps = least < limit, not least > 0.0
         self.contacts = found[:, :-1].reshape(2 * size, CONTACT)
         self._known[near, WIDTH + 1 :] = found[:, 5:CONTACT]
-        lower[near] = found[:, 0]
+        self._lower[near] = found[:, 0]
         # The bound from the motion alone holds as well.
         self.lowest = float(np.maximum(found[:, -1], lowest).min())
 
     def skip(self) -> None:
         """Record that no pair can be near in the present state."""
         self._near, self.contacts = self._near[:0], self.contacts[:0]
-        self._is_close, self.lowest = False, np.inf
+        self._is_close, self.overlaps, self.lowest = False, False, np.inf
 
     def near(self, X: Array, limit: float, fcl_reach: float) -> Found:
         """Return the contacts nearer than `limit`, m, in the present state `X`."""
@@ -109,7 +102,6 @@ class Watch:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._groups: list[_WatchedGroup] = []
-        self._parts: list[slice] = []
         self._bounds: Kernel | None = None
         self._at, self._places = b"", np.zeros((0, 3))
         self._limits = self._wanted = (-np.inf, -np.inf)
@@ -125,17 +117,12 @@ class Watch:
             Surface distance below which FCL is asked about obstacles too, m.
         """
         if limit > self._limits[0] or self_limit > self._limits[1] or not self._is_at(X):
-            self._move_to(X, limit, self_limit)
+            self._move_to(X, (limit, self_limit))
         self._wanted = _AHEAD * limit, _AHEAD * self_limit
-        limits = {False: limit, True: self_limit}
-        found = self._scene.contacts(
-            [
-                pairs.near(X, limits[pairs.group.is_self], fcl_reach)
-                for pairs in self._groups
-                if len(pairs.contacts)
-            ]
-        )
-        return found if not len(found) or found.distance.min() > 0.0 else None
+        limits, near = (limit, self_limit), [pairs for pairs in self._groups if len(pairs.contacts)]
+        if any(pairs.overlaps for pairs in near):
+            return None
+        return self._scene.contacts([pairs.near(X, limits[pairs.group.is_self], fcl_reach) for pairs in near])
 
     def follow(self, start: Array, end: Array, floor: float, self_floor: float) -> bool:
         """Return whether no surface distance falls below its floor, m, while points move straight to `end`.
@@ -144,16 +131,15 @@ class Watch:
         """
         limits = max(self._wanted[0], floor), max(self._wanted[1], self_floor)
         if not self._is_at(start):
-            self._move_to(start, *limits)
-        self._move_to(end, *limits)
-        floors = {False: floor, True: self_floor}
-        return all(pairs.lowest >= floors[pairs.group.is_self] for pairs in self._groups)
+            self._move_to(start, limits)
+        self._move_to(end, limits)
+        return all(pairs.lowest >= (self_floor if pairs.group.is_self else floor) for pairs in self._groups)
 
     def _is_at(self, X: Array) -> bool:
         """Return whether `X` (P, 3) are the positions of the present state."""
         return X.tobytes() == self._at
 
-    def _move_to(self, X: Array, limit: float, self_limit: float) -> None:
+    def _move_to(self, X: Array, limits: tuple[float, float]) -> None:
         """Make `X` the present state, and evaluate the pairs that may be nearer than the limits, m, there.
 
         Raises
@@ -168,27 +154,28 @@ class Watch:
         *least, motion = lowest.tolist()
         if not motion < FURTHEST:
             raise GeometryError("node positions must be finite numbers")
-        for k, pairs in enumerate(self._groups):
-            nearer_than = self_limit if pairs.group.is_self else limit
-            if least[k] >= nearer_than:
+        for pairs, bound in zip(self._groups, least, strict=True):
+            limit = limits[pairs.group.is_self]
+            if bound >= limit:
                 pairs.skip()
             else:
-                pairs.evaluate(self._places, lower[self._parts[k]], nearer_than)
+                pairs.evaluate(self._places, limit)
         self._places[: len(X)] = X
         bounds.inputs[2][:] = lower
-        self._at, self._limits = X.tobytes(), (limit, self_limit)
+        self._at, self._limits = X.tobytes(), limits
 
     def _start(self, X: Array) -> Kernel:
         """List all pairs, with their distances at `X`."""
         groups = every_pair(self._scene, X)
-        ends = np.cumsum([0, *map(len, groups)])
         kernel = Kernel(_bound_function(self._scene.bodies.points, groups, len(X)), compiled=False)
         self._places = np.concatenate([X, X])
         kernel.bind_input(0, self._places[len(X) :])
         kernel.bind_input(1, self._places[: len(X)])
         kernel.inputs[2][:] = np.concatenate([np.zeros(0), *(group.distance for group in groups)])
-        self._groups = [_WatchedGroup(group, len(X)) for group in groups]
-        self._parts = [slice(a, b) for a, b in pairwise(ends.tolist())]
+        parts = np.split(kernel.outputs[0], np.cumsum([len(group) for group in groups])[:-1])
+        self._groups = [
+            _WatchedGroup(group, len(X), lower) for group, lower in zip(groups, parts, strict=False)
+        ]
         self._bounds = kernel
         return kernel
 
