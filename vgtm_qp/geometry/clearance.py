@@ -174,7 +174,13 @@ class Clearance:
             For obstacles and, if it differs, between bodies, m.
         """
         self_floor = floor if self_floor is None else self_floor
-        return not len(self.near(X, time, floor, self_reach=self_floor, fcl_reach=0.0))
+        motion = self._candidates.cover(X, time, max(floor, 0.0), max(self_floor, 0.0))
+        for group in self._candidates.groups:
+            least = self_floor if group.is_self else floor
+            rows = np.flatnonzero(~(group.lower(motion, least)[0] >= least))
+            if len(rows) and not (group.distances(X, time, rows) >= least).all():
+                return False
+        return not self._solids.enclosed(X, time)
 
     def between(
         self,

@@ -87,6 +87,8 @@ class Separation:
         """Return the pairs that are too near at a configuration; empty as a rule."""
         kept, points = self.distances, self._arm.points(q)
         floors = kept.safe - kept.rounding, kept.self_safe - kept.rounding
+        if self.monitor.keeps(points, time, *floors):
+            return {}
         contacts = self.monitor.near(points, time, floors[0], self_reach=floors[1], fcl_reach=0.0)
         found: dict[Pair, float] = {}
         for k in range(len(contacts)):
