@@ -24,19 +24,10 @@ _MOST_BENDING = 0.5
 
 
 class _PairList:
-    """Pairs that share a reference.
+    """Pairs that share a reference (P, 3): where the points were when they were compared, m, at a time, s.
 
-    Attributes
-    ----------
-    reference : (P, 3)
-        Where the points were when the pairs were compared, m.
-    time : float
-        When that was, s.
-    horizon : float
-        Pairs of this kind that are not listed were as far apart there, m.
-    groups : list of Group
-    unneeded : int
-        How many pairs have been evaluated since that turned out to be far.
+    Pairs of this kind that are not listed were as far apart there as the horizon, m; `unneeded` counts the pairs that
+    have been evaluated since and turned out to be far.
     """
 
     def __init__(self, reference: Array, time: float) -> None:
@@ -60,14 +51,8 @@ class Candidates:
     There are three lists, each with a reference. One is of bodies and pieces. Two bodies are compared with each other
     again only where the arm has bent: however far two of them have moved, they are as far apart as they were if they
     moved together. Pairs in parts of the arm that were found to bend are in a list of their own, so that the pairs of
-    all other parts, which are called rigid here, keep their reference.
-
-    Parameters
-    ----------
-    scene
-        Bodies and obstacles.
-    influence, self_influence
-        From obstacles and between bodies, m: how near pairs have to be as a rule.
+    all other parts, which are called rigid here, keep their reference. As a rule pairs have to be nearer than
+    `influence` to obstacles and than `self_influence` to other bodies, m.
     """
 
     def __init__(self, scene: Scene, influence: float, self_influence: float) -> None:

@@ -16,15 +16,7 @@ BODIES = 32
 
 
 class Parts:
-    """Bodies, divided by where they are at a configuration; parts whose balls are nearer than a horizon are near.
-
-    Parameters
-    ----------
-    bodies : Bodies
-    X : (P, 3)
-        Positions of the points, m.
-    horizon : float
-        m.
+    """Bodies, divided by where they are at `X` (P, 3); parts whose balls are nearer than a horizon, m, are near.
 
     Attributes
     ----------

@@ -109,12 +109,7 @@ class Watch:
     def near(self, X: Array, limit: float, self_limit: float, fcl_reach: float) -> Contacts | None:
         """Return all contacts nearer than `limit`, or `self_limit` between bodies, m; None where surfaces overlap.
 
-        Parameters
-        ----------
-        X : (P, 3)
-            Positions of the points, m.
-        fcl_reach : float
-            Surface distance below which FCL is asked about obstacles too, m.
+        `X` (P, 3) are positions of the points, and FCL is asked about obstacles nearer than `fcl_reach` too, m.
         """
         if limit > self._limits[0] or self_limit > self._limits[1] or not self._is_at(X):
             self._move_to(X, (limit, self_limit))
