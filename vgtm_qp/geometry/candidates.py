@@ -280,7 +280,8 @@ def _near_bodies(X: Array, bodies: Bodies, among: Index, horizon: float) -> tupl
     )
     near = _inseparable(apart, span, radius[first] + radius[second] + horizon)
     first, second = first[near], second[near]
-    strangers = (joints[first][:, :, None] != joints[second][:, None, :]).all(axis=(1, 2))
+    a, b = joints[first].T, joints[second].T
+    strangers = (a != b).all(axis=0) & (a != b[::-1]).all(axis=0)
     return among[first[strangers]], among[second[strangers]]
 
 

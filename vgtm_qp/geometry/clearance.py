@@ -194,8 +194,7 @@ class Clearance:
         """Prove that no surface distance falls below its floor while the points move on straight lines.
 
         The watch is asked first. Then motion bounds, then separating planes, then halves of the time for the pairs
-        that are left. A motion not proven after twelve halvings is refused: the answer may be a false alarm,
-        never a false proof.
+        that are left. A motion not proven after twelve halvings is refused: a false alarm, never a false proof.
 
         Parameters
         ----------

@@ -152,8 +152,7 @@ def _in_frame(ends: Any, piece: Any) -> tuple[Any, Any, Any]:
 def _segment_box(ends: Any, piece: Any, *, apart: bool = False) -> tuple[SymbolicContact, SymbolicContact]:
     """Return the contacts for a box.
 
-    The squared distance is piecewise quadratic with at most six break points, where a coordinate crosses a
-    face.
+    The squared distance is piecewise quadratic with at most six break points, where a coordinate crosses a face.
     """
     a, b, turn = _in_frame(ends, piece)
     half, u = piece[12:15], b - a

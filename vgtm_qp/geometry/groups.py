@@ -192,8 +192,10 @@ class Group:
         """
         points = self.points[:count]
         reference = displacement.reference.take(points, axis=0)
-        shifts = (state.take(points, axis=0) - reference for state in displacement.states)
-        return np.asarray(np.max([np.linalg.norm(_RELATIVE @ x, axis=2).sum(axis=1) for x in shifts], axis=0))
+        vectors = (_RELATIVE @ (state.take(points, axis=0) - reference) for state in displacement.states)
+        return np.asarray(
+            np.max([np.sqrt(np.einsum("ksc,ksc->ks", v, v)).sum(axis=1) for v in vectors], axis=0)
+        )
 
     def at(self, X: Array, time: float, rows: Index) -> Array:
         """Return some pairs as the functions of :mod:`vgtm_qp.geometry.exact` take them, (k, 7 + width)."""

@@ -96,8 +96,7 @@ class BetweenReport:
     certified : bool
         No pair comes below the floor. False may also mean that the proof was not found.
     clearance : float
-        Proven lower bound of the surface distances over the motion; the least distance found where not
-        certified.
+        Proven lower bound of the surface distances over the motion; the least distance found where not certified.
     fraction : (F,)
         For each failing pair, where on the motion (0 < s <= 1) the least distance was found.
     failing : Contacts
