@@ -9,7 +9,7 @@ def point_box(x, piece):
 
 
 def point_sphere(x, piece):
-    return np.linalg.norm(x - piece[:3], axis=-1) - piece[3]
+    return np.linalg.norm(x - piece[:3], axis=-1) - piece[12]
 
 
 def point_cylinder(x, piece):

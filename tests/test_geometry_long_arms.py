@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vgtm_qp.geometry.bodies import capsules
+from vgtm_qp.geometry.candidates import Candidates, every_pair
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import box, sphere
 
@@ -33,7 +34,7 @@ def turned(X, first, rotation):
 def every_distance(monitor, X, time=0.0):
     """Distance of each pair (member, other, is_self), evaluated one by one."""
     distances = {}
-    for group in monitor.every_pair(X):
+    for group in every_pair(monitor.scene, X):
         for m, k, distance in zip(group.body, group.other, group.distance, strict=True):
             distances[
                 (int(min(m, k)), int(max(m, k)), True) if group.is_self else (int(m), int(k), False)
@@ -133,16 +134,18 @@ def check_bounds(candidates, motion, exact):
 @given(st.integers(0, 2**31), st.booleans(), st.booleans())
 def test_bounds_of_what_bends_never_exceed_the_distances(seed, rods, refreshed):
     rng, monitor, X, states = scene_and_states(seed, rods, 10)
-    monitor.near(X)
-    candidates = monitor._candidates
+    candidates = Candidates(monitor.scene, monitor.influence, monitor.self_influence)
+    candidates.cover(X, 0.0, monitor.influence, monitor.self_influence)
     before = X
     for state in states:
         # Lists are brought up to a state, and hold for the way to another one.
-        monitor.keeps(before, 0.0, 0.0, rng.choice([0.0, 0.2]))
+        candidates.cover(before, 0.0, 0.0, rng.choice([0.0, 0.2]))
         check_bounds(candidates, candidates.motion(before, 0.0), every_distance(monitor, before))
         check_bounds(candidates, candidates.motion(before, 0.0, state, 0.0), every_distance(monitor, state))
         if refreshed:
-            candidates.refresh(state, 0.0)
+            for group in candidates.groups:
+                candidates.count_unneeded(group, 10**6)
+            candidates.refresh_where_due(state, 0.0)
             check_bounds(candidates, candidates.motion(state, 0.0), every_distance(monitor, state))
         before = state
 
@@ -162,22 +165,33 @@ def test_what_is_proven_of_an_arm_that_bends_holds_on_the_way(seed, size):
         start = end
 
 
+class CountedCandidates(Candidates):
+    """Counts how often all bodies are compared with each other."""
+
+    renewed = 0
+
+    def renew_bodies(self, *arguments):
+        self.renewed += 1
+        super().renew_bodies(*arguments)
+
+
 @pytest.mark.parametrize("hinge", [None, BAYS - 3])
-def test_an_arm_that_is_carried_or_bends_in_one_place_is_compared_once(monkeypatch, hinge):
+def test_an_arm_that_is_carried_or_bends_in_one_place_is_compared_once(hinge):
     X, monitor = long_arm()
-    monitor.near(X)
-    renewed = []
-    monkeypatch.setattr(monitor._candidates, "renew_bodies", lambda *arguments: renewed.append(arguments))
+    candidates = CountedCandidates(monitor.scene, monitor.influence, monitor.self_influence)
     nearer = 0
-    for k in range(1, 40):
+    for k in range(40):
         state = X + np.array([0.3 * k, 0.1 * k, 0.0])
         if hinge is not None:
             state = turned(state, hinge, Rotation.from_rotvec((0.0, 0.06 * k, 0.0)))
+        motion = candidates.cover(state, 0.0, 0.5, 0.22)
+        exact = every_distance(monitor, state)
+        check_bounds(candidates, motion, exact)
+        assert min(candidates.beyond(motion)) >= 0.22
+        assert sum(map(len, candidates.groups)) < 5000
         near = monitor.near(state, fcl_reach=0.0)
         found = {key(*row) for row in zip(near.body, near.other, near.is_self, strict=True)}
-        exact = every_distance(monitor, state)
         assert found == {pair for pair, d in exact.items() if d < (0.22 if pair[2] else 0.5)}
-        assert sum(map(len, monitor._candidates.groups)) < 5000
         nearer += int(near.is_self.sum())
-    assert not renewed
+    assert candidates.renewed == 1
     assert (nearer > 0) == (hinge is not None)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.geometry.bodies import capsules
+from vgtm_qp.geometry.candidates import every_pair
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
@@ -41,7 +42,7 @@ def scene(rng, *, round_numbers=False, watch=True):
 
 def watch_of(monitor):
     """A watch of its own, also for scenes that their monitor does not watch."""
-    return Watch(monitor.bodies, monitor.pieces, monitor.names, monitor.fcl, monitor.every_pair)
+    return Watch(monitor.scene)
 
 
 def walk(X, rng, count, size):
@@ -221,7 +222,7 @@ def test_a_pair_whose_centres_coincide_at_first_is_watched_like_every_other():
     found = watch.near(clear, 0.6, 1.2, 0.0)
     assert sorted(found.is_self.tolist()) == [False, False, True]
     assert not watch.follow(clear, X, 0.08, 0.02)
-    assert len(monitor.every_pair(X)[0]) == 2
+    assert len(every_pair(monitor.scene, X)[0]) == 2
 
 
 def test_members_that_all_meet_at_one_node_have_nothing_to_watch():

@@ -1,4 +1,4 @@
-"""One scalar kernel over any number of rows: mapped at a few capacities and padded."""
+"""A kernel of one row over any number of rows: mapped at a few capacities and padded."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from collections.abc import Iterable
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.compiled import Compiling, Kernel
-
-Array = NDArray[np.float64]
+from vgtm_qp.geometry.bodies import Array
 
 _CAPACITIES = (16, 128, 1024)
 
@@ -24,14 +22,19 @@ and no step waits for one.
 
 
 class Batch:
-    """A CasADi function of column vectors, evaluated on rows; its outputs stand side by side in one array.
+    """A CasADi function of column vectors with one output, evaluated on rows.
 
     Not for two threads at once.
+
+    Attributes
+    ----------
+    kernels : dict
+        By capacity, those that are in use: a kernel, its inputs as rows, and its output as rows.
     """
 
     def __init__(self, function: ca.Function) -> None:
         self._function = function
-        self._kernels: dict[int, tuple[Kernel, list[Array], Array]] = {}
+        self.kernels: dict[int, tuple[Kernel, list[Array], Array]] = {}
         self._begun: dict[int, Kernel] = {}
         self._asked: dict[int, int] = {}
 
@@ -43,11 +46,11 @@ class Batch:
         self._use(_capacity(count, _CAPACITIES), for_later=for_later)
 
     def _use(self, capacity: int, *, for_later: bool = True) -> None:
-        if capacity not in self._kernels:
+        if capacity not in self.kernels:
             kernel = self._begun.pop(capacity, None)
             kernel = kernel or _kernel(self._function, capacity, for_later=for_later)
             inputs = [x.reshape(capacity, -1) for x in kernel.inputs]
-            self._kernels[capacity] = kernel, inputs, kernel.outputs[0].reshape(capacity, -1)
+            self.kernels[capacity] = kernel, inputs, kernel.outputs[0].reshape(capacity, -1)
 
     def _ask(self, capacity: int) -> None:
         """Note that a capacity that is not there would be of use."""
@@ -56,28 +59,28 @@ class Batch:
             self._use(capacity)
         elif asked == _BEGIN:
             self._begun[capacity] = _kernel(self._function, capacity, for_later=True)
-        if not self._kernels:
+        if not self.kernels:
             self._use(_CAPACITIES[0])
 
     def __call__(self, *rows: Array) -> Array:
         """Evaluate on `rows`, one (K, width) array per argument, and return a new (K, outputs) array."""
         count = len(rows[0])
         capacity = _capacity(count, _CAPACITIES)
-        if capacity not in self._kernels:
+        if capacity not in self.kernels:
             self._ask(capacity)
-            capacity = _capacity(count, self._kernels)
+            capacity = _capacity(count, self.kernels)
         if count <= capacity:
             return self._part(capacity, rows, 0, count)
         parts = []
         start = 0
         while start < count:
-            capacity = _capacity(count - start, self._kernels)
+            capacity = _capacity(count - start, self.kernels)
             parts.append(self._part(capacity, rows, start, min(start + capacity, count)))
             start += capacity
         return np.concatenate(parts)
 
     def _part(self, capacity: int, rows: tuple[Array, ...], start: int, stop: int) -> Array:
-        kernel, inputs, output = self._kernels[capacity]
+        kernel, inputs, output = self.kernels[capacity]
         size = stop - start
         for target, source in zip(inputs, rows, strict=True):
             target[:size] = source[start:stop]
@@ -89,12 +92,10 @@ _functions: dict[tuple[str, int], tuple[ca.Function, Compiling]] = {}
 
 
 def _kernel(function: ca.Function, capacity: int, *, for_later: bool) -> Kernel:
-    """Return `function` with its outputs in one column, mapped; compiled once for all batches of a process."""
+    """Return `function`, mapped; compiled once for all batches of a process."""
     key = (function.name(), capacity)
     if key not in _functions:
-        arguments = function.sx_in()
-        packed = ca.Function(function.name(), arguments, [ca.cse(ca.vertcat(*function.call(arguments)))])
-        mapped = packed.map(f"{key[0]}_{capacity}", "serial", capacity, [], [])
+        mapped = function.map(f"{key[0]}_{capacity}", "serial", capacity, [], [])
         _functions[key] = mapped, Compiling(mapped)
     mapped, compiling = _functions[key]
     return Kernel(mapped, compiled=compiling, for_later=for_later)

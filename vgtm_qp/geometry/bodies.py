@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +54,8 @@ def capsules(
 ) -> Bodies:
     """Return capsules (B) between `points` (B, 2).
 
-    Parameters
-    ----------
-    points : (B, 2) int
-    radius : float or (B,)
-        m.
-    names
-        By default ``"0"``, ``"1"``...
-    joints : (B, 2) int, optional
-        By default the points: bodies that share a point are neighbours.
-    kind
-        What a body is called in the names of rows.
+    The radius, m, may be one for all. Names are by default ``"0"``, ``"1"``..., and the joints (B, 2) the points:
+    bodies that share a point are neighbours.
     """
     span = np.asarray(points, dtype=np.int64).reshape(-1, 2)
     return Bodies(

@@ -3,46 +3,42 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vgtm_qp.geometry.bodies import Bodies
-from vgtm_qp.geometry.groups import Displacement, Displacements, Group, ShapeKernels
-from vgtm_qp.geometry.parts import Parts
-from vgtm_qp.geometry.shapes import ObstaclePieces
+from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
+from vgtm_qp.geometry.formulas import FAR, FURTHEST
+from vgtm_qp.geometry.groups import Displacement, Group, Scene
+from vgtm_qp.geometry.parts import BODIES, Parts
+from vgtm_qp.geometry.shapes import GeometryError
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+Motion = tuple[Displacement, Displacement, Displacement]
+"""Displacements from the references of the three lists."""
 
+_TO_PIECES, _RIGID, _BENDING = range(3)
+
+_FEW_PAIRS = 20_000
+"""Scenes with no more pairs list them all."""
 
 _MOST_BENDING = 0.5
 """Where a larger share of the near parts than that bends, all bodies are compared again."""
 
 
 class _PairList:
-    """Pairs that share a reference.
+    """Pairs that share a reference (P, 3): where the points were when they were compared, m, at a time, s.
 
-    Attributes
-    ----------
-    reference : (P, 3)
-        Where the points were when the pairs were compared, m.
-    horizon : float
-        Pairs of this kind that are not listed were as far apart there, m.
-    groups : list of Group
-    unneeded : int
-        How many pairs have been evaluated since that turned out to be far.
+    Pairs of this kind that are not listed were as far apart there as the horizon, m; `unneeded` counts the pairs that
+    have been evaluated since and turned out to be far.
     """
 
-    def __init__(self, reference: Array, horizon: float = np.inf) -> None:
-        self.reference, self.horizon = reference, horizon
+    def __init__(self, reference: Array, time: float) -> None:
         self.groups: list[Group] = []
-        self.unneeded = 0
+        self.renew([], reference, time, np.inf)
 
     def renew(self, groups: list[Group], X: Array, time: float, horizon: float) -> None:
         """Keep those pairs of `groups` that are nearer than `horizon`, m, at `X`, the new reference."""
         for group in groups:
             group.keep_near(X, time, horizon)
-        self.reference, self.horizon, self.unneeded = X, horizon, 0
+        self.reference, self.time, self.horizon, self.unneeded = X, time, horizon, 0
         self.groups = [group for group in groups if len(group)]
 
     def __len__(self) -> int:
@@ -55,66 +51,94 @@ class Candidates:
     There are three lists, each with a reference. One is of bodies and pieces. Two bodies are compared with each other
     again only where the arm has bent: however far two of them have moved, they are as far apart as they were if they
     moved together. Pairs in parts of the arm that were found to bend are in a list of their own, so that the pairs of
-    all other parts, which are called rigid here, keep their reference.
+    all other parts, which are called rigid here, keep their reference. As a rule pairs have to be nearer than
+    `influence` to obstacles and than `self_influence` to other bodies, m.
     """
 
-    def __init__(
-        self,
-        bodies: Bodies,
-        pieces: ObstaclePieces,
-        kernels: ShapeKernels,
-        X: Array,
-        time: float,
-        horizon: float,
-        self_horizon: float | None,
-    ) -> None:
-        self._bodies, self._pieces, self._kernels = bodies, pieces, kernels
-        self._has_self = self_horizon is not None
-        X = X.copy()
-        self._to_pieces, self._rigid, self._bending = _PairList(X), _PairList(X), _PairList(X)
-        self._seen, self._bent = X, 0.0
-        self._is_bending = np.zeros(0, dtype=bool)
-        self._bending_points = np.zeros(0, dtype=np.int64)
-        if self_horizon is None:
-            self._parts = Parts(bodies, X, 0.0)
-        else:
-            self.renew_bodies(X, time, self_horizon)
-        self.renew_pieces(X, time, horizon)
+    def __init__(self, scene: Scene, influence: float, self_influence: float) -> None:
+        self._scene, self._influence, self._self_influence = scene, influence, self_influence
+        self._lists: tuple[_PairList, ...] = ()
 
     @property
     def groups(self) -> list[Group]:
         """The pairs of each shape; no group is empty."""
-        return self._to_pieces.groups + self._rigid.groups + self._bending.groups
+        return [group for pairs in self._lists for group in pairs.groups]
 
-    def renew_pieces(self, X: Array, time: float, horizon: float) -> None:
+    def cover(
+        self,
+        X: Array,
+        time: float,
+        reach: float,
+        self_reach: float,
+        end: Array | None = None,
+        end_time: float | None = None,
+    ) -> Motion:
+        """List every pair nearer than the reaches, and return the displacements from the references.
+
+        With an `end` both hold on the whole straight path there.
+
+        Raises
+        ------
+        GeometryError
+            A position is not finite.
+        """
+        far = far_self = np.nan
+        if self._lists:
+            motion = self.motion(X, time, end, end_time)
+            far, far_self = self.beyond(motion)
+            if far >= reach and far_self >= self_reach:
+                return motion
+        # NaN fails the comparisons above and comes here.
+        if not all(np.abs(at).max(initial=0.0) < FURTHEST for at in (X, X if end is None else end)):
+            raise GeometryError("node positions must be finite numbers")
+        X = X.copy()
+        bodies, pieces = self._scene.bodies, self._scene.pieces
+        travel = 0.0 if end is None else float(np.sqrt(((end - X) ** 2).sum(axis=1).max(initial=0.0)))
+        drift = 0.0 if end_time is None else pieces.fastest * abs(end_time - time)
+        horizon = max(reach, self._influence) + self._influence + travel + drift
+        self_horizon = max(self_reach, self._self_influence) + self._influence + 2.0 * travel
+        if len(bodies) * (len(bodies) + len(pieces)) <= _FEW_PAIRS:
+            # A list of all pairs never needs another broad phase, which would cost more than the far pairs in it.
+            horizon = self_horizon = FAR
+        if not self._lists:
+            self._lists = _PairList(X, time), _PairList(X, time), _PairList(X, time)
+            if self._scene.has_self:
+                self.renew_bodies(X, time, self_horizon)
+        elif not far_self >= self_reach:
+            self._follow_bodies(X, time, self_reach, travel, self_horizon)
+        if not far >= reach:
+            self._renew_pieces(X, time, horizon)
+        return self.motion(X, time, end, end_time)
+
+    def _renew_pieces(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of a body and a piece that are nearer than `horizon`, m, at `X`, the new reference."""
-        self.time = time
-        pieces, bodies = self._pieces, self._bodies
-        groups = []
+        pieces, groups = self._scene.pieces, []
         if len(pieces):
-            body, piece = _near_pieces(X, bodies, self._parts, pieces, time, horizon)
+            body, piece = _near_pieces(X, self._scene, time, horizon)
             for shape in np.unique(pieces.shape):
                 chosen = pieces.shape[piece] == shape
-                groups.append(Group(str(shape), body[chosen], piece[chosen], bodies, pieces, self._kernels))
-        self._to_pieces.renew(groups, X.copy(), time, horizon if groups else np.inf)
+                groups.append(Group(self._scene, str(shape), body[chosen], piece[chosen]))
+        self._lists[_TO_PIECES].renew(groups, X, time, horizon if groups else np.inf)
 
     def renew_bodies(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of two bodies that are nearer than `horizon`, m, at `X`, the new reference."""
-        self._seen, self._bent = X.copy(), 0.0
+        bodies = self._scene.bodies
+        self._seen, self._bent = X, 0.0
         # Twice as far, so that parts may come somewhat nearer before their bodies have to be listed.
-        self._parts = Parts(self._bodies, X, 2.0 * horizon)
+        self._parts = Parts(bodies, X, 2.0 * horizon)
         self._is_bending = np.zeros(len(self._parts.near), dtype=bool)
-        self._bending.renew([], self._seen, time, np.inf)
-        pairs = _near_bodies(X, self._bodies, np.arange(len(self._bodies.points)), horizon)
-        self._rigid.renew([self._self_group(*pairs)], self._seen, time, horizon)
+        self._bending_points = np.zeros(0, dtype=np.int64)
+        self._lists[_BENDING].renew([], X, time, np.inf)
+        pairs = _near_bodies(X, bodies, np.arange(len(bodies)), horizon)
+        self._lists[_RIGID].renew([Group(self._scene, "segment", *pairs, place=_RIGID)], X, time, horizon)
 
-    def follow_bodies(self, X: Array, time: float, reach: float, travel: float, horizon: float) -> None:
+    def _follow_bodies(self, X: Array, time: float, reach: float, travel: float, horizon: float) -> None:
         """List all pairs of bodies that may come nearer than `reach`, m, while no point moves further than `travel`.
 
         As a rule the arm has moved far but has hardly bent, and then only in a few of its parts, so that this costs
         much less than :meth:`renew_bodies`. Pairs are listed up to `horizon`, m, where they are listed anew.
         """
-        parts, rigid, bending = self._parts, self._rigid, self._bending
+        parts, (_, rigid, bending) = self._parts, self._lists
         change = parts.distance_changes(X - rigid.reference)
         parts.update_beyond(X)
         slack = rigid.horizon - reach - 2.0 * travel
@@ -128,7 +152,7 @@ class Candidates:
         ):
             self.renew_bodies(X, time, horizon)
             return
-        self._seen, self._is_bending = X.copy(), is_bending
+        self._seen, self._is_bending = X, is_bending
         self._bent = float(change[~is_bending].max(initial=0.0))
         if now_bending.any():
             for group in rigid.groups:
@@ -137,92 +161,84 @@ class Candidates:
         elif bending.horizon - 2.0 * (self._bending_displacement(X) + travel) >= reach:
             return
         bodies, self._bending_points = parts.inside(np.unique(parts.near[is_bending]))
-        first, second = _near_bodies(X, self._bodies, bodies, horizon)
+        first, second = _near_bodies(X, self._scene.bodies, bodies, horizon)
         # Pairs of two of these parts that do not bend relative to each other are in the list of rigid parts.
         own = parts.among(is_bending, first, second)
-        pairs = self._self_group(first[own], second[own], is_bending=True)
-        bending.renew([pairs], self._seen, time, horizon)
-
-    def _self_group(self, first: Index, second: Index, *, is_bending: bool = False) -> Group:
-        arm = (self._bodies, self._pieces, self._kernels)
-        return Group("segment", first, second, *arm, is_bending=is_bending)
+        pairs = Group(self._scene, "segment", first[own], second[own], place=_BENDING)
+        bending.renew([pairs], X, time, horizon)
 
     def _bending_displacement(self, *states: Array) -> float:
         """Return how far a point of a bending part is from its reference, at most, m."""
         if not self._is_bending.any():
             return 0.0
         points = self._bending_points
-        reference = self._bending.reference.take(points, axis=0)
+        reference = self._lists[_BENDING].reference.take(points, axis=0)
         return float(_moved(tuple(X.take(points, axis=0) for X in states), reference).max())
 
     def count_unneeded(self, group: Group, count: int) -> None:
         """Count `count` pairs of `group` that were evaluated although they are far."""
-        own = self._bending if group.is_bending else self._rigid
-        (own if group.is_self else self._to_pieces).unneeded += count
+        self._lists[group.place].unneeded += count
 
     def refresh_where_due(self, X: Array, time: float) -> None:
-        """Move the references of those lists whose unneeded evaluations have cost as much as that does."""
-        lists = self._to_pieces, self._bending, self._rigid
-        costs = [len(pairs) for pairs in lists]
-        # For the last one, how the arm has bent has to be computed as well.
-        costs[-1] += len(self._bodies)
-        due = tuple(pairs.unneeded > cost for pairs, cost in zip(lists, costs, strict=True))
-        if any(due):
-            self.refresh(X, time, due)
+        """Move the references of those lists to `X` whose unneeded evaluations have cost as much as that does.
 
-    def refresh(self, X: Array, time: float, which: tuple[bool, ...] = (True, True, True)) -> None:
-        """Move references to `X` without a broad phase: the horizons shrink by the displacement of the bodies.
-
-        `which` lists are moved: that of pieces, that of bending parts, that of rigid parts.
+        There is no broad phase: the horizons shrink by the displacement of the bodies.
         """
-        X = X.copy()
-        if which[0]:
-            far = self._beyond_pieces(self.motion(X, time))
-            self.time = time
-            self._to_pieces.renew(self._to_pieces.groups, X, time, far)
-        if which[1]:
-            far = self._bending.horizon - 2.0 * self._bending_displacement(X)
-            self._bending.renew(self._bending.groups, X, time, far)
-        if which[2] and self._has_self:
-            change = self._parts.distance_changes(X - self._rigid.reference)
-            far = self._rigid.horizon - float(change[~self._is_bending].max(initial=0.0))
+        for place, pairs in enumerate(self._lists):
+            # For rigid parts, how the arm has bent has to be computed as well.
+            if pairs.unneeded > len(pairs) + (len(self._scene.bodies) if place == _RIGID else 0):
+                self._refresh(place, X.copy(), time)
+
+    def _refresh(self, place: int, X: Array, time: float) -> None:
+        pairs = self._lists[place]
+        if place == _RIGID:
+            change = self._parts.distance_changes(X - pairs.reference)
             self._parts.update_beyond(X)
-            self._seen, self._bent = X, 0.0
-            self._rigid.renew(self._rigid.groups, X, time, far)
+            self._seen, self._bent, change_since = X, 0.0, float(change[~self._is_bending].max(initial=0.0))
+        else:
+            change_since = self.motion(X, time)[place].greatest
+        pairs.renew(pairs.groups, X, time, pairs.horizon - change_since)
 
     def motion(
         self, X: Array, time: float, end: Array | None = None, end_time: float | None = None
-    ) -> Displacements:
+    ) -> Motion:
         """Return the displacements from the references; with an `end`, the greatest on the straight path there."""
         states = (X,) if end is None else (X, end)
-        elapsed = abs(time - self.time)
-        if end_time is not None:
-            elapsed = max(elapsed, abs(end_time - self.time))
-        moved = _moved(states, self._to_pieces.reference)
+        to_pieces, rigid, bending = self._lists
+        elapsed = max(abs(at - to_pieces.time) for at in (time, time if end_time is None else end_time))
+        moved = _moved(states, to_pieces.reference)
         greatest = float(moved.max(initial=0.0))
-        to_pieces = Displacement(states, self._to_pieces.reference, moved, greatest)
-        if not self._has_self:
-            return Displacements(to_pieces, to_pieces, to_pieces, elapsed)
-        if self._seen is not self._to_pieces.reference:
+        drift = self._scene.pieces.fastest * elapsed
+        first = Displacement(states, to_pieces.reference, moved, greatest + drift, elapsed)
+        if not self._scene.has_self:
+            return first, first, first
+        if self._seen is not to_pieces.reference:
             moved = _moved(states, self._seen)
             greatest = float(moved.max(initial=0.0))
-        rigid = Displacement(states, self._rigid.reference, moved, self._bent + 2.0 * greatest)
-        bending = Displacement(
-            states, self._bending.reference, moved, 2.0 * self._bending_displacement(*states)
+        bent = 2.0 * self._bending_displacement(*states)
+        return (
+            first,
+            Displacement(states, rigid.reference, moved, self._bent + 2.0 * greatest, 0.0),
+            Displacement(states, bending.reference, moved, bent, 0.0),
         )
-        return Displacements(to_pieces, rigid, bending, elapsed)
 
-    def beyond(self, motion: Displacements) -> tuple[float, float]:
+    def beyond(self, motion: Motion) -> tuple[float, float]:
         """Return lower bounds, m, of the distances of the pairs not listed: to pieces, and between bodies."""
-        if not self._has_self:
-            return self._beyond_pieces(motion), np.inf
+        to_pieces, rigid, bending = self._lists
+        far = to_pieces.horizon - motion[_TO_PIECES].greatest
+        if not self._scene.has_self:
+            return far, np.inf
         # Pairs in near parts came nearer by no more than the arm bent there; pairs in other parts are bounded by those.
-        since = motion.rigid.greatest - self._bent
-        far = min(self._rigid.horizon - self._bent, self._parts.beyond) - since
-        return self._beyond_pieces(motion), min(far, self._bending.horizon - motion.bending.greatest)
+        since = motion[_RIGID].greatest - self._bent
+        far_self = min(rigid.horizon - self._bent, self._parts.beyond) - since
+        return far, min(far_self, bending.horizon - motion[_BENDING].greatest)
 
-    def _beyond_pieces(self, motion: Displacements) -> float:
-        return self._to_pieces.horizon - motion.to_pieces.greatest - self._pieces.fastest * motion.elapsed
+
+def every_pair(scene: Scene, X: Array) -> list[Group]:
+    """Return groups of all pairs of a scene, with their distances at `X` (P, 3) and time 0."""
+    candidates = Candidates(scene, np.inf, np.inf)
+    candidates.cover(X, 0.0, np.inf, np.inf)
+    return candidates.groups
 
 
 def _moved(states: tuple[Array, ...], reference: Array) -> Array:
@@ -235,38 +251,52 @@ def _moved(states: tuple[Array, ...], reference: Array) -> Array:
     return np.asarray(np.sqrt(square))
 
 
-def _near_pieces(
-    X: Array, bodies: Bodies, parts: Parts, pieces: ObstaclePieces, time: float, horizon: float
-) -> tuple[Index, Index]:
+def _near_pieces(X: Array, scene: Scene, time: float, horizon: float) -> tuple[Index, Index]:
     """Return the pairs of a body and a piece that the plane between body and bounding sphere does not separate."""
+    pieces, radius = scene.pieces, scene.bodies.radius
     centers = pieces.center + time * pieces.velocity
-    body, piece = parts.facing(X, centers, pieces.radius + horizon)
-    if np.isinf(horizon):
-        return body, piece
-    ends = X[bodies.points[body]]
-    apart = 0.5 * (ends[:, 0] + ends[:, 1]) - centers[piece]
-    distance = np.sqrt(np.einsum("kc,kc->k", apart, apart))
-    span = 0.5 * np.abs(np.einsum("kc,kc->k", apart, ends[:, 1] - ends[:, 0]))
-    # Multiplied by the distance of the centers, which may be zero.
-    near = distance * (distance - bodies.radius[body] - pieces.radius[piece] - horizon) <= span
+    middle, half, longest = _axes(X, scene.bodies.points, radius)
+    tree = cKDTree(middle, leafsize=BODIES)
+    # In the order of the tree, which pairs at equal distances keep.
+    found = tree.query_ball_point(centers, pieces.radius + longest + horizon, return_sorted=False)
+    piece = np.repeat(np.arange(len(pieces)), [len(bodies) for bodies in found])
+    body = np.concatenate([np.zeros(0), *found]).astype(np.int64)
+    apart = middle[body] - centers[piece]
+    span = np.abs(np.einsum("kc,kc->k", apart, half[body]))
+    near = _inseparable(apart, span, radius[body] + pieces.radius[piece] + horizon)
     return body[near], piece[near]
 
 
 def _near_bodies(X: Array, bodies: Bodies, among: Index, horizon: float) -> tuple[Index, Index]:
     """Return pairs of some bodies that are not neighbours and that the plane between them does not separate."""
-    ends = X[bodies.points[among]]
-    middle, half = ends.mean(axis=1), 0.5 * (ends[:, 1] - ends[:, 0])
     joints, radius = bodies.joints[among], bodies.radius[among]
-    longest = float(np.max(np.linalg.norm(half, axis=1) + radius))
-    pairs = cKDTree(middle).query_pairs(2.0 * longest + horizon, output_type="ndarray").astype(np.int64)
-    first, second = pairs[:, 0], pairs[:, 1]
-    if not np.isinf(horizon):
-        apart = middle[first] - middle[second]
-        distance = np.sqrt(np.einsum("kc,kc->k", apart, apart))
-        span = np.abs(np.einsum("kc,kc->k", apart, half[first]))
-        span += np.abs(np.einsum("kc,kc->k", apart, half[second]))
-        near = distance * (distance - radius[first] - radius[second] - horizon) <= span
-        first, second = first[near], second[near]
-    a, b, c, d = joints[first, 0], joints[first, 1], joints[second, 0], joints[second, 1]
-    strangers = (a != c) & (a != d) & (b != c) & (b != d)
+    middle, half, longest = _axes(X, bodies.points[among], radius)
+    first, second = (
+        cKDTree(middle).query_pairs(2.0 * longest + horizon, output_type="ndarray").astype(np.int64).T
+    )
+    apart = middle[first] - middle[second]
+    span = np.abs(np.einsum("kc,kc->k", apart, half[first])) + np.abs(
+        np.einsum("kc,kc->k", apart, half[second])
+    )
+    near = _inseparable(apart, span, radius[first] + radius[second] + horizon)
+    first, second = first[near], second[near]
+    a, b = joints[first].T, joints[second].T
+    strangers = (a != b).all(axis=0) & (a != b[::-1]).all(axis=0)
     return among[first[strangers]], among[second[strangers]]
+
+
+def _axes(X: Array, points: Index, radius: Array) -> tuple[Array, Array, float]:
+    """Return middles (B, 3) and halves (B, 3) of the axes of bodies, and how far a body reaches at most, m."""
+    ends = X[points]
+    half = 0.5 * (ends[:, 1] - ends[:, 0])
+    return ends.mean(axis=1), half, float(np.max(np.linalg.norm(half, axis=1) + radius))
+
+
+def _inseparable(apart: Array, span: Array, room: Array) -> Mask:
+    """Return which pairs may be nearer than their `room` (K,) from one center line to the other, m.
+
+    `apart` (K, 3) is from center to center, and `span` (K,) how far both reach along it, times its length: that may be
+    zero.
+    """
+    distance = np.sqrt(np.einsum("kc,kc->k", apart, apart))
+    return np.asarray(distance * (distance - np.minimum(room, FAR)) <= span)

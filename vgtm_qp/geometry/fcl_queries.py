@@ -12,13 +12,8 @@ from math import sqrt
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vgtm_qp.geometry.groups import PairDistances
 from vgtm_qp.geometry.shapes import ObstaclePieces
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _AGREEMENT = 1e-9
 """How far FCL and the closed form may be apart, m."""
@@ -46,68 +41,37 @@ class FclQueries:
         self.asked = self.replaced = 0
         self._pieces = pieces
         self._objects: dict[int, Any] = {}
-        self._body: Any = None
-
-    def _start(self) -> None:
-        import fcl
-
-        self._fcl = fcl
-        self._capsule = fcl.Capsule(0.0, 1.0)
-        self._body = fcl.CollisionObject(self._capsule, fcl.Transform())
-        self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
 
     def _object(self, piece: int) -> Any:
-        if self._body is None:
-            self._start()
         if piece not in self._objects:
-            fcl, shape, row = self._fcl, self._pieces.shape[piece], self._pieces.parameters[piece]
+            import fcl
+
+            if not self._objects:
+                self._fcl, self._capsule = fcl, fcl.Capsule(0.0, 1.0)
+                self._body = fcl.CollisionObject(self._capsule, fcl.Transform())
+                self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
+            shape, row = self._pieces.shape[piece], self._pieces.parameters[piece]
             if shape == "sphere":
-                geometry, turn = fcl.Sphere(row[3]), np.eye(3)
+                geometry = fcl.Sphere(row[12])
             elif shape == "box":
-                geometry, turn = fcl.Box(*(2.0 * row[12:15])), row[3:12].reshape(3, 3)
+                geometry = fcl.Box(*(2.0 * row[12:]))
             else:
-                geometry, turn = fcl.Cylinder(row[12], 2.0 * row[13]), row[3:12].reshape(3, 3)
+                geometry = fcl.Cylinder(row[12], 2.0 * row[13])
+            turn = row[3:12].reshape(3, 3)
             self._objects[piece] = fcl.CollisionObject(geometry, fcl.Transform(turn, row[:3]))
         return self._objects[piece]
 
-    def improve(
-        self,
-        pieces: Index,
-        radius: Array,
-        segments: Array,
-        parameters: Array,
-        contacts: PairDistances,
-        rows: Index,
-        two: NDArray[np.bool_],
-    ) -> None:
-        """Ask FCL for `rows`, which should be few, and write the answers that agree into `contacts`.
-
-        Parameters
-        ----------
-        pieces, radius, segments, parameters
-            Piece indices (K,), radii (K,), m, ends (K, 6), m, and parameters (K, 15) at this time.
-        contacts
-            Exact, from surface to surface; they stay where FCL's answer is refused.
-        two
-            (K,) whether the nearest point is not unique: FCL may give one between the two ends of the contact.
-        """
-        for k in rows.tolist():
-            piece = int(pieces[k])
-            if self._pieces.moving:
-                self._object(piece).setTranslation(parameters[k, :3])
-            found = self.witness(piece, segments[k].tolist(), float(contacts.distance[k] + radius[k]))
-            if found is not None and not two[k]:
-                contacts.t[k], contacts.normal[k] = found
-
     def witness(
-        self, piece: int, ends: list[float], distance: float
+        self, piece: int, time: float, ends: list[float], distance: float
     ) -> tuple[float, tuple[float, float, float]] | None:
-        """Return where FCL finds a segment nearest to a piece: the parameter on the segment, and the normal (3).
+        """Return where FCL finds a segment nearest to a piece at `time`: the parameter on it, and the normal (3).
 
         None where its answer is refused: its distance is not the `distance`, m, of the closed form, or the segment is
         too near for the points to have a direction.
         """
         other = self._object(piece)
+        if self._pieces.moving:
+            other.setTranslation(self._pieces.at(time)[piece, :3])
         ax, ay, az, bx, by, bz = ends
         x, y, z = bx - ax, by - ay, bz - az
         length = sqrt(x * x + y * y + z * z)

@@ -1,25 +1,96 @@
-"""Pairs of one shape as arrays: exact distances, and lower bounds that shrink as the bodies move."""
+"""Pairs of one shape as arrays: exact contacts, and lower bounds of distances that shrink as the bodies move."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.bodies import Bodies
-from vgtm_qp.geometry.exact import SECOND_CONTACT, distance_function, follow_function, sweep_function
-from vgtm_qp.geometry.shapes import ObstaclePieces
+from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
+from vgtm_qp.geometry.exact import CONTACT, distance_function, follow_function, sweep_function
+from vgtm_qp.geometry.fcl_queries import FclQueries
+from vgtm_qp.geometry.pairs import Contacts, PairNames
+from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+Found = tuple[Index, Array]
+"""Contacts (R, ``CONTACT``) and before them the ``Group.numbers`` (R, 7) of their pairs."""
 
-FOLLOWED = (1, 128)
-"""Numbers of pairs that a watch evaluates at once."""
+_FIRST = 16
+"""The least distance is searched for among so many pairs first: those that were nearest at the reference."""
 
-_FEW, _MANY, _MANY_SWEPT = (1,), (1, 64, 1024), (1, 64)
+_RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
+"""From the shifts of both ends of two bodies to that of one middle from the other, and half the turns of both."""
+
+_WATCHED = ((follow_function, (1, 128)), (distance_function, (1,)), (sweep_function, (1,)))
+"""What is evaluated in a watched scene, and for how many pairs at once,"""
+_LISTED = ((distance_function, (1, 64, 1024)), (sweep_function, (1, 64)))
+"""and in any other."""
+
+
+class Scene:
+    """Bodies of an arm and obstacles, with what evaluates pairs of them.
+
+    Attributes
+    ----------
+    has_self : bool
+        Whether pairs of bodies that are not neighbours count.
+    nothing : Contacts
+        No rows.
+    """
+
+    def __init__(self, bodies: Bodies, obstacles: Sequence[Obstacle], *, has_self: bool) -> None:
+        self.bodies, self.obstacles, self.has_self = bodies, tuple(obstacles), has_self
+        self.pieces = ObstaclePieces(self.obstacles)
+        names = tuple(obstacle.name for obstacle in self.obstacles)
+        self.names = PairNames(bodies, names, tuple(self.pieces.obstacle.tolist()))
+        self.fcl = FclQueries(self.pieces)
+        self.nothing = self._contacts(np.zeros((0, 7), dtype=np.int64), np.zeros((0, CONTACT)))
+        self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
+
+    def prepare(self, *, watched: bool) -> None:
+        """Begin to compile what steps need: for a scene that is watched, and else for few and for many pairs."""
+        shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
+        for make, counts in _WATCHED if watched else _LISTED:
+            for shape in shapes:
+                for count in counts:
+                    # A watch rarely needs this: only for a motion that it cannot prove itself.
+                    for_later = watched and make is sweep_function
+                    self.batch(make, shape).prepare(count, for_later=for_later)
+
+    def contacts(self, parts: Sequence[Found]) -> Contacts:
+        """Return contacts that were found as rows, one part after the other."""
+        if not parts:
+            return self.nothing
+        if len(parts) == 1:
+            return self._contacts(*parts[0])
+        return self._contacts(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _contacts(self, numbers: Index, found: Array) -> Contacts:
+        normal, other, is_self = found[:, 5:], numbers[:, 5], numbers[:, 6] > 0
+        speed = np.zeros(len(found))
+        if self.pieces.moving:
+            piece = ~is_self
+            speed[piece] = np.einsum("kc,kc->k", normal[piece], self.pieces.velocity[other[piece]])
+        return Contacts(
+            distance=found[:, 0],
+            normal=normal,
+            points=numbers[:, :4],
+            weights=found[:, 1:5],
+            is_self=is_self,
+            normal_speed=speed,
+            body=numbers[:, 4],
+            other=other,
+            names=self.names,
+        )
+
+    def batch(self, make: Callable[[str], ca.Function], shape: str) -> Batch:
+        """Return a function of :mod:`vgtm_qp.geometry.exact` for many pairs of a shape, made when first needed."""
+        if (make, shape) not in self._batches:
+            self._batches[make, shape] = Batch(make(shape))
+        return self._batches[make, shape]
 
 
 class Displacement(NamedTuple):
@@ -27,88 +98,21 @@ class Displacement(NamedTuple):
 
     Attributes
     ----------
-    states : tuple of (P, 3)
-        Positions, or those at both ends of the path, m.
-    reference : (P, 3)
-        m.
+    states, reference : tuple of (P, 3), (P, 3)
+        Positions of one state, or at both ends of the path, m; and those of the reference.
     moved : (P,)
-        How far each point is from its reference, at most, m; for pairs of a body and a piece.
+        How far each point is from its reference, at most, m.
     greatest : float
         By how much the distance of a pair has changed since the reference at most, m.
+    elapsed : float
+        Since the reference, s, in which obstacles move.
     """
 
     states: tuple[Array, ...]
     reference: Array
     moved: Array
     greatest: float
-
-
-class Displacements(NamedTuple):
-    """Displacements from the references of pairs with pieces, of rigid parts and of bending parts; seconds since."""
-
-    to_pieces: Displacement
-    rigid: Displacement
-    bending: Displacement
     elapsed: float
-
-
-class PairDistances:
-    """Outputs of ``distance_function`` for K pairs, distances from surface to surface.
-
-    Attributes
-    ----------
-    distance, distance_second, t, t_second, s, s_second : (K,)
-    normal, normal_second : (K, 3)
-    """
-
-    def __init__(self, rows: Array) -> None:
-        self.distance, self.distance_second, self.t, self.t_second = rows[:, :4].T
-        self.normal, self.normal_second = rows[:, 4:7], rows[:, 7:10]
-        self.s, self.s_second = rows[:, 16], rows[:, 17]
-
-    def two(self) -> NDArray[np.bool_]:
-        """Return whether the second contact is worth a row of its own, (K,)."""
-        return np.asarray(np.abs(self.t_second - self.t) >= SECOND_CONTACT)
-
-
-class ShapeKernels:
-    """The batched kernels of each shape, built when first needed."""
-
-    def __init__(self) -> None:
-        self._distance: dict[str, Batch] = {}
-        self._sweep: dict[str, Batch] = {}
-        self._follow: dict[str, Batch] = {}
-
-    def prepare(self, shapes: Iterable[str], *, rests: bool) -> None:
-        """Begin to compile what steps need: for a scene that is watched, and else for few and for many pairs."""
-        shapes = tuple(shapes)
-        for shape in shapes:
-            for count in FOLLOWED if rests else ():
-                self.follow(shape).prepare(count)
-            for count in _FEW if rests else _MANY:
-                self.distance(shape).prepare(count)
-        for shape in shapes:
-            for count in _FEW if rests else _MANY_SWEPT:
-                # A watch rarely needs these: only for a motion that it cannot prove itself.
-                self.sweep(shape).prepare(count, for_later=rests)
-
-    def follow(self, shape: str) -> Batch:
-        """Return the batch of ``follow_function(shape)``."""
-        if shape not in self._follow:
-            self._follow[shape] = Batch(follow_function(shape))
-        return self._follow[shape]
-
-    def distance(self, shape: str) -> Batch:
-        """Return the batch of ``distance_function(shape)``."""
-        if shape not in self._distance:
-            self._distance[shape] = Batch(distance_function(shape))
-        return self._distance[shape]
-
-    def sweep(self, shape: str) -> Batch:
-        """Return the batch of ``sweep_function(shape)``."""
-        if shape not in self._sweep:
-            self._sweep[shape] = Batch(sweep_function(shape))
-        return self._sweep[shape]
 
 
 class Group:
@@ -118,82 +122,67 @@ class Group:
     ----------
     body, other : (C,) int
         `other` is a piece or, for ``"segment"``, a body.
-    points, other_points : (C, 2) int
-        The points that span `body` and, for ``"segment"``, `other`.
+    points : (C, 4) int
+        The points that span `body`, then those of `other`, or the same again for a piece.
+    numbers : (C, 7) int
+        These, `body`, `other` and `is_self`.
+    radius : (C,)
+        Of the body, or the sum of both radii, m.
     distance : (C,)
         Surface distance at the reference configuration, m, ascending once :meth:`keep_near` was called.
-    is_self, is_bending, moving : bool
-        Whether these are pairs of bodies; whether of parts of the arm that bend; whether some obstacle moves.
+    is_self, moving, asks_fcl : bool
+        Whether these are pairs of bodies; whether they are not and some obstacle moves; whether FCL knows the shape.
+    place : int
+        Which list of :class:`vgtm_qp.geometry.candidates.Candidates` they are in.
     """
 
-    def __init__(
-        self,
-        shape: str,
-        body: Index,
-        other: Index,
-        bodies: Bodies,
-        pieces: ObstaclePieces,
-        kernels: ShapeKernels,
-        *,
-        is_bending: bool = False,
-    ) -> None:
-        self.shape, self.is_self, self.is_bending = shape, shape == "segment", is_bending
-        self.moving = pieces.moving and not self.is_self
-        self._bodies, self._pieces, self._kernels = bodies, pieces, kernels
-        self._set(body, other)
+    def __init__(self, scene: Scene, shape: str, body: Index, other: Index, *, place: int = 0) -> None:
+        self.scene, self.shape, self.place = scene, shape, place
+        self.is_self = shape == "segment"
+        self.moving = scene.pieces.moving and not self.is_self
+        self.asks_fcl = shape in FclQueries.SHAPES
+        self._distances = scene.batch(distance_function, shape)
+        self._set(body, other, np.zeros(len(body)))
 
-    def _set(self, body: Index, other: Index) -> None:
-        bodies = self._bodies
-        self.body, self.other = body, other
-        self.distance = np.zeros(len(body))
-        self.points, self.radius = bodies.points[body], bodies.radius[body]
-        self.other_points = bodies.points[other] if self.is_self else self.points
+    def _set(self, body: Index, other: Index, distance: Array) -> None:
+        bodies = self.scene.bodies
+        self.distance, self.radius = distance, bodies.radius[body]
+        ends = bodies.points[body]
+        other_ends = bodies.points[other] if self.is_self else ends
         if self.is_self:
             self.radius = self.radius + bodies.radius[other]
-        self.speed = self._pieces.speed[other] if self.moving else np.zeros(0)
+        self.numbers = np.column_stack([ends, other_ends, body, other, np.full(len(body), self.is_self)])
+        self.points, self.body, self.other = self.numbers[:, :4], self.numbers[:, 4], self.numbers[:, 5]
 
     def __len__(self) -> int:
         return len(self.body)
 
     def keep_near(self, X: Array, time: float, horizon: float) -> None:
         """Make `X` the reference: drop the pairs from `horizon` on and sort the others by distance."""
-        distance = self.distances(X, time, np.arange(len(self))).distance
+        distance = self.distances(X, time, np.arange(len(self)))
         order = np.argsort(distance, kind="stable")
         order = order[: np.searchsorted(distance[order], horizon)]
-        self._set(self.body[order], self.other[order])
-        self.distance = distance[order]
+        self._set(self.body[order], self.other[order], distance[order])
 
-    @property
-    def follow(self) -> Batch:
-        """The batch of ``follow_function`` for this shape."""
-        return self._kernels.follow(self.shape)
-
-    def select(self, kept: NDArray[np.bool_]) -> None:
+    def select(self, kept: Mask) -> None:
         """Drop the pairs that are not `kept`, (C,)."""
-        distance = self.distance[kept]
-        self._set(self.body[kept], self.other[kept])
-        self.distance = distance
+        self._set(self.body[kept], self.other[kept], self.distance[kept])
 
-    def lower(self, motion: Displacements, limit: float) -> tuple[Array, float]:
+    def lower(self, motion: Sequence[Displacement], limit: float) -> tuple[Array, float]:
         """Return lower bounds of the surface distances of the first pairs, and one of all the others, m.
 
-        The others cannot have come nearer than `limit`, m.
+        The others cannot have come nearer than `limit`, m. `motion` is that of each list of candidates.
         """
-        own = motion.bending if self.is_bending else motion.rigid
-        displacement = own if self.is_self else motion.to_pieces
-        shrink = displacement.greatest
-        if self.moving:
-            shrink += self._pieces.fastest * motion.elapsed
+        displacement = motion[self.place]
         # Only near the head of the sorted list can the motion have mattered.
-        few = len(self) <= 64 and not self.is_self
-        count = len(self) if few else int(np.searchsorted(self.distance, limit + shrink))
+        count = int(np.searchsorted(self.distance, limit + displacement.greatest))
         if self.is_self:
             bound = self.distance[:count] - self._nearer(displacement, count)
         else:
-            bound = self.distance[:count] - displacement.moved.take(self.points[:count]).max(axis=1)
+            bound = self.distance[:count] - displacement.moved.take(self.points[:count, :2]).max(axis=1)
             if self.moving:
-                bound -= self.speed[:count] * motion.elapsed
-        return bound, float(self.distance[count] - shrink) if count < len(self) else np.inf
+                bound -= self.scene.pieces.speed[self.other[:count]] * displacement.elapsed
+        return bound, float(self.distance[count] - displacement.greatest) if count < len(self) else np.inf
 
     def _nearer(self, displacement: Displacement, count: int) -> Array:
         """Return by how much the first pairs of bodies have come nearer at most, (count,), m.
@@ -201,46 +190,59 @@ class Group:
         That is no more than a point of one has moved relative to a point of the other: no more than their middles
         have, and both have turned about those. On a straight path it is greatest at an end.
         """
-        nearer = np.zeros(count)
-        if count:
-            points = np.concatenate([self.points[:count], self.other_points[:count]], axis=1)
-            reference = displacement.reference.take(points, axis=0)
-            for state in displacement.states:
-                shift = state.take(points, axis=0) - reference
-                between = 0.5 * (shift[:, 0] + shift[:, 1] - shift[:, 2] - shift[:, 3])
-                vectors = np.stack(
-                    [between, 0.5 * (shift[:, 1] - shift[:, 0]), 0.5 * (shift[:, 3] - shift[:, 2])], axis=1
-                )
-                np.maximum(
-                    nearer, np.sqrt(np.einsum("ksc,ksc->ks", vectors, vectors)).sum(axis=1), out=nearer
-                )
-        return nearer
+        points = self.points[:count]
+        reference = displacement.reference.take(points, axis=0)
+        vectors = (_RELATIVE @ (state.take(points, axis=0) - reference) for state in displacement.states)
+        return np.asarray(
+            np.max([np.sqrt(np.einsum("ksc,ksc->ks", v, v)).sum(axis=1) for v in vectors], axis=0)
+        )
 
-    def segments(self, X: Array, rows: Index) -> Array:
-        """Return the bodies' ends (k, 6), m."""
-        return X[self.points[rows]].reshape(-1, 6)
-
-    def others(self, X: Array, time: float, rows: Index) -> Array:
-        """Return the parameters of what the bodies are compared with (k, width)."""
+    def at(self, X: Array, time: float, rows: Index) -> Array:
+        """Return some pairs as the functions of :mod:`vgtm_qp.geometry.exact` take them, (k, 7 + width)."""
+        points = self.points[rows]
+        bodies, radius = X[points[:, :2]].reshape(-1, 6), self.radius[rows, None]
         if self.is_self:
-            return X[self.other_points[rows]].reshape(-1, 6)
-        return np.asarray(self._pieces.at(time)[self.other[rows]])
+            return np.concatenate([bodies, X[points[:, 2:]].reshape(-1, 6), radius], axis=1)
+        return np.concatenate([bodies, self.scene.pieces.at(time)[self.other[rows]], radius], axis=1)
 
-    def distances(self, X: Array, time: float, rows: Index) -> PairDistances:
-        """Return exact distances of some pairs."""
-        return self.distances_of(self.segments(X, rows), self.others(X, time, rows), rows)
+    def evaluate(self, pairs: Array) -> Array:
+        """Return two contacts (k, 2, ``CONTACT``) for each of `pairs`, as given by :meth:`at`."""
+        return self._distances(pairs).reshape(len(pairs), 2, -1)
 
-    def distances_of(self, segments: Array, others: Array, rows: Index) -> PairDistances:
-        """Return the same for given ends and parameters."""
-        answer = self._kernels.distance(self.shape)(segments, others)
-        answer[:, :2] -= self.radius[rows, None]
-        return PairDistances(answer)
+    def distances(self, X: Array, time: float, rows: Index) -> Array:
+        """Return exact surface distances (k,) of some pairs, m."""
+        return self._distances(self.at(X, time, rows))[:, 0]
 
-    def sweep(self, a: Array, b: Array, other_a: Array, other_b: Array, rows: Index) -> Array:
-        """Return the outputs of ``sweep_function`` (k, 3), distances from surface to surface, m."""
-        arguments = (a, b, other_a, other_b) if self.is_self else (a, b, other_a)
-        return np.asarray(self._kernels.sweep(self.shape)(*arguments) - self.radius[rows, None])
+    def nearest(
+        self, motion: Sequence[Displacement], X: Array, time: float, best: float
+    ) -> tuple[float, int, int]:
+        """Return the least distance below `best`, m, its row, and how many pairs were evaluated after the first few.
 
-    def obstacle_displacement(self, duration: float, rows: Index) -> Array:
-        """Return the displacements (k, 3) of the obstacles in `duration`, s, in m."""
-        return np.asarray(self._pieces.velocity[self.other[rows]] * duration)
+        The row is -1 where no distance is below.
+        """
+        # The nearest pairs at the reference are likely to be so still; they make `best` small for the others.
+        rows, row = np.arange(min(len(self), _FIRST)), -1
+        for first in (True, False):
+            if len(rows):
+                distance = self.distances(X, time, rows)
+                k = int(np.argmin(distance))
+                if distance[k] < best:
+                    best, row = float(distance[k]), int(rows[k])
+            if first:
+                rows = np.flatnonzero(self.lower(motion, best)[0] < best)
+                rows = rows[rows >= _FIRST]
+        return best, row, len(rows)
+
+    def ask_fcl(self, X: Array, time: float, rows: Index, found: Array, asked: list[int]) -> None:
+        """Write FCL's answers for the rows `asked` of the contacts `found` (R, ``CONTACT``) of `rows` into these.
+
+        Those should be few, and contacts that are unique: FCL may give one between the two ends of a contact.
+        """
+        for k in asked:
+            row = int(rows[k])
+            ends = X.take(self.points[row, :2], axis=0).ravel().tolist()
+            distance = float(found[k, 0] + self.radius[row])
+            answer = self.scene.fcl.witness(int(self.other[row]), time, ends, distance)
+            if answer is not None:
+                t, normal = answer
+                found[k, 1:] = 1.0 - t, t, 0.0, 0.0, *normal

@@ -6,13 +6,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vgtm_qp.geometry.bodies import Bodies
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
 
 _COLUMNS = ("distance", "normal", "points", "weights", "is_self", "normal_speed", "body", "other")
 
@@ -92,30 +87,6 @@ class Contacts:
         return Contacts(**{column: getattr(self, column)[rows] for column in _COLUMNS}, names=self.names)
 
 
-def no_contacts(names: PairNames) -> Contacts:
-    """Return no rows."""
-    index, number = np.zeros(0, dtype=np.int64), np.zeros(0)
-    return Contacts(
-        distance=number,
-        normal=np.zeros((0, 3)),
-        points=np.zeros((0, 4), dtype=np.int64),
-        weights=np.zeros((0, 4)),
-        is_self=np.zeros(0, dtype=bool),
-        normal_speed=number,
-        body=index,
-        other=index,
-        names=names,
-    )
-
-
-def join(parts: list[Contacts], none: Contacts) -> Contacts:
-    """Return all rows of `parts`, one after the other, or `none` where there is no part."""
-    if len(parts) <= 1:
-        return parts[0] if parts else none
-    columns = {column: np.concatenate([getattr(part, column) for part in parts]) for column in _COLUMNS}
-    return Contacts(**columns, names=none.names)
-
-
 @dataclass(frozen=True, eq=False)
 class BetweenReport:
     """What was proven about a motion from one state to the next.
@@ -125,8 +96,7 @@ class BetweenReport:
     certified : bool
         No pair comes below the floor. False may also mean that the proof was not found.
     clearance : float
-        Proven lower bound of the surface distances over the motion; the least distance found where not
-        certified.
+        Proven lower bound of the surface distances over the motion; the least distance found where not certified.
     fraction : (F,)
         For each failing pair, where on the motion (0 < s <= 1) the least distance was found.
     failing : Contacts

@@ -8,12 +8,11 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vgtm_qp.errors import VgtmError
+from vgtm_qp.geometry.bodies import Array
 from vgtm_qp.geometry.exact import WIDTH
-
-Array = NDArray[np.float64]
 
 _MESH_FORMATS = (".stl", ".obj", ".ply", ".off")
 
@@ -32,7 +31,9 @@ class Obstacle:
     shape : str
         ``"box"``, ``"sphere"``, ``"cylinder"`` or ``"triangle"`` (a mesh).
     pieces : (P, 15)
-        Parameters of each piece at time 0, see :func:`vgtm_qp.geometry.exact.parameters_of`.
+        Of each piece at time 0: center (3), rotation (9, row-major, columns are its axes) and half sizes of a box (3),
+        radius of a sphere, or radius and half height of a cylinder (third axis), then zeros; or of a triangle the
+        vertices (9), counter-clockwise seen from outside, then zeros.
     velocity : (3,)
         m/s.
     solid : bool
@@ -44,18 +45,6 @@ class Obstacle:
     pieces: Array
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     solid: bool = True
-
-    def bounding_spheres(self) -> tuple[Array, Array]:
-        """Return centers (P, 3) at time 0 and radii (P,) of spheres that hold the pieces, m."""
-        pieces = self.pieces
-        if self.shape == "triangle":
-            corners = pieces[:, :9].reshape(-1, 3, 3)
-            centers = corners.mean(axis=1)
-            return centers, np.asarray(np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1))
-        if self.shape == "sphere":
-            return pieces[:, :3], pieces[:, 3]
-        sizes = pieces[:, 12:15] if self.shape == "box" else pieces[:, 12:14]
-        return pieces[:, :3], np.asarray(np.linalg.norm(sizes, axis=1))
 
 
 def box(
@@ -87,10 +76,7 @@ def box(
 
 def sphere(name: str, center: ArrayLike, radius: float, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> Obstacle:
     """Return a sphere; `center` and `radius` in m. Raises as `box`."""
-    piece = np.zeros((1, WIDTH))
-    piece[0, :3] = _vector(name, "center", center)
-    piece[0, 3] = _positive(name, np.array([radius]))[0]
-    return Obstacle(name, "sphere", piece, _vector(name, "velocity", velocity))
+    return _placed(name, "sphere", center, None, np.array([radius]), velocity)
 
 
 def cylinder(
@@ -135,7 +121,13 @@ def mesh(
         vertices, triangles = np.asarray(source[0], dtype=float), np.asarray(source[1], dtype=np.int64)
         surface = trimesh.Trimesh(vertices, triangles, process=True)
     else:
-        surface = _read(name, Path(source))
+        path = Path(source)
+        if path.suffix.lower() not in _MESH_FORMATS:
+            raise GeometryError(f'obstacle "{name}": {path.name} is not one of {", ".join(_MESH_FORMATS)}')
+        try:
+            surface = trimesh.load_mesh(path)
+        except Exception as error:  # a reader of foreign files raises anything
+            raise GeometryError(f'obstacle "{name}": cannot read {path}: {error}') from None
     if len(surface.faces) == 0:
         raise GeometryError(f'obstacle "{name}": the mesh holds no triangle')
     solid = bool(surface.is_watertight)
@@ -149,17 +141,6 @@ def mesh(
     pieces = np.zeros((len(corners), WIDTH))
     pieces[:, :9] = corners.reshape(-1, 9)
     return Obstacle(name, "triangle", pieces, _vector(name, "velocity", velocity), solid)
-
-
-def _read(name: str, path: Path) -> object:
-    import trimesh
-
-    if path.suffix.lower() not in _MESH_FORMATS:
-        raise GeometryError(f'obstacle "{name}": {path.name} is not one of {", ".join(_MESH_FORMATS)}')
-    try:
-        return trimesh.load_mesh(path)
-    except Exception as error:  # a reader of foreign files raises anything
-        raise GeometryError(f'obstacle "{name}": cannot read {path}: {error}') from None
 
 
 def _placed(
@@ -203,17 +184,12 @@ class ObstaclePieces:
 
     Attributes
     ----------
-    parameters : (P, 15)
-        At time 0.
-    shape : (P,) str
-    obstacle : (P,) int
-        Index of the obstacle each belongs to.
-    velocity : (P, 3)
-    speed : (P,)
-    fastest : float
-        Greatest speed, m/s.
-    center, radius : (P, 3), (P,)
-        Bounding spheres at time 0.
+    parameters, center, radius : (P, 15), (P, 3), (P,)
+        At time 0, with their bounding spheres, m.
+    shape, obstacle : (P,) str, (P,) int
+        The latter is the index of the obstacle each belongs to.
+    velocity, speed, fastest : (P, 3), (P,), float
+        m/s; the last one is the greatest speed.
     """
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
@@ -223,14 +199,19 @@ class ObstaclePieces:
         self.obstacle = np.repeat(np.arange(len(obstacles)), counts)
         self.velocity = np.repeat(np.reshape([o.velocity for o in obstacles], (-1, 3)), counts, axis=0)
         self.speed = np.asarray(np.linalg.norm(self.velocity, axis=1))
-        spheres = [o.bounding_spheres() for o in obstacles]
-        self.center = np.vstack([np.zeros((0, 3)), *(s[0] for s in spheres)])
-        self.radius = np.concatenate([np.zeros(0), *(s[1] for s in spheres)])
         self.fastest = float(self.speed.max(initial=0.0))
         self.moving = self.fastest > 0.0
+        triangles = self.shape == "triangle"
+        corners = self.parameters[triangles, :9].reshape(-1, 3, 3)
+        self.center, self.radius = (
+            self.parameters[:, :3].copy(),
+            np.linalg.norm(self.parameters[:, 12:], axis=1),
+        )
+        self.center[triangles] = corners.mean(axis=1)
+        spread = np.linalg.norm(corners - self.center[triangles, None], axis=2)
+        self.radius[triangles] = spread.max(axis=1, initial=0.0)
         self._shift = np.zeros_like(self.parameters)
         self._shift[:, :3] = self.velocity
-        triangles = self.shape == "triangle"
         self._shift[triangles, :9] = np.tile(self.velocity[triangles], 3)
         self._now: tuple[float, Array] = (0.0, self.parameters)
 

@@ -1,14 +1,66 @@
-"""Whether a point is inside a closed mesh, by its winding number."""
+"""Bodies inside closed meshes, told by winding numbers."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from vgtm_qp.geometry.bodies import Array
+from vgtm_qp.geometry.groups import Found, Group, Scene
 
 _ROWS = 200_000
+
+
+class Solids:
+    """The closed meshes of a scene, which may move."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        meshes = {
+            k: obstacle.pieces[:, :9].reshape(-1, 3, 3)
+            for k, obstacle in enumerate(scene.obstacles)
+            if obstacle.shape == "triangle" and obstacle.solid
+        }
+        self._meshes = [(k, t, t.min(axis=(0, 1)), t.max(axis=(0, 1))) for k, t in meshes.items()]
+
+    def enclosed(self, X: Array, time: float) -> list[Found]:
+        """Return the bodies with an end inside a closed mesh, at minus their distance to its surface."""
+        bodies, pieces = self._scene.bodies, self._scene.pieces
+        parts: list[Found] = []
+        for obstacle, triangles, low, high in self._meshes:
+            points = X - time * self._scene.obstacles[obstacle].velocity
+            inside = ((points >= low) & (points <= high)).all(axis=1)
+            if inside.any():
+                inside[inside] = winding_number(points[inside], triangles) > 0.5
+            body = np.flatnonzero(inside[bodies.points].any(axis=1))
+            if not len(body):
+                continue
+            piece = np.flatnonzero(pieces.obstacle == obstacle)
+            group = Group(self._scene, "triangle", np.repeat(body, len(piece)), np.tile(piece, len(body)))
+            found = group.evaluate(group.at(X, time, np.arange(len(group))))[:, 0]
+            nearest = found[:, 0].reshape(len(body), -1).argmin(axis=1) + len(piece) * np.arange(len(body))
+            found, radius = found[nearest], bodies.radius[body]
+            depth = found[:, 0] + radius
+            found[:, 0] = -depth - radius
+            # The way out, where the axis does not touch the surface.
+            found[:, 5:] *= np.where(depth > 0.0, -1.0, 1.0)[:, None]
+            parts.append((group.numbers[nearest], found))
+        return parts
+
+    def with_enclosed(self, parts: list[Found], X: Array, time: float) -> list[Found]:
+        """Return contacts with one that leads out for each body inside a closed mesh."""
+        enclosed = self.enclosed(X, time)
+        if not enclosed:
+            return parts
+        owner = self._scene.pieces.obstacle
+        inside = np.zeros((len(self._scene.bodies), len(self._scene.obstacles)), dtype=bool)
+        for numbers, _ in enclosed:
+            inside[numbers[:, 4], owner[numbers[:, 5]]] = True
+        kept = []
+        for numbers, found in parts:
+            outside = numbers[:, 6] > 0
+            outside[~outside] = ~inside[numbers[~outside, 4], owner[numbers[~outside, 5]]]
+            kept.append((numbers[outside], found[outside]))
+        return kept + enclosed
 
 
 def winding_number(points: Array, triangles: Array) -> Array:
@@ -28,20 +80,3 @@ def winding_number(points: Array, triangles: Array) -> Array:
             spread += np.einsum("kti,kti->kt", v, w) * length
         total += np.arctan2(volume, spread).sum(axis=1)
     return np.asarray(total / (2.0 * np.pi))
-
-
-class Solid:
-    """A closed mesh that may move."""
-
-    def __init__(self, triangles: Array, velocity: Array) -> None:
-        self._triangles, self._velocity = triangles, velocity
-        self._low, self._high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-
-    def contains(self, points: Array, time: float) -> Mask:
-        """Return which of `points` (K, 3) are inside at `time`."""
-        local = points - time * self._velocity
-        inside = ((local >= self._low) & (local <= self._high)).all(axis=1)
-        rows = np.flatnonzero(inside)
-        if len(rows):
-            inside[rows] = winding_number(local[rows], self._triangles) > 0.5
-        return np.asarray(inside)

@@ -2,109 +2,95 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.geometry.bodies import Array, Index
+from vgtm_qp.geometry.exact import CONTACT, sweep_function
 from vgtm_qp.geometry.groups import Group
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _DEPTH = 12
 _PIECES = 16
 _SAMPLES = np.linspace(0.0, 1.0, 33)[1:-1]
 
 
-@dataclass(frozen=True, eq=False)
-class SweepResult:
+class SweepResult(NamedTuple):
     """Which pairs of a group were certified over a motion.
 
     Attributes
     ----------
-    proven : float
-        Least lower bound of the pairs that were certified, m.
+    lowest : float
+        Least lower bound of the pairs that were certified, or least distance found of the others, m.
     rows : (F,) int
         Rows of the group that were not certified.
     fraction : (F,)
         Where on the motion each of those was found nearest, 0 < s <= 1.
-    worst : float
-        Least distance found of the pairs that were not certified, m.
+    contacts : (F, CONTACT)
+        Their contacts there.
     """
 
-    proven: float
+    lowest: float
     rows: Index
     fraction: Array
-    worst: float = np.inf
-
-    def placed(
-        self, group: Group, start: Array, end: Array, start_time: float, end_time: float
-    ) -> tuple[Array, Array]:
-        """Return segments and parameters of the failing pairs at their fractions, in the base frame."""
-        motion = _RelativeMotion(group, self.rows, start, end, start_time, end_time)
-        segments, others = motion.at(np.arange(len(self.rows)), self.fraction)
-        if group.is_self:
-            return segments, others
-        shift = group.obstacle_displacement(end_time - start_time, self.rows) * self.fraction[:, None]
-        corners = _corners(group.shape)
-        others = others.copy()
-        others[:, : 3 * corners] += np.tile(shift, corners)
-        return segments + np.tile(shift, 2), others
+    contacts: Array
 
 
-def _corners(shape: str) -> int:
-    return 3 if shape == "triangle" else 1
-
-
-class _RelativeMotion:
-    """The segments of some pairs over a motion, in the frame of the obstacle, which rests there."""
+class _Sweep:
+    """Some pairs over a motion, each in the frame of its obstacle, which rests there."""
 
     def __init__(
         self, group: Group, rows: Index, start: Array, end: Array, start_time: float, end_time: float
     ) -> None:
-        self._is_self = group.is_self
-        self.segments = group.segments(start, rows)
-        self.change = group.segments(end, rows) - self.segments
-        self.others = group.others(start, start_time, rows)
-        if group.is_self:
-            self.other_change = group.others(end, end_time, rows) - self.others
-        elif group.moving:
-            self.change -= np.tile(group.obstacle_displacement(end_time - start_time, rows), 2)
+        self.group = group
+        self._start = group.at(start, start_time, rows)
+        self._change = group.at(end, start_time, rows) - self._start
+        if group.moving:
+            velocity = group.scene.pieces.velocity[group.other[rows]]
+            self._change[:, :6] -= np.tile((end_time - start_time) * velocity, 2)
 
-    def at(self, k: Index, fraction: Array) -> tuple[Array, Array]:
-        """Return segments and parameters of the pairs `k` at their `fraction`."""
-        s = fraction[:, None]
-        others = self.others[k]
-        if self._is_self:
-            others = others + s * self.other_change[k]
-        return self.segments[k] + s * self.change[k], others
+    def at(self, k: Index, fraction: Array) -> Array:
+        """Return the pairs `k` at their `fraction` of the motion."""
+        return np.asarray(self._start[k] + fraction[:, None] * self._change[k])
+
+    def bounds(self, k: Index, left: Array, right: Array) -> Array:
+        """Return ``sweep_function`` (len(k), 3) of the pairs `k` between the fractions `left` and `right`."""
+        sweep = self.group.scene.batch(sweep_function, self.group.shape)
+        return sweep(self.at(k, left), self.at(k, right))
+
+    def nearest(self, chosen: Index, worst: Array, fraction: Array) -> Array:
+        """Return where the `chosen` pairs are nearest: the better of the point known and of even samples."""
+        pairs = self.at(np.repeat(chosen, len(_SAMPLES)), np.tile(_SAMPLES, len(chosen)))
+        distance = self.group.evaluate(pairs)[:, 0, 0].reshape(len(chosen), -1)
+        best = distance.argmin(axis=1)
+        better = distance[np.arange(len(chosen)), best] < worst
+        return np.asarray(np.maximum(np.where(better, _SAMPLES[best], fraction), _SAMPLES[0]))
 
 
 def sweep_group(
     group: Group, rows: Index, start: Array, end: Array, start_time: float, end_time: float, floor: float
 ) -> SweepResult:
     """Return which of the pairs `rows` stay above `floor` over the motion, provably."""
-    motion = _RelativeMotion(group, rows, start, end, start_time, end_time)
+    sweep = _Sweep(group, rows, start, end, start_time, end_time)
     count = len(rows)
     # The motion of few pairs is cut at once, as finely as a call costs no more: one call instead of several.
     pieces = max(_PIECES // count, 1)
     k = np.repeat(np.arange(count), pieces)
     cuts = np.arange(pieces + 1) / pieces
     left, right = np.tile(cuts[:-1], count), np.tile(cuts[1:], count)
-    answer = _swept(group, motion, rows, k, left, right)
-    if (answer[:, 0] >= floor).all():
-        return SweepResult(float(answer[:, 0].min()), rows[:0], left[:0])
+    bounds = sweep.bounds(k, left, right)
+    if (bounds[:, 0] >= floor).all():
+        return SweepResult(float(bounds[:, 0].min()), rows[:0], left[:0], np.zeros((0, CONTACT)))
     failed = np.zeros(count, dtype=bool)
     worst, proven = np.full(count, np.inf), np.full(count, np.inf)
     fraction = np.full(count, 0.5)
     for depth in range(_DEPTH + 1):
         if depth:
-            answer = _swept(group, motion, rows, k, left, right)
+            bounds = sweep.bounds(k, left, right)
         # A negated comparison is true for NaN.
-        open_ = ~(answer[:, 0] >= floor)
-        np.minimum.at(proven, k[~open_], answer[~open_, 0])
-        for distance, where in ((answer[:, 1], left), (answer[:, 2], right)):
+        open_ = ~(bounds[:, 0] >= floor)
+        np.minimum.at(proven, k[~open_], bounds[~open_, 0])
+        for distance, where in ((bounds[:, 1], left), (bounds[:, 2], right)):
             np.minimum.at(worst, k, distance)
             here = distance == worst[k]
             fraction[k[here]] = where[here]
@@ -118,26 +104,9 @@ def sweep_group(
         left, right = np.concatenate([left[split], middle]), np.concatenate([middle, right[split]])
         k = np.concatenate([k[split], k[split]])
     chosen = np.flatnonzero(failed)
-    kept = float(proven[~failed].min(initial=np.inf))
-    if len(chosen):
-        fraction[chosen] = _nearest_fraction(group, motion, rows, chosen, worst[chosen], fraction[chosen])
-    return SweepResult(kept, rows[chosen], fraction[chosen], float(worst[chosen].min(initial=np.inf)))
-
-
-def _swept(group: Group, motion: _RelativeMotion, rows: Index, k: Index, left: Array, right: Array) -> Array:
-    """Return the sweep of the pairs `k` between the fractions `left` and `right` of the motion, (len(k), 3)."""
-    a, other_a = motion.at(k, left)
-    b, other_b = motion.at(k, right)
-    return group.sweep(a, b, other_a, other_b, rows[k])
-
-
-def _nearest_fraction(
-    group: Group, motion: _RelativeMotion, rows: Index, chosen: Index, worst: Array, fraction: Array
-) -> Array:
-    """Return where the `chosen` pairs are nearest: the better of the point known and of even samples."""
-    k = np.repeat(chosen, len(_SAMPLES))
-    segments, others = motion.at(k, np.tile(_SAMPLES, len(chosen)))
-    distance = group.distances_of(segments, others, rows[k]).distance.reshape(len(chosen), -1)
-    best = distance.argmin(axis=1)
-    better = distance[np.arange(len(chosen)), best] < worst
-    return np.asarray(np.maximum(np.where(better, _SAMPLES[best], fraction), _SAMPLES[0]))
+    lowest = float(np.where(failed, worst, proven).min())
+    if not len(chosen):
+        return SweepResult(lowest, rows[:0], left[:0], np.zeros((0, CONTACT)))
+    fraction = sweep.nearest(chosen, worst[chosen], fraction[chosen])
+    contacts = group.evaluate(sweep.at(chosen, fraction))[:, 0]
+    return SweepResult(lowest, rows[chosen], fraction, contacts)
