@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics, Pose
 from vgtm_qp.curve.families import make_family
+from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.path import Path

@@ -12,12 +12,13 @@ from steps import SHAPES, assert_same_answer, make_step, pressing, shaped
 
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.curve.families import make_family
+from vgtm_qp.qp.answer import Accuracy
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import make_solver
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.step.engine import Accuracy, FusedEngine, GeneralEngine
+from vgtm_qp.step.engine import FusedEngine, GeneralEngine
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.target import QPInput, Target
 

@@ -16,9 +16,10 @@ from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.errors import SolverError, VgtmError
 from vgtm_qp.problem.method import Weights
+from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.linearise import Linearisation, StepInput
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
 from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.qp.solvers import FullSolver, available_solvers, make_solver
 from vgtm_qp.rows.tip import TipGoal

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.qp import daqp
+from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers
+from vgtm_qp.rows.curve import free_basis
 
 Array = NDArray[np.float64]
 
@@ -87,9 +89,9 @@ class CondensedSolver:
             axes, shift = numbers.base_axes, numbers.base_displacement
             start[first : first + 3] = shift
             start[first + 3 : first + 6] = shift + numbers.base_rhs @ axes
-            Z[first + 3 : first + 6, count] = np.cross(axes[0], axes[1])
-            others = np.arange(layout.free_curve - 1)
-            Z[first + 6 + others, count + 1 + others] = 1.0
+            curve = slice(first, column["torsion"].stop)
+            basis = free_basis(np.cross(axes[0], axes[1]), curve.stop - first)
+            Z[curve, count : count + layout.free_curve] = basis
             gaps, rows = builder.gaps, builder.gap_rows
             Z[gaps] = (qp.A @ Z)[rows]
             start[gaps] = (qp.A @ start)[rows] - qp.row_lower[rows]

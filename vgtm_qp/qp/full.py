@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from vgtm_qp.arm.arm import Label
+from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution, beyond, norm, slack_curvature
+from vgtm_qp.qp.numbers import StepNumbers, beyond, norm, slack_curvature
 from vgtm_qp.rows.tip import unit
 
 Array = NDArray[np.float64]

@@ -6,74 +6,27 @@ It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in 10 to 20 times less ti
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from vgtm_qp.qp import daqp
+from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
 from vgtm_qp.qp.daqp import EQUALITY, DenseAnswer
 from vgtm_qp.qp.fused_rows import row_function
 from vgtm_qp.qp.fused_settle import NEAR, settle_function
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
-from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, StepSolution
+from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows
 from vgtm_qp.qp.residual import refuse_large
+from vgtm_qp.rows.curve import free_basis
+from vgtm_qp.rows.tip import TipGoal
 
 Array = NDArray[np.float64]
 
 _AXES = np.arange(3)
 _NOWHERE: Array = np.zeros((0, 3))
-
-
-@dataclass(frozen=True, eq=False)
-class Closed:
-    """A configuration whose quantities are what they should be.
-
-    Attributes
-    ----------
-    q : configuration
-    quantities : (M,)
-    error : float
-        Greatest deviation of a quantity from what it should be.
-    tip_position, tip_rotation : (3,), (3, 3)
-    """
-
-    q: Array
-    quantities: Array
-    error: float
-    tip_position: Array
-    tip_rotation: Array
-
-
-class Taken(NamedTuple):
-    """Where the answer of a QP leads.
-
-    Attributes
-    ----------
-    solution : StepSolution
-        Whose ``nodes`` and ``vertices`` are left empty: `q` and `vertices` say where they lead.
-    q : configuration
-        By the answer alone.
-    closed : Closed
-        With the tip at its goal.
-    vertices : (V, 3)
-        The curve, m.
-    progress, moved : float
-        Progress along the path, and the greatest displacement of a node's coordinate by the answer, m.
-    before, after : float
-        The tip's errors before and after it was settled, m and rad.
-    """
-
-    solution: StepSolution
-    q: Array
-    closed: Closed
-    vertices: Array
-    progress: float
-    moved: float
-    before: float
-    after: float
 
 
 class _Room:
@@ -121,7 +74,7 @@ class FusedSolver:
         settled.bind_input(15, self._hessian)
         settled.bind_input(16, self._gradient)
         self._answer, self._multipliers = settled.inputs[17], settled.inputs[18]
-        self._gram, self._taken = settled.inputs[19].reshape(actuators, actuators), settled.inputs[20]
+        self._gram, self._follows = settled.inputs[19].reshape(actuators, actuators), settled.inputs[20]
         self._room = _Room()
         self._reserve(size + self._tip + self._hard + NEAR)
         self._draw(layout)
@@ -228,8 +181,10 @@ class FusedSolver:
         self._answer[:] = answer.x
         return answer
 
-    def take(self, answer: DenseAnswer, near: int) -> Taken:
+    def move(self, answer: DenseAnswer, near: int, torsion: Array, accuracy: Accuracy) -> Move:
         """Return where an answer of :meth:`ask` leads that had so many clearance rows, at most ``NEAR``.
+
+        The solution's ``nodes`` and ``vertices`` are left empty. `torsion` (T,) is the curve's before the step, rad.
 
         Raises
         ------
@@ -243,38 +198,43 @@ class FusedSolver:
         out = self._settled.outputs
         error, before, after, progress, moved, primal, dual = out[5].tolist()
         refuse_large(primal, dual, answer.name)
-        vertices = out[4].reshape(-1, 3).copy()
         solution = self._solution(answer, near, _NOWHERE, _NOWHERE)
-        q = out[6].reshape(self._shape).copy()
-        return Taken(solution, q, self._closed(error), vertices, progress, moved, before, after)
+        torsion = torsion + solution.torsion if len(torsion) else torsion
+        q, vertices = out[6].reshape(self._shape).copy(), out[4].reshape(-1, 3).copy()
+        closed = self._closed(error, before, after, accuracy)
+        return Move(solution, q, vertices, torsion, progress, moved, closed)
 
     def settle(
-        self, q: Array, vertices: Array, lower: Array, upper: Array, position: Array, rotation: Array
-    ) -> tuple[Closed, float, float]:
-        """Return configuration `q` with its quantities closed, actuators in their boxes (n_a,), and its tip at a pose.
+        self, q: Array, vertices: Array, lower: Array, upper: Array, goal: TipGoal, accuracy: Accuracy
+    ) -> Closed | None:
+        """Return configuration `q` with its quantities closed, actuators in their boxes (n_a,), and its tip at `goal`.
 
-        `vertices` (V, 3), m, are the curve that stations are held on with hard tracking. Beside the configuration
-        stand the tip's errors before and after settling, m and rad.
+        `vertices` (V, 3), m, are the curve that stations are held on with hard tracking. None where that was not
+        reached.
         """
         inputs = self._settled.inputs
         inputs[0][:] = q.reshape(-1)
         inputs[1][:] = lower
         inputs[2][:] = upper
-        inputs[3][:] = position
-        inputs[4][:] = rotation.T.reshape(-1)
+        inputs[3][:] = goal.position
+        inputs[4][:] = goal.rotation.T.reshape(-1)
         inputs[14][:] = vertices.reshape(-1)
         self._settle(0.0)
-        error, before, after = self._settled.outputs[5].tolist()[:3]
-        return self._closed(error), before, after
+        error, before, after = self._settled.outputs[5][:3].tolist()
+        return self._closed(error, before, after, accuracy)
 
-    def _settle(self, taken: float) -> None:
+    def _settle(self, follows: float) -> None:
+        """Settle where the answer leads, or at 0 the configuration that was loaded."""
         if not self._hard:
             response = self._response[: self._actuators]
             np.dot(response, response.T, out=self._gram)
-        self._taken[0] = taken
+        self._follows[0] = follows
         self._settled()
 
-    def _closed(self, error: float) -> Closed:
+    def _closed(self, error: float, before: float, after: float, accuracy: Accuracy) -> Closed | None:
+        """Return where settling ended; None if it is not exact enough, the tip's errors included, m and rad."""
+        if not (error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip):
+            return None
         q, quantities, position, rotation = self._settled.outputs[:4]
         return Closed(
             q.reshape(self._shape).copy(),
@@ -327,18 +287,11 @@ class FusedSolver:
 
     def _constant_hessian(self) -> Array:
         """Return the part of the Hessian that only a turning base changes."""
-        count, weights = self._actuators, self.layout.weights
-        constant = np.zeros((self._size - 1, self._size - 1))
-        index = np.arange(count)
-        constant[index, index] = weights.actuator_rate + weights.stroke_centring
-        if self._free_curve:
-            bending, end = self.layout.vertex_hessian, self._torsion
-            constant[count, count] = bending[1, 1]
-            constant[count, count + 1 : end] = np.kron(bending[1, 2:], self._normal)
-            constant[count + 1 :, count] = constant[count, count + 1 :]
-            constant[count + 1 : end, count + 1 : end] = np.kron(bending[2:, 2:], np.eye(3))
-            constant[end:, end:] = weights.curve_rate * np.eye(self.layout.torsion)
-        return constant
+        layout, weights = self.layout, self.layout.weights
+        basis = free_basis(self._normal, 3 * layout.vertices + layout.torsion)
+        of_curve = basis.T @ layout.curve_hessian @ basis
+        of_actuators = (weights.actuator_rate + weights.stroke_centring) * np.eye(self._actuators)
+        return np.asarray(block_diag(of_actuators, of_curve))
 
     def _spread_rows(self, clearance: ClearanceRows) -> Array:
         """Return the clearance rows (R, 3 (N - N_c)) over the free nodes' displacements."""

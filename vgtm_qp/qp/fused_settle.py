@@ -25,7 +25,7 @@ def settle_function(layout: Layout) -> Bound:
     Arguments: q; lower, upper (n_a); goal position (3), rotation (3, 3), velocity and spin (3) per unit of progress;
     progress so far; results 0 to 3, 6 and 7 of `row_function`, with the tip rows and bounds followed by those of hard
     tracking and of ``NEAR`` clearances; p (3, V); Hessian and gradient; the QP's answer and multipliers; Gram matrix
-    (n_a, n_a) of the weighted node displacements in R; and 1 where the answer is to be taken, 0 where q is to be
+    (n_a, n_a) of the weighted node displacements in R; and 1 where the answer is to be followed, 0 where q is to be
     settled at the goal given. With hard tracking the stations are held on the curve instead, where they and the fixed
     quantities determine the configuration: the tip then is where the curve ends.
 
@@ -42,7 +42,7 @@ def settle_function(layout: Layout) -> Bound:
     frames = tip_frames(layout, constants) if arm.end_effector.has_frame else None
     goal, turned = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
     velocity, spin, progress = ca.MX.sym("velocity", 3), ca.MX.sym("spin", 3), ca.MX.sym("progress")
-    vertices, taken = ca.MX.sym("p", 3, layout.vertices), ca.MX.sym("taken")
+    vertices, follows = ca.MX.sym("p", 3, layout.vertices), ca.MX.sym("follows")
     scales = np.array(
         [
             layout.weights.actuator_rate + layout.weights.stroke_centring,
@@ -59,11 +59,11 @@ def settle_function(layout: Layout) -> Bound:
     reached = ca.fmin(ca.fmax(progress + qp.answer[-1], 0.0), 1.0)
     left = (1.0 - reached) * ca.fmax(ca.norm_inf(velocity), ca.norm_inf(spin))
     reached = ca.if_else(left <= LEFT, 1.0, reached)
-    gone = taken * (reached - progress)
+    gone = follows * (reached - progress)
     goal_pose = goal + gone * velocity, rotated(gone * spin) @ turned
-    moved = taken * scale * (qp.response @ qp.actuators + qp.particular)
-    vertices_after = vertices + taken * qp.curve_displacement()
-    start = symbols.along(q, symbols.coordinates(moved, taken * qp.actuators))
+    moved = follows * scale * (qp.response @ qp.actuators + qp.particular)
+    vertices_after = vertices + follows * qp.curve_displacement()
+    start = symbols.along(q, symbols.coordinates(moved, follows * qp.actuators))
 
     is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
     held = symbols.held(layout.tracked.tolist()) if is_plain else None
@@ -91,7 +91,7 @@ def settle_function(layout: Layout) -> Bound:
     inputs = [
         *(q, lower, upper, goal, turned, velocity, spin, progress),
         *(qp.rows, qp.constraint, qp.low, qp.high, qp.offset, qp.normal, vertices),
-        *(qp.hessian, qp.linear, qp.answer, qp.multipliers, qp.gram, taken),
+        *(qp.hessian, qp.linear, qp.answer, qp.multipliers, qp.gram, follows),
     ]
     outputs = [end, quantities, *tip(end), vertices_after, ca.vertcat(*measures), start]
     function = ca.Function(

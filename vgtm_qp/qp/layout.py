@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from vgtm_qp.arm.arm import Arm
 from vgtm_qp.curve.families import CurveFamily
@@ -138,6 +139,12 @@ class Layout:
         drawn = np.isin(np.arange(self.vertices), self.vertex_goals) * self.weights.vertex_goal
         rate = self.weights.curve_rate * np.eye(self.vertices)
         return np.asarray(rate + self.weights.smoothness * self.polygon_bending + np.diag(drawn))
+
+    @cached_property
+    def curve_hessian(self) -> Array:
+        """(D, D) the same over all coordinates of the curve: control vertices, then torsion."""
+        vertices = np.kron(self.vertex_hessian, np.eye(3))
+        return np.asarray(block_diag(vertices, self.weights.curve_rate * np.eye(self.torsion)))
 
     def goal_pull(self, vertices: Array, goals: Array | None) -> Array:
         """Return (V, 3) the gradient of the control vertices' goals (V, 3), m; NaN where a vertex has none.

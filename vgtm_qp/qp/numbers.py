@@ -145,43 +145,6 @@ class StepNumbers(RowNumbers):
         return position.reshape(-1, size), turn.reshape(-1, size)
 
 
-@dataclass(frozen=True)
-class StepSolution:
-    """The primal and dual answer of one QP, in the arm's terms.
-
-    Attributes
-    ----------
-    nodes : (N, 3)
-        Displacements of all nodes, base nodes included, m.
-    actuators : (n_a,)
-        Changes of the actuated lengths, m.
-    vertices : (V, 3)
-        Displacements of the control vertices, m.
-    torsion : (T,)
-        Changes of the torsion coordinates, rad.
-    progress : float
-        Change of the path variable alpha.
-    actuator_multipliers : (n_a,)
-        Positive at an upper, negative at a lower bound.
-    clearance_multipliers : (R,)
-        Nonnegative.
-    iterations : int
-        Iterations of the solver.
-    tip_slack : float
-        How far the tip's rows are left at most, m or rad; zero where they are hard.
-    """
-
-    nodes: Array
-    actuators: Array
-    vertices: Array
-    progress: float
-    actuator_multipliers: Array
-    clearance_multipliers: Array
-    iterations: int = 0
-    torsion: Array = field(default_factory=lambda: np.zeros(0))
-    tip_slack: float = 0.0
-
-
 _SLACK_CURVATURE, _LEAST_PENALTY = 1e-5, 0.1
 
 

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from vgtm_qp.errors import SolverError, nearest
+from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import chain_solver, prefers_staged
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import StepNumbers
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, NoAnswerError, refuse_large, relative
 
 Array = NDArray[np.float64]

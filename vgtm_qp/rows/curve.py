@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 
 def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
@@ -17,6 +21,15 @@ def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
     offset[:, 0] = centre - vertices[:, 0]
     offset[:, 1] = offset[:, 0] - across @ (across.T @ (vertices[:, 1] - vertices[:, 0]))
     return offset
+
+
+def free_basis(normal: Array, size: int) -> Array:
+    """Return (D, q) what the coordinates that the base leaves free do to all D of them; q = 0 without a curve."""
+    basis = np.eye(size)[:, 5:]
+    basis[:6] = 0.0
+    if size:
+        basis[3:6, 0] = normal
+    return basis
 
 
 def free_columns(rows: Any, normal: Any) -> Any:

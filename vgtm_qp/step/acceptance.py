@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics, Pose
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.answer import Accuracy, Closed
 from vgtm_qp.qp.graph import StationSymbols
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import beyond, norm
 from vgtm_qp.rows.tip import TipGoal
-from vgtm_qp.step.engine import Accuracy
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.target import Target, base_frame
 

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import EvaluationError, SolverError
-from vgtm_qp.qp.fused import Closed
-from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance, TrackingError
 from vgtm_qp.step.actuation import Actuation
-from vgtm_qp.step.engine import Accuracy, Move
 from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State

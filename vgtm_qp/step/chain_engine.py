@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.symbols import Bound, Constants, Frames
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import PeriodValues
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.sweep import MOST_STEPS, TOO_FAR
 from vgtm_qp.qp.long.tracked import TrackedSolver
-from vgtm_qp.qp.numbers import RowNumbers, StepSolution
+from vgtm_qp.qp.numbers import RowNumbers
 from vgtm_qp.qp.settle import held
 from vgtm_qp.rows.curve import base_offset
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 from vgtm_qp.step.closing import Closing, enough_length, within
-from vgtm_qp.step.engine import Accuracy, Engine, enough_tip_error
+from vgtm_qp.step.engine import Engine, enough_tip_error
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
 

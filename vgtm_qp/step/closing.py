@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.answer import Closed
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import LengthSolver
 

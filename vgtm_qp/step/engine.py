@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,14 @@ from numpy.typing import NDArray
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.errors import EvaluationError, SolverError
+from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
 from vgtm_qp.qp.full import FullBuilder, StepQP
-from vgtm_qp.qp.fused import Closed, FusedSolver
+from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.fused_settle import NEAR
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.long.sweep import MOST_STEPS
-from vgtm_qp.qp.numbers import StepNumbers, StepSolution
+from vgtm_qp.qp.numbers import StepNumbers
 from vgtm_qp.qp.residual import FailedStepError, InfeasibleStepError
 from vgtm_qp.qp.settle import LEFT, SETTLING_STEPS, held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
@@ -41,35 +41,6 @@ _ROUNDING = float(np.finfo(float).eps)
 
 _ON_PATH = 1e-6
 """Solvers leave slacks of this size, m or rad, where the answer's are zero."""
-
-
-class Accuracy(NamedTuple):
-    """How exactly quantities, the tip, and stations that track hard are settled, m or rad.
-
-    These are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. A tip
-    that is further off than `start` after a QP calls for another one.
-    """
-
-    member: float
-    tip: float
-    start: float
-    tracking: float = 1e-7
-
-
-class Move(NamedTuple):
-    """Where the answer of one QP leads: the configuration `q` by the answer alone, the curve and the progress.
-
-    `furthest` is the greatest displacement of a node's coordinate, m. `closed` is the configuration with its quantities
-    closed and its tip at its goal, None where only another QP leads there.
-    """
-
-    solution: StepSolution
-    q: Array
-    vertices: Array
-    torsion: Array
-    progress: float
-    furthest: float
-    closed: Closed | None
 
 
 Spent = Callable[[str], None]
@@ -289,16 +260,13 @@ class FusedEngine(Engine):
             self._solver.load(asked.linear(self.layout))
             answer = self._solver.ask(asked.rows)
             spent("qp")
-            end = self._solver.take(answer, near)
+            return self._solver.move(answer, near, asked.torsion, accuracy)
         except (InfeasibleStepError, EvaluationError):
             # There may be an answer without the margin, or one that other steps settle.
             return super().move(asked, accuracy, spent)
         except FailedStepError as error:
             error.build = lambda: self.qp(asked)
             raise
-        torsion = asked.torsion + end.solution.torsion if len(asked.torsion) else asked.torsion
-        closed = _if_settled(end.closed, end.before, end.after, accuracy)
-        return Move(end.solution, end.q, end.vertices, torsion, end.progress, end.moved, closed)
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
@@ -309,13 +277,4 @@ class FusedEngine(Engine):
 
     def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
         """See :class:`Engine`."""
-        bounds = target.lower, target.upper
-        found = self._solver.settle(q, self._vertices, *bounds, goal.position, goal.rotation)
-        return _if_settled(*found, accuracy)
-
-
-def _if_settled(closed: Closed, before: float, after: float, accuracy: Accuracy) -> Closed | None:
-    """Return a configuration whose tip was off by so much, m or rad, `before` and `after` it was settled; or None."""
-    if closed.error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip:
-        return closed
-    return None
+        return self._solver.settle(q, self._vertices, target.lower, target.upper, goal, accuracy)

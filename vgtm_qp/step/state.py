@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm
 from vgtm_qp.geometry.clearance import Pair
-from vgtm_qp.qp.fused import Closed
+from vgtm_qp.qp.answer import Closed
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
+from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import StepQP
-from vgtm_qp.qp.numbers import ClearanceRows, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import FailedStepError
 from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.state import State

@@ -20,6 +20,7 @@ from vgtm_qp.qp.long.elimination import member_lengths
 from vgtm_qp.qp.long.sparse_symbols import dense_function, nonzeros, sparsity_of
 from vgtm_qp.qp.numbers import StepNumbers
 from vgtm_qp.rows import tracking
+from vgtm_qp.rows.curve import free_basis
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -78,9 +79,7 @@ class ChainData:
         self._tracking = 0.0 if layout.hard_tracking else layout.weights.tracking
         along = self._polygon + self._tracking * self.weights.T @ self.weights
         self._hessian, self._polygon_hessian = np.kron(along, np.eye(3)), np.kron(self._polygon, np.eye(3))
-        # What the free coordinates of the curve do to the vertices' coordinates: the second vertex slides on a line.
-        self._free = np.eye(3 * layout.vertices)[:, 5:]
-        self._free[:6] = 0.0
+        self._free = free_basis(np.zeros(3), 3 * layout.vertices)
 
     def fill(self, numbers: StepNumbers) -> None:
         """Overwrite everything with the values of `numbers`."""

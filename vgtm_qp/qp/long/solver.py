@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.long.chain_data import ChainData
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import ChainClosing
 from vgtm_qp.qp.long.working_set import Answer, Key, Moved, RowTable, solve_rows
-from vgtm_qp.qp.numbers import RowNumbers, StepNumbers, StepSolution, beyond, norm
+from vgtm_qp.qp.numbers import RowNumbers, StepNumbers, beyond, norm
 from vgtm_qp.qp.residual import refuse_large, relative
 
 Array = NDArray[np.float64]

@@ -1,0 +1,97 @@
+"""What comes of a step's QP: its answer, and where that leads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StepSolution:
+    """The primal and dual answer of one QP, in the arm's terms.
+
+    Attributes
+    ----------
+    nodes : (N, 3)
+        Displacements of all nodes, base nodes included, m.
+    actuators : (n_a,)
+        Changes of the actuated lengths, m.
+    vertices : (V, 3)
+        Displacements of the control vertices, m.
+    torsion : (T,)
+        Changes of the torsion coordinates, rad.
+    progress : float
+        Change of the path variable alpha.
+    actuator_multipliers : (n_a,)
+        Positive at an upper, negative at a lower bound.
+    clearance_multipliers : (R,)
+        Nonnegative.
+    iterations : int
+        Iterations of the solver.
+    tip_slack : float
+        How far the tip's rows are left at most, m or rad; zero where they are hard.
+    """
+
+    nodes: Array
+    actuators: Array
+    vertices: Array
+    progress: float
+    actuator_multipliers: Array
+    clearance_multipliers: Array
+    iterations: int = 0
+    torsion: Array = field(default_factory=lambda: np.zeros(0))
+    tip_slack: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """A configuration whose quantities are what they should be.
+
+    Attributes
+    ----------
+    q : configuration
+    quantities : (M,)
+    error : float
+        Greatest deviation of a quantity from what it should be.
+    tip_position, tip_rotation : (3,), (3, 3)
+    """
+
+    q: Array
+    quantities: Array
+    error: float
+    tip_position: Array
+    tip_rotation: Array
+
+
+class Accuracy(NamedTuple):
+    """How exactly quantities, the tip, and stations that track hard are settled, m or rad.
+
+    These are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. A tip
+    that is further off than `start` after a QP calls for another one.
+    """
+
+    member: float
+    tip: float
+    start: float
+    tracking: float = 1e-7
+
+
+class Move(NamedTuple):
+    """Where the answer of one QP leads: the configuration `q` by the answer alone, the curve and the progress.
+
+    `furthest` is the greatest displacement of a node's coordinate, m. `closed` is the configuration with its quantities
+    closed and its tip at its goal, None where only another QP leads there.
+    """
+
+    solution: StepSolution
+    q: Array
+    vertices: Array
+    torsion: Array
+    progress: float
+    furthest: float
+    closed: Closed | None
