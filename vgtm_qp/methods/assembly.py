@@ -52,7 +52,7 @@ class SegmentKinematics:
             if len(fixed) not in self._members:
                 self._members[len(fixed)] = Kernel(member_function(truss).map(len(fixed)))
             members = self._members[len(fixed)]
-            members.inputs[0][:] = X[truss.member_nodes[fixed]].ravel()
+            members.inputs[0][:] = X.take(truss.member_nodes[fixed].ravel(), axis=0).ravel()
             if truss.joints is not None:
                 members.inputs[1][:] = truss.joints.offset[fixed].ravel()
             members()
@@ -132,7 +132,7 @@ class SegmentGroup:
         """Return the derivatives by own nodes (K, r, c) and by those before (K, r, b)."""
         kinematics = self._kinematics
         values = [
-            kinematics.gradient[self._fixed].ravel(),
+            kinematics.gradient.take(self._fixed, axis=0).ravel(),
             self._centre_rows,
             self._tracked(kinematics.station_spin[self._face]).ravel(),
         ]
@@ -146,8 +146,8 @@ class SegmentGroup:
 
     def residuals(self, X: Array, nodes: CurveNodes) -> Array:
         """Return (K, r) what is missing in lengths and to the curve nodes at `X`, where kinematics is evaluated."""
-        lengths = self._home - self._kinematics.quantities[self._fixed]
-        gap = nodes.position[self.numbers] - (self._weights @ X[self._corners])[:, 0]
+        lengths = self._home - self._kinematics.quantities.take(self._fixed)
+        gap = nodes.position.take(self.numbers, axis=0) - (self._weights @ X.take(self._corners, axis=0))[:, 0]
         if self._tracks == "position":
             return np.concatenate([lengths, gap], axis=1)
         frames, wanted = self._kinematics.station_rotation[self._face], nodes.frame[self.numbers]

@@ -95,20 +95,22 @@ class Tracker:
         SolverError
             It does not converge; the segment is named.
         """
-        start, X, travelled = X, np.array(X), np.zeros(self._columns)
+        start, X, travelled = X, np.array(X), np.zeros((2, self._columns))
         for chain in self._chains:
-            self._converge(chain, start, X, travelled, nodes)
+            self._converge(chain, start, X, *travelled, nodes)
         return X
 
-    def _converge(self, chain: _Chain, start: Array, X: Array, travelled: Array, nodes: CurveNodes) -> None:
+    def _converge(
+        self, chain: _Chain, start: Array, X: Array, travelled: Array, step: Array, nodes: CurveNodes
+    ) -> None:
         """Bring the nodes that a chain places to where they belong, in `X` and in what they have `travelled`."""
         # The first step is taken from the old configuration of the bays below too, and passes their motion on.
-        at, step = start, travelled.copy()
+        at, step[chain.before] = start, travelled[chain.before]
         for _ in range(MAX_CORRECTIONS + 1):
             chain.evaluate(at)
             residuals = [group.residuals(at, nodes) for group in chain.groups]
             is_met = all(float(np.abs(residual).max()) <= LENGTH_TOLERANCE for residual in residuals)
-            is_met = is_met and not step[: chain.own.start].any()
+            is_met = is_met and not step[chain.before].any()
             if is_met and chain.is_square:
                 return
             chain.solve(residuals, travelled, step)
@@ -120,7 +122,7 @@ class Tracker:
                 raise SolverError(chain.failure.format("diverges"))
             travelled[chain.own] += own
             X[chain.nodes] += own.reshape(-1, 3)
-            at, step = X, np.zeros(self._columns)
+            at, step[chain.before] = X, 0.0
         raise SolverError(chain.failure.format("does not converge"))
 
 
@@ -137,8 +139,8 @@ class _Chain:
         Evaluates the kinematics of all groups at node positions (N, 3).
     failure : str
         Says of Newton's method what is put into it.
-    nodes, own
-        The nodes that the segments place, and the slice of their columns.
+    nodes, own, before
+        The nodes that the segments place, the slice of their columns, and that of the columns that these stand on.
     """
 
     def __init__(
@@ -159,6 +161,7 @@ class _Chain:
         self.is_square = all(group.is_square for group in self.groups)
         self.nodes = np.concatenate([segment.nodes for segment in segments])
         self.own = slice(segments[0].start, segments[-1].start + segments[-1].columns)
+        self.before = slice(segments[0].first, segments[0].start)
 
     def solve(self, right: list[Array], travelled: Array, step: Array) -> None:
         """Overwrite the own columns of `step` with what solves all segments, the columns before them being given."""
