@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.ipopt import NonlinearStep
@@ -19,8 +18,6 @@ from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import StepStatus
 from vgtm_qp.step.state import State
-
-Array = NDArray[np.float64]
 
 
 class Contestant(Protocol):

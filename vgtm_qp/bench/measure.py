@@ -15,15 +15,13 @@ from time import perf_counter, process_time
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vgtm_qp.bench.contestants import Contestant
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.resolver import Resolver, StepStatus
 from vgtm_qp.step.state import State
-
-Array = NDArray[np.float64]
 
 _LEAST_STEPS = 10
 _WARM_UP = 5

@@ -11,14 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.comparison.row import Row
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.view.drawing import drawing_of_maneuver
-
-Array = NDArray[np.float64]
 
 _COLUMNS = 5
 _FLOOR = 1e-16

@@ -7,8 +7,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import RecordedArm
@@ -20,7 +20,6 @@ from vgtm_qp.view.drawing import (
     stroke_colours,
 )
 
-Array = NDArray[np.float64]
 Element = ElementTree.Element
 
 MASS_PER_LENGTH = 1.0

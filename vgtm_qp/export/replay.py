@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.clearance import AgainstBody, RecordedMotion
 from vgtm_qp.verify.obstacles import read_obstacles
-
-Array = NDArray[np.float64]
 
 _SETTLING_STEPS = 200
 _PROBED_TIP_MOTION = 1e-4

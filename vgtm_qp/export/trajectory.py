@@ -7,12 +7,10 @@ from io import BytesIO, StringIO
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.result.result import Result
-
-Array = NDArray[np.float64]
 
 STATES_TOPIC = "/joint_states"
 TRAJECTORY_TOPIC = "/joint_trajectory"

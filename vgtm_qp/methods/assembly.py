@@ -7,19 +7,16 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.frames import frame_function, frame_tables
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class CurveNodes(NamedTuple):
@@ -147,7 +144,9 @@ class SegmentGroup:
     def residuals(self, X: Array, nodes: CurveNodes) -> Array:
         """Return (K, r) what is missing in lengths and to the curve nodes at `X`, where kinematics is evaluated."""
         lengths = self._home - self._kinematics.quantities.take(self._fixed)
-        gap = nodes.position.take(self.numbers, axis=0) - (self._weights @ X.take(self._corners, axis=0))[:, 0]
+        gap = (
+            nodes.position.take(self.numbers, axis=0) - (self._weights @ X.take(self._corners, axis=0))[:, 0]
+        )
         if self._tracks == "position":
             return np.concatenate([lengths, gap], axis=1)
         frames, wanted = self._kinematics.station_rotation[self._face], nodes.frame[self.numbers]

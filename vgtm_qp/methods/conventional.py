@@ -11,6 +11,7 @@ from scipy.linalg.lapack import dgbsv
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from vgtm_qp.arm.truss.arm import truss_of
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.objectives import DEFAULT_TERMS, Terms, TrussObjective
 from vgtm_qp.methods.pseudoinverse import (
@@ -34,9 +35,6 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Method
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.path import Path
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _LOWER = np.tril_indices(3)
 

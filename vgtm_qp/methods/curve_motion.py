@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
 from vgtm_qp.errors import CurveError, SolverError
@@ -19,8 +19,6 @@ from vgtm_qp.qp.numbers import UNBOUNDED
 from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
-
-Array = NDArray[np.float64]
 
 DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import CurveError, GoalError, SolverError
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import vector_from_rotation
@@ -22,8 +23,6 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
-
-Array = NDArray[np.float64]
 
 _COLLAPSED = 1e-3
 LENGTH_TOLERANCE = 1e-11

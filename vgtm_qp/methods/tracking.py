@@ -8,17 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.truss.arm import truss_of
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.assembly import CurveNodes, SegmentGroup, SegmentKinematics
 from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-
-Array = NDArray[np.float64]
 
 THREADED = 2000
 """Bays from which factorisations are shared out to threads: a few milliseconds of work; for less it does not pay."""
@@ -95,9 +93,10 @@ class Tracker:
         SolverError
             It does not converge; the segment is named.
         """
-        start, X, travelled = X, np.array(X), np.zeros((2, self._columns))
+        start, X = X, np.array(X)
+        travelled, step = np.zeros((2, self._columns))
         for chain in self._chains:
-            self._converge(chain, start, X, *travelled, nodes)
+            self._converge(chain, start, X, travelled, step, nodes)
         return X
 
     def _converge(

@@ -7,17 +7,15 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.build import build_truss
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.setup import Setup
-
-Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-11
 

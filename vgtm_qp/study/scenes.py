@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
@@ -16,8 +16,6 @@ from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.study.arms import bring_lengths, least_singular_value
-
-Array = NDArray[np.float64]
 
 MODULES = ("octahedral", "double-octahedral", "hexapod", "longeron", "tetrahedral")
 SAFE = 0.08

@@ -14,7 +14,8 @@ from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_ways
 from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.symbols import TrussSymbols
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
 from vgtm_qp.geometry.bodies import capsules
 

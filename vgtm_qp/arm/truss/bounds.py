@@ -9,7 +9,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 
 
 def longest_ways(truss: Truss, sources: Index) -> Array:

@@ -15,7 +15,8 @@ from scipy.linalg import qr
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 from vgtm_qp.arm.truss.kinematics import length_gradients
-from vgtm_qp.arm.truss.truss import Array, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import TrussError
 
 RANK_TOLERANCE = 1e-10

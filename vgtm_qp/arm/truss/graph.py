@@ -14,7 +14,8 @@ from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
 from vgtm_qp.arm.truss.joints import Joints, axial_joints, joint_triangles
 from vgtm_qp.arm.truss.mobility import trackable_coordinates
 from vgtm_qp.arm.truss.stages import placement_stages
-from vgtm_qp.arm.truss.truss import Array, Index, Truss, check_stroke
+from vgtm_qp.arm.truss.truss import Truss, check_stroke
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import GraphTruss, Member
 

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _LEAST_SINE = 0.1
 """A triangle with a smaller sine at the node does not orient a joint: its normal would turn too fast."""

@@ -6,8 +6,9 @@ import casadi as ca
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from vgtm_qp.arm.truss.joints import Array, Index, Joints
+from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
 

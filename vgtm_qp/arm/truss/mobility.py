@@ -10,7 +10,8 @@ from scipy.sparse.linalg import splu
 from vgtm_qp.arm.arm import has_full_rank, rank
 from vgtm_qp.arm.frames import frame_spins
 from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, in_words, length_jacobian
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 
 _ROLL_REASON = (
     ": where the arm is straight, a twist of two faces makes one of a node's two fixed longerons longer "

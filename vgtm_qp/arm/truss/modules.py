@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
-from vgtm_qp.arm.truss.truss import Array, Index, Truss, check_stroke
+from vgtm_qp.arm.truss.truss import Truss, check_stroke
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
 

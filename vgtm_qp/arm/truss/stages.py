@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 
-from vgtm_qp.arm.truss.truss import Index, Mask
+from vgtm_qp.arrays import Index, Mask
 from vgtm_qp.errors import TrussError
 
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from vgtm_qp.arm.symbols import ArmSymbols, Constants
 from vgtm_qp.arm.truss.kinematics import member_function
-from vgtm_qp.arm.truss.truss import Index, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Index
 
 _Layers = list[tuple[Index, ca.Sparsity]]
 """Terms whose sum is a block: places in the gradients, and the sparsity that they fill."""

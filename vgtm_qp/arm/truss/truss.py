@@ -7,15 +7,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.scatter import LengthScatter
 from vgtm_qp.arm.truss.joints import Joints, joint_ends
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.errors import TrussError, nearest
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
