@@ -54,12 +54,8 @@ class DeterminacyReport:
 def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
     """Return d lengths / d unknown node coordinates, (M, 3 (N - N_c)), its columns in the order of ``free``.
 
-    Parameters
-    ----------
-    truss : Truss
-        Offset joints are differentiated through their frames, eqs. (19)-(21).
-    X : (N, 3), optional
-        Node positions, m; home if not given.
+    `X` (N, 3) are node positions, m, home if not given; offset joints are differentiated through their frames, eqs.
+    (19)-(21).
     """
     X = truss.home if X is None else X
     return sparse.csc_array(truss.scatter.sparse(length_gradients(truss, X)))
@@ -68,12 +64,7 @@ def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
 def check_determinacy(truss: Truss, X: Array | None = None) -> DeterminacyReport:
     """Return the report of a statically determinate truss; refuse any other.
 
-    Parameters
-    ----------
-    truss : Truss
-        Its stages need not be set.
-    X : (N, 3), optional
-        Node positions, m; home if not given.
+    `X` (N, 3) are node positions, m, home if not given. The stages of the truss need not be set.
 
     Raises
     ------

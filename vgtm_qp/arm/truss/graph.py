@@ -65,20 +65,14 @@ def truss_from_graph(spec: GraphTruss) -> Truss:
         tip_weights=np.full(len(spec.tip), 1 / len(spec.tip)),
         tip_frame=np.eye(3),
         stage=np.where(base, -1, 0),
-        bays=max(len(faces) - 1, 0),
     )
     check_determinacy(truss)
     truss = dataclasses.replace(truss, home=_corrected_home(spec, truss))
-    truss = _with_stages_and_joints(spec, truss)
-    truss = _with_frames(truss)
+    truss = _with_frames(_with_stages_and_joints(spec, truss))
     if truss.joints is not None:
         check_determinacy(truss)
     truss = dataclasses.replace(truss, stroke=_strokes(spec, truss))
-    return dataclasses.replace(
-        truss,
-        trackable=trackable_coordinates(truss),
-        bays=truss.bays if len(faces) else int(truss.stage.max()) + 1,
-    )
+    return dataclasses.replace(truss, trackable=trackable_coordinates(truss))
 
 
 def _check_connected(spec: GraphTruss, base: Array, pairs: Index) -> None:
