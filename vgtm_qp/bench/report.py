@@ -51,8 +51,7 @@ def measure_scene(
     plan = make_plan(problem, *resolver.tip())
     alone = run_alone(resolver, plan, seconds=seconds, steps=steps)
     baselines = {name: _against(scene, name, resolver, plan, seconds=seconds, steps=steps) for name in names}
-    data = problem.to_dict()
-    truss = resolver.setup.truss
+    data, truss = problem.to_dict(), resolver.setup.truss
     return {
         "name": scene.name,
         "kind": scene.kind,
@@ -129,8 +128,7 @@ def measure(
     for scene in scenes:
         if progress is not None:
             progress(scene)
-        found = measure_scene(scene, names, seconds=seconds, steps=steps, cold=cold)
-        document["scenes"].append(found)
+        document["scenes"].append(measure_scene(scene, names, seconds=seconds, steps=steps, cold=cold))
     document["growth"] = growth(document["scenes"])
     return document
 

@@ -49,7 +49,6 @@ def write_result(path: Path, arrays: Mapping[str, NDArray[Any]], manifest: Mappi
         np.savez_compressed(file, **content)
         file.flush()
         os.fsync(file.fileno())
-    _sync_directory(path.parent)
     _remove_stale_scratch(path)
 
 
@@ -62,6 +61,7 @@ def replacing(path: Path, error: type[ResultError | ExportError] = ResultError) 
         try:
             yield scratch
             scratch.replace(path)
+            _sync_directory(path.parent)
         finally:
             scratch.unlink(missing_ok=True)
     except OSError as reason:
