@@ -52,8 +52,8 @@ class MethodResolver(ABC):
         self.state: State = setup.home_state()
         self.rank: int | None = None
         self.solver: str | None = None
-        self._clock = Phases()
-        self._clock.seconds = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
+        phases = ("kinematics", "solve", "correction", "acceptance")
+        self._clock = Phases(dict.fromkeys(phases, 0.0))
         self._limit = step_limit
         self._steps = 0
 

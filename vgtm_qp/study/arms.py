@@ -32,12 +32,8 @@ def bending_problem(
 ) -> Problem:
     """Return a maneuver that takes the tip from straight up by `goal` times the arm's height.
 
-    Parameters
-    ----------
-    cubes
-        Two cubes beside the arm, as in the five-bay example, at the same parts of its height.
-    **truss
-        Further keys of the ``[truss]`` table.
+    `cubes` are two beside the arm, at the same parts of its height as in the five-bay example; `truss` has more keys
+    of the ``[truss]`` table.
     """
     data: dict[str, Any] = {
         "name": f"{bays} bays, {module}",

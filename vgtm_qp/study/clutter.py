@@ -9,12 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.compare import run_method
-from vgtm_qp.comparison.statistics import wilson_interval
-from vgtm_qp.comparison.tables import crossed_table
+from vgtm_qp.comparison.tables import crossed_table, wilson_interval
 from vgtm_qp.geometry import shapes
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.arms import bending_problem, built_truss
-from vgtm_qp.study.drawing import MARKS, label, panels
+from vgtm_qp.study.drawing import MARKS, label, panels, select
 from vgtm_qp.study.scenes import is_clear
 from vgtm_qp.study.workers import Row, Task
 
@@ -138,5 +137,5 @@ def _cell(done: int, count: int) -> str:
 
 
 def _count(rows: Sequence[Row], method: str, density: int) -> tuple[int, int]:
-    mine = [row for row in rows if row["cubes"] == density]
+    mine = select(rows, cubes=density)
     return sum(bool(row[f"{method}: kept"]) for row in mine), len(mine)

@@ -150,9 +150,7 @@ class TrussArm(Arm):
                 "weights": truss.tip_weights.tolist(),
                 "frame": truss.tip_frame.tolist(),
             },
-            "joints": None
-            if joints is None
-            else {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
+            "joints": joints and {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
         }
 
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:

@@ -151,12 +151,10 @@ class TrussSymbols(ArmSymbols):
             error = self.home - lengths
             centres = (X[:, truss.faces[face].tolist()] @ ca.DM(truss.face_weights[face]) for face in order)
             gaps = points - ca.horzcat(*centres)
-            blocks, rhs, placed = (
-                [],
-                [],
-                zip(self._stages, self._blocks(gradients), faces.tolist(), strict=True),
-            )
-            for stage, (D, L), face in placed:
+            blocks, rhs = [], []
+            for stage, (D, L), face in zip(
+                self._stages, self._blocks(gradients), faces.tolist(), strict=True
+            ):
                 fixed = np.flatnonzero(~truss.actuated[stage.members]).tolist()
                 weight = dict(zip(truss.faces[face].tolist(), truss.face_weights[face], strict=True))
                 centre = ca.sparsify(ca.DM(np.kron([weight[int(n)] for n in stage.nodes], np.eye(3))))
