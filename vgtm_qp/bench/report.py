@@ -39,12 +39,7 @@ def measure_scene(
     ``qps``, QPs a step; ``warm`` and ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
     ``baselines``, what `_against` returns, by name.
 
-    Parameters
-    ----------
-    seconds, steps
-        Each run, alone and in turn with each baseline, ends after so many steps or when so much time has passed.
-    cold
-        Set up with an empty cache of kernels too.
+    Each run, alone and in turn with each baseline, ends after so many `steps` or when so many `seconds` have passed.
     """
     problem = scene.problem
     resolver = Resolver(problem)
@@ -101,18 +96,9 @@ def measure(
     pinned: bool = True,
     progress: Callable[[BenchScene], None] | None = None,
 ) -> dict[str, Any]:
-    """Measure scenes and return the document, plain data for JSON.
+    """Measure scenes against baselines and return the document, plain data for JSON; see :func:`measure_scene`.
 
-    Parameters
-    ----------
-    scenes, names
-        What is measured, against which baselines.
-    seconds, steps, cold
-        See :func:`measure_scene`.
-    pinned
-        Whether BLAS was held to one thread; see :func:`vgtm_qp.machine.pin_threads`.
-    progress
-        Called before each scene.
+    `pinned` says whether BLAS was held to one thread; `progress` is called before each scene.
     """
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,

@@ -73,14 +73,7 @@ class SegmentKinematics:
 class SegmentGroup:
     """The equations of K segments of one shape, stacked: r rows over c own columns and b columns before them.
 
-    Attributes
-    ----------
-    numbers : (K,) int
-        Which segments they are.
-    columns : (K, c) int
-        Columns of the layout that belong to the nodes that each segment places.
-    is_square : bool
-        Whether there are as many equations as unknowns.
+    ``numbers`` (K,) says which segments they are, ``columns`` (K, c) which columns of the layout their nodes have.
     """
 
     def __init__(

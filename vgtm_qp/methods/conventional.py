@@ -42,14 +42,8 @@ _LOWER = np.tril_indices(3)
 class Linear(NamedTuple):
     """J d = x for the nodes' displacements, at one configuration.
 
-    Attributes
-    ----------
-    gradient : (M, Q, 3)
-        Of the member lengths.
-    tip : (n_e, 3 K_tip)
-        J_u of eq. (16) at the tip's nodes.
-    x_e, x_g : (n_e,), (n_l,)
-        Displacement of the end effector, and changes of the fixed members' lengths.
+    J is made of the member lengths' ``gradient`` (M, Q, 3) and J_u of eq. (16) at the tip's nodes (n_e, 3 K_tip); x of
+    the displacement ``x_e`` (n_e,) of the end effector and the changes ``x_g`` (n_l,) of the fixed lengths.
     """
 
     gradient: Array
@@ -157,10 +151,7 @@ class SparseSolution:
 class BandedSystem:
     """A symmetric sparse system of constant pattern, ordered to a narrow band, whose values change.
 
-    Parameters
-    ----------
-    rows, columns : (E,) int
-        Place of each entry, which stands in the mirrored place too; entries of one place are added up.
+    An entry of `rows` and `columns` (E,) stands in the mirrored place too; entries of one place are added up.
     """
 
     def __init__(self, rows: Index, columns: Index) -> None:

@@ -29,12 +29,7 @@ _MARGIN = 1e-5
 
 
 class CurveMotion:
-    """Moves a reference curve so that its end follows the path.
-
-    Attributes
-    ----------
-    s : (F,)
-        Parameters of the curve nodes, one a face, that of the base included.
+    """Moves a reference curve, with curve nodes at parameters `s` (F,), one a face, so that its end follows the path.
 
     Raises
     ------
@@ -152,14 +147,8 @@ class CurveMotion:
         the first one, linear as it is, left over: without gradients, and back along the path if need be. A member
         near an obstacle moves with the curve where it stands: that is all a curve can know of the truss.
 
-        Parameters
-        ----------
-        now
-            The pose at `progress`, 0 to 1, on a piece of path; its rates are the displacement over the piece.
-        time
-            At which the obstacles are met, s.
-        X : (N, 3)
-            Node positions, m.
+        `now` is the pose at `progress`, 0 to 1, on a piece of path, its rates the displacement over the piece.
+        Obstacles are met at `time`, s, by nodes at `X` (N, 3), m.
 
         Raises
         ------

@@ -54,13 +54,9 @@ class MethodResolver(ABC):
         self.solver: str | None = None
         phases = ("kinematics", "solve", "correction", "acceptance")
         self._clock = Phases(dict.fromkeys(phases, 0.0))
+        self.phases = self._clock.seconds
         self._limit = step_limit
         self._steps = 0
-
-    @property
-    def phases(self) -> dict[str, float]:
-        """Seconds spent so far in each phase."""
-        return self._clock.seconds
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:

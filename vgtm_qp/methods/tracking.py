@@ -31,10 +31,6 @@ class Tracker:
     the step; the others have one answer. Recursive and parallel solve the same equations: *recursive* converges
     each segment before it goes on to the next; *parallel* factorises all segments at the present configuration at
     once, and a chain of small products passes on what each does to the next (block condensation).
-
-    Attributes
-    ----------
-    segments : sequence of Segment
     """
 
     def __init__(
@@ -62,12 +58,7 @@ class Tracker:
     def rates(self, X: Array, moved: Array, turned: Array) -> Array:
         """Return node positions (N, 3), m, after a step that meets eq. (39) to first order from `X`.
 
-        Parameters
-        ----------
-        X : (N, 3)
-            Node positions, m.
-        moved, turned : (S, 3)
-            Displacements, m, and rotation vectors, rad, of the curve nodes.
+        The curve nodes are `moved`, m, and `turned`, rad, by displacements and rotation vectors (S, 3).
 
         Raises
         ------
@@ -131,15 +122,8 @@ class _Chain:
     Each segment's matrix is factorised with no knowledge of the others; what remains in sequence is, for each
     segment, the product of a small matrix with the displacement of the nodes that it stands on.
 
-    Attributes
-    ----------
-    groups : list of SegmentGroup
-    evaluate : callable
-        Evaluates the kinematics of all groups at node positions (N, 3).
-    failure : str
-        Says of Newton's method what is put into it.
-    nodes, own, before
-        The nodes that the segments place, the slice of their columns, and that of the columns that these stand on.
+    `evaluate` evaluates the kinematics of all ``groups`` at node positions (N, 3); `failure` says of Newton's method
+    what is put into it. The segments place ``nodes``, with the columns ``own``, on what has the columns ``before``.
     """
 
     def __init__(

@@ -93,16 +93,13 @@ def draw(rows: Sequence[Row]) -> Figure:
         counts = [_count(rows, method, density) for density in densities]
         shares = np.array([done / count for done, count in counts])
         low, high = np.transpose([wilson_interval(*count) for count in counts])
+        style: Any = {"marker": mark, "markersize": 4, "linestyle": "--", "capsize": 2, "linewidth": 0.9}
         axes[0].errorbar(
             np.array(densities) + 0.08 * (k - len(methods) / 2),
             shares,
             np.maximum([shares - low, high - shares], 0.0),
-            marker=mark,
-            markersize=4,
-            linestyle="--",
-            capsize=2,
-            linewidth=0.9,
             label=method,
+            **style,
         )
     axes[0].set_ylim(-0.03, 1.03)
     label(axes[0], "cubes", "part of the scenes solved")

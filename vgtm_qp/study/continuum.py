@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from vgtm_qp.comparison.figure import draw_members
 from vgtm_qp.comparison.tables import crossed_table, exponent
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.study.arms import bending_problem, furthest, moving_curve
-from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels, select
+from vgtm_qp.study.drawing import draw_arm, draw_line, label, mark_bays, panels, select
 from vgtm_qp.study.workers import Row, Task
 
 _HEIGHT = 4.0
@@ -65,9 +64,7 @@ def draw(rows: Sequence[Row]) -> Figure:
     figure, axes = panels(2, 3, width=3.0, height=2.9)
     shown = [row for row in select(rows, module="octahedral") if "nodes" in row][:3]
     for panel, row in zip(axes, shown, strict=False):
-        draw_members(panel, row["nodes"], row["members"], row["actuated"])
-        panel.plot(*np.array(row["curve"])[:, [0, 2]].T, color="tab:red", linewidth=1.0)
-        label(panel, "x [m]", "z [m]", f"{row['bays']} bays", legend=False)
+        draw_arm(panel, row["nodes"], row, f"{row['bays']} bays", row["curve"])
     for panel in axes[len(shown) : 3]:
         panel.set_axis_off()
     for panel, (key, name) in zip(axes[3:], _MEASURES.items(), strict=True):

@@ -9,7 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
+from numpy.typing import ArrayLike
 
+from vgtm_qp.comparison.figure import draw_members
 from vgtm_qp.study.workers import Row
 
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
@@ -27,6 +29,17 @@ def panels(rows: int, columns: int, *, width: float, height: float) -> tuple[Fig
     for one in axes:
         one.tick_params(labelsize=7)
     return figure, axes
+
+
+def draw_arm(
+    axes: Axes, nodes: ArrayLike, row: Row, title: str, curve: ArrayLike = (), **limits: tuple[float, float]
+) -> None:
+    """Draw an arm with the members of a row, and points (P, 3) of its curve, as seen along y."""
+    if len(points := np.reshape(curve, (-1, 3))):
+        axes.plot(*points[:, [0, 2]].T, color="tab:red", linewidth=0.9)
+    draw_members(axes, nodes, row["members"], row["actuated"])
+    label(axes, "x [m]", "z [m]", title, legend=False)
+    axes.set(**limits)
 
 
 def draw_line(

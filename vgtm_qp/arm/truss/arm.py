@@ -145,11 +145,7 @@ class TrussArm(Arm):
             "rate": or_none(truss.rate),
             "acceleration": or_none(truss.acceleration),
             "radius": truss.radius.tolist(),
-            "tip": {
-                "nodes": truss.tip.tolist(),
-                "weights": truss.tip_weights.tolist(),
-                "frame": truss.tip_frame.tolist(),
-            },
+            "tip": {key: getattr(self.end_effector, key).tolist() for key in ("nodes", "weights", "frame")},
             "joints": joints and {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
         }
 

@@ -31,23 +31,14 @@ _NAMED = 6
 
 @dataclass(frozen=True)
 class DeterminacyReport:
-    """How regular the square length Jacobian of a statically determinate truss is.
-
-    Attributes
-    ----------
-    members, coordinates : int
-        Number of members and of unknown node coordinates 3 (N - N_c); equal.
-    rank : int
-        Rank of the length Jacobian; equal to both.
-    smallest_singular_value, condition : float
-        Of the length Jacobian; both without unit. The smallest one is the least change of length, per metre
-        of node displacement, of any motion.
-    """
+    """How regular the square length Jacobian of a statically determinate truss is."""
 
     members: int
     coordinates: int
+    """Unknown node coordinates 3 (N - N_c), as many as members."""
     rank: int
     smallest_singular_value: float
+    """The least change of length, m, per metre of node displacement, of any motion."""
     condition: float
 
 

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.arm.truss.joints import Joints, axial_joints, joint_triangles
+from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
 from vgtm_qp.arm.truss.mobility import trackable_coordinates
 from vgtm_qp.arm.truss.stages import placement_stages
 from vgtm_qp.arm.truss.truss import Truss, check_stroke
@@ -142,9 +142,7 @@ def _with_stages_and_joints(spec: GraphTruss, truss: Truss) -> Truss:
             joints.offset[k] = member.offsets
     # A triangle that a table names may reach into later stages, which then have to be placed together.
     reach = np.hstack([truss.members, triangle[truss.members].reshape(-1, 6)])
-    return dataclasses.replace(
-        truss, stage=placement_stages(truss.base, reach), joints=Joints(triangle, joints.offset)
-    )
+    return dataclasses.replace(truss, stage=placement_stages(truss.base, reach), joints=joints)
 
 
 def _with_frames(truss: Truss) -> Truss:

@@ -67,14 +67,8 @@ def joint_triangles(
     """Return (N, 3) the nodes whose triangle orients each node's joint, the node itself first.
 
     The two others are neighbours of the same or an earlier stage, so that no member's length depends on a
-    later stage. Neighbours of the node's own stage come first, then the triangle with the largest sine.
-
-    Parameters
-    ----------
-    node_names, home, members, stage
-        As in :class:`vgtm_qp.arm.truss.truss.Truss`.
-    chosen : mapping, optional
-        The two other nodes of some nodes' triangles, counter-clockwise about z.
+    later stage. Neighbours of the node's own stage come first, then the triangle with the largest sine. For some nodes
+    the two others are `chosen`, counter-clockwise about z.
 
     Raises
     ------

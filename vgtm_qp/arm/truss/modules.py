@@ -30,23 +30,14 @@ class MemberRow(NamedTuple):
 
 
 class _Module(NamedTuple):
-    """What tells the modules of triangular layers apart.
-
-    Attributes
-    ----------
-    longerons : bool
-        Whether the members between two layers are actuated (but for diagonals).
-    battens : tuple of bool
-        Whether the battens of each layer of a bay are.
-    stroke : (2,)
-        Least and greatest length of an actuated member over its home length, where a table has none.
-    trackable, face_stride
-        See ``Truss``.
-    """
+    """What tells the modules of triangular layers apart; ``trackable`` and ``face_stride`` are those of ``Truss``."""
 
     longerons: bool
+    """Whether the members between two layers are actuated (but for diagonals)."""
     battens: tuple[bool, ...]
+    """Whether the battens of each layer of a bay are."""
     stroke: tuple[float, float]
+    """Least and greatest length of an actuated member over its home length, where a table has none."""
     trackable: tuple[str, ...]
     face_stride: int = 1
 
@@ -264,16 +255,8 @@ def _assemble(
 ) -> Truss:
     """Return the truss of a table, whose face and tip frames at home are those of the base.
 
-    Parameters
-    ----------
-    stroke_factors
-        Least and greatest length of an actuated member over its home length, where the table has no stroke.
-    weights
-        Of the nodes of the tip and of every face.
-    tip
-        The last face if not given.
-
-    Other parameters are as in :class:`vgtm_qp.arm.truss.truss.Truss`.
+    Without a stroke in the table, actuated members are `stroke_factors` times their home lengths, least and greatest.
+    The tip, the last face if not given, and every face have the same `weights`.
     """
     names = tuple(member.name for member in members)
     pairs = np.array([member.nodes for member in members], dtype=np.int64)
