@@ -17,6 +17,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.rotation import vector_from_rotation
 
 
 class CurveNodes(NamedTuple):
@@ -164,6 +165,8 @@ class SegmentGroup:
 
 def rotation_vectors(rotations: Array) -> Array:
     """Return the rotation vectors (K, 3), rad, of rotations (K, 3, 3) by less than half a turn."""
+    if len(rotations) == 1:
+        return vector_from_rotation(rotations[0])[None]
     skew = rotations - np.swapaxes(rotations, 1, 2)
     twist = skew[:, [2, 0, 1], [1, 2, 0]] / 2.0
     cosine = (np.einsum("kii->k", rotations) - 1.0) / 2.0
