@@ -70,7 +70,6 @@ def tripod(joints: Joints | None = None, home_lengths: Array | None = None) -> T
         tip_weights=np.ones(1),
         tip_frame=np.eye(3),
         stage=np.array([-1, -1, -1, 0, 1]),
-        bays=1,
         joints=joints,
     )
 

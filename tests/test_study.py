@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import study_tasks
 
-from vgtm_qp.comparison.statistics import exponent, wilson_interval
+from vgtm_qp.comparison.tables import exponent, wilson_interval
 from vgtm_qp.errors import GoalError
 from vgtm_qp.study import STUDIES, Study, clutter, run_study
 from vgtm_qp.study import study as study_module

@@ -25,12 +25,9 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.scatter import LengthScatter
 from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants, Frames
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 RANK_TOLERANCE = 1e-8
 """Singular values of a Jacobian below this fraction of the greatest one count as zero."""

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from vgtm_qp.arrays import Array, Index
 
 
 def fitted_frame(nodes: ca.SX, cosines: ca.SX, sines: ca.SX) -> ca.SX:

@@ -9,13 +9,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.frames import frame_function, frame_tables
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _TINY = 1e-30
 

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods import make_resolver
+from vgtm_qp.methods.conventional import DenseSolution
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import StepStatus
 from vgtm_qp.step.state import State
-
-Array = NDArray[np.float64]
 
 
 class Contestant(Protocol):
@@ -48,14 +47,8 @@ class BarePseudoinverse:
 
     def __init__(self, problem: Problem) -> None:
         self._setup = setup = arm_without_curve(problem)
-        layout, task, truss = setup.layout, setup.task, setup.truss
-        first = layout.node_column[truss.tip]
-        self._tip = (first[:, None] + np.arange(3)).reshape(-1)
-        self._lengths = np.zeros((truss.member_count, layout.node_columns))
-        self._J = np.zeros((len(task.row_names) + len(truss.fixed), layout.node_columns))
-        self._x = np.zeros(len(self._J))
-        self._nodes = truss.home
-        self.reached = self._nodes
+        self._solution = DenseSolution(setup.layout, problem.method)
+        self._nodes = self.reached = setup.truss.home
 
     def place(self, state: State) -> None:
         """See :class:`Contestant`."""
@@ -63,13 +56,11 @@ class BarePseudoinverse:
 
     def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
         """See :class:`Contestant`."""
-        setup, truss, J, x = self._setup, self._setup.truss, self._J, self._x
+        setup, truss = self._setup, self._setup.truss
         setup.kinematics.evaluate(self._nodes)
         tip = setup.task.rows(self._nodes, setup.kinematics, path.at(end))
-        rows = len(tip.error)
-        J[:rows, self._tip] = tip.jacobian
-        J[rows:] = truss.scatter.dense(setup.kinematics.gradient, self._lengths)[truss.fixed]
-        x[:rows] = tip.error
+        J, _ = self._solution.jacobians(setup.kinematics.gradient, tip.jacobian)
+        x = np.concatenate([tip.error, np.zeros(len(truss.fixed))])
         X = np.array(self._nodes)
         X[truss.free] += (np.linalg.pinv(J) @ x).reshape(-1, 3)
         self.reached = X
@@ -79,8 +70,9 @@ class BarePseudoinverse:
 class ResolverStep:
     """A resolver of the package, with `changes` to the problem's method."""
 
-    def __init__(self, problem: Problem, changes: dict[str, Any]) -> None:
-        self.resolver: Mover = make_resolver(problem.replace(changes))
+    def __init__(self, problem: Problem, **changes: Any) -> None:
+        changed = problem.replace({f"method.{key}": value for key, value in changes.items()})
+        self.resolver: Mover = make_resolver(changed)
 
     def place(self, state: State) -> None:
         """See :class:`Contestant`."""
@@ -94,26 +86,21 @@ class ResolverStep:
         return self.resolver.follow(path, start, end, dt=dt).status is StepStatus.REACHED
 
 
-def _changed(**changes: Any) -> Callable[[Problem], Contestant]:
-    named = {f"method.{key}": value for key, value in changes.items()}
-    return lambda problem: ResolverStep(problem, named)
-
-
 BASELINES: dict[BaselineName, Baseline] = {
     "eq28": Baseline("eq. (28), dense pseudoinverse alone", 100, BarePseudoinverse),
     "eq28-sparse": Baseline(
         "eq. (28), banded",
         1000,
-        _changed(name="pseudoinverse", algebra="sparse", tracking="none", hard_tracking=False),
+        partial(ResolverStep, name="pseudoinverse", algebra="sparse", tracking="none", hard_tracking=False),
     ),
     "curve": Baseline(
         "curve by pseudoinverse, bays after it",
         1000,
-        _changed(name="curve-pseudoinverse", tracking="recursive", hard_tracking=False),
+        partial(ResolverStep, name="curve-pseudoinverse", tracking="recursive", hard_tracking=False),
     ),
     "ipopt": Baseline("one nonlinear program a step, IPOPT", 20, NonlinearStep),
-    "osqp": Baseline("the same QPs, sparse, OSQP", 200, _changed(solver="osqp")),
-    "piqp": Baseline("the same QPs, sparse, PIQP", 200, _changed(solver="piqp")),
+    "osqp": Baseline("the same QPs, sparse, OSQP", 200, partial(ResolverStep, solver="osqp")),
+    "piqp": Baseline("the same QPs, sparse, PIQP", 200, partial(ResolverStep, solver="piqp")),
 }
 
 

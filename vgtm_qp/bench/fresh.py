@@ -40,12 +40,7 @@ def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> dict[str, f
     Keys: ``imports``, s, of what a resolver needs; ``setup`` and ``setup_cpu``, s from the problem to a resolver that
     can take its first step, kernels included, by the clock and of the processor, the C compiler's included;
     ``first_step``, s; ``peak_memory`` and ``imported_memory``, the greatest resident memory after some steps and after
-    the imports alone, bytes.
-
-    Parameters
-    ----------
-    cold
-        With an empty cache of kernels, in a temporary folder, in the place of the user's.
+    the imports alone, bytes. Where it is `cold`, the cache of kernels is an empty one in the place of the user's.
 
     Raises
     ------

@@ -10,16 +10,14 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.clearance import clearance_rows
 from vgtm_qp.rows.limits import actuator_box
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State
-
-Array = NDArray[np.float64]
 
 _PAIRS = 24
 _OPTIONS: dict[str, Any] = {

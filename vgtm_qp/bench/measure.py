@@ -9,13 +9,13 @@ as it is for every user.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter, process_time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vgtm_qp.bench.contestants import Contestant
 from vgtm_qp.errors import VgtmError
@@ -23,7 +23,7 @@ from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.resolver import Resolver, StepStatus
 from vgtm_qp.step.state import State
 
-Array = NDArray[np.float64]
+_Answer = TypeVar("_Answer")
 
 _LEAST_STEPS = 10
 _WARM_UP = 5
@@ -62,19 +62,10 @@ def breakdown(seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> dict[str, 
 
 @dataclass
 class Steps:
-    """Steps that the resolver took by itself.
+    """Steps that the resolver took by itself: seconds of each in every phase, and its QPs.
 
-    Attributes
-    ----------
-    spent : list of Spent
-    phases : dict of lists of float
-        Seconds of each step in every phase.
-    qps : list of int
-        QPs solved in each step.
-    covered : float
-        The greatest share of the maneuver that one pass covered, 0 to 1.
-    stopped_by : str
-        What blocked the arm, empty if nothing did.
+    ``covered`` is the greatest share of the maneuver that one pass covered, 0 to 1; ``stopped_by`` what blocked the
+    arm, empty if nothing did.
     """
 
     spent: list[Spent] = field(default_factory=list)
@@ -108,19 +99,16 @@ class _Place(NamedTuple):
 
 
 class _Walk:
-    """A resolver that repeats a plan from home."""
+    """A resolver that repeats a plan from home, by the steps that a maneuver takes."""
 
     def __init__(self, resolver: Resolver, plan: Plan) -> None:
         self._resolver, self._plan = resolver, plan
-        self.stuck = ""
         self.restart()
 
-    def restart(self) -> bool:
-        """Go home; False if the arm was stuck at home, so that another attempt is useless."""
-        hopeless = bool(self.stuck) and self.covered == 0.0
+    def restart(self) -> None:
+        """Go home."""
         self._resolver.state = self._resolver.setup.home_state()
-        self._value, self._index, self._stalled, self.stuck = self._plan.path.start, 0, 0, ""
-        return not hopeless
+        self._value, self._stalled, self.stuck = self._plan.path.start, 0, ""
 
     @property
     def covered(self) -> float:
@@ -129,32 +117,21 @@ class _Walk:
         return (self._value - path.start) / (path.end - path.start)
 
     @property
-    def ended(self) -> bool:
-        """Whether the plan is done or the arm is stuck."""
-        return self._index == len(self._plan.marks) or bool(self.stuck)
-
-    @property
     def place(self) -> _Place:
         """Where the next step begins."""
-        marks = self._plan.marks
-        end = float(marks[self._index])
-        before = float(marks[self._index - 1]) if self._index else self._plan.path.start
-        return _Place(self._resolver.state, self._value, end, end - before)
+        return _Place(self._resolver.state, self._value, *self._plan.next_mark(self._value))
 
     def step(self) -> tuple[Spent, int]:
         """Take a step; return what it took and its QPs."""
-        place = self.place
-        wall, cpu = perf_counter(), process_time()
-        step = self._resolver.follow(self._plan.path, place.start, place.end, dt=place.dt)
-        spent = Spent(perf_counter() - wall, process_time() - cpu)
+        _, start, end, dt = self.place
+        spent, step = _timed(lambda: self._resolver.follow(self._plan.path, start, end, dt=dt))
         self._stalled = self._stalled + 1 if step.progress < _STALLED_PROGRESS else 0
         if step.status is StepStatus.BLOCKED or self._stalled == _STALLED_STEPS:
             self.stuck = ", ".join(step.blocked_by) or "nothing that has a name"
         elif step.status is StepStatus.SLOWED:
-            self._value += step.progress * (place.end - place.start)
+            self._value += step.progress * (end - start)
         else:
-            self._value = place.end
-            self._index += 1
+            self._value = end
         return spent, step.qps
 
     def repeat(self, seconds: float, steps: int) -> Iterator[int]:
@@ -168,8 +145,10 @@ class _Walk:
             if count and perf_counter() - started >= limit:
                 return
             yield count
-            if self.ended and not self.restart():
+            if self.stuck and self.covered == 0.0:
                 return
+            if self.stuck or self._value >= self._plan.marks[-1]:
+                self.restart()
 
 
 def run_alone(resolver: Resolver, plan: Plan, *, seconds: float, steps: int) -> Steps:
@@ -215,9 +194,17 @@ def run_in_turn(resolver: Resolver, baseline: Contestant, plan: Plan, *, seconds
 def _take(contestant: Contestant, place: _Place, plan: Plan) -> tuple[Spent, bool]:
     """Let a baseline take the step at `place`; return what it took and whether it found an answer."""
     contestant.place(place.state)
+
+    def answers() -> bool:
+        try:
+            return contestant.step(plan.path, place.start, place.end, place.dt)
+        except (VgtmError, np.linalg.LinAlgError):
+            return False
+
+    return _timed(answers)
+
+
+def _timed(take: Callable[[], _Answer]) -> tuple[Spent, _Answer]:
     wall, cpu = perf_counter(), process_time()
-    try:
-        answered = contestant.step(plan.path, place.start, place.end, place.dt)
-    except (VgtmError, np.linalg.LinAlgError):
-        answered = False
-    return Spent(perf_counter() - wall, process_time() - cpu), answered
+    answer = take()
+    return Spent(perf_counter() - wall, process_time() - cpu), answer

@@ -15,7 +15,7 @@ from vgtm_qp.bench.contestants import BASELINES, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.measure import breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.scenes import BenchScene
-from vgtm_qp.comparison.statistics import exponent
+from vgtm_qp.comparison.tables import exponent
 from vgtm_qp.errors import ResultError, VgtmError
 from vgtm_qp.machine import commit, machine_record, versions
 from vgtm_qp.maneuver.plan import Plan, make_plan
@@ -39,20 +39,14 @@ def measure_scene(
     ``qps``, QPs a step; ``warm`` and ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
     ``baselines``, what `_against` returns, by name.
 
-    Parameters
-    ----------
-    seconds, steps
-        Each run, alone and in turn with each baseline, ends after so many steps or when so much time has passed.
-    cold
-        Set up with an empty cache of kernels too.
+    Each run, alone and in turn with each baseline, ends after so many `steps` or when so many `seconds` have passed.
     """
     problem = scene.problem
     resolver = Resolver(problem)
     plan = make_plan(problem, *resolver.tip())
     alone = run_alone(resolver, plan, seconds=seconds, steps=steps)
     baselines = {name: _against(scene, name, resolver, plan, seconds=seconds, steps=steps) for name in names}
-    data = problem.to_dict()
-    truss = resolver.setup.truss
+    data, truss = problem.to_dict(), resolver.setup.truss
     return {
         "name": scene.name,
         "kind": scene.kind,
@@ -102,18 +96,9 @@ def measure(
     pinned: bool = True,
     progress: Callable[[BenchScene], None] | None = None,
 ) -> dict[str, Any]:
-    """Measure scenes and return the document, plain data for JSON.
+    """Measure scenes against baselines and return the document, plain data for JSON; see :func:`measure_scene`.
 
-    Parameters
-    ----------
-    scenes, names
-        What is measured, against which baselines.
-    seconds, steps, cold
-        See :func:`measure_scene`.
-    pinned
-        Whether BLAS was held to one thread; see :func:`vgtm_qp.machine.pin_threads`.
-    progress
-        Called before each scene.
+    `pinned` says whether BLAS was held to one thread; `progress` is called before each scene.
     """
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
@@ -129,8 +114,7 @@ def measure(
     for scene in scenes:
         if progress is not None:
             progress(scene)
-        found = measure_scene(scene, names, seconds=seconds, steps=steps, cold=cold)
-        document["scenes"].append(found)
+        document["scenes"].append(measure_scene(scene, names, seconds=seconds, steps=steps, cold=cold))
     document["growth"] = growth(document["scenes"])
     return document
 

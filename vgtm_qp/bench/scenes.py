@@ -15,6 +15,13 @@ BAYS = (5, 10, 20, 50, 100, 200, 500, 1000)
 CLUTTERED_BAYS = 50
 CLUTTER = 100
 
+_BUNDLED: dict[SceneKind, str] = {
+    "free": "five_bay_free",
+    "cubes": "five_bay_two_cubes",
+    "pointing": "five_bay_two_cubes_pointing",
+    "clutter": "five_bay_two_cubes",
+    "tetrahedral": "tetrahedral_truss_circle",
+}
 _BUNDLED_BAYS = 5
 _BAY = math.sqrt(2.0 / 3.0)
 """Height of an octahedral bay whose members are all 1 m long, m."""
@@ -46,10 +53,10 @@ def make_scenes(
     scenes = []
     for kind in dict.fromkeys(kinds):
         if kind == "tetrahedral":
-            problem = load_problem("tetrahedral_truss_circle")
-            scenes.append(BenchScene("tetrahedral", kind, 14, "none", problem))
+            scenes.append(BenchScene("tetrahedral", kind, 14, "none", load_problem(_BUNDLED[kind])))
             continue
-        for count in _bays_of(kind, bays):
+        counts = bays if kind == "cubes" else [CLUTTERED_BAYS if kind == "clutter" else _BUNDLED_BAYS]
+        for count in dict.fromkeys(counts):
             problem = _problem(kind, count)
             for tracking in ("elastic",) if kind == "pointing" else dict.fromkeys(trackings):
                 hard = tracking == "hard"
@@ -60,18 +67,8 @@ def make_scenes(
     return scenes
 
 
-def _bays_of(kind: SceneKind, bays: Sequence[int]) -> Iterable[int]:
-    if kind == "cubes":
-        return dict.fromkeys(bays)
-    return (CLUTTERED_BAYS,) if kind == "clutter" else (_BUNDLED_BAYS,)
-
-
 def _problem(kind: SceneKind, bays: int) -> Problem:
-    if kind == "free":
-        return load_problem("five_bay_free")
-    if kind == "pointing":
-        return load_problem("five_bay_two_cubes_pointing")
-    problem = load_problem("five_bay_two_cubes")
+    problem = load_problem(_BUNDLED[kind])
     if bays != _BUNDLED_BAYS:
         problem = _scaled(problem, bays)
     if kind == "clutter":
@@ -86,12 +83,10 @@ def _scaled(problem: Problem, bays: int) -> Problem:
     The cubes keep their distance from the arm and stand at the same parts of its height, so that it has to
     bend round them; the tip goes sideways by as much, and down by what an arm of that height loses.
     """
-    height = bays * _BAY
-    stretch = bays / _BUNDLED_BAYS
-    cubes = []
-    for cube in problem.to_dict()["obstacle"]:
-        x, y, z = cube["center"]
-        cubes.append({**cube, "center": [x, y, stretch * z]})
+    height, stretch = bays * _BAY, bays / _BUNDLED_BAYS
+    cubes = problem.to_dict()["obstacle"]
+    for cube in cubes:
+        cube["center"] = [*cube["center"][:2], stretch * cube["center"][2]]
     return problem.replace(
         {
             "name": f"{bays}-bay arm between two cubes",

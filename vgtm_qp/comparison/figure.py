@@ -11,14 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.comparison.row import Row
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.view.drawing import drawing_of_maneuver
-
-Array = NDArray[np.float64]
 
 _COLUMNS = 5
 _FLOOR = 1e-16
@@ -47,9 +46,7 @@ def _draw_maneuver(axes: Axes, row: Row, maneuver: Maneuver | None, limits: tupl
     axes.set_title(
         f"{row.method}\n{verdict}, {100 * row.reached:.0f} % of the path", fontsize=7.5, color=colour
     )
-    axes.set_aspect("equal")
-    axes.set_xlim(limits[0][0], limits[1][0])
-    axes.set_ylim(limits[0][1], limits[1][1])
+    axes.set(aspect="equal", **dict(zip(("xlim", "ylim"), np.transpose(limits), strict=True)))
     axes.tick_params(labelsize=6.5)
     if maneuver is None:
         axes.text(0.5, 0.5, _folded(row.reason), transform=axes.transAxes, ha="center", fontsize=6.5)

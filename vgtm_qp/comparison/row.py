@@ -8,8 +8,7 @@ import numpy as np
 
 from vgtm_qp.maneuver.maneuver import Maneuver
 
-MEMBER_TOLERANCE = 1e-3
-TIP_TOLERANCE = 1e-3
+_DRIFT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -61,11 +60,10 @@ def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
     summary, failures = maneuver.summary(), certificate.failures()
     done = maneuver.status == "solved"
     member, tip = certificate.member_error.value or 0.0, certificate.tip_error.value or 0.0
-    drifting = member <= MEMBER_TOLERANCE and tip <= TIP_TOLERANCE
+    drifting = max(member, tip) <= _DRIFT
     others = [line for line in failures if not line.startswith(("member error", "tip error"))]
-    between = certificate.clearance_between.value
     travel = np.abs(np.diff(maneuver.actuator_values, axis=0)).sum()
-    reason = ", ".join(maneuver.blocked_by[:3]) if not done else next(iter([*others, *failures]), "")
+    reason = next(iter([*others, *failures]), "") if done else ", ".join(maneuver.blocked_by[:3])
     return Row(
         problem=problem,
         method=method,
@@ -77,7 +75,7 @@ def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
         reason=reason,
         tip_error=certificate.tip_error.value,
         member_drift=member,
-        least_clearance=between,
+        least_clearance=certificate.clearance_between.value,
         stroke_violation=certificate.stroke_violation.value,
         rate_violation=certificate.rate_violation.value,
         actuator_travel=float(travel),

@@ -1,9 +1,12 @@
-"""Markdown tables."""
+"""Markdown tables, and what they say of measurements: growth exponents and confidence intervals."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], *, right: bool = False) -> str:
@@ -22,16 +25,26 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], *, righ
 def crossed_table(
     titles: Sequence[str], columns: Mapping[Any, str], lines: Mapping[Any, Mapping[Any, str]]
 ) -> str:
-    """Return a Markdown table with a cell for each line and column, "-" where a line has none.
+    """Return a Markdown table of `lines`: cells by the keys of their columns, by the names that the line begins with.
 
-    Parameters
-    ----------
-    titles
-        Of what names the lines.
-    columns
-        Titles of the columns by their keys.
-    lines
-        Cells by the keys of their columns, by the tuple of the line's names; a line without cells is left out.
+    `titles` stand over these names, those of `columns` over the cells; "-" is where a line has none, and a line without
+    cells is left out.
     """
     rows = [(*names, *(cells.get(key, "-") for key in columns)) for names, cells in lines.items() if cells]
     return markdown_table((*titles, *columns.values()), rows)
+
+
+def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
+    """Return p of the least-squares fit values = c sizes^p, in logarithms."""
+    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Return Wilson's interval of a proportion (J. Am. Stat. Assoc. 22, 1927), 95 %."""
+    if trials == 0:
+        return 0.0, 1.0
+    z = 1.96
+    share, square = successes / trials, z * z
+    middle = (share + square / (2 * trials)) / (1 + square / trials)
+    half = z * math.sqrt(share * (1 - share) / trials + square / (4 * trials**2)) / (1 + square / trials)
+    return max(middle - half, 0.0), min(middle + half, 1.0)

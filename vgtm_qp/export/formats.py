@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import secrets
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from vgtm_qp.errors import ExportError, nearest
+from vgtm_qp.result.file import replacing
 
 if TYPE_CHECKING:
     from vgtm_qp.result.result import Result
@@ -75,14 +75,6 @@ def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None
     form = FORMATS[to]
     if form.module == "pictures" and path.suffix.lower() != form.suffix:
         raise ExportError(f'{path}: a {to} cannot be "{path.suffix}"; choices: {form.suffix}')
-    scratch = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            scratch.write_bytes(form.content(maneuver))
-            scratch.replace(path)
-        finally:
-            scratch.unlink(missing_ok=True)
-    except OSError as error:
-        raise ExportError(f"{path}: cannot be written: {error.strerror or error}") from None
+    with replacing(path, ExportError) as scratch:
+        scratch.write_bytes(form.content(maneuver))
     return path

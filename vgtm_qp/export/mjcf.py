@@ -7,8 +7,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import RecordedArm
@@ -20,7 +20,6 @@ from vgtm_qp.view.drawing import (
     stroke_colours,
 )
 
-Array = NDArray[np.float64]
 Element = ElementTree.Element
 
 MASS_PER_LENGTH = 1.0
@@ -89,13 +88,8 @@ def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
         else:
             for axis, direction in zip("xyz", np.eye(3), strict=True):
                 _add(body, "joint", name=f"{name} {axis}", type="slide", axis=direction)
-            look = {
-                "size": radius,
-                "mass": masses[k],
-                "rgba": "0.4 0.41 0.43 1",
-                "contype": 1,
-                "conaffinity": 2,
-            }
+            look = {"size": radius, "rgba": "0.4 0.41 0.43 1", "contype": 1, "conaffinity": 2}
+            look["mass"] = masses[k]
         _add(body, "geom", type="sphere", **look)
         _add(body, "site", name=name, size=0.5 * radius)
 

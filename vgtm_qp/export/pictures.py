@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,12 +24,12 @@ _NEARLY_WHITE = 248
 
 def pdf(maneuver: Result) -> bytes:
     """Return frames of the maneuver side by side as PDF."""
-    return _written("figure.pdf", lambda path: save_figure(plot_frames(maneuver), path))
+    return _written(".pdf", partial(save_figure, plot_frames(maneuver)))
 
 
 def png(maneuver: Result) -> bytes:
     """Return frames of the maneuver side by side as PNG."""
-    return _written("figure.png", lambda path: save_figure(plot_frames(maneuver), path))
+    return _written(".png", partial(save_figure, plot_frames(maneuver)))
 
 
 def gif(maneuver: Result) -> bytes:
@@ -71,7 +72,7 @@ def mp4(maneuver: Result) -> bytes:
             writer.send(np.ascontiguousarray(picture))
         writer.close()
 
-    return _written("video.mp4", write)
+    return _written(".mp4", write)
 
 
 def _pictures(maneuver: Result) -> tuple[list[NDArray[np.uint8]], float]:
@@ -90,9 +91,9 @@ def _pictures(maneuver: Result) -> tuple[list[NDArray[np.uint8]], float]:
     return pictures, min(float(maneuver.time[-1] - maneuver.time[0]), _LONGEST) or 1.0
 
 
-def _written(name: str, write: Callable[[Path], object]) -> bytes:
-    """Return what `write` writes into a file of that name, which says what is written."""
+def _written(suffix: str, write: Callable[[Path], object]) -> bytes:
+    """Return what `write` writes into a file with that suffix, which says what is written."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / name
+        path = Path(folder, f"maneuver{suffix}")
         write(path)
         return path.read_bytes()

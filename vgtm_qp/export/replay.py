@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.clearance import AgainstBody, RecordedMotion
 from vgtm_qp.verify.obstacles import read_obstacles
-
-Array = NDArray[np.float64]
 
 _SETTLING_STEPS = 200
 _PROBED_TIP_MOTION = 1e-4
@@ -26,25 +24,18 @@ _PROBED_STATES = 51
 
 @dataclass(frozen=True, eq=False)
 class ReplayRun:
-    """How a replay followed a maneuver, over its states.
-
-    Attributes
-    ----------
-    length_error, tip_error : (T,)
-        Greatest error of a member length, and distance of the tip from where it should be, m.
-    actuator_error : (T,)
-        Root of the summed squares of the errors of the actuated lengths, m.
-    clearance : (T,)
-        Least distance from members to obstacles at the states, m; inf without obstacles.
-    contacts : int
-        Time steps in which MuJoCo found a node in contact with an obstacle.
-    """
+    """How a replay followed a maneuver, over its states; all but the contacts are (T,), m."""
 
     length_error: Array
+    """Greatest error of a member length."""
     tip_error: Array
+    """Distance of the tip from where it should be."""
     actuator_error: Array
+    """Root of the summed squares of the errors of the actuated lengths."""
     clearance: Array
+    """Least distance from members to obstacles at the states; inf without obstacles."""
     contacts: int
+    """Time steps in which MuJoCo found a node in contact with an obstacle."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the worst values as strict JSON data, m; None if there are no obstacles."""
@@ -61,24 +52,16 @@ class ReplayRun:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A kinematic and a physical replay of one maneuver.
-
-    Attributes
-    ----------
-    kinematic, physics : ReplayRun
-    tip_error_per_millimetre : float
-        mm at the tip for actuator errors whose squares sum to 1 mm^2, found by pushing each actuator.
-    probed_state : int
-        The state at which that was measured: the one where it is greatest.
-    certified_tip_error_per_millimetre : float
-        The same from the Jacobian, as the certificate has it.
-    """
+    """A kinematic and a physical replay of one maneuver."""
 
     kinematic: ReplayRun
     physics: ReplayRun
     tip_error_per_millimetre: float
+    """mm at the tip for actuator errors whose squares sum to 1 mm^2, found by pushing each actuator."""
     probed_state: int
+    """The state at which that was measured: the one where it is greatest."""
     certified_tip_error_per_millimetre: float
+    """The same from the Jacobian, as the certificate has it."""
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return the table: quantity, certificate, kinematic replay, physics replay."""
@@ -99,13 +82,8 @@ class Replay:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the same as strict JSON data; lengths in m."""
-        return {
-            "tip_error_per_millimetre": self.tip_error_per_millimetre,
-            "certified_tip_error_per_millimetre": self.certified_tip_error_per_millimetre,
-            "probed_state": self.probed_state,
-            "kinematic": self.kinematic.to_dict(),
-            "physics": self.physics.to_dict(),
-        }
+        runs = {"kinematic": self.kinematic.to_dict(), "physics": self.physics.to_dict()}
+        return {**vars(self), **runs}
 
 
 def replay(maneuver: Result) -> Replay:

@@ -7,15 +7,10 @@ from io import BytesIO, StringIO
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.result.result import Result
-
-Array = NDArray[np.float64]
-
-STATES_TOPIC = "/joint_states"
-TRAJECTORY_TOPIC = "/joint_trajectory"
 
 _HEADER = """std_msgs/Header header
 {own}
@@ -118,23 +113,22 @@ def mcap_bytes(maneuver: Result) -> bytes:
         from mcap_ros2.writer import Writer
     except ImportError:
         raise MissingExtraError("export", "mcap-ros2-support") from None
-    names, values = list(maneuver.actuator_names), maneuver.actuator_values.tolist()
-    rates, file = through_rates(maneuver).tolist(), BytesIO()
+    trajectory, file = joint_trajectory(maneuver), BytesIO()
     with Writer(file) as writer:
         state_schema = writer.register_msgdef("sensor_msgs/msg/JointState", _JOINT_STATE)
         trajectory_schema = writer.register_msgdef("trajectory_msgs/msg/JointTrajectory", _JOINT_TRAJECTORY)
         first = _nanoseconds(float(maneuver.time[0]))
-        writer.write_message(TRAJECTORY_TOPIC, trajectory_schema, joint_trajectory(maneuver), first, first)
-        for k, time in enumerate(maneuver.time):
+        writer.write_message("/joint_trajectory", trajectory_schema, trajectory, first, first)
+        for k, (time, point) in enumerate(zip(maneuver.time, trajectory["points"], strict=True)):
             message = {
                 "header": {"stamp": _split(float(time)), "frame_id": "base"},
-                "name": names,
-                "position": values[k],
-                "velocity": rates[k],
+                "name": trajectory["joint_names"],
+                "position": point["positions"],
+                "velocity": point["velocities"],
                 "effort": [],
             }
             stamp = _nanoseconds(float(time))
-            writer.write_message(STATES_TOPIC, state_schema, message, stamp, stamp, sequence=k)
+            writer.write_message("/joint_states", state_schema, message, stamp, stamp, sequence=k)
     return file.getvalue()
 
 

@@ -7,19 +7,17 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.frames import frame_function, frame_tables
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from vgtm_qp.rotation import vector_from_rotation
 
 
 class CurveNodes(NamedTuple):
@@ -52,7 +50,7 @@ class SegmentKinematics:
             if len(fixed) not in self._members:
                 self._members[len(fixed)] = Kernel(member_function(truss).map(len(fixed)))
             members = self._members[len(fixed)]
-            members.inputs[0][:] = X[truss.member_nodes[fixed]].ravel()
+            members.inputs[0][:] = X.take(truss.member_nodes[fixed].ravel(), axis=0).ravel()
             if truss.joints is not None:
                 members.inputs[1][:] = truss.joints.offset[fixed].ravel()
             members()
@@ -76,14 +74,7 @@ class SegmentKinematics:
 class SegmentGroup:
     """The equations of K segments of one shape, stacked: r rows over c own columns and b columns before them.
 
-    Attributes
-    ----------
-    numbers : (K,) int
-        Which segments they are.
-    columns : (K, c) int
-        Columns of the layout that belong to the nodes that each segment places.
-    is_square : bool
-        Whether there are as many equations as unknowns.
+    ``numbers`` (K,) says which segments they are, ``columns`` (K, c) which columns of the layout their nodes have.
     """
 
     def __init__(
@@ -132,7 +123,7 @@ class SegmentGroup:
         """Return the derivatives by own nodes (K, r, c) and by those before (K, r, b)."""
         kinematics = self._kinematics
         values = [
-            kinematics.gradient[self._fixed].ravel(),
+            kinematics.gradient.take(self._fixed, axis=0).ravel(),
             self._centre_rows,
             self._tracked(kinematics.station_spin[self._face]).ravel(),
         ]
@@ -146,8 +137,10 @@ class SegmentGroup:
 
     def residuals(self, X: Array, nodes: CurveNodes) -> Array:
         """Return (K, r) what is missing in lengths and to the curve nodes at `X`, where kinematics is evaluated."""
-        lengths = self._home - self._kinematics.quantities[self._fixed]
-        gap = nodes.position[self.numbers] - (self._weights @ X[self._corners])[:, 0]
+        lengths = self._home - self._kinematics.quantities.take(self._fixed)
+        gap = (
+            nodes.position.take(self.numbers, axis=0) - (self._weights @ X.take(self._corners, axis=0))[:, 0]
+        )
         if self._tracks == "position":
             return np.concatenate([lengths, gap], axis=1)
         frames, wanted = self._kinematics.station_rotation[self._face], nodes.frame[self.numbers]
@@ -172,6 +165,8 @@ class SegmentGroup:
 
 def rotation_vectors(rotations: Array) -> Array:
     """Return the rotation vectors (K, 3), rad, of rotations (K, 3, 3) by less than half a turn."""
+    if len(rotations) == 1:
+        return vector_from_rotation(rotations[0])[None]
     skew = rotations - np.swapaxes(rotations, 1, 2)
     twist = skew[:, [2, 0, 1], [1, 2, 0]] / 2.0
     cosine = (np.einsum("kii->k", rotations) - 1.0) / 2.0

@@ -11,10 +11,11 @@ from scipy.linalg.lapack import dgbsv
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from vgtm_qp.arm.truss.arm import truss_of
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.objectives import DEFAULT_TERMS, Terms, TrussObjective
 from vgtm_qp.methods.pseudoinverse import (
-    Inverse,
+    RANK_TOLERANCE,
     Objective,
     moore_penrose,
     null_space_vector,
@@ -35,23 +36,14 @@ from vgtm_qp.problem.method import Method
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.path import Path
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 _LOWER = np.tril_indices(3)
 
 
 class Linear(NamedTuple):
     """J d = x for the nodes' displacements, at one configuration.
 
-    Attributes
-    ----------
-    gradient : (M, Q, 3)
-        Of the member lengths.
-    tip : (n_e, 3 K_tip)
-        J_u of eq. (16) at the tip's nodes.
-    x_e, x_g : (n_e,), (n_l,)
-        Displacement of the end effector, and changes of the fixed members' lengths.
+    J is made of the member lengths' ``gradient`` (M, Q, 3) and J_u of eq. (16) at the tip's nodes (n_e, 3 K_tip); x of
+    the displacement ``x_e`` (n_e,) of the end effector and the changes ``x_g`` (n_l,) of the fixed lengths.
     """
 
     gradient: Array
@@ -71,17 +63,19 @@ class DenseSolution:
 
     def displacement(self, system: Linear, terms: Terms) -> Array:
         """Return the node displacements (3 (N - N_c),), m: eq. (28) with the null-space vector of `terms`."""
-        truss, method = self._truss, self._method
-        lengths = truss.scatter.dense(system.gradient, self._lengths)
-        J = self._jacobian(lengths[truss.fixed], system.tip)
-        actuated = lengths[truss.actuators]
+        method = self._method
+        J, actuated = self.jacobians(system.gradient, system.tip)
         hessian = terms.actuator * actuated.T @ actuated
         hessian[np.diag_indices_from(hessian)] += terms.node
         count = len(terms.blocks)
         by_node = hessian.reshape(count, 3, count, 3)
         by_node[np.arange(count), :, np.arange(count)] += terms.blocks
         objective = Objective(hessian, actuated.T @ terms.actuator_gradient + terms.node_gradient)
-        inverse = self._inverse(J, objective)
+        if method.variant in ("moore-penrose", "truncated"):
+            truncation = method.truncation if method.variant == "truncated" else RANK_TOLERANCE
+            inverse = moore_penrose(J, truncation=truncation)
+        else:
+            inverse = weighted(J, hessian, damping=method.damping if method.variant == "damped" else 0.0)
         self.rank = inverse.rank
         start = inverse.matrix @ np.concatenate([system.x_e, system.x_g])
         N = projector(inverse, J)
@@ -91,20 +85,14 @@ class DenseSolution:
             return np.asarray(start)
         return np.asarray(start + N @ null_space_vector(N, start, objective))
 
-    def _jacobian(self, fixed: Array, tip: Array) -> Array:
-        """Return J (n_e + n_l, 3 (N - N_c)), eq. (26), of rows of fixed lengths and of the tip at its nodes."""
-        J = np.zeros((len(tip) + len(fixed), fixed.shape[1]))
+    def jacobians(self, gradient: Array, tip: Array) -> tuple[Array, Array]:
+        """Return J (n_e + n_l, 3 (N - N_c)), eq. (26), of tip and fixed lengths, and the rows of actuated lengths."""
+        truss = self._truss
+        lengths = truss.scatter.dense(gradient, self._lengths)
+        J = np.zeros((len(tip) + len(truss.fixed), lengths.shape[1]))
         J[: len(tip), self._tip] = tip[:, self._present]
-        J[len(tip) :] = fixed
-        return J
-
-    def _inverse(self, J: Array, objective: Objective) -> Inverse:
-        method = self._method
-        if method.variant == "moore-penrose":
-            return moore_penrose(J)
-        if method.variant == "truncated":
-            return moore_penrose(J, truncation=method.truncation)
-        return weighted(J, objective.hessian, damping=method.damping if method.variant == "damped" else 0.0)
+        J[len(tip) :] = lengths[truss.fixed]
+        return J, lengths[truss.actuators]
 
 
 class SparseSolution:
@@ -163,10 +151,7 @@ class SparseSolution:
 class BandedSystem:
     """A symmetric sparse system of constant pattern, ordered to a narrow band, whose values change.
 
-    Parameters
-    ----------
-    rows, columns : (E,) int
-        Place of each entry, which stands in the mirrored place too; entries of one place are added up.
+    An entry of `rows` and `columns` (E,) stands in the mirrored place too; entries of one place are added up.
     """
 
     def __init__(self, rows: Index, columns: Index) -> None:

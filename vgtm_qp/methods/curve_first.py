@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
@@ -18,8 +18,6 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
-
-Array = NDArray[np.float64]
 
 _SMALLEST = 1 / 64
 _MAX_QPS = 5

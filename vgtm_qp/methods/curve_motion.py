@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
 from vgtm_qp.errors import CurveError, SolverError
@@ -20,8 +20,6 @@ from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 
-Array = NDArray[np.float64]
-
 DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 
 _SAMPLES = 400
@@ -31,12 +29,7 @@ _MARGIN = 1e-5
 
 
 class CurveMotion:
-    """Moves a reference curve so that its end follows the path.
-
-    Attributes
-    ----------
-    s : (F,)
-        Parameters of the curve nodes, one a face, that of the base included.
+    """Moves a reference curve, with curve nodes at parameters `s` (F,), one a face, so that its end follows the path.
 
     Raises
     ------
@@ -154,14 +147,8 @@ class CurveMotion:
         the first one, linear as it is, left over: without gradients, and back along the path if need be. A member
         near an obstacle moves with the curve where it stands: that is all a curve can know of the truss.
 
-        Parameters
-        ----------
-        now
-            The pose at `progress`, 0 to 1, on a piece of path; its rates are the displacement over the piece.
-        time
-            At which the obstacles are met, s.
-        X : (N, 3)
-            Node positions, m.
+        `now` is the pose at `progress`, 0 to 1, on a piece of path, its rates the displacement over the piece.
+        Obstacles are met at `time`, s, by nodes at `X` (N, 3), m.
 
         Raises
         ------

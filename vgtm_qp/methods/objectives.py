@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.step.setup import Setup
-
-Array = NDArray[np.float64]
 
 DEFAULT_TERMS = ("actuator_rate",)
 """With node displacements alone as the objective, long arms collapse their battens."""

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
-
-Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-10
 

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import CurveError, GoalError, SolverError
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import vector_from_rotation
@@ -21,8 +22,6 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
-
-Array = NDArray[np.float64]
 
 _COLLAPSED = 1e-3
 LENGTH_TOLERANCE = 1e-11
@@ -52,15 +51,11 @@ class MethodResolver(ABC):
         self.state: State = setup.home_state()
         self.rank: int | None = None
         self.solver: str | None = None
-        self._clock = Phases()
-        self._clock.seconds = dict.fromkeys(("kinematics", "solve", "correction", "acceptance"), 0.0)
+        phases = ("kinematics", "solve", "correction", "acceptance")
+        self._clock = Phases(dict.fromkeys(phases, 0.0))
+        self.phases = self._clock.seconds
         self._limit = step_limit
         self._steps = 0
-
-    @property
-    def phases(self) -> dict[str, float]:
-        """Seconds spent so far in each phase."""
-        return self._clock.seconds
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:

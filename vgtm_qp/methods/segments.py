@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.arm import truss_of
+from vgtm_qp.arrays import Index
 from vgtm_qp.errors import CurveError
 from vgtm_qp.qp.layout import Layout
-
-Index = NDArray[np.int64]
 
 _ROWS = {"position": 3, "pointing": 5, "orientation": 6}
 

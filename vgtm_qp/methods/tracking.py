@@ -8,17 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.truss.arm import truss_of
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.assembly import CurveNodes, SegmentGroup, SegmentKinematics
 from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-
-Array = NDArray[np.float64]
 
 THREADED = 2000
 """Bays from which factorisations are shared out to threads: a few milliseconds of work; for less it does not pay."""
@@ -33,10 +31,6 @@ class Tracker:
     the step; the others have one answer. Recursive and parallel solve the same equations: *recursive* converges
     each segment before it goes on to the next; *parallel* factorises all segments at the present configuration at
     once, and a chain of small products passes on what each does to the next (block condensation).
-
-    Attributes
-    ----------
-    segments : sequence of Segment
     """
 
     def __init__(
@@ -64,12 +58,7 @@ class Tracker:
     def rates(self, X: Array, moved: Array, turned: Array) -> Array:
         """Return node positions (N, 3), m, after a step that meets eq. (39) to first order from `X`.
 
-        Parameters
-        ----------
-        X : (N, 3)
-            Node positions, m.
-        moved, turned : (S, 3)
-            Displacements, m, and rotation vectors, rad, of the curve nodes.
+        The curve nodes are `moved`, m, and `turned`, rad, by displacements and rotation vectors (S, 3).
 
         Raises
         ------
@@ -95,20 +84,23 @@ class Tracker:
         SolverError
             It does not converge; the segment is named.
         """
-        start, X, travelled = X, np.array(X), np.zeros(self._columns)
+        start, X = X, np.array(X)
+        travelled, step = np.zeros((2, self._columns))
         for chain in self._chains:
-            self._converge(chain, start, X, travelled, nodes)
+            self._converge(chain, start, X, travelled, step, nodes)
         return X
 
-    def _converge(self, chain: _Chain, start: Array, X: Array, travelled: Array, nodes: CurveNodes) -> None:
+    def _converge(
+        self, chain: _Chain, start: Array, X: Array, travelled: Array, step: Array, nodes: CurveNodes
+    ) -> None:
         """Bring the nodes that a chain places to where they belong, in `X` and in what they have `travelled`."""
         # The first step is taken from the old configuration of the bays below too, and passes their motion on.
-        at, step = start, travelled.copy()
+        at, step[chain.before] = start, travelled[chain.before]
         for _ in range(MAX_CORRECTIONS + 1):
             chain.evaluate(at)
             residuals = [group.residuals(at, nodes) for group in chain.groups]
             is_met = all(float(np.abs(residual).max()) <= LENGTH_TOLERANCE for residual in residuals)
-            is_met = is_met and not step[: chain.own.start].any()
+            is_met = is_met and not step[chain.before].any()
             if is_met and chain.is_square:
                 return
             chain.solve(residuals, travelled, step)
@@ -120,7 +112,7 @@ class Tracker:
                 raise SolverError(chain.failure.format("diverges"))
             travelled[chain.own] += own
             X[chain.nodes] += own.reshape(-1, 3)
-            at, step = X, np.zeros(self._columns)
+            at, step[chain.before] = X, 0.0
         raise SolverError(chain.failure.format("does not converge"))
 
 
@@ -130,15 +122,8 @@ class _Chain:
     Each segment's matrix is factorised with no knowledge of the others; what remains in sequence is, for each
     segment, the product of a small matrix with the displacement of the nodes that it stands on.
 
-    Attributes
-    ----------
-    groups : list of SegmentGroup
-    evaluate : callable
-        Evaluates the kinematics of all groups at node positions (N, 3).
-    failure : str
-        Says of Newton's method what is put into it.
-    nodes, own
-        The nodes that the segments place, and the slice of their columns.
+    `evaluate` evaluates the kinematics of all ``groups`` at node positions (N, 3); `failure` says of Newton's method
+    what is put into it. The segments place ``nodes``, with the columns ``own``, on what has the columns ``before``.
     """
 
     def __init__(
@@ -159,6 +144,7 @@ class _Chain:
         self.is_square = all(group.is_square for group in self.groups)
         self.nodes = np.concatenate([segment.nodes for segment in segments])
         self.own = slice(segments[0].start, segments[-1].start + segments[-1].columns)
+        self.before = slice(segments[0].first, segments[0].start)
 
     def solve(self, right: list[Array], travelled: Array, step: Array) -> None:
         """Overwrite the own columns of `step` with what solves all segments, the columns before them being given."""

@@ -9,15 +9,15 @@ import secrets
 import time
 import zipfile
 import zlib
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import ResultError
+from vgtm_qp.errors import ExportError, ResultError
 from vgtm_qp.result.layout import check_arrays
 from vgtm_qp.result.manifest import check_manifest, dump_manifest, parse_manifest
 
@@ -44,22 +44,28 @@ def write_result(path: Path, arrays: Mapping[str, NDArray[Any]], manifest: Mappi
     """
     unsigned = {key: value for key, value in manifest.items() if key != "digest"}
     text = dump_manifest({**unsigned, "digest": content_digest(arrays, unsigned)})
+    content: dict[str, Any] = {**arrays, "manifest": np.array(text)}
+    with replacing(path) as scratch, scratch.open("xb") as file:
+        np.savez_compressed(file, **content)
+        file.flush()
+        os.fsync(file.fileno())
+    _remove_stale_scratch(path)
+
+
+@contextmanager
+def replacing(path: Path, error: type[ResultError | ExportError] = ResultError) -> Iterator[Path]:
+    """Yield a scratch file beside `path` that takes its place once it is whole; raise `error` where that fails."""
     scratch = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with scratch.open("xb") as file:
-                content: dict[str, Any] = {**arrays, "manifest": np.array(text)}
-                np.savez_compressed(file, **content)
-                file.flush()
-                os.fsync(file.fileno())
+            yield scratch
             scratch.replace(path)
+            _sync_directory(path.parent)
         finally:
             scratch.unlink(missing_ok=True)
-        _sync_directory(path.parent)
-        _remove_stale_scratch(path)
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
+    except OSError as reason:
+        raise error(f"{path}: cannot be written: {reason.strerror or reason}") from None
 
 
 def read_result(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

@@ -7,17 +7,15 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.build import build_truss
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.setup import Setup
-
-Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-11
 
@@ -34,12 +32,8 @@ def bending_problem(
 ) -> Problem:
     """Return a maneuver that takes the tip from straight up by `goal` times the arm's height.
 
-    Parameters
-    ----------
-    cubes
-        Two cubes beside the arm, as in the five-bay example, at the same parts of its height.
-    **truss
-        Further keys of the ``[truss]`` table.
+    `cubes` are two beside the arm, at the same parts of its height as in the five-bay example; `truss` has more keys
+    of the ``[truss]`` table.
     """
     data: dict[str, Any] = {
         "name": f"{bays} bays, {module}",

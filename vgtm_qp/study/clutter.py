@@ -9,12 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.compare import run_method
-from vgtm_qp.comparison.statistics import wilson_interval
-from vgtm_qp.comparison.tables import crossed_table
+from vgtm_qp.comparison.tables import crossed_table, wilson_interval
 from vgtm_qp.geometry import shapes
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.arms import bending_problem, built_truss
-from vgtm_qp.study.drawing import MARKS, label, panels
+from vgtm_qp.study.drawing import MARKS, label, panels, select
 from vgtm_qp.study.scenes import is_clear
 from vgtm_qp.study.workers import Row, Task
 
@@ -94,16 +93,13 @@ def draw(rows: Sequence[Row]) -> Figure:
         counts = [_count(rows, method, density) for density in densities]
         shares = np.array([done / count for done, count in counts])
         low, high = np.transpose([wilson_interval(*count) for count in counts])
+        style: Any = {"marker": mark, "markersize": 4, "linestyle": "--", "capsize": 2, "linewidth": 0.9}
         axes[0].errorbar(
             np.array(densities) + 0.08 * (k - len(methods) / 2),
             shares,
             np.maximum([shares - low, high - shares], 0.0),
-            marker=mark,
-            markersize=4,
-            linestyle="--",
-            capsize=2,
-            linewidth=0.9,
             label=method,
+            **style,
         )
     axes[0].set_ylim(-0.03, 1.03)
     label(axes[0], "cubes", "part of the scenes solved")
@@ -138,5 +134,5 @@ def _cell(done: int, count: int) -> str:
 
 
 def _count(rows: Sequence[Row], method: str, density: int) -> tuple[int, int]:
-    mine = [row for row in rows if row["cubes"] == density]
+    mine = select(rows, cubes=density)
     return sum(bool(row[f"{method}: kept"]) for row in mine), len(mine)

@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from vgtm_qp.comparison.figure import draw_members
-from vgtm_qp.comparison.statistics import exponent
-from vgtm_qp.comparison.tables import crossed_table
+from vgtm_qp.comparison.tables import crossed_table, exponent
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.study.arms import bending_problem, furthest, moving_curve
-from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels
+from vgtm_qp.study.drawing import draw_arm, draw_line, label, mark_bays, panels, select
 from vgtm_qp.study.workers import Row, Task
 
 _HEIGHT = 4.0
@@ -64,16 +62,14 @@ def run(module: str, bays: int, steps: int) -> Row:
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw arms of one module, and the measures against the number of bays."""
     figure, axes = panels(2, 3, width=3.0, height=2.9)
-    shown = [row for row in rows if row["module"] == "octahedral" and "nodes" in row][:3]
+    shown = [row for row in select(rows, module="octahedral") if "nodes" in row][:3]
     for panel, row in zip(axes, shown, strict=False):
-        draw_members(panel, row["nodes"], row["members"], row["actuated"])
-        panel.plot(*np.array(row["curve"])[:, [0, 2]].T, color="tab:red", linewidth=1.0)
-        label(panel, "x [m]", "z [m]", f"{row['bays']} bays", legend=False)
+        draw_arm(panel, row["nodes"], row, f"{row['bays']} bays", row["curve"])
     for panel in axes[len(shown) : 3]:
         panel.set_axis_off()
     for panel, (key, name) in zip(axes[3:], _MEASURES.items(), strict=True):
         for k, module in enumerate(_MODULES):
-            mine = [row for row in rows if row["module"] == module]
+            mine = select(rows, module=module)
             if mine and max(row[key] for row in mine) > _EXACT:
                 draw_line(panel, k, module, mine, "bays", key)
         label(panel, "bays", name, log="xy")
@@ -86,7 +82,7 @@ def text(rows: Sequence[Row]) -> str:
     columns = {n: f"{n} bays" for n in sorted({row["bays"] for row in rows})}
     lines = {}
     for module in _MODULES:
-        mine = {row["bays"]: row for row in rows if row["module"] == module}
+        mine = {row["bays"]: row for row in select(rows, module=module)}
         for key, name in _MEASURES.items():
             values = [row[key] for row in mine.values()]
             order = f"{-exponent(list(mine), values):.2f}" if min(values, default=0.0) > _EXACT else "exact"

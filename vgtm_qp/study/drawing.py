@@ -1,17 +1,25 @@
-"""What the studies' figures share: panels of one size and style, lines with marks, labelled axes."""
+"""What figures and texts of the studies share: rows by their values, panels, lines with marks, labelled axes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
+from numpy.typing import ArrayLike
 
+from vgtm_qp.comparison.figure import draw_members
 from vgtm_qp.study.workers import Row
 
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+
+def select(rows: Sequence[Row], **wanted: Any) -> list[Row]:
+    """Return the rows that have the `wanted` values."""
+    return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
 
 
 def panels(rows: int, columns: int, *, width: float, height: float) -> tuple[Figure, list[Axes]]:
@@ -21,6 +29,17 @@ def panels(rows: int, columns: int, *, width: float, height: float) -> tuple[Fig
     for one in axes:
         one.tick_params(labelsize=7)
     return figure, axes
+
+
+def draw_arm(
+    axes: Axes, nodes: ArrayLike, row: Row, title: str, curve: ArrayLike = (), **limits: tuple[float, float]
+) -> None:
+    """Draw an arm with the members of a row, and points (P, 3) of its curve, as seen along y."""
+    if len(points := np.reshape(curve, (-1, 3))):
+        axes.plot(*points[:, [0, 2]].T, color="tab:red", linewidth=0.9)
+    draw_members(axes, nodes, row["members"], row["actuated"])
+    label(axes, "x [m]", "z [m]", title, legend=False)
+    axes.set(**limits)
 
 
 def draw_line(
@@ -44,17 +63,15 @@ def label(axes: Axes, x: str, y: str, title: str = "", *, legend: bool = True, l
     """Name the axes; those in `log`, of ``"xy"``, are logarithmic."""
     axes.set_xlabel(x, fontsize=8)
     axes.set_ylabel(y, fontsize=8)
-    if "x" in log:
-        axes.set_xscale("log")
-    if "y" in log:
-        axes.set_yscale("log")
-    if title:
-        axes.set_title(title, fontsize=8)
+    axes.set_title(title, fontsize=8)
+    for axis in log:
+        axes.set(**{f"{axis}scale": "log"})
     if legend:
         axes.legend(fontsize=6.5, frameon=False)
 
 
 def mark_bays(axes: Axes, bays: Sequence[int]) -> None:
     """Mark the numbers of bays on a logarithmic axis, and no others."""
-    axes.set_xticks(sorted(set(bays)), [str(n) for n in sorted(set(bays))])
+    ticks = sorted(set(bays))
+    axes.set_xticks(ticks, [str(n) for n in ticks])
     axes.xaxis.set_minor_locator(NullLocator())

@@ -10,10 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from vgtm_qp.comparison.compare import run_method
-from vgtm_qp.comparison.figure import draw_members
 from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.problem import load_problem
-from vgtm_qp.study.drawing import label, panels
+from vgtm_qp.study.drawing import draw_arm, panels
 from vgtm_qp.study.workers import Row, Task
 
 _FRAMES = 5
@@ -56,11 +55,9 @@ def draw(rows: Sequence[Row]) -> Figure:
             for x, _, z, edge in row["cubes"]:
                 panel.add_patch(Rectangle((x - edge / 2, z - edge / 2), edge, edge, color="0.8"))
             frame = row["frames"][j]
-            draw_members(panel, frame["nodes"], row["members"], row["actuated"])
-            label(panel, "x [m]", "z [m]", f"{row['method']}\nstep {frame['step']}", legend=False)
+            title = f"{row['method']}\nstep {frame['step']}"
+            draw_arm(panel, frame["nodes"], row, title, xlim=(-1.8, 2.1), ylim=(-0.2, 4.4))
             panel.title.set_fontsize(6.5)
-            panel.set_xlim(-1.8, 2.1)
-            panel.set_ylim(-0.2, 4.4)
     return figure
 
 

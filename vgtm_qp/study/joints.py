@@ -12,7 +12,7 @@ from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import load_problem
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.study.arms import bring_lengths
-from vgtm_qp.study.drawing import draw_line, label, panels
+from vgtm_qp.study.drawing import draw_line, label, panels, select
 from vgtm_qp.study.workers import Row, Task
 
 _PROBLEMS = ("five_bay_free", "five_bay_two_cubes", "ten_bay_round_a_cube")
@@ -45,7 +45,7 @@ def draw(rows: Sequence[Row]) -> Figure:
     """Draw the tip error against the offset."""
     figure, axes = panels(1, 1, width=4.2, height=3.2)
     for k, problem in enumerate(_PROBLEMS):
-        mine = [row for row in rows if row["problem"] == problem and row["posed"] == row["steps"]]
+        mine = [row for row in select(rows, problem=problem) if row["posed"] == row["steps"]]
         draw_line(axes[0], k, problem, mine, "offset", "tip_error")
     label(axes[0], "joint offset [m]", "greatest tip error [m]", log="xy")
     return figure
@@ -56,7 +56,7 @@ def text(rows: Sequence[Row]) -> str:
     table = crossed_table(
         ("greatest tip error [mm]",),
         {offset: f"{1e3 * offset:g} mm" for offset in sorted({row["offset"] for row in rows})},
-        {(p,): {row["offset"]: _cell(row) for row in rows if row["problem"] == p} for p in _PROBLEMS},
+        {(p,): {row["offset"]: _cell(row) for row in select(rows, problem=p)} for p in _PROBLEMS},
     )
     return (
         "Strokes found for ideal pin joints are given to an arm whose members end the given distance from the nodes, "

@@ -10,7 +10,7 @@ from vgtm_qp.comparison.compare import run_method
 from vgtm_qp.comparison.tables import crossed_table
 from vgtm_qp.curve.redundancy import degree_of_redundancy
 from vgtm_qp.problem import load_problem
-from vgtm_qp.study.drawing import draw_line, label, panels
+from vgtm_qp.study.drawing import draw_line, label, panels, select
 from vgtm_qp.study.workers import Row, Task
 
 _CASES = (
@@ -45,11 +45,11 @@ def run(problem: str, method: str, vertices: int) -> Row:
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw reach, travel of the solved ones, and step time."""
     figure, axes = panels(1, 3, width=3.4, height=3.1)
-    for k, case in enumerate(_CASES):
-        mine = _of(rows, case)
-        name, timed = ": ".join(case), [row for row in mine if row["step_time"] is not None]
+    for k, (problem, method) in enumerate(_CASES):
+        name, mine = f"{problem}: {method}", select(rows, problem=problem, method=method)
+        timed = [row for row in mine if row["step_time"] is not None]
         draw_line(axes[0], k, name, mine, "vertices", "reached")
-        draw_line(axes[1], k, name, [row for row in mine if row["solved"]], "vertices", "travel")
+        draw_line(axes[1], k, name, select(mine, solved=True), "vertices", "travel")
         draw_line(axes[2], k, name, timed, "vertices", "step_time", factor=1e3)
     label(axes[0], "control vertices", "part of the path", "how far")
     label(axes[1], "control vertices", "actuator travel [m]", "solved maneuvers", legend=False)
@@ -63,16 +63,15 @@ def text(rows: Sequence[Row]) -> str:
     table = crossed_table(
         ("path covered; travel [m]",),
         {v: f"V = {v} ({degree_of_redundancy(v, 3)})" for v in vertices},
-        {(": ".join(case),): {row["vertices"]: _cell(row) for row in _of(rows, case)} for case in _CASES},
+        {
+            (f"{p}: {m}",): {row["vertices"]: _cell(row) for row in select(rows, problem=p, method=m)}
+            for p, m in _CASES
+        },
     )
     return (
         "In brackets the free motions of the curve once base and tip are held, 3 V - 5 - 3. A curve with more of them "
         f"than the arm means nothing to it; one with too few may not pass.\n\n{table}"
     )
-
-
-def _of(rows: Sequence[Row], case: tuple[str, str]) -> list[Row]:
-    return [row for row in rows if (row["problem"], row["method"]) == case]
 
 
 def _cell(row: Row) -> str:

@@ -8,10 +8,9 @@ from time import process_time
 
 from matplotlib.figure import Figure
 
-from vgtm_qp.comparison.statistics import wilson_interval
-from vgtm_qp.comparison.tables import markdown_table
+from vgtm_qp.comparison.tables import markdown_table, wilson_interval
 from vgtm_qp.maneuver.solve import solve
-from vgtm_qp.study.drawing import label, panels
+from vgtm_qp.study.drawing import label, panels, select
 from vgtm_qp.study.scenes import random_scene
 from vgtm_qp.study.workers import Row, Task
 
@@ -55,7 +54,7 @@ def draw(rows: Sequence[Row]) -> Figure:
     figure, axes = panels(1, 1, width=5.6, height=3.2)
     kinds = sorted({row["stop"] for row in rows if row["stop"]}) or ["nothing"]
     for k, kind in enumerate(kinds):
-        reached = sorted(row["reached"] for row in rows if row["stop"] == kind)
+        reached = sorted(row["reached"] for row in select(rows, stop=kind))
         places = [k + 0.6 * i / len(reached) for i in range(len(reached))]
         axes[0].plot(reached, places, "o", markersize=3, label=kind)
     axes[0].set_yticks(range(len(kinds)), kinds)
@@ -70,18 +69,18 @@ def text(rows: Sequence[Row]) -> str:
         return "No scene was run."
     broken = sum(bool(row["failures"]) for row in rows)
     groups = {
-        "goal reachable by construction": [row for row in rows if row["reachable"]],
-        "any goal": [row for row in rows if not row["reachable"]],
-        "with a direction of the tip": [row for row in rows if row["directed"]],
+        "goal reachable by construction": select(rows, reachable=True),
+        "any goal": select(rows, reachable=False),
+        "with a direction of the tip": select(rows, directed=True),
     }
     for module in sorted({row["module"] for row in rows}):
-        groups[module] = [row for row in rows if row["module"] == module]
+        groups[module] = select(rows, module=module)
     parts = [
         f"Seed {rows[0]['seed']}, scenes 0 to {max(row['number'] for row in rows)}, {rows[0]['steps']} steps each. "
         f"{_of(rows)} solved; states that break a tolerance by the independent check: in {broken} scenes.",
         markdown_table(("", "solved"), [(name, _of(some)) for name, some in groups.items()]),
     ]
-    solved = [row for row in rows if row["status"] == "solved"]
+    solved = select(rows, status="solved")
     for words, key, some in (
         ("Solved by another way out", "way_out", solved),
         ("The others stopped by", "stop", rows),
@@ -95,6 +94,6 @@ def text(rows: Sequence[Row]) -> str:
 def _of(rows: Sequence[Row]) -> str:
     if not rows:
         return "none of 0"
-    done = sum(row["status"] == "solved" for row in rows)
+    done = len(select(rows, status="solved"))
     low, high = wilson_interval(done, len(rows))
     return f"{done} of {len(rows)} ({100 * low:.1f}-{100 * high:.1f} %)"

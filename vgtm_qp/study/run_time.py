@@ -8,12 +8,11 @@ from time import thread_time
 import numpy as np
 from matplotlib.figure import Figure
 
-from vgtm_qp.comparison.statistics import exponent
-from vgtm_qp.comparison.tables import crossed_table
+from vgtm_qp.comparison.tables import crossed_table, exponent
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import make_resolver, with_method
 from vgtm_qp.study.arms import bending_problem
-from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels
+from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels, select
 from vgtm_qp.study.workers import Row, Task
 
 _STEPS = 50
@@ -91,7 +90,7 @@ def draw(rows: Sequence[Row]) -> Figure:
             draw_line(panel, k, name, _of(rows, method, cubes), "bays", "time", style=style)
         title = "two cubes, clearance watched" if cubes else "no obstacles"
         label(panel, "bays", f"processor time of {_STEPS} steps [s]", title, log="xy")
-        mark_bays(panel, [row["bays"] for row in rows if row["cubes"] is cubes])
+        mark_bays(panel, [row["bays"] for row in select(rows, cubes=cubes)])
     return figure
 
 
@@ -103,7 +102,7 @@ def text(rows: Sequence[Row]) -> str:
         "know no obstacles, as in the paper; the QP keeps limits and clearances and proves them between the states."
     ]
     for cubes, names in ((False, _NAMES), (True, _WITH_CUBES)):
-        bays = sorted({row["bays"] for row in rows if row["cubes"] is cubes})
+        bays = sorted({row["bays"] for row in select(rows, cubes=cubes)})
         if not bays:
             continue
         lines = {}
@@ -126,23 +125,20 @@ def text(rows: Sequence[Row]) -> str:
 
 
 def _verdict(rows: Sequence[Row]) -> str:
-    def times(method: str) -> dict[int, float]:
-        return {row["bays"]: row["time"] for row in _of(rows, method, False)}
-
-    lines, left = [], {}
+    times = {name: {row["bays"]: row["time"] for row in _of(rows, name, False)} for name in _NAMES}
+    lines, sparse = [], []
     for method, algebra in (("pseudoinverse", "dense algebra"), ("pseudoinverse-sparse", "a sparse solver")):
-        other, gains = times(method), []
+        gains = []
         for way in ("curve-pseudoinverse", "curve-pseudoinverse-parallel"):
-            curve = times(way)
-            shared = sorted(set(curve) & set(other))
-            if shared:
-                n = shared[-1]
-                gain = left[method, way] = other[n] / curve[n]
-                factor = f"{gain:.0f}" if gain >= 10.0 else f"{gain:.1f}"
-                gains.append(f"{factor} times as fast in the {_NAMES[way].removeprefix('curve, ')} form")
+            if shared := times[way].keys() & times[method].keys():
+                most = max(shared)
+                gain = times[method][most] / times[way][most]
+                digits, form = int(gain < 10.0), _NAMES[way].removeprefix("curve, ")
+                gains.append(f"{gain:.{digits}f} times as fast in the {form} form")
+                if method == "pseudoinverse-sparse":
+                    sparse.append(gain)
         if gains:
-            lines.append(f"Against {algebra} the curve method is {' and '.join(gains)}, at {n} bays.")
-    sparse = [gain for (method, _), gain in left.items() if method == "pseudoinverse-sparse"]
+            lines.append(f"Against {algebra} the curve method is {' and '.join(gains)}, at {most} bays.")
     if sparse and max(sparse) < 1.0:
         lines.append(
             "The advantage that the paper reports is over dense algebra; over a sparse solver there is none."
@@ -153,5 +149,4 @@ def _verdict(rows: Sequence[Row]) -> str:
 
 
 def _of(rows: Sequence[Row], method: str, cubes: bool) -> list[Row]:
-    mine = [row for row in rows if row["method"] == method and row["cubes"] is cubes]
-    return sorted(mine, key=lambda row: int(row["bays"]))
+    return sorted(select(rows, method=method, cubes=cubes), key=lambda row: int(row["bays"]))

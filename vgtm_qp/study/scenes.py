@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
@@ -17,8 +17,6 @@ from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.study.arms import bring_lengths, least_singular_value
 
-Array = NDArray[np.float64]
-
 MODULES = ("octahedral", "double-octahedral", "hexapod", "longeron", "tetrahedral")
 SAFE = 0.08
 _ROOM = 0.02
@@ -27,16 +25,9 @@ _LEAST_SINGULAR_VALUE = 0.1
 
 
 class RandomScene(NamedTuple):
-    """A random problem.
+    """A random problem, and whether its goal is the tip pose of a `shape` (N, 3), m, that keeps limits and clearances.
 
-    Attributes
-    ----------
-    reachable : bool
-        Whether the goal is the tip pose of a shape that keeps every limit and clearance. That there is such a shape
-        does not mean that it can be reached along the straight path.
-    problem : Problem
-    shape : (N, 3) or None
-        That shape, m.
+    That there is such a shape does not mean that it can be reached along the straight path.
     """
 
     reachable: bool
@@ -50,9 +41,9 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
     truss = _truss(random)
     directed = bool(random.random() < 0.4)
     reachable = bool(random.random() < 0.75)
-    waypoint: dict[str, Any] = {"time": 10.0, "position": [0, 0, 1]} | (
-        {"pointing": [0, 0, 1]} if directed else {}
-    )
+    waypoint: dict[str, Any] = {"time": 10.0, "position": [0, 0, 1]}
+    if directed:
+        waypoint["pointing"] = [0, 0, 1]
     problem: dict[str, Any] = {
         "name": f"scene {seed}-{number}",
         "truss": truss,
@@ -62,22 +53,17 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
         "clearance": {"safe": SAFE, "influence": 0.5},
     }
     setup = build_arm(Problem.from_dict(problem))
-    home = setup.truss.home
     shape = random_shape(setup, random)
-    kinematics = setup.kinematics
-    if reachable:
-        kinematics.evaluate(shape)
-        waypoint["position"] = setup.arm.end_effector.position(shape).tolist()
-        if directed:
-            waypoint["pointing"] = kinematics.tip_rotation[:, 2].tolist()
-    else:
-        kinematics.evaluate(home)
+    setup.kinematics.evaluate(shape if reachable else setup.truss.home)
+    position, pointing = setup.arm.end_effector.position(shape), setup.kinematics.tip_rotation[:, 2]
+    if not reachable:
         aim = random.normal(size=3)
         aim[2] = abs(aim[2])
         reach = setup.truss.height * random.uniform(0.3, 1.2)
-        waypoint["position"] = (aim * (reach / np.linalg.norm(aim))).tolist()
-        if directed:
-            waypoint["pointing"] = (kinematics.tip_rotation[:, 2] + 0.5 * random.normal(size=3)).tolist()
+        position = aim * (reach / np.linalg.norm(aim))
+    waypoint["position"] = position.tolist()
+    if directed:
+        waypoint["pointing"] = (pointing if reachable else pointing + 0.5 * random.normal(size=3)).tolist()
     problem["obstacle"] = _cubes(setup, random, shape if reachable else None, int(random.integers(1, 9)))
     return RandomScene(reachable, Problem.from_dict(problem), shape if reachable else None)
 
@@ -130,9 +116,8 @@ def random_shape(setup: Setup, random: np.random.Generator) -> Array:
 
 
 def _tip_motion(setup: Setup, X: Array) -> float:
-    return float(
-        np.linalg.norm(setup.arm.end_effector.position(X) - setup.arm.end_effector.position(setup.truss.home))
-    )
+    tip = setup.arm.end_effector
+    return float(np.linalg.norm(tip.position(X) - tip.position(setup.truss.home)))
 
 
 def _random_lengths(setup: Setup, random: np.random.Generator) -> Array:
@@ -180,15 +165,8 @@ def _cubes(
         local = np.abs((passage - center) @ rotation_from_vector(vector)) - edge / 2
         if float(np.linalg.norm(np.maximum(local, 0.0), axis=1).min()) < SAFE + 0.1:
             continue
-        cubes.append(
-            {
-                "name": f"cube {len(cubes) + 1}",
-                "shape": "box",
-                "center": center.tolist(),
-                "size": edge,
-                "rotation_vector": vector.tolist(),
-            }
-        )
+        pose = {"center": center.tolist(), "rotation_vector": vector.tolist()}
+        cubes.append({"name": f"cube {len(cubes) + 1}", "shape": "box", "size": edge, **pose})
     return cubes
 
 

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from vgtm_qp.comparison.figure import draw_members
 from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.study.arms import bending_problem, built_truss, moving_curve
-from vgtm_qp.study.drawing import label, panels
+from vgtm_qp.study.drawing import draw_arm, panels
 from vgtm_qp.study.workers import Row, Task
 
 _FRAMES = 4
@@ -59,12 +58,8 @@ def draw(rows: Sequence[Row]) -> Figure:
     figure, axes = panels(len(rows), _FRAMES, width=1.9, height=2.6)
     for i, row in enumerate(rows):
         for j, frame in enumerate(row["frames"]):
-            panel = axes[_FRAMES * i + j]
-            panel.plot(*np.array(frame["curve"])[:, [0, 2]].T, color="tab:red", linewidth=0.9)
-            draw_members(panel, frame["nodes"], row["members"], row["actuated"])
-            label(panel, "x [m]", "z [m]", f"{row['module']}, step {frame['step']}", legend=False)
-            panel.set_xlim(-1.2, 3.8)
-            panel.set_ylim(-0.3, 8.4)
+            panel, title = axes[_FRAMES * i + j], f"{row['module']}, step {frame['step']}"
+            draw_arm(panel, frame["nodes"], row, title, frame["curve"], xlim=(-1.2, 3.8), ylim=(-0.3, 8.4))
     return figure
 
 

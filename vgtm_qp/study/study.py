@@ -89,17 +89,13 @@ def run_study(
 ) -> Path:
     """Run a study, or what is left of it, and write its rows, figure and text.
 
+    In `folder` a folder ``NAME/`` is made: ``rows.jsonl`` grows by a line a task; ``NAME.csv``, ``.json``, ``.pdf`` and
+    ``.md`` are written at the end. Tasks whose rows are there already are not run again; failed ones are.
+
     Parameters
     ----------
-    name
-        One of `STUDIES`.
-    folder
-        Where ``NAME/`` is made: ``rows.jsonl`` grows by a line a task; ``NAME.csv``, ``.json``, ``.pdf`` and ``.md``
-        are written at the end. Tasks whose rows are there already are not run again; failed ones are.
-    workers
-        Number of processes, each with one BLAS thread; 1 is this process.
-    dask
-        Address of a dask.distributed scheduler, in the place of processes.
+    workers, dask
+        Number of processes, each with one BLAS thread, 1 being this process; or address of a Dask scheduler.
     progress
         Called with the numbers of tasks done and in all.
     options

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 
-from vgtm_qp.errors import ResultError, VgtmError
+from vgtm_qp.errors import VgtmError
+from vgtm_qp.result.file import replacing
 from vgtm_qp.result.result import Result
 from vgtm_qp.view.drawing import (
     CURVE_COLOUR,
@@ -118,17 +118,8 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise VgtmError(f'{path}: a figure cannot be "{path.suffix}"; choices: {", ".join(SUFFIXES)}')
-    scratch = path.with_name(f".{path.name}.{secrets.token_hex(8)}{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with mpl.rc_context(_RC):
-                figure.savefig(scratch, dpi=220)
-            scratch.replace(path)
-        finally:
-            scratch.unlink(missing_ok=True)
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
+    with replacing(path) as scratch, mpl.rc_context(_RC):
+        figure.savefig(scratch, dpi=220, format=path.suffix[1:].lower())
     return path
 
 

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, has_full_rank, or_none
-from vgtm_qp.arm.serial.chain import Array, SerialChain
+from vgtm_qp.arm.serial.chain import SerialChain
 from vgtm_qp.arm.serial.symbols import ChainSymbols
 from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.bodies import Bodies, capsules
 from vgtm_qp.problem.arm import ArmTable
 from vgtm_qp.rotation import rotation_from_vector, turn_between, vector_near

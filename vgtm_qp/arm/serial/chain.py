@@ -7,14 +7,11 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.symbols import rotated
+from vgtm_qp.arrays import Array, Mask
 from vgtm_qp.problem.arm import ArmTable
 from vgtm_qp.rotation import rotation_from_vector
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

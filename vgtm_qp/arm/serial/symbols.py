@@ -6,9 +6,9 @@ from typing import Any
 
 import casadi as ca
 
-from vgtm_qp.arm.arm import Index
-from vgtm_qp.arm.serial.chain import Array, SerialChain
+from vgtm_qp.arm.serial.chain import SerialChain
 from vgtm_qp.arm.symbols import ArmSymbols, Constants
+from vgtm_qp.arrays import Array, Index
 
 
 class ChainSymbols(ArmSymbols):

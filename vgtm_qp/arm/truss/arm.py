@@ -14,7 +14,8 @@ from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_ways
 from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.symbols import TrussSymbols
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
 from vgtm_qp.geometry.bodies import capsules
 
@@ -144,14 +145,8 @@ class TrussArm(Arm):
             "rate": or_none(truss.rate),
             "acceleration": or_none(truss.acceleration),
             "radius": truss.radius.tolist(),
-            "tip": {
-                "nodes": truss.tip.tolist(),
-                "weights": truss.tip_weights.tolist(),
-                "frame": truss.tip_frame.tolist(),
-            },
-            "joints": None
-            if joints is None
-            else {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
+            "tip": {key: getattr(self.end_effector, key).tolist() for key in ("nodes", "weights", "frame")},
+            "joints": joints and {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
         }
 
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:

@@ -9,7 +9,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 
 
 def longest_ways(truss: Truss, sources: Index) -> Array:
@@ -38,12 +39,8 @@ def hollow(truss: Truss) -> float:
     if len(tip) == 1:
         return offset
     between = np.isin(truss.members, tip).all(axis=1)
-    if (
-        len(tip) == 3
-        and np.count_nonzero(between) == 3
-        and np.allclose(truss.tip_weights, 1.0 / 3.0)
-        and not offset
-    ):
+    is_triangle = len(tip) == 3 and np.count_nonzero(between) == 3
+    if is_triangle and np.allclose(truss.tip_weights, 1.0 / 3.0) and not offset:
         return float(truss.stroke[between, 1].max()) / (2.0 * math.sqrt(3.0))
     return float((longest_ways(truss, tip)[:, tip] @ np.abs(truss.tip_weights)).min()) + offset
 

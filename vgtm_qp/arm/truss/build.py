@@ -30,10 +30,7 @@ class LockError(TrussError):
 def build_truss(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
     """Build the truss of a problem; members locked from the start are fixed at their home length.
 
-    Parameters
-    ----------
-    spec
-        The validated ``[truss]`` table. Locks with a later time are left to the maneuver.
+    Locks with a later time are left to the maneuver.
 
     Raises
     ------

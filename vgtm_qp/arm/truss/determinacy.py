@@ -15,7 +15,8 @@ from scipy.linalg import qr
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 from vgtm_qp.arm.truss.kinematics import length_gradients
-from vgtm_qp.arm.truss.truss import Array, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import TrussError
 
 RANK_TOLERANCE = 1e-10
@@ -30,35 +31,22 @@ _NAMED = 6
 
 @dataclass(frozen=True)
 class DeterminacyReport:
-    """How regular the square length Jacobian of a statically determinate truss is.
-
-    Attributes
-    ----------
-    members, coordinates : int
-        Number of members and of unknown node coordinates 3 (N - N_c); equal.
-    rank : int
-        Rank of the length Jacobian; equal to both.
-    smallest_singular_value, condition : float
-        Of the length Jacobian; both without unit. The smallest one is the least change of length, per metre
-        of node displacement, of any motion.
-    """
+    """How regular the square length Jacobian of a statically determinate truss is."""
 
     members: int
     coordinates: int
+    """Unknown node coordinates 3 (N - N_c), as many as members."""
     rank: int
     smallest_singular_value: float
+    """The least change of length, m, per metre of node displacement, of any motion."""
     condition: float
 
 
 def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
     """Return d lengths / d unknown node coordinates, (M, 3 (N - N_c)), its columns in the order of ``free``.
 
-    Parameters
-    ----------
-    truss : Truss
-        Offset joints are differentiated through their frames, eqs. (19)-(21).
-    X : (N, 3), optional
-        Node positions, m; home if not given.
+    `X` (N, 3) are node positions, m, home if not given; offset joints are differentiated through their frames, eqs.
+    (19)-(21).
     """
     X = truss.home if X is None else X
     return sparse.csc_array(truss.scatter.sparse(length_gradients(truss, X)))
@@ -67,12 +55,7 @@ def length_jacobian(truss: Truss, X: Array | None = None) -> sparse.csc_array:
 def check_determinacy(truss: Truss, X: Array | None = None) -> DeterminacyReport:
     """Return the report of a statically determinate truss; refuse any other.
 
-    Parameters
-    ----------
-    truss : Truss
-        Its stages need not be set.
-    X : (N, 3), optional
-        Node positions, m; home if not given.
+    `X` (N, 3) are node positions, m, home if not given. The stages of the truss need not be set.
 
     Raises
     ------

@@ -11,10 +11,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
-from vgtm_qp.arm.truss.joints import Joints, axial_joints, joint_triangles
+from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
 from vgtm_qp.arm.truss.mobility import trackable_coordinates
 from vgtm_qp.arm.truss.stages import placement_stages
-from vgtm_qp.arm.truss.truss import Array, Index, Truss, check_stroke
+from vgtm_qp.arm.truss.truss import Truss, check_stroke
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import GraphTruss, Member
 
@@ -64,20 +65,14 @@ def truss_from_graph(spec: GraphTruss) -> Truss:
         tip_weights=np.full(len(spec.tip), 1 / len(spec.tip)),
         tip_frame=np.eye(3),
         stage=np.where(base, -1, 0),
-        bays=max(len(faces) - 1, 0),
     )
     check_determinacy(truss)
     truss = dataclasses.replace(truss, home=_corrected_home(spec, truss))
-    truss = _with_stages_and_joints(spec, truss)
-    truss = _with_frames(truss)
+    truss = _with_frames(_with_stages_and_joints(spec, truss))
     if truss.joints is not None:
         check_determinacy(truss)
     truss = dataclasses.replace(truss, stroke=_strokes(spec, truss))
-    return dataclasses.replace(
-        truss,
-        trackable=trackable_coordinates(truss),
-        bays=truss.bays if len(faces) else int(truss.stage.max()) + 1,
-    )
+    return dataclasses.replace(truss, trackable=trackable_coordinates(truss))
 
 
 def _check_connected(spec: GraphTruss, base: Array, pairs: Index) -> None:
@@ -147,9 +142,7 @@ def _with_stages_and_joints(spec: GraphTruss, truss: Truss) -> Truss:
             joints.offset[k] = member.offsets
     # A triangle that a table names may reach into later stages, which then have to be placed together.
     reach = np.hstack([truss.members, triangle[truss.members].reshape(-1, 6)])
-    return dataclasses.replace(
-        truss, stage=placement_stages(truss.base, reach), joints=Joints(triangle, joints.offset)
-    )
+    return dataclasses.replace(truss, stage=placement_stages(truss.base, reach), joints=joints)
 
 
 def _with_frames(truss: Truss) -> Truss:

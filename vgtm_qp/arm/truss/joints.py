@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _LEAST_SINE = 0.1
 """A triangle with a smaller sine at the node does not orient a joint: its normal would turn too fast."""
@@ -70,14 +67,8 @@ def joint_triangles(
     """Return (N, 3) the nodes whose triangle orients each node's joint, the node itself first.
 
     The two others are neighbours of the same or an earlier stage, so that no member's length depends on a
-    later stage. Neighbours of the node's own stage come first, then the triangle with the largest sine.
-
-    Parameters
-    ----------
-    node_names, home, members, stage
-        As in :class:`vgtm_qp.arm.truss.truss.Truss`.
-    chosen : mapping, optional
-        The two other nodes of some nodes' triangles, counter-clockwise about z.
+    later stage. Neighbours of the node's own stage come first, then the triangle with the largest sine. For some nodes
+    the two others are `chosen`, counter-clockwise about z.
 
     Raises
     ------

@@ -6,8 +6,9 @@ import casadi as ca
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from vgtm_qp.arm.truss.joints import Array, Index, Joints
+from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
 
@@ -92,11 +93,7 @@ class EndKinematics:
 class LengthRows:
     """J d_rho - E d_a = rhs, eqs. (22)-(24) with the actuated members beside the fixed ones; see ``arm.MotionRows``.
 
-    Attributes
-    ----------
-    gradient : (M, Q, 3)
-    rhs : (M,)
-        m.
+    J has the gradients (M, Q, 3); `rhs` (M,) is in m.
     """
 
     def __init__(self, truss: Truss, gradient: Array, rhs: Array) -> None:

@@ -10,7 +10,8 @@ from scipy.sparse.linalg import splu
 from vgtm_qp.arm.arm import has_full_rank, rank
 from vgtm_qp.arm.frames import frame_spins
 from vgtm_qp.arm.truss.determinacy import DeterminacyReport, check_determinacy, in_words, length_jacobian
-from vgtm_qp.arm.truss.truss import Array, Index, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array, Index
 
 _ROLL_REASON = (
     ": where the arm is straight, a twist of two faces makes one of a node's two fixed longerons longer "
@@ -74,18 +75,8 @@ def pose_response(truss: Truss, nodes: Index, weights: Array, rotations: Array, 
     """Return (F, 6, n_a) twists of F poses for unit rates of each actuator, fixed members kept.
 
     Three rows for the velocity of each centroid, m/m, and three for its angular velocity, rad/m, both in the base
-    frame; the first three alone where a pose has no frame.
-
-    Parameters
-    ----------
-    truss : Truss
-        Statically determinate.
-    nodes, weights : (F, K)
-        What each pose is made of; three nodes or more have a frame.
-    rotations : (F, 3, 3)
-        At home.
-    X : (N, 3)
-        Node positions, m.
+    frame; the first three alone where a pose has no frame. Each pose is made of `nodes` with `weights` (F, K), of three
+    or more with a frame, `rotations` (F, 3, 3) at home; nodes are at `X` (N, 3), m, of a determinate truss.
     """
     count, corners = nodes.shape
     rows = np.zeros((count, 6 if corners >= 3 else 3, truss.node_count, 3))
@@ -125,14 +116,7 @@ def trackable_coordinates(truss: Truss) -> tuple[str, ...]:
 
 
 def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
-    """Return the counts of a truss, its determinacy and what its tip can do.
-
-    Parameters
-    ----------
-    truss : Truss
-        Any truss.
-    X : (N, 3), optional
-        Node positions, m; home if not given.
+    """Return the counts of a truss, its determinacy and what its tip can do, at `X` (N, 3), m, or at home.
 
     Raises
     ------
@@ -145,7 +129,8 @@ def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
     scaled[3:] *= _size(truss)
     left, values, _ = np.linalg.svd(scaled)
     tip_rank = rank(values)
-    fixed = int(np.count_nonzero(~truss.actuated))
+    missing = _roll_first(left[:, tip_rank:], truss)
+    fixed = len(truss.fixed)
     return TrussDescription(
         module=truss.module,
         bays=truss.bays,
@@ -159,9 +144,7 @@ def describe(truss: Truss, X: Array | None = None) -> TrussDescription:
         determinacy=report,
         tip_rank=tip_rank,
         tip_coordinates=len(response),
-        unreachable=tuple(
-            _twist_in_words(twist, truss) for twist in _roll_first(left[:, tip_rank:], truss).T
-        ),
+        unreachable=tuple(_twist_in_words(twist, truss) for twist in missing.T),
     )
 
 
@@ -173,8 +156,7 @@ def _size(truss: Truss) -> float:
 def _roll_first(missing: Array, truss: Truss) -> Array:
     """Return another orthonormal basis (columns) of the twists `missing`, roll first where it is one of them.
 
-    A singular value decomposition mixes roll with the other missing twists; a person wants to read it by
-    itself.
+    A singular value decomposition mixes roll with the other missing twists.
     """
     if len(missing) < 6:
         return missing

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
-from vgtm_qp.arm.truss.truss import Array, Index, Truss, check_stroke
+from vgtm_qp.arm.truss.truss import Truss, check_stroke
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
 
@@ -29,23 +30,14 @@ class MemberRow(NamedTuple):
 
 
 class _Module(NamedTuple):
-    """What tells the modules of triangular layers apart.
-
-    Attributes
-    ----------
-    longerons : bool
-        Whether the members between two layers are actuated (but for diagonals).
-    battens : tuple of bool
-        Whether the battens of each layer of a bay are.
-    stroke : (2,)
-        Least and greatest length of an actuated member over its home length, where a table has none.
-    trackable, face_stride
-        See ``Truss``.
-    """
+    """What tells the modules of triangular layers apart; ``trackable`` and ``face_stride`` are those of ``Truss``."""
 
     longerons: bool
+    """Whether the members between two layers are actuated (but for diagonals)."""
     battens: tuple[bool, ...]
+    """Whether the battens of each layer of a bay are."""
     stroke: tuple[float, float]
+    """Least and greatest length of an actuated member over its home length, where a table has none."""
     trackable: tuple[str, ...]
     face_stride: int = 1
 
@@ -81,12 +73,15 @@ def stacked(spec: ModuleTruss) -> Truss:
     if not is_prism:
         turn, height = math.pi / 3.0, math.sqrt(spec.longeron**2 - spec.batten**2 / 3.0)
     home = np.vstack([_triangle(spec.batten, (k % 2) * turn, k * height) for k in range(layers + 1)])
-    return _layered(
+    nodes = np.arange(len(home))
+    return _assemble(
         spec,
+        _layer_names(len(home)),
         home,
+        nodes // 3 - 1,
         members,
         module.stroke,
-        layers_per_bay=per_bay,
+        faces=nodes.reshape(-1, 3)[::per_bay],
         trackable=module.trackable,
         face_stride=module.face_stride,
     )
@@ -113,14 +108,17 @@ def tetrahedral(spec: TetrahedralTruss) -> Truss:
         for k, kind in ((1, "B"), (2, "D"), (3, "L"))
     ]
     weight = 1.0 / (2.0 * (1.0 - cosine))
-    return _layered(
+    nodes = np.arange(len(home))
+    return _assemble(
         spec,
+        _layer_names(len(home)),
         home,
+        np.maximum(nodes - 3, -1),
         members,
         (0.75, 1.3),
-        trackable=_POSE if len(spec.actuated) > 1 else ("position",),
+        faces=nodes.reshape(-1, 3),
         weights=(weight, 1.0 - 2.0 * weight, weight),
-        stage=np.maximum(np.arange(len(home)) - 3, -1),
+        trackable=_POSE if len(spec.actuated) > 1 else ("position",),
     )
 
 
@@ -138,20 +136,15 @@ def plate(spec: PlateTruss) -> Truss:
         A home length is outside its stroke, or the joint offsets leave no member.
     """
     rows, columns, spacing = spec.rows, spec.columns, spec.spacing
-    names: list[str] = []
-    positions: list[tuple[float, float, float]] = []
-    stages: list[int] = []
     left = -0.5 * spacing * (columns - 1)
+    nodes: list[tuple[str, tuple[float, float, float], int]] = []
     for i in range(rows):
-        if i:
-            for j in range(columns - 1):
-                names.append(f"a{i - 1}-{j + 1}")
-                positions.append((left + spacing * (j + 0.5), -spec.depth, spacing * (i - 0.5)))
-                stages.append(max(i - 2, -1))
+        for j in range(columns - 1 if i else 0):
+            apex = left + spacing * (j + 0.5), -spec.depth, spacing * (i - 0.5)
+            nodes.append((f"a{i - 1}-{j + 1}", apex, max(i - 2, -1)))
         for j in range(columns):
-            names.append(f"n{i}-{j + 1}")
-            positions.append((left + spacing * j, 0.0, spacing * i))
-            stages.append(max(i - 2, -1))
+            nodes.append((f"n{i}-{j + 1}", (left + spacing * j, 0.0, spacing * i), max(i - 2, -1)))
+    names, positions, stages = zip(*nodes, strict=True)
     index = {name: i for i, name in enumerate(names)}
     members = [
         MemberRow(name, (index[first], index[second]), name[0] != "G")
@@ -160,18 +153,20 @@ def plate(spec: PlateTruss) -> Truss:
     ]
     return _assemble(
         spec,
-        tuple(names),
+        names,
         np.array(positions),
         np.array(stages, dtype=np.int64),
         members,
         (0.7, 1.4),
         faces=np.empty((0, 3), dtype=np.int64),
-        weights=(1 / 3, 1 / 3, 1 / 3),
-        tip=np.array([index[f"n{rows - 1}-1"], index[f"n{rows - 1}-{columns}"]]),
-        tip_weights=(0.5, 0.5),
-        bays=rows - 2,
+        weights=(0.5, 0.5),
         trackable=("position",),
+        tip=np.array([index[f"n{rows - 1}-1"], index[f"n{rows - 1}-{columns}"]]),
     )
+
+
+def _layer_names(count: int) -> tuple[str, ...]:
+    return tuple(f"n{i // 3}-{i % 3 + 1}" for i in range(count))
 
 
 def _triangle(batten: float, angle: float, z: float) -> Array:
@@ -223,38 +218,6 @@ def _battens(layer: int, *, actuated: bool) -> Iterator[MemberRow]:
         yield MemberRow(f"B{layer}-{i + 1}", (3 * layer + i, 3 * layer + (i + 1) % 3), actuated)
 
 
-def _layered(
-    spec: ModuleTruss | TetrahedralTruss,
-    home: Array,
-    members: Sequence[MemberRow],
-    stroke_factors: tuple[float, float],
-    *,
-    trackable: tuple[str, ...],
-    layers_per_bay: int = 1,
-    face_stride: int = 1,
-    weights: Sequence[float] = (1 / 3, 1 / 3, 1 / 3),
-    stage: Index | None = None,
-) -> Truss:
-    """Assemble a truss of layers of three nodes; a face ends each bay."""
-    nodes = np.arange(len(home))
-    faces = nodes.reshape(-1, 3)[::layers_per_bay]
-    return _assemble(
-        spec,
-        tuple(f"n{i // 3}-{i % 3 + 1}" for i in range(len(home))),
-        home,
-        nodes // 3 - 1 if stage is None else stage,
-        members,
-        stroke_factors,
-        faces=faces,
-        weights=weights,
-        tip=faces[-1],
-        tip_weights=weights,
-        bays=spec.bays,
-        trackable=trackable,
-        face_stride=face_stride,
-    )
-
-
 def _row(i: int, columns: int) -> list[tuple[str, str, str]]:
     """Return name and node names of the members that place row `i` and the apexes below it."""
     members: list[tuple[str, str, str]] = []
@@ -285,23 +248,15 @@ def _assemble(
     stroke_factors: tuple[float, float],
     *,
     faces: Index,
-    weights: Sequence[float],
-    tip: Index,
-    tip_weights: Sequence[float],
-    bays: int,
     trackable: tuple[str, ...],
+    weights: Sequence[float] = (1 / 3, 1 / 3, 1 / 3),
+    tip: Index | None = None,
     face_stride: int = 1,
 ) -> Truss:
     """Return the truss of a table, whose face and tip frames at home are those of the base.
 
-    Parameters
-    ----------
-    stroke_factors
-        Least and greatest length of an actuated member over its home length, where the table has no stroke.
-    weights
-        Of the three nodes of every face.
-
-    Other parameters are as in :class:`vgtm_qp.arm.truss.truss.Truss`.
+    Without a stroke in the table, actuated members are `stroke_factors` times their home lengths, least and greatest.
+    The tip, the last face if not given, and every face have the same `weights`.
     """
     names = tuple(member.name for member in members)
     pairs = np.array([member.nodes for member in members], dtype=np.int64)
@@ -335,13 +290,12 @@ def _assemble(
         acceleration=np.where(actuated, spec.acceleration or np.inf, np.inf),
         radius=np.full(len(members), spec.member_radius),
         faces=faces,
-        face_weights=np.tile(np.asarray(weights, dtype=np.float64), (len(faces), 1)),
+        face_weights=np.resize(np.asarray(weights, dtype=np.float64), faces.shape),
         face_frames=np.tile(np.eye(3), (len(faces), 1, 1)),
-        tip=tip,
-        tip_weights=np.asarray(tip_weights, dtype=np.float64),
+        tip=faces[-1] if tip is None else tip,
+        tip_weights=np.asarray(weights, dtype=np.float64),
         tip_frame=np.eye(3),
         stage=stage,
-        bays=bays,
         trackable=trackable,
         face_stride=face_stride,
         joints=joints,

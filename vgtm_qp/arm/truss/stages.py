@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 
-from vgtm_qp.arm.truss.truss import Index, Mask
+from vgtm_qp.arrays import Index, Mask
 from vgtm_qp.errors import TrussError
 
 
@@ -20,12 +20,8 @@ def placement_stages(base: Mask, members: Index) -> Index:
     where it hangs on three nodes placed before, all three of a face that must be placed at once. Dulmage &
     Mendelsohn, Can. J. Math. 10 (1958): the components are the same for every such choice of members.
 
-    Parameters
-    ----------
-    base : (N,) bool
-        Which nodes are given.
-    members : (M, Q) int
-        Nodes that each member's length depends on, M = 3 (number of other nodes); the first two are its own.
+    `base` (N,) says which nodes are given; `members` (M, Q) are the nodes that each member's length depends on, its own
+    two first, M = 3 (number of other nodes).
 
     Raises
     ------

@@ -16,7 +16,8 @@ import numpy as np
 
 from vgtm_qp.arm.symbols import ArmSymbols, Constants
 from vgtm_qp.arm.truss.kinematics import member_function
-from vgtm_qp.arm.truss.truss import Index, Truss
+from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Index
 
 _Layers = list[tuple[Index, ca.Sparsity]]
 """Terms whose sum is a block: places in the gradients, and the sparsity that they fill."""
@@ -150,12 +151,10 @@ class TrussSymbols(ArmSymbols):
             error = self.home - lengths
             centres = (X[:, truss.faces[face].tolist()] @ ca.DM(truss.face_weights[face]) for face in order)
             gaps = points - ca.horzcat(*centres)
-            blocks, rhs, placed = (
-                [],
-                [],
-                zip(self._stages, self._blocks(gradients), faces.tolist(), strict=True),
-            )
-            for stage, (D, L), face in placed:
+            blocks, rhs = [], []
+            for stage, (D, L), face in zip(
+                self._stages, self._blocks(gradients), faces.tolist(), strict=True
+            ):
                 fixed = np.flatnonzero(~truss.actuated[stage.members]).tolist()
                 weight = dict(zip(truss.faces[face].tolist(), truss.face_weights[face], strict=True))
                 centre = ca.sparsify(ca.DM(np.kron([weight[int(n)] for n in stage.nodes], np.eye(3))))

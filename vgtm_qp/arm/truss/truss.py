@@ -7,15 +7,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.scatter import LengthScatter
 from vgtm_qp.arm.truss.joints import Joints, joint_ends
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.errors import TrussError, nearest
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +54,6 @@ class Truss:
         The stage in which a node is placed, going out from the base: base nodes are in stage -1. Every member joins
         nodes of its own or earlier stages, and each stage has three members for each of its nodes where the truss
         allows it, so that the square length Jacobian is block lower triangular.
-    bays : int
-        Number of bays.
     trackable : tuple of str
         What every `face_stride`-th face of this truss can track at once, to first order: ``"position"``,
         ``"pointing"``, ``"orientation"``, each with those before it.
@@ -88,7 +82,6 @@ class Truss:
     tip_weights: Array
     tip_frame: Array
     stage: Index
-    bays: int
     trackable: tuple[str, ...] = ("position",)
     face_stride: int = 1
     joints: Joints | None = field(default=None)
@@ -102,6 +95,11 @@ class Truss:
     def member_count(self) -> int:
         """Number of members M, fixed and actuated."""
         return len(self.member_names)
+
+    @cached_property
+    def bays(self) -> int:
+        """Number of bays: one before each face but the base, one a stage where there are no faces."""
+        return len(self.faces) - 1 if len(self.faces) else int(self.stage.max()) + 1
 
     @cached_property
     def free(self) -> Index:
