@@ -51,8 +51,7 @@ class MethodResolver(ABC):
         self.state: State = setup.home_state()
         self.rank: int | None = None
         self.solver: str | None = None
-        phases = ("kinematics", "solve", "correction", "acceptance")
-        self._clock = Phases(dict.fromkeys(phases, 0.0))
+        self._clock = Phases("kinematics", "solve", "correction", "acceptance")
         self.phases = self._clock.seconds
         self._limit = step_limit
         self._steps = 0

@@ -44,10 +44,10 @@ _ROUNDING = float(np.finfo(float).eps)
 
 
 class Phases:
-    """Seconds spent in each phase of a step."""
+    """Seconds spent in each of the phases of a step, by their names."""
 
-    def __init__(self) -> None:
-        self.seconds = dict.fromkeys(("distance", "qp", "correction", "acceptance"), 0.0)
+    def __init__(self, *names: str) -> None:
+        self.seconds = dict.fromkeys(names, 0.0)
         self.start()
 
     def start(self) -> None:
@@ -66,7 +66,8 @@ class Attempt:
 
     def __init__(self, setup: Setup, separation: Separation, actuation: Actuation) -> None:
         self._arm, self._influence = setup.arm, setup.influence
-        self.separation, self.phases = separation, Phases()
+        self.separation = separation
+        self.phases = Phases("distance", "qp", "correction", "acceptance")
         # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
         exact = max(1e-12, 32.0 * _ROUNDING * setup.arm.height)
         member = 1e-10 if actuation.starts_at_once else exact
