@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.maneuver.maneuver import Maneuver
-from vgtm_qp.result.manifest import make_manifest
+from vgtm_qp.result.manifest import SCHEMA_VERSION, recorded_versions
 
 Array = NDArray[np.float64]
 
@@ -108,17 +109,21 @@ def maneuver_of(
     lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
     waypoints = [{"time": float(t), "position": p.tolist()} for t, p in zip(time[1:], tip[1:], strict=True)]
     whole = {"maneuver": {"steps": count - 1, "waypoint": waypoints}, **problem_of(problem or {})}
-    manifest = make_manifest(
-        whole,
-        TrussArm(truss).record(),
-        status=status,
-        reached=reached,
-        method="qp",
-        solver="daqp",
-        setup_time=0.1,
-        meshes=meshes,
-        directory=directory,
-    )
+    manifest = {
+        "schema_version": SCHEMA_VERSION,
+        "problem": whole,
+        "arm": TrussArm(truss).record(),
+        "status": status,
+        "reached": reached,
+        "blocked_by": [],
+        "method": "qp",
+        "solver": "daqp",
+        "setup_time": 0.1,
+        "directory": str(Path(directory).resolve()),
+        "meshes": meshes or {},
+        "versions": recorded_versions(),
+        "certificate": None,
+    }
     infinite = np.full(count, np.inf)
     return Maneuver(
         time=time,

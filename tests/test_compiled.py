@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 
 import casadi as ca
@@ -44,6 +45,41 @@ def test_where_the_cache_is_no_folder_the_virtual_machine_serves(tmp_path, monke
     kernel = Kernel(_square())
     assert not kernel.is_compiled
     assert _value(kernel) == 9.0
+
+
+@needs_compiler
+@pytest.mark.parametrize("as_given", ["{cc} -O1", "'{cc}' -DWANTED=1 -O1"])
+def test_the_compiler_may_have_flags(tmp_path, monkeypatch, as_given):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    found = shlex.split(compiler() or "")[0]
+    monkeypatch.setenv("VGTM_CC", as_given.format(cc=found))
+    assert shlex.split(compiler() or "") == shlex.split(as_given.format(cc=found))
+    kernel = Kernel(_square())
+    assert kernel.is_compiled
+    assert _value(kernel) == 9.0
+
+
+@needs_compiler
+@pytest.mark.parametrize("as_given", ["{cc}", "'{cc}' -DWANTED=1"])
+def test_the_folder_of_the_compiler_may_have_a_space(tmp_path, monkeypatch, as_given):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "a cache"))
+    wrapper = tmp_path / "a folder" / "cc"
+    wrapper.parent.mkdir()
+    # The wrapper tells that it ran.
+    wrapper.write_text(f'#!/bin/sh\necho ran >> "{tmp_path / "ran"}"\nexec {compiler()} "$@"\n')
+    wrapper.chmod(0o755)
+    monkeypatch.setenv("VGTM_CC", as_given.format(cc=wrapper))
+    kernel = Kernel(_square())
+    assert kernel.is_compiled
+    assert _value(kernel) == 9.0
+    assert (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("as_given", ["", "none", "  ", "no-such-compiler -m64", "'cc"])
+def test_without_a_compiler_by_that_name_the_virtual_machine_serves(monkeypatch, as_given):
+    monkeypatch.setenv("VGTM_CC", as_given)
+    assert compiler() is None
+    assert _value(Kernel(_square())) == 9.0
 
 
 def _long(name: str, scale: float) -> ca.Function:

@@ -38,7 +38,7 @@ def surface(
 @given(angles, st.floats(-1.4, 1.4))
 @settings(max_examples=30, deadline=None)
 def test_a_projection_is_a_right_handed_rotation_with_z_up(azimuth: float, elevation: float):
-    axes = Projection.looking(azimuth, elevation).axes
+    axes = Projection(azimuth, elevation).axes
     assert np.allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.isclose(np.linalg.det(axes), 1.0)
     assert abs(axes[0, 2]) < 1e-12
@@ -48,7 +48,7 @@ def test_a_projection_is_a_right_handed_rotation_with_z_up(azimuth: float, eleva
 @given(angles, st.floats(-1.2, 1.2), st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
 @settings(max_examples=80, deadline=None)
 def test_a_point_is_before_a_box_where_its_line_of_sight_says_so(azimuth, elevation, place):
-    projection = Projection.looking(azimuth, elevation)
+    projection = Projection(azimuth, elevation)
     center, half = np.array([0.3, -0.2, 0.5]), np.array([0.5, 0.4, 0.6])
     body = surface(trimesh.creation.box(extents=2 * half), projection, tuple(center))
     point = np.array(place)
@@ -64,14 +64,14 @@ def test_a_point_is_before_a_box_where_its_line_of_sight_says_so(azimuth, elevat
 
 
 def test_layers_count_the_surfaces_behind_a_point():
-    projection = Projection.looking(0.0, 0.0)
+    projection = Projection(0.0, 0.0)
     boxes = [surface(trimesh.creation.box(extents=(1, 1, 1)), projection, (x, 0.0, 0.0)) for x in (-3.0, 3.0)]
     points = np.array([[-5.0, 0.0, 0.0], [0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
     assert layers(points, boxes, 0.0).tolist() == [0, 1, 2]
 
 
 def test_a_moving_obstacle_is_where_it_is_at_the_time():
-    projection = Projection.looking(0.0, 0.0)
+    projection = Projection(0.0, 0.0)
     box = trimesh.creation.box(extents=(1, 1, 1))
     body = ProjectedMesh(
         ObstacleMesh(
@@ -85,8 +85,8 @@ def test_a_moving_obstacle_is_where_it_is_at_the_time():
 
 def test_a_body_with_a_hollow_is_not_convex():
     ring = trimesh.creation.annulus(0.5, 1.0, 0.3)
-    assert not surface(ring, Projection.looking(0.3, 0.4), (0.0, 0.0, 0.0)).is_convex
-    assert surface(trimesh.creation.icosphere(), Projection.looking(0.3, 0.4), (0.0, 0.0, 0.0)).is_convex
+    assert not surface(ring, Projection(0.3, 0.4), (0.0, 0.0, 0.0)).is_convex
+    assert surface(trimesh.creation.icosphere(), Projection(0.3, 0.4), (0.0, 0.0, 0.0)).is_convex
 
 
 def test_pieces_cover_a_member_and_nothing_beyond_it():
@@ -102,7 +102,7 @@ def test_panels_have_one_scale_and_hold_the_arm(maneuver: vq.Maneuver):
     figure = plot_frames(maneuver, frames=5, azimuth=-1.0, elevation=0.3)
     panels = figure.axes[:5]
     width, height = figure.get_size_inches()
-    projection = Projection.looking(-1.0, 0.3)
+    projection = Projection(-1.0, 0.3)
     arm = projection.flat(maneuver.nodes)
     for axes in panels:
         (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()

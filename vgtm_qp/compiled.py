@@ -18,6 +18,7 @@ import contextlib
 import hashlib
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -69,14 +70,23 @@ _PRELUDE = """#include <math.h>
 
 
 def compiler() -> str | None:
-    """Return the C compiler to use: ``$VGTM_CC``, else the first of cc, gcc, clang; ``None`` where there is none.
+    """Return the command of the C compiler, as a shell reads it; None where there is none.
 
-    ``VGTM_CC=none`` asks for the virtual machine.
+    It is ``$VGTM_CC``, a program or one with flags, else the first of cc, gcc, clang. ``VGTM_CC=none`` asks for the
+    virtual machine.
     """
     wanted = os.environ.get("VGTM_CC")
-    if wanted is not None:
-        return None if wanted in ("", "none") else shutil.which(wanted)
-    return next((path for name in ("cc", "gcc", "clang") if (path := shutil.which(name))), None)
+    if wanted in ("", "none"):
+        return None
+    commands = [["cc"], ["gcc"], ["clang"]] if wanted is None else [[wanted]]
+    if wanted:
+        # The whole is tried first, for the path of a program may hold spaces.
+        with contextlib.suppress(ValueError):
+            commands.append(shlex.split(wanted))
+    for program, *flags in filter(None, commands):
+        if path := shutil.which(program):
+            return shlex.join([path, *flags])
+    return None
 
 
 def cache_directory() -> Path:
@@ -157,7 +167,7 @@ class _Workers:
         """Begin to compile `text` into the object `target`, unless that is done or being done."""
         with self._lock:
             if target not in self._objects or (self._objects[target].done() and not target.exists()):
-                command = [cc, *_FLAGS, *flags, "-x", "c", "-c", "-"]
+                command = [*shlex.split(cc), *_FLAGS, *flags, "-x", "c", "-c", "-"]
                 self._objects[target] = self._compilers.submit(_make, target, command, text)
             return self._objects[target]
 
@@ -178,7 +188,7 @@ if hasattr(os, "register_at_fork"):
 def _link(cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | None:
     """Return the shared library, made of `objects` if it is not there; None where it cannot be made."""
     if not library.exists() and all(made.result() for made in objects.values()):
-        _make(library, [cc, "-shared", *map(str, objects), "-lm"])
+        _make(library, [*shlex.split(cc), "-shared", *map(str, objects), "-lm"])
         with contextlib.suppress(OSError):
             library.with_suffix(".o").unlink()
     # Another process may have made the library meanwhile, and cleared up.
@@ -266,13 +276,10 @@ def finish_compiling() -> None:
 
 
 class Kernel:
-    """A CasADi function bound to arrays that live as long as it does.
+    """A CasADi function bound to arrays that live as long as it does: `inputs` and `outputs`.
 
-    Attributes
-    ----------
-    inputs, outputs
-        One flat float64 array per argument and result: the nonzeros in CasADi's column-major order. Write the
-        inputs in place, call the kernel, read the outputs. One kernel must not be called by two threads at once.
+    They are one flat float64 array per argument and result: the nonzeros in CasADi's column-major order. Write the
+    inputs in place, call the kernel, read the outputs. One kernel must not be called by two threads at once.
     """
 
     def __init__(
@@ -312,10 +319,7 @@ class Kernel:
     def __call__(self) -> None:
         """Evaluate: read `inputs`, overwrite `outputs`.
 
-        Raises
-        ------
-        EvaluationError
-            The function could not be evaluated, at a singular matrix say; all outputs are NaN.
+        EvaluationError, with all outputs NaN, where the function could not be evaluated, at a singular matrix say.
         """
         if self._found is None:
             self._resolve()

@@ -8,7 +8,7 @@ from vgtm_qp.arm.arm import Arm
 from vgtm_qp.arm.serial.arm import SerialArm
 from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.build import LockError, build_truss
-from vgtm_qp.errors import Mistake, ProblemError
+from vgtm_qp.errors import Mistake
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.arm import ArmTable
 from vgtm_qp.problem.table import shown
@@ -27,14 +27,14 @@ def make_arm(problem: Problem) -> Arm:
     if problem.arm is not None:
         mistakes = list(_beyond_serial(problem, problem.arm))
         if mistakes:
-            raise ProblemError(str(problem.source or problem.name), mistakes)
+            raise problem.error(mistakes)
         return SerialArm(problem.arm)
     assert problem.truss is not None
     try:
         return TrussArm(build_truss(problem.truss))
     except LockError as error:
         wrong = [Mistake(f"truss.locked[{place}]", shown(name), said) for place, name, said in error.wrong]
-        raise ProblemError(str(problem.source or problem.name), wrong) from None
+        raise problem.error(wrong) from None
 
 
 def _beyond_serial(problem: Problem, spec: ArmTable) -> Iterator[Mistake]:

@@ -10,8 +10,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from vgtm_qp.bench import BaselineName, SceneKind, TrackingName
-from vgtm_qp.cli.output import Json, Output, Switch, answer, document, note, say
-from vgtm_qp.cli.progress import bar, following
+from vgtm_qp.cli.output import Json, Output, Switch, answer, bar, document, following, note, say
 
 if TYPE_CHECKING:
     from vgtm_qp.step.resolver import Step
@@ -100,8 +99,7 @@ def study(
     for option, value in (("--workers", workers), ("--scenes", scenes)):
         if value is not None and value < 1:
             raise GoalError(f"{option} must be 1 or more, not {value}")
-    given = {"scenes": scenes, "seed": seed}
-    options = {key: value for key, value in given.items() if value is not None}
+    options = {key: value for key, value in (("scenes", scenes), ("seed", seed)) if value is not None}
     for name in titles:
         study_tasks(name, short=short, **options)
     written = []

@@ -9,7 +9,6 @@ def check(problem: ProblemName, /, *, json: Json = False) -> None:
     """Check a problem file: its keys and values, its arm, its obstacles and goals at the home pose."""
     from dataclasses import asdict
 
-    from vgtm_qp.errors import ProblemError
     from vgtm_qp.problem import load_problem
     from vgtm_qp.step.build import build_arm
     from vgtm_qp.step.checks import check_problem, find_warnings
@@ -19,7 +18,7 @@ def check(problem: ProblemName, /, *, json: Json = False) -> None:
     setup = build_arm(loaded)
     mistakes = check_problem(loaded, setup)
     if mistakes:
-        raise ProblemError(source, mistakes)
+        raise loaded.error(mistakes)
     warnings = find_warnings(loaded, setup)
     for warning in warnings:
         note(f"{source}: warning: {warning}")

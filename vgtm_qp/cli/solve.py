@@ -7,8 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import ExitCode, Json, Output, ProblemName, answer, check_writable, note, table
-from vgtm_qp.cli.progress import following
+from vgtm_qp.cli.output import (
+    ExitCode,
+    Json,
+    Output,
+    ProblemName,
+    answer,
+    check_writable,
+    following,
+    note,
+    table,
+)
 from vgtm_qp.cli.results import outcome_code
 
 if TYPE_CHECKING:

@@ -24,12 +24,8 @@ _LEVEL = 1e-13
 class ClosestPoints(NamedTuple):
     """All local minima of a distance along a curve, the nearest first.
 
-    Attributes
-    ----------
-    s, position : (m,), (m, 3)
-        Parameters and points of the curve, m.
-    witness, distance : (m, 3), (m,)
-        Nearest points of the obstacle, and the distances, m; these are negative inside a box.
+    They are parameters (n,) and points (n, 3) of the curve, m, nearest points (n, 3) of the obstacle, m, and the
+    distances (n,), m, which are negative inside a box.
     """
 
     s: Array
@@ -41,10 +37,7 @@ class ClosestPoints(NamedTuple):
 def closest_to_point(curve: Curve, point: ArrayLike) -> ClosestPoints:
     """Find all local minima of |r(s) - q| for a point q (3,), m; ends count where the distance falls to them.
 
-    Raises
-    ------
-    CurveError
-        The point is not three finite numbers.
+    CurveError where the point is not three finite numbers.
     """
     goal = _vector("the point", point)
     return _closest(curve, curve.family.breaks, lambda r: (np.broadcast_to(goal, r.shape), np.ones(len(r))))
@@ -53,25 +46,12 @@ def closest_to_point(curve: Curve, point: ArrayLike) -> ClosestPoints:
 def closest_to_box(
     curve: Curve, center: ArrayLike, size: ArrayLike, rotation: ArrayLike | None = None
 ) -> ClosestPoints:
-    """Find all local minima of the signed distance to a box along the curve.
+    """Find all local minima of the signed distance along the curve to a box, turned by `rotation` (3, 3) if given.
 
-    Outside that is the distance; inside it is minus the depth below the nearest face. The curve is cut
-    where it passes a face's plane and where the face nearest to it from inside changes. On each piece the
-    distance, or its square, is one polynomial. Of a stretch at constant distance the end is given.
-
-    Parameters
-    ----------
-    center : (3,)
-        m.
-    size : float or (3,)
-        Edge, or the three edges, m.
-    rotation : (3, 3), optional
-        Rotation of the box; none where not given.
-
-    Raises
-    ------
-    CurveError
-        Not finite numbers, or an edge that is not positive.
+    The box has its `center` (3,), m, and one or three edges, `size`, m. Outside the signed distance is the distance;
+    inside it is minus the depth below the nearest face. The curve is cut where it passes a face's plane and where the
+    face nearest to it from inside changes. On each piece the distance, or its square, is one polynomial. Of a stretch
+    at constant distance the end is given. CurveError for numbers that are not finite, or an edge that is not positive.
     """
     middle = _vector("the center", center)
     half = _vector("the size", np.broadcast_to(np.asarray(size, dtype=float), 3)) / 2

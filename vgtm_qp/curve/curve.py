@@ -85,12 +85,8 @@ class Curve:
 
         A rotation-minimising frame by double reflection (Wang et al., ACM Trans. Graphics 27, 2008; error of
         fourth order in the step), turned by tau(s) about the tangent. Straight parts and inflections are no
-        singularities of it.
-
-        Raises
-        ------
-        CurveError
-            The family has kinks, r' vanishes, or the curve leaves against the base normal.
+        singularities of it. CurveError where the family has kinks, r' vanishes, or the curve leaves against the base
+        normal.
         """
         self._require_smooth()
         s = np.asarray(s, dtype=float)

@@ -24,38 +24,28 @@ _OUTSIDE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class CurveFamily:
-    """The weights w_i(s), 0 <= s <= 1, of eqs. (29)-(30): non-negative, with sum 1.
-
-    Attributes
-    ----------
-    name : str
-        One of `FAMILIES`.
-    degree : int
-        Degree d of the segments.
-    breaks : (S + 1,)
-        Parameters at which the segments begin and end, from 0 to 1.
-    extraction : (S, d + 1, V)
-        Bezier points of each segment as weighted averages of the V control vertices.
-    abscissae : (V,)
-        Control vertices at these fractions of a straight line give r(s) linear along it (Greville abscissae).
-        With bias != 1 or tension > 0 it is the same line, but the speed along it varies.
-    smooth : bool
-        True if the direction of the tangent is continuous wherever it exists.
-    knots : (V + d + 1,)
-        Knots of a B-spline; empty for the other families.
-    bias, tension : float
-        Shape parameters of a Beta-spline.
-    """
+    """The weights w_i(s), 0 <= s <= 1, of eqs. (29)-(30): non-negative, with sum 1."""
 
     name: str
+    """One of `FAMILIES`."""
     degree: int
+    """Degree d of the segments."""
     breaks: Array
+    """(S + 1,) parameters at which the segments begin and end, from 0 to 1."""
     extraction: Array
+    """(S, d + 1, V) Bezier points of each segment as weighted averages of the V control vertices."""
     abscissae: Array
+    """(V,) fractions of a straight line: control vertices there give r(s) linear along it (Greville abscissae).
+
+    With bias != 1 or tension > 0 it is the same line, but the speed along it varies.
+    """
     smooth: bool
+    """True if the direction of the tangent is continuous wherever it exists."""
     knots: Array
+    """(V + d + 1,) knots of a B-spline; empty for the other families."""
     bias: float = 1.0
     tension: float = 0.0
+    """Shape parameters of a Beta-spline."""
 
     @property
     def control_vertices(self) -> int:
@@ -65,12 +55,8 @@ class CurveFamily:
     def weights(self, s: ArrayLike, order: int = 0) -> Array:
         """Weights w_i, eq. (30), or their derivatives of `order` by s, at s of any shape: (..., V).
 
-        At a break where a derivative jumps it is the one of the segment that begins there.
-
-        Raises
-        ------
-        CurveError
-            Some s is outside 0 <= s <= 1 or is not a number.
+        At a break where a derivative jumps it is the one of the segment that begins there. CurveError where some s is
+        outside 0 <= s <= 1 or is not a number.
         """
         given = np.asarray(s, dtype=float)
         if not np.all((given >= -_OUTSIDE) & (given <= 1.0 + _OUTSIDE)):
@@ -104,13 +90,7 @@ class CurveFamily:
 
 
 def bezier(control_vertices: int) -> CurveFamily:
-    """Bezier curve of degree V - 1.
-
-    Raises
-    ------
-    CurveError
-        Fewer than two control vertices.
-    """
+    """Bezier curve of degree V - 1; CurveError for fewer than two control vertices."""
     _require_vertices("bezier", control_vertices, 2)
     without_knots = b_spline(control_vertices, control_vertices - 1)
     return replace(without_knots, name="bezier", knots=np.empty(0))
@@ -121,15 +101,9 @@ def b_spline(
 ) -> CurveFamily:
     """B-spline of any degree whose ends are clamped at the first and last control vertex.
 
-    Parameters
-    ----------
-    interior_knots : (V - degree - 1,), optional
-        Not decreasing, each strictly between 0 and 1 and at most `degree` times; uniform where not given.
-
-    Raises
-    ------
-    CurveError
-        Degree below one, fewer than degree + 1 control vertices, or wrong knots.
+    The `interior_knots` (V - degree - 1,) do not decrease, each strictly between 0 and 1 and at most `degree` times;
+    they are uniform where not given. CurveError for a degree below 1, for fewer than degree + 1 control vertices, and
+    for wrong knots.
     """
     if degree < 1:
         raise CurveError(f"the degree of a b-spline must be 1 or more, not {degree}")
@@ -166,12 +140,8 @@ def beta_spline(control_vertices: int, bias: float = 1.0, tension: float = 0.0) 
     With b1 the bias and b2 the tension, segments join with r'+ = b1 r'- and r''+ = b1^2 r''- + b2 r'- (in the
     segments' own parameters): direction of the tangent and curvature are continuous, r' itself is not unless
     b1 = 1. Two phantom vertices, p_0 + (p_0 - p_1) / b1^3 and p_N + b1^3 (p_N - p_N-1), bring it to its end
-    vertices along the first and last leg of the control polygon.
-
-    Raises
-    ------
-    CurveError
-        Fewer than two control vertices, bias not positive, or tension negative.
+    vertices along the first and last leg of the control polygon. CurveError for fewer than two control vertices, a
+    bias that is not positive, or a negative tension.
     """
     _require_vertices("beta-spline", control_vertices, 2)
     if not (np.isfinite(bias) and bias > 0.0):
@@ -214,10 +184,7 @@ def make_family(
 ) -> CurveFamily:
     """Make a family by its name in a problem file; `degree` is the B-spline's, the rest the Beta-spline's.
 
-    Raises
-    ------
-    CurveError
-        Unknown name, or parameters that the family cannot have.
+    CurveError for an unknown name, or for parameters that the family cannot have.
     """
     if name == "bezier":
         return bezier(control_vertices)

@@ -19,20 +19,11 @@ _SAMPLES = 100
 
 
 class Refit(NamedTuple):
-    """A curve that stands for another one, and the price.
-
-    Attributes
-    ----------
-    curve : Curve
-        The new curve; both ends and the direction of the base tangent are those of the old one, and so are
-        torsion and base frame.
-    change : float
-        Greatest distance between old and new position at the same s, m, sampled at 100 parameters a segment;
-        rounding error where the curve did not move.
-    """
+    """A curve that stands for another one: with its ends, direction of the base tangent, torsion and base frame."""
 
     curve: Curve
     change: float
+    """Greatest distance between old and new position at the same s, m, sampled at 100 parameters a segment."""
 
 
 def degree_of_redundancy(control_vertices: int, tip_rows: int, torsion_vertices: int = 0) -> int:
@@ -43,10 +34,7 @@ def degree_of_redundancy(control_vertices: int, tip_rows: int, torsion_vertices:
 def excess_freedom(curve_dof: int, arm_dof: int) -> str | None:
     """Warn of a curve with more degrees of freedom than the arm that tracks it, or return None.
 
-    Parameters
-    ----------
-    curve_dof, arm_dof
-        Either both with the tip held or both with the tip free.
+    Both are counted with the tip held, or both with the tip free.
     """
     excess = curve_dof - arm_dof
     if excess <= 0:
@@ -81,12 +69,8 @@ def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
 def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
     """Give a curve fewer control vertices, by least squares; `change` says how far it moved.
 
-    A B-spline loses the knots that it misses least; once it has no more interior knots, its degree falls.
-
-    Raises
-    ------
-    CurveError
-        Fewer than three control vertices would be left to keep both ends and the base tangent.
+    A B-spline loses the knots that it misses least; once it has no more interior knots, its degree falls. CurveError
+    where fewer than three control vertices would be left to keep both ends and the base tangent.
     """
     lowered = curve
     for _ in range(count):
@@ -98,12 +82,8 @@ def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
 def refit(curve: Curve, family: CurveFamily) -> Refit:
     """Fit a curve of another family or number of control vertices: least squares of r(s) over 0 <= s <= 1.
 
-    Both ends and the direction of the base tangent are kept; the distance of p_1 from p_0 is free.
-
-    Raises
-    ------
-    CurveError
-        The family has fewer than three control vertices, or the curve has no tangent at its base.
+    Both ends and the direction of the base tangent are kept; the distance of p_1 from p_0 is free. CurveError where the
+    family has fewer than three control vertices, or the curve has no tangent at its base.
     """
     vertices = family.control_vertices
     if vertices < _LEAST_VERTICES:

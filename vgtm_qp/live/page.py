@@ -51,12 +51,7 @@ def view(
     """Serve the live page of a problem or a result, to this machine alone, until interrupted.
 
     The `port` is the next free one from there on, 0 for any; `ready` is called with the page's address once it can be
-    opened; `stop` ends the page when it is set.
-
-    Raises
-    ------
-    MissingExtraError, ProblemError
-        viser is not installed; the problem cannot be set up.
+    opened; `stop` ends the page when it is set. MissingExtraError where viser is not installed.
     """
     maneuver = shown if isinstance(shown, Maneuver) else None
     problem = Problem.from_dict(maneuver.manifest["problem"]) if maneuver else shown

@@ -27,18 +27,10 @@ _RETRY_AFTER = 10
 
 
 class Reading(NamedTuple):
-    """Outcome, active constraints, clearances and step time, as the page shows them.
+    """What the page shows: one of `OUTCOMES` or ``"at rest"``, and what holds the arm back, most decisive first.
 
-    Attributes
-    ----------
-    outcome : str
-        One of `OUTCOMES`, or ``"at rest"``.
-    stopped_by, active : tuple of str
-        What holds the arm back, most decisive first, and the names of all active rows of the last QP.
-    clearance, self_clearance, nearest : float, float, str
-        Least distance to obstacles, and between members that share no node, m; the pair nearest to an obstacle.
-    step_time : float
-        Computing time of the last step, s.
+    Then all active rows of the last QP, the least distances to obstacles and between members that share no node, m, the
+    pair nearest to an obstacle, and the computing time of the last step, s.
     """
 
     outcome: str
@@ -129,10 +121,7 @@ class Session:
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change values of the problem, by key path, and go on from the same state.
 
-        Raises
-        ------
-        VgtmError
-            A value is wrong, or the method cannot serve this problem; nothing has changed.
+        VgtmError, and no change, where a value is wrong or the method cannot serve this problem.
         """
         problem = self.problem.replace(settings)
         resolver = _make_resolver(problem)
@@ -190,6 +179,4 @@ class Session:
 
 def _make_resolver(problem: Problem) -> Mover:
     # A hand may draw control vertices, which the coupled QP alone follows.
-    if problem.method.name == "qp":
-        return Resolver(problem)
-    return make_resolver(problem)
+    return Resolver(problem) if problem.method.name == "qp" else make_resolver(problem)

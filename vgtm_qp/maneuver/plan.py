@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import Mistake, ProblemError
+from vgtm_qp.errors import Mistake
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.rotation import rotation_from_vector, turn_between
@@ -46,20 +46,15 @@ class Plan:
 def make_plan(problem: Problem, position: Array, rotation: Array) -> Plan:
     """Return the plan of a problem's maneuver from the home pose of the tip, `position` (3,) and `rotation` (3, 3).
 
-    Raises
-    ------
-    ProblemError
-        The maneuver is of a kind that has no path, or its file is wrong.
+    ProblemError where the maneuver is of a kind that has no path, or its file is wrong.
     """
     maneuver = problem.maneuver
     if isinstance(maneuver, WaypointManeuver):
         return _through_waypoints(maneuver, position, rotation)
     if isinstance(maneuver, PathManeuver):
         return _along_file(maneuver, position, rotation)
-    mistake = Mistake(
-        "maneuver.kind", '"deployment"', 'a path: "path" (deployment is not available in this version)'
-    )
-    raise ProblemError(str(problem.source or problem.name), [mistake])
+    expected = 'a path: "path" (deployment is not available in this version)'
+    raise problem.error([Mistake("maneuver.kind", '"deployment"', expected)])
 
 
 def _through_waypoints(maneuver: WaypointManeuver, position: Array, rotation: Array) -> Plan:

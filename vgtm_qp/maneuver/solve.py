@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.errors import ProblemError
 from vgtm_qp.machine import THREADS, environment
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
@@ -20,7 +19,7 @@ from vgtm_qp.maneuver.retries import DeadEnd, retries
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
-from vgtm_qp.result.manifest import make_manifest, mesh_record
+from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, recorded_versions
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.state import State
@@ -57,7 +56,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     resolver = make_resolver(problem)
     mistakes = check_problem(problem, resolver.setup)
     if mistakes:
-        raise ProblemError(str(problem.source or problem.name), mistakes)
+        raise problem.error(mistakes)
     attempt = _Attempt(problem, resolver)
     setup_time = perf_counter() - started
 
@@ -238,24 +237,29 @@ def _assemble(
         for obstacle, pieces in zip(problem.obstacle, setup.monitor.obstacles, strict=True)
         if obstacle.shape == "mesh"
     }
-    manifest = make_manifest(
-        problem.to_dict(),
-        setup.arm.record(),
-        status="solved" if stop is None else "blocked",
+    manifest = {
+        "schema_version": SCHEMA_VERSION,
+        "problem": problem.to_dict(),
+        "arm": setup.arm.record(),
+        "status": "solved" if stop is None else "blocked",
         # That of the last whole row: an interrupt may have come before the next.
-        reached=float(attempt.rows["progress"][-1]),
-        blocked_by=() if stop is None else stop.names,
-        stop=None if stop is None else stop.to_dict(),
-        way_out=way,
-        recovered=_too_near(resolver),
-        method=problem.method.name,
-        solver=resolver.solver,
-        setup_time=setup_time,
-        directory=Path(problem.source).parent if problem.source else Path.cwd(),
-        meshes=meshes,
-    )
-    # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank only.
-    manifest["jacobian_rank"] = resolver.rank
+        "reached": float(attempt.rows["progress"][-1]),
+        "blocked_by": [] if stop is None else list(stop.names),
+        "stop": None if stop is None else stop.to_dict(),
+        "way_out": way,
+        "recovered": [
+            {"pair": pair, "distance": apart} for pair, apart in sorted(_too_near(resolver).items())
+        ],
+        "method": problem.method.name,
+        "solver": resolver.solver,
+        "setup_time": setup_time,
+        "directory": str((problem.source.parent if problem.source else Path.cwd()).resolve()),
+        "meshes": meshes,
+        "versions": recorded_versions(),
+        "certificate": None,
+        # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank.
+        "jacobian_rank": resolver.rank,
+    }
     arrays: dict[str, Any] = {name: np.asarray(rows, dtype=float) for name, rows in attempt.rows.items()}
     rotation = arrays.pop("tip_target_rotation")
     arrays |= setup.arm.recorded(arrays.pop("configuration"), arrays.pop("quantities"))

@@ -68,14 +68,9 @@ def count(least: int, greatest: int) -> Within:
 
 
 class ByKey:
-    """Annotation of a union of tables: the value of one key picks the table.
+    """Annotation of a union of tables: the value of one key, a ``Literal`` of strings in each of them, picks the table.
 
-    Parameters
-    ----------
-    key
-        The key, a ``Literal`` of strings in each table; a table in which it has a default needs no key.
-    pick
-        Returns the table for a value in the place of the look-up by the key, or None.
+    A table in which it has a default needs no key. Where given, `pick` returns the table for a value, or None, instead.
     """
 
     def __init__(self, key: str, pick: Callable[[Any], type[BaseModel] | None] | None = None) -> None:
@@ -175,27 +170,16 @@ def _array(item: dict[str, Any], size: int) -> WithJsonSchema:
     return WithJsonSchema({"type": "array", "items": item, "minItems": size, "maxItems": size})
 
 
+_COORDINATE = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
+_LENGTH = f"a length in metres greater than 0 (from {LEAST_LENGTH:g} to {GREATEST_LENGTH:g})"
 _LENGTH_SCHEMA = {"type": "number", "exclusiveMinimum": 0, "maximum": GREATEST_LENGTH}
 _COORDINATE_SCHEMA = {"type": "number", "minimum": -GREATEST_LENGTH, "maximum": GREATEST_LENGTH}
 
 Flag = Annotated[bool, Field(strict=True), expect("true or false")]
 Number = Annotated[float, Within("a finite number", ge=-1e6, le=1e6)]
-Coordinate = Annotated[
-    float,
-    Within(
-        f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}",
-        ge=-GREATEST_LENGTH,
-        le=GREATEST_LENGTH,
-    ),
-]
+Coordinate = Annotated[float, Within(_COORDINATE, ge=-GREATEST_LENGTH, le=GREATEST_LENGTH)]
 Length = Annotated[
-    float,
-    Within(
-        f"a length in metres greater than 0 (from {LEAST_LENGTH:g} to {GREATEST_LENGTH:g})",
-        ge=LEAST_LENGTH,
-        le=GREATEST_LENGTH,
-    ),
-    WithJsonSchema(_LENGTH_SCHEMA),
+    float, Within(_LENGTH, ge=LEAST_LENGTH, le=GREATEST_LENGTH), WithJsonSchema(_LENGTH_SCHEMA)
 ]
 Distance = Annotated[float, Within("a distance in metres, 0 or more", ge=0, le=GREATEST_LENGTH)]
 Angle = Annotated[
@@ -238,7 +222,5 @@ Stroke = Annotated[
 Edges = Annotated[
     tuple[Length, Length, Length],
     WrapValidator(_edges),
-    WithJsonSchema(
-        {"anyOf": [_LENGTH_SCHEMA, {"type": "array", "items": _LENGTH_SCHEMA, "minItems": 3, "maxItems": 3}]}
-    ),
+    WithJsonSchema({"anyOf": [_LENGTH_SCHEMA, _array(_LENGTH_SCHEMA, 3).json_schema]}),
 ]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from vgtm_qp.errors import Mistake, ProblemError, nearest
-from vgtm_qp.problem.fields import quoted
+from vgtm_qp.problem.fields import entry, quoted
 from vgtm_qp.problem.path_file import read_path
 from vgtm_qp.problem.problem import SCHEMA_VERSION, Problem
 from vgtm_qp.problem.table import shown
@@ -65,23 +66,18 @@ def problem_schema() -> dict[str, Any]:
 
 def _find(path: str | Path) -> Path:
     """Return the file, or the bundled one of that name."""
-    file = Path(path)
-    bundled = bundled_problems()
-    try:
+    file, name, bundled = Path(path), str(path), bundled_problems()
+    beside: list[str] = []
+    # A path that is too long, say, or has a null character is one of no file.
+    with suppress(OSError, ValueError):
         if file.is_file():
             return file
-        exists, name = file.exists(), str(path)
-    except (OSError, ValueError):
-        exists, name = False, str(path)
-    if not exists and name in bundled:
-        return bundled[name]
-    if exists:
-        found = "a folder" if file.is_dir() else "something that is not a regular file"
-        raise ProblemError.at(name, "file", found, "a problem file in TOML")
-    try:
+        if file.exists():
+            found = "a folder" if file.is_dir() else "something that is not a regular file"
+            raise ProblemError.at(name, "file", found, "a problem file in TOML")
         beside = [entry.name for entry in file.parent.iterdir() if entry.suffix == ".toml"]
-    except (OSError, ValueError):
-        beside = []
+    if name in bundled:
+        return bundled[name]
     hint = nearest(file.name, [*beside, *bundled])
     expected = f"a problem file that exists, or the name of a bundled problem: {quoted(bundled)}{hint}"
     raise ProblemError.at(name, "file", "nothing", expected)
@@ -131,8 +127,7 @@ def _toml_mistake(text: str, message: str) -> Mistake:
 
 def _path_mistakes(file: Path, data: Mapping[str, Any]) -> list[Mistake]:
     """Return the wrong cells of the path file, if the problem has one that exists."""
-    maneuver = data.get("maneuver")
-    name = maneuver.get("path") if isinstance(maneuver, Mapping) else None
+    name, track = entry(data.get("maneuver"), "path"), entry(data.get("end_effector"), "track")
     if not isinstance(name, str) or not name:
         return []
     try:
@@ -148,8 +143,6 @@ def _path_mistakes(file: Path, data: Mapping[str, Any]) -> list[Mistake]:
             Mistake(f'maneuver.path "{name}", {mistake.key}', mistake.value, mistake.expected)
             for mistake in error.mistakes
         ]
-    end_effector = data.get("end_effector")
-    track = end_effector.get("track") if isinstance(end_effector, Mapping) else None
     turned = isinstance(track, list) and ("pointing" in track or "orientation" in track)
     if turned and table.rotation_vector is None:
         expected = "the columns t,x,y,z,rx,ry,rz, since end_effector.track has a direction"

@@ -24,16 +24,9 @@ _GREATEST_MISTAKES = 100
 
 @dataclass(frozen=True, eq=False)
 class PathTable:
-    """The rows of a path file.
+    """The rows of a path file: times (K,), s, increasing from 0 or later, and poses in the base frame.
 
-    Attributes
-    ----------
-    time : (K,)
-        Increasing, from 0 or later, s.
-    position : (K, 3)
-        In the base frame, m.
-    rotation_vector : (K, 3) or None
-        Orientation relative to the base frame, rad; None where the file has no such columns.
+    Those are positions (K, 3), m, and rotation vectors (K, 3), rad, or None where the file has no such columns.
     """
 
     time: NDArray[np.float64]
@@ -44,10 +37,7 @@ class PathTable:
 def read_path(file: str | Path) -> PathTable:
     """Read a path: a header ``t,x,y,z`` or ``t,x,y,z,rx,ry,rz``, in any order, and one row a step.
 
-    Raises
-    ------
-    ProblemError
-        The file is missing, is not text, or has wrong cells: each is named by line and column.
+    ProblemError where the file is missing, is not text, or has wrong cells: each is named by line and column.
     """
     import numpy as np
 
@@ -123,11 +113,12 @@ def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mist
     row: dict[str, float] = {}
     for name, cell in zip(header, cells, strict=True):
         try:
-            row[name] = float(cell)
+            number = float(cell)
         except ValueError:
-            row[name] = math.nan
-        # `not <=` refuses NaN with the infinities.
-        if not abs(row[name]) <= GREATEST_LENGTH:
+            number = math.nan
+        # NaN fails this comparison too.
+        if abs(number) <= GREATEST_LENGTH:
+            row[name] = number
+        else:
             mistakes.append(Mistake(f"line {line}, column {name}", shown(cell), "a finite number"))
-            del row[name]
     return row

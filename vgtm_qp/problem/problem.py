@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -71,21 +71,10 @@ class Problem(Table, called="a problem"):
     def from_dict(
         cls, data: Mapping[str, Any], *, source: str | Path | None = None, check_files: bool = False
     ) -> Self:
-        """Make a problem from what :meth:`to_dict` returned.
+        """Make a problem from what :meth:`to_dict` returned; ProblemError with one mistake per mistake.
 
-        Parameters
-        ----------
-        data
-            JSON data of the form of the problem file.
-        source
-            File that the data came from: relative files are taken from its folder, and mistakes name it.
-        check_files
-            Whether files that the problem names must exist; not so for a result that was moved elsewhere.
-
-        Raises
-        ------
-        ProblemError
-            With one mistake per mistake.
+        Mistakes name `source`, the file that the data came from, and relative files are taken from its folder. With
+        `check_files` the files that the problem names must exist; not so for a result that was moved elsewhere.
         """
         context = {"source": source, "check_files": check_files}
         if source is not None:
@@ -95,17 +84,10 @@ class Problem(Table, called="a problem"):
         return problem
 
     def replace(self, changes: Mapping[str, Any]) -> Self:
-        """Return a problem with some values changed and everything checked again.
+        """Return a problem with some values changed, by key path, and everything checked again.
 
-        Parameters
-        ----------
-        changes
-            From key paths to values: ``{"method.solver": "osqp", "maneuver.steps": 20}``.
-
-        Raises
-        ------
-        ProblemError
-            A key does not exist or a value is wrong.
+        The changes are as in ``{"method.solver": "osqp", "maneuver.steps": 20}``. ProblemError where a key does not
+        exist or a value is wrong.
         """
         data = self.to_dict()
         for key, value in changes.items():
@@ -120,6 +102,10 @@ class Problem(Table, called="a problem"):
     def mistake(self, place: Place, expected: str) -> Mistake:
         """Return a mistake that a later check found at a place such as ``("obstacle", 1, "center")``."""
         return Mistake(key_path(self, place), shown(value_at(self, place)), expected)
+
+    def error(self, mistakes: Sequence[Mistake]) -> ProblemError:
+        """Return the error of mistakes that a later check found."""
+        return ProblemError(str(self.source or self.name), mistakes)
 
     @model_validator(mode="before")
     @classmethod

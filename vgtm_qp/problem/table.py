@@ -38,10 +38,7 @@ _nested: ContextVar[bool] = ContextVar("_nested", default=False)
 class Table(BaseModel):
     """One table of a problem file: immutable, checked when made, in Python as in a file.
 
-    Raises
-    ------
-    ProblemError
-        With one :class:`~vgtm_qp.errors.Mistake` per mistake, those of the tables inside it too.
+    ProblemError with one :class:`~vgtm_qp.errors.Mistake` per mistake, those of the tables inside it too.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
@@ -181,14 +178,9 @@ def _echo(found: ErrorDetails) -> bool:
 
 
 def key_path(data: Any, place: Place) -> str:
-    """Return a place in a problem as ``obstacle[1] ("right cube").size``.
+    """Return a place in a table, or in the mapping it is made from, as ``obstacle[1] ("right cube").size``.
 
-    Parameters
-    ----------
-    data
-        The table, or the mapping it is made from, that the place begins in.
-    place
-        Keys and indices from there; the tags of unions, ``"<...>"`` before a deeper key, are left out.
+    The tags of unions, ``"<...>"`` before a deeper key, are left out.
     """
     path = ""
     for depth, part in enumerate(place):

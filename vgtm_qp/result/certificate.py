@@ -135,13 +135,7 @@ class Certificate:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Certificate:
-        """Read what `to_dict` wrote.
-
-        Raises
-        ------
-        ResultError
-            A measure is missing or is not one.
-        """
+        """Read what `to_dict` wrote; ResultError where a measure is missing or is not one."""
         texts = {"contradictions", "notes"}
         try:
             values: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The result file: one ``.npz`` without pickle, written atomically and read with all of it checked."""
+"""The result file: one ``.npz`` of named arrays, without pickle, written atomically and read with all of it checked."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ import secrets
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ExportError, ResultError
-from vgtm_qp.result.layout import check_arrays
 from vgtm_qp.result.manifest import check_manifest, dump_manifest, parse_manifest
 
 _STALE_SECONDS = 60.0
@@ -34,14 +33,51 @@ _UNREADABLE = (
 """What zipfile and numpy raise over a file that is cut, damaged, encrypted or of another kind."""
 
 
-def write_result(path: Path, arrays: Mapping[str, NDArray[Any]], manifest: Mapping[str, Any]) -> None:
-    """Write a result file; a process killed meanwhile leaves the old file or the new one.
+class ArrayLayout(NamedTuple):
+    """Axes by name or size, kinds of number and finiteness of an array of the result file."""
 
-    Raises
-    ------
-    ResultError
-        The file cannot be written.
-    """
+    axes: tuple[str | int, ...]
+    kinds: str = "f"
+    finite: bool = True
+    required: bool = True
+
+
+LAYOUTS = {
+    "time": ArrayLayout(("T",)),
+    "nodes": ArrayLayout(("T", "N", 3)),
+    "members": ArrayLayout(("M", 2), "iu"),
+    "member_names": ArrayLayout(("M",), "U"),
+    "member_actuated": ArrayLayout(("M",), "b"),
+    "member_lengths": ArrayLayout(("T", "M")),
+    "joints": ArrayLayout(("T", "J")),
+    "joint_names": ArrayLayout(("J",), "U"),
+    "body_names": ArrayLayout(("B",), "U"),
+    "control_vertices": ArrayLayout(("T", "V", 3)),
+    "tip_position": ArrayLayout(("T", 3)),
+    "tip_rotation": ArrayLayout(("T", 3, 3)),
+    "tip_target_position": ArrayLayout(("T", 3)),
+    "clearance": ArrayLayout(("T",), finite=False),
+    "self_clearance": ArrayLayout(("T",), finite=False),
+    "progress": ArrayLayout(("T",)),
+    "step_time": ArrayLayout(("T",)),
+    "phase_names": ArrayLayout(("P",), "U"),
+    "phase_time": ArrayLayout(("T", "P")),
+    "tip_target_rotation": ArrayLayout(("T", 3, 3), required=False),
+    "tip_target_pointing": ArrayLayout(("T", 3), required=False),
+}
+
+OF_TRUSSES = ("nodes", "members", "member_names", "member_actuated", "member_lengths")
+OF_SERIAL_ARMS = ("joints", "joint_names", "body_names")
+
+
+def names_of(arrays: Collection[str]) -> list[str]:
+    """Return the names of the arrays that a result file of the kind of these may have."""
+    others = OF_TRUSSES if "joints" in arrays else OF_SERIAL_ARMS
+    return [name for name in LAYOUTS if name not in others]
+
+
+def write_result(path: Path, arrays: Mapping[str, NDArray[Any]], manifest: Mapping[str, Any]) -> None:
+    """Write a result file; a process killed meanwhile leaves the old file or the new one."""
     unsigned = {key: value for key, value in manifest.items() if key != "digest"}
     text = dump_manifest({**unsigned, "digest": content_digest(arrays, unsigned)})
     content: dict[str, Any] = {**arrays, "manifest": np.array(text)}
@@ -69,13 +105,7 @@ def replacing(path: Path, error: type[ResultError | ExportError] = ResultError) 
 
 
 def read_result(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return the arrays and the manifest of a result file, read without pickle and checked.
-
-    Raises
-    ------
-    ResultError
-        There is no such file, it is cut or altered, of another version, or an array is missing or malformed.
-    """
+    """Return the arrays and the manifest of a result file, read without pickle and checked; see `Result.load`."""
     try:
         with zipfile.ZipFile(path) as archive:
             broken = archive.testzip()
@@ -104,6 +134,55 @@ def read_result(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     return arrays, manifest
 
 
+def plain(array: Any) -> NDArray[Any]:
+    """Return an array in the byte order and width of the file."""
+    array = np.asarray(array)
+    wide = {"f": np.float64, "i": np.int64, "u": np.int64}.get(array.dtype.kind)
+    return np.asarray(array, dtype=wide, order="C")
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a copy on immutable bytes, which cannot be made writable again either."""
+    return np.ndarray(array.shape, array.dtype, buffer=array.tobytes())
+
+
+def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise ResultError for the first array that is missing, unknown, malformed or holds no number."""
+    possible = names_of(arrays)
+    for name in arrays:
+        if name not in possible:
+            raise ResultError(f"array {name} is not one of a result file; those are {', '.join(possible)}")
+    sizes: dict[str, int] = {}
+    for name in possible:
+        layout = LAYOUTS[name]
+        if name not in arrays:
+            if layout.required:
+                raise ResultError(f"array {name} is missing")
+            continue
+        array = arrays[name]
+        if array.dtype.kind not in layout.kinds:
+            raise ResultError(f"array {name} holds {array.dtype}; expected kind {' or '.join(layout.kinds)}")
+        expected = tuple(sizes.get(a, a) if isinstance(a, str) else a for a in layout.axes)
+        if array.ndim != len(expected) or any(
+            isinstance(e, int) and e != size for e, size in zip(expected, array.shape, strict=True)
+        ):
+            axes = ", ".join(f"{a} = {sizes[a]}" if a in sizes else str(a) for a in layout.axes)
+            raise ResultError(f"array {name} has shape {array.shape}; expected ({axes})")
+        sizes |= {a: size for a, size in zip(layout.axes, array.shape, strict=True) if isinstance(a, str)}
+        if array.dtype.kind == "f" and (np.isnan(array).any() or (layout.finite and np.isinf(array).any())):
+            row = int(np.argwhere(~np.isfinite(array))[0][0])
+            raise ResultError(f"array {name} holds a value that is not a number, row {row}")
+    states = "joints" if "joints" in arrays else "nodes"
+    if min(arrays[states].shape[:2]) < 1:
+        raise ResultError(f"there is no state in it: array {states} is empty")
+    members = arrays.get("members", np.zeros(0))
+    if members.size and (members.min() < 0 or members.max() >= sizes["N"]):
+        raise ResultError(f"array members names a node outside 0..{sizes['N'] - 1}")
+    if (np.diff(arrays["time"]) <= 0.0).any():
+        row = int(np.argmax(np.diff(arrays["time"]) <= 0.0)) + 1
+        raise ResultError(f"array time does not increase at row {row}")
+
+
 def content_digest(arrays: Mapping[str, NDArray[Any]], manifest: Mapping[str, Any]) -> str:
     """Return the SHA-256 of names, kinds, shapes and values of `arrays` and of `manifest` less its digest."""
     digest = hashlib.sha256(dump_manifest(manifest).encode())
@@ -127,7 +206,7 @@ def _read_array(path: Path, file: Any, name: str) -> NDArray[Any]:
 def _remove_stale_scratch(path: Path) -> None:
     """Remove scratch files that killed saves of `path` left behind; a young one may belong to a save under way."""
     scratch = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{16}}\.tmp")
-    # The result is saved already: a scratch file that cannot be removed, or that another save removes, is no failure.
+    # The file is saved already: a scratch file that cannot be removed, or that another save removes, is no failure.
     with suppress(OSError):
         for entry in path.parent.iterdir():
             if scratch.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > _STALE_SECONDS:

@@ -1,11 +1,19 @@
-"""The manifest of a result file: problem, arm, outcome and versions as strict JSON data."""
+"""The manifest of a result file: problem, arm, outcome and versions as strict JSON data.
+
+It has `schema_version`; the `problem` in the form of its file; the `arm` as its `record` gives it; `status`, `reached`,
+the share of the path covered, 0 to 1, and `blocked_by`, the names of what stopped the arm; the `stop` as its `to_dict`
+gives it; `way_out`, the change of the problem with which a retry came further; `recovered`, pairs below their clearance
+in the home pose and their distances there, m; `method` and `solver`; `setup_time`, s; `directory`, where relative paths
+of the problem start; `meshes`, what `mesh_record` returns for each; `versions`; the `certificate`, null before
+verification; and `jacobian_rank`, that of the last step where the method reveals it.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,72 +32,13 @@ _PACKAGES = ("vgtm-qp", "numpy", "casadi", "daqp", "osqp", "piqp", "python-fcl",
 _MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "blocked_by", "versions")
 
 
-def make_manifest(
-    problem: Mapping[str, Any],
-    arm: Mapping[str, Any],
-    *,
-    status: str,
-    reached: float,
-    blocked_by: Iterable[str] = (),
-    stop: Mapping[str, Any] | None = None,
-    way_out: str = "",
-    recovered: Mapping[str, float] | None = None,
-    method: str,
-    solver: str | None,
-    setup_time: float,
-    directory: str | Path = ".",
-    meshes: Mapping[str, Mapping[str, Any]] | None = None,
-) -> dict[str, Any]:
-    """Return the manifest of a result file.
-
-    Parameters
-    ----------
-    problem, arm : mapping
-        The whole problem as JSON data, in the form of the problem file; what the arm's `record` returns.
-    status, reached, blocked_by
-        One of `STATUSES`, the share of the path covered, 0 to 1, and the names of what stopped it.
-    stop : mapping, optional
-        What ``Stop.to_dict`` returns.
-    way_out : str
-        The change of the problem with which a retry came further, empty if there was none.
-    recovered : mapping, optional
-        Pairs below their clearance in the home pose, ``member / obstacle`` or ``member / member``, and their
-        distances there, m.
-    method, solver, setup_time
-        As in the problem's ``[method]``; what solved the QPs, None where the method solves none; s.
-    directory : path
-        Where the relative paths of the problem start.
-    meshes : mapping, optional
-        What `mesh_record` returns for each mesh obstacle, by the obstacle's name.
-    """
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "problem": dict(problem),
-        "arm": dict(arm),
-        "status": status,
-        "reached": float(reached),
-        "blocked_by": list(blocked_by),
-        "stop": None if stop is None else dict(stop),
-        "way_out": way_out,
-        "recovered": [
-            {"pair": pair, "distance": float(apart)} for pair, apart in sorted((recovered or {}).items())
-        ],
-        "method": method,
-        "solver": solver,
-        "setup_time": float(setup_time),
-        "directory": str(Path(directory).resolve()),
-        "meshes": {name: dict(record) for name, record in (meshes or {}).items()},
-        "versions": _versions(),
-        "certificate": None,
-    }
-
-
 def mesh_record(path: str | Path, triangles: int) -> dict[str, Any]:
     """Return what ties a result to a mesh file: its SHA-256 and the number of its triangles."""
     return {"sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(), "triangles": int(triangles)}
 
 
-def _versions() -> dict[str, str]:
+def recorded_versions() -> dict[str, str]:
+    """Return the versions of what a result depends on."""
     return {
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate
 from vgtm_qp.result.chain import RecordedChain, is_serial
-from vgtm_qp.result.file import read_result, write_result
-from vgtm_qp.result.layout import check_arrays, frozen, names_of, plain
+from vgtm_qp.result.file import check_arrays, frozen, names_of, plain, read_result, write_result
 from vgtm_qp.result.manifest import check_manifest
 from vgtm_qp.result.poses import base_poses
 
@@ -42,7 +41,7 @@ class Result:
     step_time, phase_names, phase_time : (T,), (P,), (T, P)
         Computing time of each step and of its phases, s; 0 in row 0.
     manifest : dict
-        Plain data, see `make_manifest`.
+        Plain data, see `vgtm_qp.result.manifest`.
     tip_target_rotation, tip_target_pointing : (T, 3, 3) or None, (T, 3) or None
         Targets of orientation or direction where they were tracked.
     nodes : (T, N, 3)
@@ -236,12 +235,9 @@ class Result:
         return {"median": median, "p95": p95, "p99": p99, "phases": named}
 
     def save(self, path: str | Path) -> Path:
-        """Write the result file and return its path; a process killed meanwhile leaves the old or the new.
+        """Write the result file and return its path; ResultError where it cannot be written.
 
-        Raises
-        ------
-        ResultError
-            The file cannot be written.
+        A process killed meanwhile leaves the old file or the new one.
         """
         write_result(Path(path), self.arrays, self.manifest)
         return Path(path)

@@ -169,6 +169,8 @@ class RecordedArm:
         The length Jacobian is d lengths / d (free node positions), square in a determinate truss; the tip's
         is d tip position / d actuated lengths. None where the truss is not determinate or has no actuator.
         """
+        from scipy.sparse import csc_array
+
         unknowns = 3 * len(self.free)
         if unknowns != len(self.members) or not self.actuated.any():
             return None
@@ -184,28 +186,19 @@ class RecordedArm:
         for node, weight in zip(self.tip, self.tip_weights, strict=True):
             if column[node] >= 0:
                 tip[3 * column[node] : 3 * column[node] + 3] += weight * np.eye(3)
-        if unknowns <= _DENSE_UNKNOWNS:
-            return self._dense_values(rows, columns, values, tip)
-        return self._sparse_values(rows, columns, values, tip)
-
-    def _dense_values(
-        self, rows: Index, columns: Index, values: Array, tip: Array
-    ) -> tuple[float, float, float]:
-        J = np.zeros((len(tip), len(tip)))
-        np.add.at(J, (rows, columns), values)
-        least = float(np.linalg.svd(J, compute_uv=False)[-1])
+        J = csc_array((values, (rows, columns)), shape=(unknowns, unknowns))
+        if unknowns > _DENSE_UNKNOWNS:
+            return self._sparse_values(J, tip)
+        dense = J.toarray()
+        least = float(np.linalg.svd(dense, compute_uv=False)[-1])
         if least == 0.0:
             return 0.0, 0.0, np.inf
-        return least, *extreme_values(np.linalg.solve(J.T, tip)[self.actuated])
+        return least, *extreme_values(np.linalg.solve(dense.T, tip)[self.actuated])
 
-    def _sparse_values(
-        self, rows: Index, columns: Index, values: Array, tip: Array
-    ) -> tuple[float, float, float]:
+    def _sparse_values(self, J: Any, tip: Array) -> tuple[float, float, float]:
         """Inverse power iteration on J^T J: it comes down to the least singular value from above."""
-        from scipy.sparse import csc_array
         from scipy.sparse.linalg import splu
 
-        J = csc_array((values, (rows, columns)), shape=(len(tip), len(tip)))
         try:
             factors = splu(J)
         except RuntimeError:

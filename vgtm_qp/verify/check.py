@@ -25,7 +25,14 @@ from vgtm_qp.verify.clearance import (
     RecordedMotion,
 )
 from vgtm_qp.verify.obstacles import read_obstacles
-from vgtm_qp.verify.path import DIRECTION_TOLERANCE, TIP_TOLERANCE, check_path, direction_error, tip_error
+from vgtm_qp.verify.path import (
+    DIRECTION_TOLERANCE,
+    TIP_TOLERANCE,
+    angles,
+    check_path,
+    direction_error,
+    tip_error,
+)
 from vgtm_qp.verify.recovery import excuse_recovering
 
 Array = NDArray[np.float64]
@@ -48,13 +55,7 @@ _FEW_STATES = 21
 
 
 def verify_file(path: str | Path) -> Certificate:
-    """Load a result file and verify it.
-
-    Raises
-    ------
-    ResultError
-        The file is cut, altered, of another version, or its arm record is malformed.
-    """
+    """Load a result file and verify it; ResultError where it cannot be loaded, or its arm record is malformed."""
     return verify(Result.load(path))
 
 
@@ -233,12 +234,10 @@ def _member_angle(motion: RecordedMotion) -> Least:
     for state, ends in enumerate(motion.ends):
         along = ends[:, 1] - ends[:, 0]
         leaving = np.stack([along, -along], axis=1).reshape(-1, 3)
-        first, second = leaving[pairs[:, 0]], leaving[pairs[:, 1]]
-        across = np.linalg.norm(np.cross(first, second), axis=1)
-        angles = np.arctan2(across, np.sum(first * second, axis=1))
-        if len(angles) and angles.min() < least.value:
-            names = " / ".join(motion.arm.member_names[k // 2] for k in pairs[int(np.argmin(angles))])
-            least = Least(float(angles.min()), f"state {state}: {names}")
+        between = angles(leaving[pairs[:, 0]], leaving[pairs[:, 1]])
+        if len(between) and between.min() < least.value:
+            names = " / ".join(motion.arm.member_names[k // 2] for k in pairs[int(np.argmin(between))])
+            least = Least(float(between.min()), f"state {state}: {names}")
     return least
 
 

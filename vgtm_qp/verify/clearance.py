@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,28 +34,15 @@ _GREATEST_COUNT = 1_000_000
 _CHUNK = 200_000
 
 
-@dataclass(frozen=True)
 class RecordedMotion:
-    """The moving arm.
+    """The moving arm: times (T,), s, and states: nodes (T, N, 3), m, or joints and base (T, J + 6).
 
-    Attributes
-    ----------
-    arm : RecordedArm or RecordedChain
-        Its bodies.
-    time, states : (T,), (T, ...)
-        Times, s, and configurations: nodes (N, 3), m, or joints and base (J + 6,).
-    ends : (T, M, 2, 3)
-        Ends of the bodies at the states, m.
+    The ends (T, M, 2, 3), m, are those of its bodies at the states.
     """
 
-    arm: Arm
-    time: Array
-    states: Array
-    ends: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Place the ends of all bodies at all states."""
-        object.__setattr__(self, "ends", self.arm.states_ends(self.states))
+    def __init__(self, arm: Arm, time: Array, states: Array) -> None:
+        self.arm, self.time, self.states = arm, time, states
+        self.ends = arm.states_ends(states)
 
     def ends_between(self, step: int, body: Index, share: Array) -> Array:
         """Return (P, 2, 3) the ends, m, of bodies (P,) at shares (P,) of the motion from state `step` to the next."""

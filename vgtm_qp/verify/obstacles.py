@@ -21,24 +21,16 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Shape:
-    """K convex pieces about the origin, along their own axes.
-
-    Attributes
-    ----------
-    corners : (K, C, 3)
-        Points whose convex hulls hold the pieces, m.
-    separation
-        Distances and normals of P segments, from start to end (P, 3), against the pieces (P,).
-    support
-        Greatest ``normal . x`` (P,) over the points x of the pieces (P,) for normals (P, 3), m.
-    closed : bool or None
-        Whether the pieces are a closed surface, with an inside; None where they are solid themselves.
-    """
+    """K convex pieces about the origin, along their own axes."""
 
     corners: Array
+    """(K, C, 3) points whose convex hulls hold the pieces, m."""
     separation: Callable[[Array, Array, Index], Separation]
+    """Distances and normals of P segments, from start to end (P, 3), against the pieces (P,)."""
     support: Callable[[Array, Index], Array]
+    """Greatest ``normal . x`` (P,) over the points x of the pieces (P,) for normals (P, 3), m."""
     closed: bool | None = None
+    """Whether the pieces are a closed surface, with an inside; None where they are solid themselves."""
 
 
 _BOX_CORNERS: Array = np.array([list(itertools.product((-1.0, 1.0), repeat=3))])
@@ -83,18 +75,9 @@ def mesh(triangles: Array, closed: bool) -> Shape:
 
 @dataclass(frozen=True)
 class Body:
-    """An obstacle; positions it takes and gives are relative to its centre, in directions of the base frame.
+    """An obstacle of a `shape`, with `center` (3,), m, at time 0, `velocity` (3,), m/s, and attitude `rotation` (3, 3).
 
-    Attributes
-    ----------
-    name : str
-        Its name in the problem.
-    center, velocity : (3,)
-        Position at time 0, m, and its rate, m/s.
-    rotation : (3, 3)
-        Its attitude.
-    shape : Shape
-        In directions of its own axes.
+    Positions it takes and gives are relative to its centre, in directions of the base frame.
     """
 
     name: str
@@ -145,16 +128,10 @@ class Body:
 def read_obstacles(
     problem: Mapping[str, Any], meshes: Mapping[str, Any], directory: Path
 ) -> tuple[list[Body], list[str], list[str]]:
-    """Return the obstacles of `problem`, what contradicts the problem, and what could not be checked.
+    """Return the obstacles of `problem`, as JSON data, what contradicts the problem, and what could not be checked.
 
-    Parameters
-    ----------
-    problem : mapping
-        A problem as JSON data.
-    meshes : mapping
-        The SHA-256 and triangle count of each mesh file by its obstacle's name, as the result recorded them.
-    directory : Path
-        Where relative paths of mesh files start.
+    The result recorded SHA-256 and triangle count of mesh files in `meshes`, by obstacle. Relative paths of those files
+    start in `directory`.
     """
     bodies: list[Body] = []
     contradictions: list[str] = []

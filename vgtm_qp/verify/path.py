@@ -20,6 +20,12 @@ TIP_TOLERANCE = 1e-6
 DIRECTION_TOLERANCE = 1e-6
 """Tip direction and orientation, rad."""
 
+_DIRECTIONS = {
+    "orientation": ("tip_target_rotation", "rotation_vector"),
+    "pointing": ("tip_target_pointing", "pointing"),
+}
+"""The array of targets and the key of a waypoint for each kind of direction that can be tracked."""
+
 
 def tip_error(maneuver: Result, tip: Array) -> Array | None:
     """Return (T,) distances of the tip (T, 3) from its targets over the tracked axes, m; None without any."""
@@ -31,30 +37,24 @@ def tip_error(maneuver: Result, tip: Array) -> Array | None:
 
 def direction_error(maneuver: Result, rotation: Array) -> Array | None:
     """Return (T,) angles of the tip's attitude (T, 3, 3) or z axis from its targets, rad; None if not tracked."""
-    errors = []
-    if "orientation" in _tracked(maneuver) and maneuver.tip_target_rotation is not None:
-        errors.append(_rotation_angle(rotation, maneuver.tip_target_rotation))
-    if "pointing" in _tracked(maneuver) and maneuver.tip_target_pointing is not None:
-        errors.append(_angle(rotation[:, :, 2], maneuver.tip_target_pointing))
+    directions = {"orientation": rotation, "pointing": rotation[:, :, 2]}
+    found = _direction_targets(maneuver).items()
+    errors = [angles(directions[kind], targets) for kind, targets in found if targets is not None]
     return np.max(errors, axis=0) if errors else None
 
 
 def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], list[str]]:
     """Return what is wrong with the targets of a maneuver whose tip (T, 3), m, was at `tip`.
 
-    Returns
-    -------
-    target_error : (T,) or None
-        Distance of each position target from the path, m; None if there is no path of positions.
-    contradictions, notes : list of str
-        As in the certificate.
+    That is the distance (T,) of each position target from the path, m, or None if there is no path of positions; then
+    contradictions and notes, as in the certificate.
     """
     wanted = maneuver.manifest["problem"].get("maneuver") or {}
     axes = _tracked_axes(maneuver)
     contradictions = [
-        f"{kind} is tracked, but there is no array {array}"
-        for kind, array in (("orientation", "tip_target_rotation"), ("pointing", "tip_target_pointing"))
-        if kind in _tracked(maneuver) and getattr(maneuver, array) is None
+        f"{kind} is tracked, but there is no array {_DIRECTIONS[kind][0]}"
+        for kind, targets in _direction_targets(maneuver).items()
+        if targets is None
     ]
     notes, corners = [], None
     if wanted.get("kind") == "deployment":
@@ -85,6 +85,12 @@ def _tracked_axes(maneuver: Result) -> list[int]:
     return [k for k, axis in enumerate("xyz") if axis in track or "position" in track]
 
 
+def _direction_targets(maneuver: Result) -> dict[str, Array | None]:
+    """Return the targets of each kind of direction that is tracked, None where the result has none."""
+    kinds = (kind for kind in _DIRECTIONS if kind in _tracked(maneuver))
+    return {kind: getattr(maneuver, _DIRECTIONS[kind][0]) for kind in kinds}
+
+
 def _corners(manifest: Mapping[str, Any], home: Array) -> Array | None:
     """Return (C, 3) the corners of the path, from the home tip on; None if no position is asked for."""
     wanted = manifest["problem"].get("maneuver") or {}
@@ -112,28 +118,21 @@ def _to_polyline(points: Array, corners: Array) -> Array:
 
 def _last_direction(maneuver: Result, waypoints: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield whether a solved maneuver ends in another direction than the last waypoint that names one."""
-    for kind, key, targets in (
-        ("pointing", "pointing", maneuver.tip_target_pointing),
-        ("orientation", "rotation_vector", maneuver.tip_target_rotation),
-    ):
+    for kind, targets in _direction_targets(maneuver).items():
+        key = _DIRECTIONS[kind][1]
         goals = [np.asarray(entry[key], dtype=np.float64) for entry in waypoints if entry.get(key)]
-        if maneuver.status != "solved" or not goals or kind not in _tracked(maneuver) or targets is None:
-            continue
-        if kind == "pointing":
-            off = float(_angle(targets[-1:], goals[-1][None])[0])
-        else:
-            off = float(_rotation_angle(targets[-1:], rotation_matrix(goals[-1])[None])[0])
-        if off > DIRECTION_TOLERANCE:
-            yield f"solved, but the last {kind} target is {off:.3g} rad from the problem's"
+        if maneuver.status == "solved" and goals and targets is not None:
+            goal = rotation_matrix(goals[-1]) if kind == "orientation" else goals[-1]
+            off = float(angles(targets[-1:], goal[None])[0])
+            if off > DIRECTION_TOLERANCE:
+                yield f"solved, but the last {kind} target is {off:.3g} rad from the problem's"
 
 
-def _angle(first: Array, second: Array) -> Array:
-    """Return (T,) the angles between vectors (T, 3), rad, accurate near 0."""
+def angles(first: Array, second: Array) -> Array:
+    """Return (T,) the angles between vectors (T, 3) or rotations (T, 3, 3), rad, accurate near 0."""
+    if first.ndim == 3:
+        # |A - B| = 2 sqrt(2) sin(angle / 2).
+        apart = np.linalg.norm(first - second, axis=(1, 2))
+        return np.asarray(2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0)))
     across = np.linalg.norm(np.cross(first, second), axis=1)
     return np.asarray(np.arctan2(across, np.sum(first * second, axis=1)))
-
-
-def _rotation_angle(first: Array, second: Array) -> Array:
-    """Return (T,) the angles between rotations (T, 3, 3), rad: |A - B| = 2 sqrt(2) sin(angle / 2)."""
-    apart = np.linalg.norm(first - second, axis=(1, 2))
-    return np.asarray(2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0)))

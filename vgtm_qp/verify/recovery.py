@@ -19,20 +19,10 @@ def excuse_recovering(
 ) -> tuple[list[str], list[str]]:
     """Return the faults of recovering pairs, one line each, and a note that sums them up.
 
-    The encounters ignore a recovering pair until it has reached its clearance. Until then its distance may not
-    decrease from one state to the next.
-
-    Parameters
-    ----------
-    record
-        Of the manifest: entries with ``pair``, as encounters name it, and ``distance`` at home, m.
-    encounters
-        Each with the distance that its pairs keep, m.
-
-    Raises
-    ------
-    ResultError
-        The record is malformed.
+    The `record` of the manifest has entries of ``pair``, as encounters name it, and ``distance`` at home, m; the
+    `encounters` come with the distances that their pairs keep, m. They ignore a recovering pair until it has reached
+    its clearance. Until then its distance may not decrease from one state to the next. ResultError where the record is
+    malformed.
     """
     try:
         wanted = {str(entry["pair"]): float(entry["distance"]) for entry in record}

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.curve.families import make_family
-from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.verify.arm import RecordedArm, recorded_arm
+from vgtm_qp.verify.arm import Arm, recorded_arm
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -62,7 +61,7 @@ class Drawing:
     """
 
     name: str
-    arm: RecordedArm | RecordedChain
+    arm: Arm
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
 
@@ -109,9 +108,7 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
     return make_drawing(manifest["problem"], arm, vertices, manifest.get("directory") or ".")
 
 
-def make_drawing(
-    problem: Mapping[str, Any], arm: RecordedArm | RecordedChain, vertices: int, directory: str | Path
-) -> Drawing:
+def make_drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory: str | Path) -> Drawing:
     """Return the drawing of an arm with so many control vertices among the obstacles of a problem, as plain data."""
     weights = np.zeros((0, vertices))
     spec = problem.get("curve")

@@ -110,10 +110,7 @@ def each_frame(maneuver: Result, rows: Sequence[int]) -> Iterator[Figure]:
 def save_figure(figure: Figure, path: str | Path) -> Path:
     """Write a figure in the format of the suffix of `path`, one of `SUFFIXES`, and return the path.
 
-    Raises
-    ------
-    VgtmError
-        The suffix is another one, or the file cannot be written.
+    VgtmError where the suffix is another one, or the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -137,15 +134,13 @@ class _View:
         if azimuth is None:
             # The tip goes to the right and a little towards the viewer.
             azimuth = heading(maneuver.tip_position) - np.radians(70.0)
-        self.projection = projection = Projection.looking(azimuth, elevation)
+        self.projection = projection = Projection(azimuth, elevation)
         self.surfaces = [ProjectedMesh(mesh, projection) for mesh in self.drawing.obstacles]
         arm = maneuver.nodes[seen].reshape(-1, 3)
         size = float(np.ptp(arm, axis=0).max())
         self.step = _round_step(size / 6.0)
-        self.ground, self.top = (
-            float(maneuver.nodes[0, self.drawing.arm.base, 2].min()),
-            float(arm[:, 2].max()),
-        )
+        self.ground = float(maneuver.nodes[0, self.drawing.arm.base, 2].min())
+        self.top = float(arm[:, 2].max())
         around = [vertices[:, :2] for vertices in self.drawing.surfaces()]
         least, most = with_surroundings(arm[:, :2], around, 0.4 * size) / self.step
         self.floor = np.stack([np.floor(least + 0.2), np.ceil(most - 0.2)]) * self.step

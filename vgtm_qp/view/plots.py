@@ -40,8 +40,7 @@ def _draw_clearance(axes: Axes, maneuver: Result) -> None:
     floor = min(0.0, *(1100.0 * float(values.min()) for _, values in shown)) if shown else 0.0
     axes.axhspan(floor, safe, label=f"below {safe:g} mm", **_FORBIDDEN)
     axes.set_ylim(bottom=floor)
-    axes.set(xlabel="time (s)", ylabel="least clearance (mm)")
-    _set_time(axes, maneuver)
+    axes.set_ylabel("least clearance (mm)")
     axes.legend(frameon=False)
 
 
@@ -70,8 +69,7 @@ def _draw_strokes(axes: Axes, maneuver: Result) -> None:
     axes.axhspan(top, top + room, **_FORBIDDEN)
     axes.set_ylim(bottom - room, top + room)
     unit = "length (m)" if maneuver.joints is None else "value (rad or m)"
-    axes.set(xlabel="time (s)", ylabel=f"actuator {unit}" if alike else "part of the stroke (%)")
-    _set_time(axes, maneuver)
+    axes.set_ylabel(f"actuator {unit}" if alike else "part of the stroke (%)")
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), title="nearest a limit")
 
 
@@ -82,8 +80,7 @@ def _draw_tip_error(axes: Axes, maneuver: Result) -> None:
         shown = np.maximum(error, _SMALLEST)
         axes.semilogy(maneuver.time, shown, color=_COLOURS[0], marker=".", markersize=3.0)
     axes.axhline(TIP_TOLERANCE, color="#b91c1c", linestyle="--", linewidth=0.9, label="tolerance")
-    axes.set(xlabel="time (s)", ylabel="tip error (m)", ylim=(_SMALLEST / 2.0, None))
-    _set_time(axes, maneuver)
+    axes.set(ylabel="tip error (m)", ylim=(_SMALLEST / 2.0, None))
     axes.legend(frameon=False)
 
 
@@ -106,11 +103,6 @@ def _draw_step_time(axes: Axes, maneuver: Result) -> None:
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _set_time(axes: Axes, maneuver: Result) -> None:
-    if len(maneuver.time) > 1:
-        axes.set_xlim(maneuver.time[0], maneuver.time[-1])
-
-
 _DRAW: dict[str, Callable[[Axes, Result], None]] = {
     "clearance": _draw_clearance,
     "strokes": _draw_strokes,
@@ -124,6 +116,9 @@ def plot(quantity: str, maneuver: Result, axes: Axes | None) -> Figure:
     with mpl.rc_context(_STYLE):
         if axes is None:
             axes = Figure(figsize=_SIZE, layout="constrained").add_subplot()
+        axes.set_xlabel("time (s)")
+        if len(maneuver.time) > 1:
+            axes.set_xlim(maneuver.time[0], maneuver.time[-1])
         _DRAW[quantity](axes, maneuver)
     figure = axes.get_figure(root=True)
     assert figure is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,19 +13,14 @@ _MANY_FACES = 4000
 _SHARP = np.radians(20.0)
 
 
-@dataclass(frozen=True, eq=False)
 class Projection:
-    """A parallel projection."""
+    """The parallel projection from `azimuth` about +z and `elevation` above the x-y plane, rad; +z is up."""
 
-    axes: Array
-    """(3, 3), rows: to the right on paper, up on paper, and towards the viewer."""
-
-    @classmethod
-    def looking(cls, azimuth: float, elevation: float) -> Projection:
-        """Return the view from `azimuth` about +z and `elevation` above the x-y plane, rad; +z is up."""
+    def __init__(self, azimuth: float, elevation: float) -> None:
         toward = direction(azimuth, elevation)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        return cls(np.stack([right, np.cross(toward, right), toward]))
+        self.axes = np.stack([right, np.cross(toward, right), toward])
+        """(3, 3), rows: to the right on paper, up on paper, and towards the viewer."""
 
     def flat(self, points: Array) -> Array:
         """Return (..., 2) the places on paper of points (..., 3), m."""
