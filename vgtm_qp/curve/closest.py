@@ -10,8 +10,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve
-from vgtm_qp.curve.families import Array
 from vgtm_qp.errors import CurveError
 
 _ROUNDING = 1e-14

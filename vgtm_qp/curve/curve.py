@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.curve.families import Array, CurveFamily, bernstein, within
+from vgtm_qp.arrays import Array
+from vgtm_qp.curve.families import CurveFamily, bernstein, within
 from vgtm_qp.errors import CurveError
 from vgtm_qp.rotation import rotation_from_vector, turn_between
 

@@ -9,11 +9,10 @@ from itertools import pairwise
 from math import comb, perm
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import CurveError, nearest
-
-Array = NDArray[np.float64]
 
 FAMILIES = ("bezier", "b-spline", "beta-spline")
 

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve
-from vgtm_qp.curve.families import Array, CurveFamily, b_spline, beta_spline, bezier, within
+from vgtm_qp.curve.families import CurveFamily, b_spline, beta_spline, bezier, within
 from vgtm_qp.errors import CurveError
 
 BASE_ROWS = 5

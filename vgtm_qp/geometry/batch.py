@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import casadi as ca
 import numpy as np
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Compiling, Kernel
-from vgtm_qp.geometry.bodies import Array
 
 _CAPACITIES = (16, 128, 1024)
 

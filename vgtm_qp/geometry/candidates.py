@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
+from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.formulas import FAR, FURTHEST
 from vgtm_qp.geometry.groups import Displacement, Group, Scene
 from vgtm_qp.geometry.parts import BODIES, Parts

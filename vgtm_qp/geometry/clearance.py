@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vgtm_qp.geometry.bodies import Array, Bodies, Index
+from vgtm_qp.arrays import Array, Index
+from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.formulas import FAR
 from vgtm_qp.geometry.groups import Found, Group, Scene

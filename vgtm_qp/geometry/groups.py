@@ -8,8 +8,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.batch import Batch
-from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
+from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.exact import CONTACT, distance_function, follow_function, sweep_function
 from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.pairs import Contacts, PairNames

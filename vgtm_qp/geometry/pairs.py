@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
+from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.geometry.bodies import Bodies
 
 _COLUMNS = ("distance", "normal", "points", "weights", "is_self", "normal_speed", "body", "other")
 

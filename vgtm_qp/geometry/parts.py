@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vgtm_qp.geometry.bodies import Array, Bodies, Index, Mask
+from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.geometry.bodies import Bodies
 
 BODIES = 32
 """A part has no more bodies than that: some three bays of a truss."""

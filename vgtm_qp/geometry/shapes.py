@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
-from vgtm_qp.geometry.bodies import Array
 from vgtm_qp.geometry.exact import WIDTH
 
 _MESH_FORMATS = (".stl", ".obj", ".ply", ".off")

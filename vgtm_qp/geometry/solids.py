@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vgtm_qp.geometry.bodies import Array
+from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.groups import Found, Group, Scene
 
 _ROWS = 200_000

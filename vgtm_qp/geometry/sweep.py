@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.geometry.bodies import Array, Index
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.geometry.exact import CONTACT, sweep_function
 from vgtm_qp.geometry.groups import Group
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.geometry.bodies import Array, Index
 from vgtm_qp.geometry.candidates import every_pair
 from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
 from vgtm_qp.geometry.formulas import FAR, FURTHEST

@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.live.session import Session
 from vgtm_qp.maneuver.maneuver import Maneuver
@@ -19,7 +20,7 @@ from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Method
-from vgtm_qp.view.drawing import CURVE_COLOUR, Array, camera_for, resampled, stroke_colours
+from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled, stroke_colours
 from vgtm_qp.view.scene import ArmScene, viser_server
 
 _PERIOD = 1.0 / 30.0

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.methods import make_resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.mover import Mover
@@ -17,7 +18,7 @@ from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.verify.arm import recorded_arm
-from vgtm_qp.view.drawing import Array, make_drawing
+from vgtm_qp.view.drawing import make_drawing
 
 OUTCOMES = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatus.BLOCKED: "blocked"}
 

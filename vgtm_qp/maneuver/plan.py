@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import Mistake
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.rotation import rotation_from_vector, turn_between
 from vgtm_qp.step.path import Path
-
-Array = NDArray[np.float64]
 
 _SMALL_REST = 0.05
 """Share of an interval between marks below which no step of its own is made."""

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.goal import WaypointManeuver
 from vgtm_qp.step.stops import Stop, StopKind
-
-Array = NDArray[np.float64]
 
 _HOPELESS = (StopKind.INTERRUPTED, StopKind.SINGULAR, StopKind.OUT_OF_REACH, StopKind.LOCKED)
 

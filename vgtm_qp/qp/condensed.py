@@ -10,14 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.qp import daqp
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers
 from vgtm_qp.rows.curve import free_basis
-
-Array = NDArray[np.float64]
 
 
 class CondensedSolver:

@@ -8,10 +8,9 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.qp.numbers import beyond, norm
 from vgtm_qp.qp.residual import InfeasibleStepError, refuse_large, relative
-
-Array = NDArray[np.float64]
 
 EQUALITY = 5
 """DAQP's mark for a row that is always active."""

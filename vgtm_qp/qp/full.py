@@ -15,17 +15,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from vgtm_qp.arm.arm import Label
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import StepNumbers, beyond, norm, slack_curvature
 from vgtm_qp.rows.tip import unit
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

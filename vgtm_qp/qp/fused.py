@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.qp import daqp
 from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
 from vgtm_qp.qp.daqp import EQUALITY, DenseAnswer
@@ -22,8 +23,6 @@ from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows
 from vgtm_qp.qp.residual import refuse_large
 from vgtm_qp.rows.curve import free_basis
 from vgtm_qp.rows.tip import TipGoal
-
-Array = NDArray[np.float64]
 
 _AXES = np.arange(3)
 _NOWHERE: Array = np.zeros((0, 3))

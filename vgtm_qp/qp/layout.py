@@ -6,17 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from vgtm_qp.arm.arm import Arm
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 
 _GOAL_REACH = 0.01
 """Greatest part of the arm's length that a control vertex is drawn towards its goal in one step."""

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import LinAlgError, solve_banded
 from scipy.sparse.linalg import splu
 
 from vgtm_qp.arm.arm import Bays
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _WIDEST = 200
 """Number of diagonals up to which a band is factorised sooner than a sparse matrix."""

@@ -6,17 +6,15 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.symbols import Bound, Constants
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.graph import StationSymbols, StepGraph
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
-
-Array = NDArray[np.float64]
 
 
 class StepInput(NamedTuple):

@@ -7,14 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import MotionRows
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.shape import CurveRows
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.numbers import norm
 
 if TYPE_CHECKING:
     from vgtm_qp.qp.full import StepQP
 
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-6
 """Greatest residual of an answer: m or rad, and for the dual one relative to the objective's forces.

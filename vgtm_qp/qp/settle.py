@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv, dposv
 
-Array = NDArray[np.float64]
+from vgtm_qp.arrays import Array
 
 WORST_CONDITION = 1e8
 SETTLING_STEPS = 6

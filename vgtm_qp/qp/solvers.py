@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError, nearest
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
@@ -21,8 +22,6 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import chain_solver, prefers_staged
 from vgtm_qp.qp.numbers import StepNumbers
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, NoAnswerError, refuse_large, relative
-
-Array = NDArray[np.float64]
 
 DEFAULT_SOLVER = "daqp"
 

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.poses import rotations
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class RecordedChain:

@@ -9,14 +9,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate
 from vgtm_qp.result.chain import RecordedChain, is_serial
 from vgtm_qp.result.file import check_arrays, frozen, names_of, plain, read_result, write_result
 from vgtm_qp.result.manifest import check_manifest
 from vgtm_qp.result.poses import base_poses
-
-Array = NDArray[np.float64]
 
 _LEFT_OUT: Any = None
 """Of a serial arm these follow from its joints."""

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from vgtm_qp.arrays import Array, Index
 
 _LEAST_SINE = 1e-6
 """The gradient of an angle is infinite where the bodies are parallel: its denominator is no smaller."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from vgtm_qp.arrays import Array
 
 
 def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:

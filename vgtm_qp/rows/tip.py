@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, nearest
-
-Array = NDArray[np.float64]
 
 _ROWS = {
     "position": ("tip x", "tip y", "tip z"),

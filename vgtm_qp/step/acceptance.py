@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics, Pose
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.answer import Accuracy, Closed
 from vgtm_qp.qp.graph import StationSymbols
@@ -21,8 +22,6 @@ from vgtm_qp.qp.numbers import beyond, norm
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.target import Target, base_frame
-
-Array = NDArray[np.float64]
 
 _LOOSER = 10.0
 """What was settled to a tolerance is refused from so many times that on.

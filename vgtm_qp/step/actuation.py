@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.rows.limits import actuator_box, binding
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 
-Array = NDArray[np.float64]
 Box = tuple[Array, Array]
 """Least and greatest values (n_a,) of the actuators after a step."""
 

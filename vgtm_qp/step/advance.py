@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Attempt
@@ -17,8 +16,6 @@ from vgtm_qp.step.state import State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.stops import CANNOT_BRAKE
 from vgtm_qp.step.target import Target
-
-Array = NDArray[np.float64]
 
 _TRUST = 0.2
 """An actuator moves by no more than this times the share of the step that is tried, m, where the whole one failed."""

@@ -6,8 +6,8 @@ from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
 from vgtm_qp.qp.numbers import ClearanceRows
@@ -20,8 +20,6 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.target import QPInput, Target
-
-Array = NDArray[np.float64]
 
 _MOST_QPS = 8
 

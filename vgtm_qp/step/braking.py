@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.step.actuation import Actuation, Box
 from vgtm_qp.step.attempt import Attempt
@@ -22,7 +21,6 @@ from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step, StepStatus
 
-Array = NDArray[np.float64]
 Steps = list[tuple[State, float]]
 """States, and the values of a path there."""
 

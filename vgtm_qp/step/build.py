@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm, Kinematics
 from vgtm_qp.arm.build import make_arm
 from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
@@ -33,8 +33,6 @@ from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
 from vgtm_qp.step.path import base_motion
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import TipTask
-
-Array = NDArray[np.float64]
 
 _CONDENSED_ALL_THE_SAME = (
     "elastic end effector: the elimination along the bays does not know its slacks, so the QP is condensed onto the "

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.symbols import Bound, Constants, Frames
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
 from vgtm_qp.qp.layout import Layout
@@ -27,8 +27,6 @@ from vgtm_qp.step.closing import Closing, enough_length, within
 from vgtm_qp.step.engine import Engine, enough_tip_error
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
-
-Array = NDArray[np.float64]
 
 
 class ChainEngine(Engine):

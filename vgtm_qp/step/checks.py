@@ -6,9 +6,9 @@ import warnings
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import rank
+from vgtm_qp.arrays import Array
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.geometry.bodies import capsules
@@ -20,8 +20,6 @@ from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import over_all_nodes, tip_response
-
-Array = NDArray[np.float64]
 
 _POINT = 1e-6
 """Length of the member that stands for a point, m; distances are printed to no more digits."""

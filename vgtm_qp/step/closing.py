@@ -6,15 +6,13 @@ from collections.abc import Callable
 from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.answer import Closed
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import LengthSolver
-
-Array = NDArray[np.float64]
 
 _MOST_STEPS = 8
 

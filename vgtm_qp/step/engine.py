@@ -11,10 +11,10 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
 from vgtm_qp.qp.full import FullBuilder, StepQP
@@ -31,8 +31,6 @@ from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask, over_all_nodes, tip_response
-
-Array = NDArray[np.float64]
 
 _SETTLED = 1e-3
 """A tip this much nearer to its goal than it must be gains nothing by another iteration."""

@@ -9,14 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Pose
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

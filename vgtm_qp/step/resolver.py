@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
@@ -28,7 +28,6 @@ from vgtm_qp.step.task import duration
 
 __all__ = ["Resolver", "Step", "StepStatus"]
 
-Array = NDArray[np.float64]
 
 _SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
 """The least shares of a piece of path that are tried: by any arm, and by one that can brake instead."""

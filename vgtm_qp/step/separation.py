@@ -9,16 +9,14 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import BetweenReport, Contacts, Pair
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.angles import angle_gradients, angles, corners
 from vgtm_qp.rows.clearance import clearance_rows, slowed
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
-
-Array = NDArray[np.float64]
 
 RECOVERY = 0.01
 """A pair that is too near at the start of a step is driven apart by so much in it, m."""

@@ -5,19 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm, Kinematics, Pose
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.truss import Truss
+from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

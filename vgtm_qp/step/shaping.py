@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.families import CurveFamily
@@ -21,8 +22,6 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.target import Target, base_frame
 from vgtm_qp.step.task import vector
-
-Array = NDArray[np.float64]
 
 
 class Shaping:

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm
+from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Pair
 from vgtm_qp.qp.answer import Closed
-
-Array = NDArray[np.float64]
 
 Shortfall = Mapping[Pair, float]
 """Pairs that are nearer than they may be, with their distances, m."""

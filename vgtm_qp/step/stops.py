@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from vgtm_qp.arm.arm import Arm
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.actuation import Limits
@@ -29,8 +30,6 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step
 from vgtm_qp.step.task import over_all_nodes, tip_response
-
-Array = NDArray[np.float64]
 
 _TRUST = 0.05
 """How far actuators move in the linear program, m: further, its rows mean little."""

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm, Pose
+from vgtm_qp.arrays import Array
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.path import Path
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

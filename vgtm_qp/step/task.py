@@ -7,16 +7,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vgtm_qp.arm.arm import Arm, Kinematics
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError
 from vgtm_qp.rotation import rotation_from_vector, turn_between
 from vgtm_qp.rows.tip import TipGoal, axes, row_names, tip_function
 from vgtm_qp.step.path import Path
-
-Array = NDArray[np.float64]
 
 _UNCHANGED = "the state of the arm is unchanged"
 

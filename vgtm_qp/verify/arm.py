@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.chain import RecordedChain, extreme_values, is_serial, numbers
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _DENSE_UNKNOWNS = 300
 """Above this many free coordinates singular values come from a sparse factorisation."""

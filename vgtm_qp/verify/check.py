@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.chain import RecordedChain
@@ -34,8 +35,6 @@ from vgtm_qp.verify.path import (
     tip_error,
 )
 from vgtm_qp.verify.recovery import excuse_recovering
-
-Array = NDArray[np.float64]
 
 MEMBER_TOLERANCE = 1e-9
 """Fixed and locked members, base nodes, m."""

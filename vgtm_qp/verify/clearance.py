@@ -12,14 +12,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.distance import Separation, segment_segment
 from vgtm_qp.verify.obstacles import Body
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Pairs = tuple[Index, Index]
 
 CLEARANCE_TOLERANCE = 1e-9

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.result.poses import rotation_matrix
 from vgtm_qp.result.result import Result
-
-Array = NDArray[np.float64]
 
 TIP_TOLERANCE = 1e-6
 """Tip position and its target's distance from the path, m."""

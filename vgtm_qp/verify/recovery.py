@@ -6,12 +6,10 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ResultError
 from vgtm_qp.verify.clearance import BETWEEN_TOLERANCE, CLEARANCE_TOLERANCE, Encounters, Least, Pairs
-
-Array = NDArray[np.float64]
 
 
 def excuse_recovering(

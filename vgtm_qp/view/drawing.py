@@ -8,15 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.verify.arm import Arm, recorded_arm
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 FIXED_COLOUR = (0.70, 0.72, 0.74)
 OBSTACLE_COLOUR = (0.90, 0.62, 0.0)

@@ -7,7 +7,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.view.drawing import Array, Index, ObstacleMesh, direction
+from vgtm_qp.arrays import Array, Index
+from vgtm_qp.view.drawing import ObstacleMesh, direction
 
 _MANY_FACES = 4000
 _SHARP = np.radians(20.0)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.view.drawing import (
     CURVE_COLOUR,
@@ -17,7 +18,6 @@ from vgtm_qp.view.drawing import (
     OBSTACLE_COLOUR,
     PATH_COLOUR,
     POLYGON_COLOUR,
-    Array,
     Camera,
     Drawing,
     ObstacleMesh,

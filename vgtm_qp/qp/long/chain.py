@@ -7,14 +7,10 @@ from functools import cached_property, lru_cache
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Bays
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.qp.layout import Layout
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _LONGEST_PERIOD = 6
 _MOST_NODES = 12

@@ -10,10 +10,10 @@ from typing import cast
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import LengthRowsLike
 from vgtm_qp.arm.frames import fitted_frame, frame_constants, turning
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.elimination import member_lengths
@@ -21,9 +21,6 @@ from vgtm_qp.qp.long.sparse_symbols import dense_function, nonzeros, sparsity_of
 from vgtm_qp.qp.numbers import StepNumbers
 from vgtm_qp.rows import tracking
 from vgtm_qp.rows.curve import free_basis
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class ChainData:

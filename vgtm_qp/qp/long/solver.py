@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.long.chain_data import ChainData
@@ -15,9 +16,6 @@ from vgtm_qp.qp.long.sweep import ChainClosing
 from vgtm_qp.qp.long.working_set import Answer, Key, Moved, RowTable, solve_rows
 from vgtm_qp.qp.numbers import RowNumbers, StepNumbers, beyond, norm
 from vgtm_qp.qp.residual import refuse_large, relative
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
 

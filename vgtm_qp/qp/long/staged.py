@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.elimination import Elimination
@@ -17,9 +18,6 @@ from vgtm_qp.qp.long.solver import SINGULAR, ChainSolver
 from vgtm_qp.qp.long.sweep import ChainClosing, Sweep
 from vgtm_qp.qp.long.working_set import BLOCK, Moved
 from vgtm_qp.qp.settle import WORST_CONDITION
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class StagedSolver(ChainSolver):

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
-
-Array = NDArray[np.float64]
 
 MOST_STEPS = 12
 TOO_FAR = 1e-2

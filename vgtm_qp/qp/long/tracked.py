@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.elimination import Elimination
@@ -18,9 +18,6 @@ from vgtm_qp.qp.long.solver import SINGULAR, ChainSolver
 from vgtm_qp.qp.long.sparse_symbols import dense_function, nonzeros, small_inverse, symbols_like
 from vgtm_qp.qp.long.sweep import ChainClosing, Sweep
 from vgtm_qp.qp.long.working_set import Moved
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class Following:

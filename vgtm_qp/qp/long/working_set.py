@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp import daqp
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, RowNumbers
 from vgtm_qp.qp.residual import InfeasibleStepError
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 BLOCK = 8
 """Rows that enter the dual QP at once, at least."""
