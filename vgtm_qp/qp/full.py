@@ -312,9 +312,9 @@ class FullBuilder:
         over_face = np.broadcast_to((faces[k, slot][:, None] + axis)[:, None, :], (len(k), turns, 3))
         if layout.general is None:
             moves = np.kron(layout.curve_weights != 0.0, np.eye(3)).nonzero()
-            leans = np.kron(layout.curve_slopes != 0.0, np.ones((turns, 3))).nonzero()
+            rotates = np.kron(layout.curve_slopes != 0.0, np.ones((turns, 3))).nonzero()
         else:
-            moves, leans = (np.ones((rows * count, len(curve))).nonzero() for rows in (3, turns))
+            moves, rotates = (np.ones((rows * count, len(curve))).nonzero() for rows in (3, turns))
 
         def base_axes(numbers: StepNumbers) -> Array:
             return np.concatenate([-numbers.base_axes, numbers.base_axes], axis=1)
@@ -340,7 +340,7 @@ class FullBuilder:
         ]
         tangent = [
             _Entries(at_turn, over_face, turned),
-            _Entries(leans[0], curve[leans[1]], lambda numbers: numbers.curve_rows(layout)[1][leans]),
+            _Entries(rotates[0], curve[rotates[1]], lambda numbers: numbers.curve_rows(layout)[1][rotates]),
             gap("tangent"),
         ]
         pieces = np.arange(layout.spacings)

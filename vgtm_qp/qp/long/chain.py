@@ -43,7 +43,7 @@ class Chain:
         Which coordinates a member's length depends on, in any of the periods.
     member_places : (3m, 2) int or None
         The places that a period's members join; None where the periods are not alike.
-    soft : (3m,) bool
+    actuated : (3m,) bool
         The places of actuated members.
     locked : (l,) int
         Fixed members that stand where other periods have an actuated one.
@@ -66,7 +66,7 @@ class Chain:
     window: Index
     pattern: Mask
     member_places: Index | None
-    soft: Mask
+    actuated: Mask
     locked: Index
     faces: Index
     face_places: Index
@@ -109,7 +109,7 @@ class Chain:
     def is_square(self) -> bool:
         """Whether a period's fixed members and its faces' positions determine its nodes, given the curve."""
         faces = self.faces.shape[1]
-        return faces > 0 and int(self.soft.sum()) == 3 * faces and not len(self.locked)
+        return faces > 0 and int(self.actuated.sum()) == 3 * faces and not len(self.locked)
 
 
 @lru_cache(maxsize=4)
@@ -240,10 +240,10 @@ def _of_ordered(
         return None
     pattern = np.zeros((3 * own, len(handed) + own), dtype=bool)
     pattern[np.nonzero(places >= 0)[1], places[places >= 0]] = True
-    actuated = bays.actuated[members]
-    soft = actuated.mean(axis=0) > 0.5
-    locked = members[~actuated & soft]
-    if (actuated & ~soft).any() or len(locked) > _MOST_LOCKED:
+    each = bays.actuated[members]
+    actuated = each.mean(axis=0) > 0.5
+    locked = members[~each & actuated]
+    if (each & ~actuated).any() or len(locked) > _MOST_LOCKED:
         return None
     before = np.vstack([np.zeros_like(nodes[:1]), nodes[:-1]])
     before[0, : len(base)] = base
@@ -260,7 +260,7 @@ def _of_ordered(
         window=np.hstack([before[:, handed], nodes]),
         pattern=np.repeat(pattern, 3, axis=1),
         member_places=places[0] if is_alike else None,
-        soft=soft,
+        actuated=actuated,
         locked=locked,
         faces=faces,
         face_places=face_places[0],

@@ -32,7 +32,7 @@ class ChainData:
         In the order of ``elimination.Inputs``; periods from the base to the tip, or the other way where `is_reversed`.
     part : dict
         Their parts by name.
-    lean : (n, 9f)
+    turn_squares : (n, 9f)
         Products t t' of the rows t of ``tangent_curve``, summed over the two angles of a face.
     window, members, face_order : (n, w + m), (n, 3m), (n, f, 3) int
         Those of the chain, by row.
@@ -59,7 +59,7 @@ class ChainData:
             for (name, size), end in zip(parts.items(), ends, strict=True):
                 self.part[name] = arrays[-1][:, end - size : end]
         self.head, self.tail, self.table = arrays
-        self.lean: Array = np.zeros((chain.periods, 9 * chain.faces.shape[1]))
+        self.turn_squares: Array = np.zeros((chain.periods, 9 * chain.faces.shape[1]))
         self.window, self.members = chain.window[order], chain.members[order]
         self.at = np.argsort(self.members.reshape(-1))
         self.faces, self.face_order = chain.faces[order].reshape(-1), chain.face_order[order]
@@ -69,7 +69,7 @@ class ChainData:
         self._slope_products = (self.slopes[:, :, None] * self.slopes[:, None, :]).reshape(
             len(self.faces), layout.vertices**2
         )
-        self._soft = self.members[:, chain.soft]
+        self._actuated = self.members[:, chain.actuated]
         self.offset, self.normal = np.zeros((layout.vertices, 3)), np.zeros(3)
         self.vertex_gradient = np.zeros((layout.vertices, 3))
         self._polygon = layout.vertex_hessian
@@ -89,7 +89,7 @@ class ChainData:
         part["rhs"][:] = rows.rhs[self.members]
         actuator = np.zeros(chain.bays.member_count)
         actuator[chain.bays.actuators] = numbers.actuator_gradient
-        part["actuator_gradient"][:] = actuator[self._soft]
+        part["actuator_gradient"][:] = actuator[self._actuated]
         if not len(self.offset):
             return
         axes = numbers.base_axes
@@ -99,19 +99,21 @@ class ChainData:
         self.vertex_gradient = numbers.vertex_gradient
         turns = numbers.tangent_face[self.faces].reshape(-1, 2, 3, 3)
         order = self.face_order.reshape(-1, 1, 3, 1)
-        lean = numbers.tangent_curve[self.faces]
+        over_slope = numbers.tangent_curve[self.faces]
         gap = numbers.position_rhs[self.faces] - self.weights @ self.offset
         tilt = numbers.tangent_rhs[self.faces]
-        tilt = tilt + np.einsum("kac,kc->ka", lean, self.slopes @ self.offset)
+        tilt = tilt + np.einsum("kac,kc->ka", over_slope, self.slopes @ self.offset)
         filled = {
             "tangent_face": np.take_along_axis(turns, order, axis=2),
-            "tangent_curve": lean,
+            "tangent_curve": over_slope,
             "gap": gap,
             "tilt": tilt,
         }
         for name, values in filled.items():
             part[name][:] = values.reshape(part[name].shape)
-        self.lean[:] = np.einsum("kac,kad->kcd", lean, lean).reshape(self.lean.shape)
+        self.turn_squares[:] = np.einsum("kac,kad->kcd", over_slope, over_slope).reshape(
+            self.turn_squares.shape
+        )
 
     def hold_base(self, offset: Array, normal: Array) -> None:
         """Set what the base makes of the curve: `offset` (V, 3) and `normal` (3,)."""
@@ -142,16 +144,16 @@ class ChainData:
     def curve_terms(self) -> tuple[Array, Array]:
         """Return Hessian and gradient of all terms in the curve's coordinates while the faces stay."""
         count = len(self.offset)
-        leaning = self._slope_products.T @ self.lean.reshape(-1, 9)
-        leaning = leaning.reshape(count, count, 3, 3).transpose(0, 2, 1, 3).reshape(3 * count, 3 * count)
-        hessian = self._hessian + self._chain.layout.weights.tangent * leaning
+        turning = self._slope_products.T @ self.turn_squares.reshape(-1, 9)
+        turning = turning.reshape(count, count, 3, 3).transpose(0, 2, 1, 3).reshape(3 * count, 3 * count)
+        hessian = self._hessian + self._chain.layout.weights.tangent * turning
         gap, tilt = self.part["gap"].reshape(-1, 3), self.part["tilt"].reshape(-1, 2)
         return self._free.T @ hessian @ self._free, self.curve_gradient(self.offset, gap, tilt)
 
     def curve_gradient(self, vertices: Array, gap: Array, tilt: Array) -> Array:
         """Return (3V - 5,) the objective's gradient in the curve's coordinates, given all gaps and angles."""
-        lean = self.part["tangent_curve"].reshape(-1, 2, 3)
-        angles = tilt[:, :1] * lean[:, 0] + tilt[:, 1:] * lean[:, 1]
+        over_slope = self.part["tangent_curve"].reshape(-1, 2, 3)
+        angles = tilt[:, :1] * over_slope[:, 0] + tilt[:, 1:] * over_slope[:, 1]
         gradient = self._chain.layout.weights.tangent * self.slopes.T @ angles
         gradient -= self._tracking * self.weights.T @ gap
         return self.polygon_gradient(vertices) + gradient.reshape(-1) @ self._free
@@ -159,9 +161,9 @@ class ChainData:
     def misfit(self, vertices: Array, faces: Array) -> tuple[Array, Array]:
         """Return gap (K, 3) and tilt (K, 2) for displaced vertices and the faces' own parts (K, 5)."""
         moved = vertices - self.offset
-        lean = self.part["tangent_curve"].reshape(-1, 2, 3)
+        over_slope = self.part["tangent_curve"].reshape(-1, 2, 3)
         gap = self.part["gap"].reshape(-1, 3) - self.weights @ moved
-        tilt = self.part["tilt"].reshape(-1, 2) + np.einsum("kac,kc->ka", lean, self.slopes @ moved)
+        tilt = self.part["tilt"].reshape(-1, 2) + np.einsum("kac,kc->ka", over_slope, self.slopes @ moved)
         return gap + faces[:, :3], tilt + faces[:, 3:]
 
 
@@ -178,7 +180,7 @@ class PeriodValues:
         layout, bays = chain.layout, chain.bays
         self._chain, self._data = chain, data
         self._kernel = Kernel(period_values(chain).map(chain.periods))
-        for k, array in enumerate((data.head, data.tail, data.lean)):
+        for k, array in enumerate((data.head, data.tail, data.turn_squares)):
             self._kernel.bind_output(k, array)
         inputs = [array.reshape(chain.periods, -1) for array in self._kernel.inputs]
         self._X, self._Y = (array.reshape(-1, 3) for array in inputs[:2])
@@ -224,7 +226,7 @@ def period_values(chain: Chain) -> ca.Function:
     (12f), for each face its point, the point's displacement with the base, the slope and that slope's displacement;
     switches (2), motion and gap.
 
-    Results: ``head`` and ``tail`` of ``elimination.Inputs``, ``ChainData.lean`` and the lengths (3m) at X.
+    Results: ``head`` and ``tail`` of ``elimination.Inputs``, ``ChainData.turn_squares`` and the lengths (3m) at X.
     """
     layout, faces = chain.layout, chain.faces.shape[1]
     X, Y = (ca.SX.sym(name, 3, chain.window.shape[1]) for name in "XY")
@@ -233,25 +235,25 @@ def period_values(chain: Chain) -> ca.Function:
     curve, switches = ca.SX.sym("curve", 12 * faces), ca.SX.sym("switches", 2)
     motion, gap_on = switches[0], switches[1]
 
-    lengths, soft = member_lengths(chain, X), np.flatnonzero(chain.soft).tolist()
+    lengths, actuated = member_lengths(chain, X), np.flatnonzero(chain.actuated).tolist()
     jacobian = ca.jacobian(member_lengths(chain, Y), ca.vec(Y))
     head = [nonzeros(ca.project(jacobian, sparsity_of(chain.pattern))), fixed * (home - lengths)]
-    tail = [motion * layout.weights.stroke_centring * ((1.0 - fixed) * (lengths - home))[soft]]
-    turns, leans, gaps, tilts, products = [], [], [], [], []
+    tail = [motion * layout.weights.stroke_centring * ((1.0 - fixed) * (lengths - home))[actuated]]
+    turns, turn_curves, gaps, tilts, products = [], [], [], [], []
     for k, places in enumerate(chain.face_places.tolist()):
         polar, nodes = ca.vertsplit(angles[6 * k : 6 * k + 6], 3), Y[:, places]
         rotation = fitted_frame(X[:, places], *polar) @ alignment[:, 3 * k : 3 * k + 3]
         point, moved, slope, slope_moved = ca.vertsplit(curve[12 * k : 12 * k + 12], 3)
-        tilt, c, lean = tracking.slope_rows(rotation, slope)
+        tilt, c, over_slope = tracking.slope_rows(rotation, slope)
         turns.append(ca.vec(turning(fitted_frame(nodes, *polar), nodes, c).T))
-        leans.append(ca.vec(lean.T))
-        products.append(ca.vec(lean.T @ lean))
+        turn_curves.append(ca.vec(over_slope.T))
+        products.append(ca.vec(over_slope.T @ over_slope))
         centre = X[:, places] @ ca.DM(chain.face_weights[k])
         gaps.append(gap_on * tracking.gap(centre, point) - moved)
-        tilts.append(motion * tilt + lean @ slope_moved)
+        tilts.append(motion * tilt + over_slope @ slope_moved)
     outputs = [
         ca.vertcat(*head, *turns),
-        ca.vertcat(*tail, *leans, *gaps, *tilts),
+        ca.vertcat(*tail, *turn_curves, *gaps, *tilts),
         ca.vertcat(*products),
         lengths,
     ]

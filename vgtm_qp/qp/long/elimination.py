@@ -43,7 +43,7 @@ class Stage:
     own: list[int]
     before: list[int]
     hard: list[int]
-    soft: list[int]
+    actuated: list[int]
     T: ca.SX
     rhs: ca.SX
     G: ca.SX
@@ -62,7 +62,7 @@ class Inputs:
     ----------
     head, tail, table : vector
         What all sweeps read, what the factorisation alone reads, and what depends on the curve's base alone.
-    jacobian : (3m, 3w + 3m), rhs : (3m,), actuator_gradient : (soft,)
+    jacobian : (3m, 3w + 3m), rhs : (3m,), actuator_gradient : (actuated,)
     weights, slopes : lists of (V,)
         Of the control vertices, by face.
     tangent_face, tangent_curve, gap, tilt : lists of (2, 9), (2, 3), (3,), (2,)
@@ -83,7 +83,7 @@ class Inputs:
                 "tangent_face": (faces, 2, 9),
             },
             "tail": {
-                "actuator_gradient": (1, int(chain.soft.sum()), 1),
+                "actuator_gradient": (1, int(chain.actuated.sum()), 1),
                 "tangent_curve": (faces, 2, 3),
                 "gap": (faces, 3, 1),
                 "tilt": (faces, 2, 1),
@@ -120,7 +120,7 @@ class Elimination:
     ----------
     chain : Chain
     stages : list of Stage
-    soft : list of int
+    actuated : list of int
         Places of the actuated members.
     live : list of int
         Coordinates that the next period takes over.
@@ -133,7 +133,7 @@ class Elimination:
     def __init__(self, chain: Chain) -> None:
         self.chain = chain
         self.inputs = Inputs(chain)
-        self.soft = np.flatnonzero(chain.soft).tolist()
+        self.actuated = np.flatnonzero(chain.actuated).tolist()
         self.size = chain.before + chain.own
         self.live = [chain.before + 3 * place + axis for place in chain.carried.tolist() for axis in range(3)]
         self.curve = chain.layout.free_curve
@@ -144,9 +144,11 @@ class Elimination:
                 list(range(chain.before + start, chain.before + end)),
                 list(range(chain.before + start)),
             )
-            hard, soft = ([i for i in range(start, end) if chain.soft[i] == kind] for kind in (False, True))
+            hard, actuated = (
+                [i for i in range(start, end) if chain.actuated[i] == kind] for kind in (False, True)
+            )
             split = range_and_null(J[hard, own])
-            self.stages.append(Stage(own, before, hard, soft, -J[hard, before], rhs[hard], *split))
+            self.stages.append(Stage(own, before, hard, actuated, -J[hard, before], rhs[hard], *split))
         self.freedom = sum(stage.freedom for stage in self.stages)
         self._gain_parts: list[ca.SX] = []
 
@@ -188,11 +190,11 @@ class Elimination:
         V[self.live, :] = ca.reshape(linear, len(self.live), columns)
         own = list(range(self.chain.before, self.size))
         H[own, own] += weights.node_rate * ca.SX.eye(len(own))
-        if self.soft:
-            J = inputs.jacobian[self.soft, :]
+        if self.actuated:
+            J = inputs.jacobian[self.actuated, :]
             stiffness = weights.actuator_rate + weights.stroke_centring
             H += symmetric(stiffness * (J.T @ J))
-            V[:, -1] += J.T @ (inputs.actuator_gradient - stiffness * inputs.rhs[self.soft])
+            V[:, -1] += J.T @ (inputs.actuator_gradient - stiffness * inputs.rhs[self.actuated])
         for k in range(self.chain.faces.shape[1]):
             centre, tangent = self.centre_row(k), self.tangent_row(k)
             point, turned = self.curve_columns(k)
@@ -217,7 +219,7 @@ class Elimination:
             V = rest + T.T @ (G.T @ total - W.T @ Y) - Wb.T @ Y
             H = ca.sparsify(symmetric(H[before, before] + T.T @ (M @ T) + cross + cross.T - Wb.T @ Wb))
             curve_gradient += total[:, :-1].T @ placed - Y[:, :-1].T @ Y[:, -1]
-            gains = [free, G, W, Wb, small_inverse(inputs.jacobian[stage.soft, u] @ free), *gains]
+            gains = [free, G, W, Wb, small_inverse(inputs.jacobian[stage.actuated, u] @ free), *gains]
             outer = [Y, *outer]
         self._gain_parts = gains
         handed = ca.vertcat(nonzeros(ca.project(H, upper)), ca.densify(ca.vec(V)), curve_gradient)
@@ -244,17 +246,17 @@ class Elimination:
         return dense_function("columns", [carry, self.inputs.head, vector, rows], [V, Z.T])
 
     def balance(self) -> ca.Function:
-        """Return (carry, head, gains, nodal (3m,), actuator (soft,), faces (5f,)) -> (carry, residual).
+        """Return (carry, head, gains, nodal (3m,), actuator (actuated,), faces (5f,)) -> (carry, residual).
 
         The costates of given gradients; the residual (freedom,) is what is left of stationarity.
         """
         vector, gains = self._gains()
         carry, nodal = ca.SX.sym("carry", len(self.live)), ca.SX.sym("nodal", self.chain.own)
         faces = range(self.chain.faces.shape[1])
-        actuator, face = ca.SX.sym("actuator", len(self.soft)), ca.SX.sym("face", 5 * len(faces))
+        actuator, face = ca.SX.sym("actuator", len(self.actuated)), ca.SX.sym("face", 5 * len(faces))
         V = ca.vertcat(ca.SX.zeros(self.chain.before), nodal)
         V[self.live] += carry
-        V += self.inputs.jacobian[self.soft, :].T @ actuator
+        V += self.inputs.jacobian[self.actuated, :].T @ actuator
         V += self._face_rows().T @ face
         unmoved = [[free, G, ca.SX(*W.shape), ca.SX(*Wb.shape), S] for free, G, W, Wb, S in gains]
         V, residual = self._costates(V, unmoved)
@@ -289,7 +291,7 @@ class Elimination:
         vector, gains = self._gains()
         carry, rows = ca.SX.sym("carry", len(self.live), count), ca.SX.sym("z", count, self.freedom)
         u = self._moved(carry, rows.T, gains, [ca.SX(len(stage.hard), count) for stage in self.stages])
-        changed = self.inputs.jacobian[self.soft, :] @ u
+        changed = self.inputs.jacobian[self.actuated, :] @ u
         return dense_function(
             "strokes", [carry, self.inputs.head, vector, rows], [u[self.live, :], changed.T]
         )
@@ -312,7 +314,9 @@ class Elimination:
             for stage, (free, G, _, _, S) in zip(self.stages, gains, strict=True):
                 placed = G @ (error[stage.hard] + stage.T @ u)
                 missing = (
-                    error[stage.soft] - J[stage.soft, stage.before] @ u - J[stage.soft, stage.own] @ placed
+                    error[stage.actuated]
+                    - J[stage.actuated, stage.before] @ u
+                    - J[stage.actuated, stage.own] @ placed
                 )
                 u = ca.vertcat(u, placed + free @ (S @ missing))
             return u, error

@@ -44,8 +44,8 @@ class ChainSolver(ABC):
         self._free = np.zeros(self._curve)
         at = np.argsort(chain.members.reshape(-1))
         self._strokes_at, self._held_at = at[chain.bays.actuators], at[chain.locked]
-        soft = np.cumsum(np.tile(chain.soft, chain.periods)) - 1
-        self._among_soft = soft[self._strokes_at]
+        actuated = np.cumsum(np.tile(chain.actuated, chain.periods)) - 1
+        self._among_actuated = actuated[self._strokes_at]
         self._active: set[Key] = set()
         self._last: tuple[RowTable, Answer] | None = None
 

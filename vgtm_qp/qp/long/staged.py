@@ -85,7 +85,7 @@ class StagedSolver(ChainSolver):
         sweep, periods = self._strokes, self.chain.periods
         sweep.inputs[3].reshape(periods, -1)[:] = motions.reshape(periods, -1)[::-1]
         sweep()
-        return sweep.outputs[1].reshape(-1, motions.shape[1]).take(self._among_soft, axis=0)
+        return sweep.outputs[1].reshape(-1, motions.shape[1]).take(self._among_actuated, axis=0)
 
     def closing(self) -> ChainClosing:
         """See :class:`ChainSolver`."""
@@ -152,7 +152,7 @@ class StagedSolver(ChainSolver):
         chain = self.chain
         gradient, force, face = self._balance.inputs[3:]
         nodal.take(chain.nodes[::-1].reshape(-1), axis=0, out=gradient.reshape(-1, 3), mode="clip")
-        force[:] = forces[::-1, chain.soft].reshape(-1)
+        force[:] = forces[::-1, chain.actuated].reshape(-1)
         dual = [self._balance.outputs[1]]
         if self._curve:
             weights, parts = self.layout.weights, self._forward.outputs[3].reshape(chain.periods, -1)[::-1]

@@ -49,7 +49,7 @@ class Following:
     def response(self) -> ca.Function:
         """Return (carry, head, tail, table) -> (carry, gains, D, R, U): what follows from the curve.
 
-        D (soft, 3V - 5 + 1), strokes, R (2f, ...), angles, and U (3m, ...), displacements, are stored row by row, as
+        D (actuated, 3V - 5 + 1), strokes, R (2f, ...), angles, and U (3m, ...), displacements, are stored by rows, as
         is the carry, the displacements of the live nodes; their last columns are constants. U is left out where the
         next period uses all nodes of this one in order. The gains are those of :meth:`hold`.
         """
@@ -60,8 +60,8 @@ class Following:
         on_curve = [elimination.curve_columns(k) for k in self._faces]
         gap = ca.vertcat(*[ca.horzcat(on_curve[k][0], -inputs.gap[k]) for k in self._faces])
         moved = self._placed(before.T, rhs, self._gains, gap)
-        strokes = inputs.jacobian[elimination.soft, :] @ moved
-        strokes[:, -1] -= inputs.rhs[elimination.soft]
+        strokes = inputs.jacobian[elimination.actuated, :] @ moved
+        strokes[:, -1] -= inputs.rhs[elimination.actuated]
         angles = [
             elimination.tangent_row(k) @ moved + ca.horzcat(on_curve[k][1], inputs.tilt[k])
             for k in self._faces
@@ -124,7 +124,7 @@ class TrackedSolver(ChainSolver):
     def _least(self, combined: Array) -> tuple[Moved, Array, Array]:
         self._free = -dtrtrs(self._factor, self._rhs + combined, lower=1, trans=1)[0]
         self._one[:-1] = self._free
-        return self._moved_by, (self._strokes @ self._one).take(self._among_soft), np.zeros(0)
+        return self._moved_by, (self._strokes @ self._one).take(self._among_actuated), np.zeros(0)
 
     def _moved_by(self, nodes: Index) -> Array:
         return self._moving.take(self._place[nodes], axis=0) @ self._one
@@ -160,7 +160,7 @@ class TrackedSolver(ChainSolver):
         changed[self._strokes_at] -= strokes
         gap, tilt = self.data.misfit(vertices, sweep.outputs[2].reshape(-1, 5))
         dual = nodal.take(order, axis=0).reshape(-1) @ self._moved[:, :-1]
-        dual += forces[:, chain.soft].reshape(-1) @ self._strokes[:, :-1]
+        dual += forces[:, chain.actuated].reshape(-1) @ self._strokes[:, :-1]
         dual += self.layout.weights.tangent * tilt.reshape(-1) @ self._angles[:, :-1]
         dual += self.data.polygon_gradient(vertices)
         return np.concatenate([changed, gap.reshape(-1)]), dual
