@@ -15,7 +15,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
-from vgtm_qp.errors import Mistake, ProblemError, nearest
+from vgtm_qp.errors import Mistake, nearest
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
@@ -118,7 +118,7 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
     mistakes = list(_beyond_the_arm(problem, arm, task))
     if mistakes:
-        raise ProblemError(str(problem.source or problem.name), mistakes)
+        raise problem.error(mistakes)
     options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
     family = make_family(spec.family, spec.control_vertices, **options)
     stride = stations.stride if method.hard_tracking else 1
@@ -239,7 +239,7 @@ def _check_supported(problem: Problem) -> None:
         expected["maneuver", "kind"] = '"path"; deployment is not available in this version'
     if expected:
         mistakes = [problem.mistake(place, text) for place, text in expected.items()]
-        raise ProblemError(str(problem.source or problem.name), mistakes)
+        raise problem.error(mistakes)
 
 
 def check_solver(problem: Problem) -> None:
@@ -248,7 +248,7 @@ def check_solver(problem: Problem) -> None:
     if name != DEFAULT_SOLVER and name not in (choices := available_solvers()):
         expected = f"one of the solvers installed here, {quoted(choices)}{nearest(name, choices)}"
         mistake = problem.mistake(("method", "solver"), expected)
-        raise ProblemError(str(problem.source or problem.name), [mistake])
+        raise problem.error([mistake])
 
 
 def make_obstacle(spec: Any) -> shapes.Obstacle:

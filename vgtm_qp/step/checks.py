@@ -10,7 +10,7 @@ import numpy as np
 from vgtm_qp.arm.arm import rank
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
-from vgtm_qp.errors import Mistake, ProblemError
+from vgtm_qp.errors import Mistake
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
@@ -36,7 +36,7 @@ def checked_arm(problem: Problem) -> Setup:
     setup = build_arm(problem)
     mistakes = list(unreachable_tip(problem, setup))
     if mistakes:
-        raise ProblemError(str(problem.source or problem.name), mistakes)
+        raise problem.error(mistakes)
     for excess in excess_of_freedom(problem, setup):
         warnings.warn(f"{excess.key} = {excess.value}: {excess.expected}", stacklevel=3)
     return setup
