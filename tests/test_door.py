@@ -561,3 +561,24 @@ def test_what_stops_a_serial_arm_is_named_as_what_it_is(what):
 def test_a_lock_of_what_an_arm_has_not_names_what_it_has():
     with pytest.raises(vq.GoalError, match=r'"p9", which there is not; actuators are p1, y1'):
         vq.Resolver(problem_of("serial")).lock("p9")
+
+
+def test_stations_of_joints_in_one_place_have_an_attitude():
+    problem = vq.load_problem("snake_past_a_cube").replace({"arm.every": 1})
+    stations = build_arm(problem, compiled=False).arm.stations
+    assert (
+        (np.diff(stations.centres(build_arm(problem, compiled=False).arm.home), axis=0) == 0.0)
+        .all(axis=1)
+        .any()
+    )
+    np.testing.assert_allclose(
+        stations.frames @ np.swapaxes(stations.frames, 1, 2) - np.eye(3), 0.0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("name", "pseudoinverse"), ("name", "curve-pseudoinverse"), ("tracking", "parallel")]
+)
+def test_a_method_that_moves_trusses_alone_is_refused_by_its_key(key, value):
+    with pytest.raises(vq.ProblemError, match=rf'method\.{key}: found "{value}"'):
+        vq.load_problem("snake_past_a_cube").replace({f"method.{key}": value})

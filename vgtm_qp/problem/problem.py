@@ -120,6 +120,10 @@ class Problem(Table, called="a problem"):
             yield ("truss",), "a table [truss], or a table [arm] in its place"
         if self.truss is not None and self.arm is not None:
             yield ("arm",), "a truss or an arm, not both"
+        if self.arm is not None and self.method.name != "qp":
+            yield ("method", "name"), '"qp": the pseudoinverse methods move trusses, not serial arms'
+        elif self.arm is not None and self.method.tracking in ("recursive", "parallel"):
+            yield ("method", "tracking"), '"coupled" or "none": the others go along the bays of a truss'
         if isinstance(self.truss, PlateTruss):
             if self.curve is not None:
                 yield ("curve",), "no curve, since a plate tracks a surface: [surface]"

@@ -122,8 +122,9 @@ class SerialArm(Arm):
         self.free = np.flatnonzero(~self.base)
         frames = [np.eye(3)]
         for before, after in pairwise(self.home[origins]):
-            way = after - before
-            turn = turn_between(frames[-1][:, 2], way / np.linalg.norm(way))
+            way, length = after - before, float(np.linalg.norm(after - before))
+            # Of two stations in one place the second has the attitude of the first.
+            turn = turn_between(frames[-1][:, 2], way / length) if length > 0.0 else np.zeros(3)
             frames.append(rotation_from_vector(turn) @ frames[-1])
         weights = np.tile([1.0, 0.0, 0.0], (len(nodes), 1))
         trackable = ("position",) if self._can_hold(jacobian[origins[1:]]) else ()
