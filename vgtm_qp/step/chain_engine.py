@@ -130,7 +130,7 @@ class ChainEngine(Engine):
                 break
             own = closer.copy()
             if solver.knows_gain:
-                error = tip_error(*self._tip_of(own))
+                error = tip_error(*self._tip_of(own, turned=self._task.turns is not None))
                 off = float(np.abs(error).max())
                 if off > accuracy.start:
                     return None
@@ -162,12 +162,15 @@ class ChainEngine(Engine):
         lengths = self._closing.lengths.reshape(-1).take(self._members_at)
         return Closed(nodes, lengths, worst, *self._tip_of(own))
 
-    def _tip_of(self, own: Array) -> tuple[Array, Array]:
-        """Return position (3,) and rotation (3, 3) of the tip where the free nodes are at `own`."""
+    def _tip_of(self, own: Array, *, turned: bool = True) -> tuple[Array, Array]:
+        """Return position (3,) and rotation (3, 3) of the tip where the free nodes are at `own`; if not `turned`, I."""
         corners, ends = own[self._tip], self._ends
+        position = self.layout.arm.end_effector.weights @ corners
+        if not turned:
+            return position, np.eye(3)
         ends.inputs[0][:] = corners.reshape(-1)
         ends()
-        return self.layout.arm.end_effector.weights @ corners, ends.outputs[0].reshape(3, 3).T.copy()
+        return position, ends.outputs[0].reshape(3, 3).T.copy()
 
 
 def _end_kernel(layout: Layout) -> Kernel:
