@@ -197,6 +197,12 @@ def test_arc_nodes_move_along_the_curve_by_the_term_the_paper_omits(family):
     assert np.abs(whole - curve.position_jacobian(s)).max() > 0.1
 
 
+@pytest.mark.parametrize("fraction", [-0.1, 1.1, float("nan")])
+def test_fractions_outside_are_refused(fraction):
+    with pytest.raises(CurveError, match="0 to 1"):
+        bent_curve(bezier(4)).arc_parameter(fraction)
+
+
 def test_arc_parameters_around_a_cusp_and_a_sudden_stop():
     cusp = Curve(bezier(4), np.array([[0, 0, 0], [1, 0, 1], [0, 0, 1], [1, 0, 0]], dtype=float))
     stop = Curve(bezier(5), np.array([[0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 2]], dtype=float))

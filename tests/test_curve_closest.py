@@ -81,6 +81,10 @@ def test_straight_curve_beside_and_through_a_box():
     beside = closest_to_box(curve, [1.15, 0, 2.2], 0.9)
     np.testing.assert_allclose(beside.distance, [0.7], atol=1e-12)
     assert 1.75 - 1e-12 <= beside.position[0, 2] <= 2.65 + 1e-12
+    tied = closest_to_box(curve, [0.1, 0, 2.0], [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(tied.distance, [-0.4], atol=1e-12)
+    # Where the depth stays the same for a stretch, its end has the side and the lid of the box equally near.
+    np.testing.assert_allclose(np.linalg.norm(tied.witness - tied.position, axis=1), [0.4], atol=1e-12)
     through = closest_to_box(curve, [0.1, 0, 2.0], [1.0, 2.0, 6.0])
     np.testing.assert_allclose(through.distance, [-0.4], atol=1e-12)
     np.testing.assert_allclose(through.witness[0, 0], -0.4, atol=1e-12)

@@ -152,6 +152,8 @@ def test_excess_freedom_is_named_with_its_number():
     "change",
     [
         lambda c: remove_control_vertices(c, 2),
+        lambda c: remove_control_vertices(c, -1),
+        lambda c: add_control_vertices(c, -1),
         lambda c: refit(c, bezier(2)),
     ],
 )

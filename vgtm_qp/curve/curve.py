@@ -125,8 +125,11 @@ class Curve:
         """Parameters s at which these fractions, 0 to 1, of the whole arc length are reached: (...).
 
         Newton's method within the brackets of cells, with bisection wherever a step shrinks by less than half.
+        CurveError where a fraction is outside 0 to 1 or not a number.
         """
         fraction = np.asarray(fraction, dtype=float)
+        if not np.all((fraction >= 0.0) & (fraction <= 1.0)):
+            raise CurveError("fractions of the arc length must be within 0 to 1")
         cells = self.family.cells
         lengths = self.length(cells)
         goal = fraction.ravel() * lengths[-1]

@@ -50,8 +50,9 @@ def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
     """Give a curve more control vertices where it is.
 
     A Bezier curve is raised in degree, a B-spline gets knots, each in the middle of the longest span: they move by
-    rounding alone. A uniform Beta-spline has no exact way and moves by `change`.
+    rounding alone. A uniform Beta-spline has no exact way and moves by `change`. CurveError where `count` is negative.
     """
+    _require_count(count)
     family = curve.family
     if not count:
         return Refit(curve, 0.0)
@@ -71,8 +72,9 @@ def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
     """Give a curve fewer control vertices, by least squares; `change` says how far it moved.
 
     A B-spline loses the knots that it misses least; once it has no more interior knots, its degree falls. CurveError
-    where fewer than three control vertices would be left to keep both ends and the base tangent.
+    where `count` is negative, or fewer than three control vertices would be left to keep both ends and the base tangent.
     """
+    _require_count(count)
     lowered = curve
     for _ in range(count):
         fits = [refit(lowered, family) for family in _lower_families(lowered.family)]
@@ -111,6 +113,11 @@ def refit(curve: Curve, family: CurveFamily) -> Refit:
     control = np.vstack([start, start + solution[0] * tangent, solution[1:].reshape(-1, 3), end])
     fitted = replace(curve, family=family, control_vertices=control)
     return Refit(fitted, _greatest_change(curve, fitted))
+
+
+def _require_count(count: int) -> None:
+    if count < 0:
+        raise CurveError(f"the number of control vertices to add or remove must be 0 or more, not {count}")
 
 
 def _quadrature(*families: CurveFamily) -> tuple[Array, Array]:
