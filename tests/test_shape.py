@@ -137,6 +137,41 @@ def test_the_rows_of_a_general_curve_are_those_of_the_equations(module, bays, cu
         assert (found.curve is None) == (layout.general is None)
 
 
+@pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL, ids=str)
+def test_rows_of_gaps_and_turns_are_the_derivatives_of_their_residuals(module, bays, curve, method):
+    rng = np.random.default_rng(3)
+    setup = built(module, bays, curve, method)
+    layout, arm, h = setup.layout, setup.arm, 1e-6
+    linearisation = Linearisation(layout, compiled=False)
+    q, _, vertices, torsion = near_home(setup, rng)
+    q[arm.base] = arm.home[arm.base]
+    moved = np.where(arm.base[:, None], 0.0, rng.normal(size=q.shape))
+    points, turned = rng.normal(size=vertices.shape), rng.normal(size=torsion.shape)
+    lengths = arm.home_quantities[arm.actuators]
+    still = Path(np.array([0.0, 1.0]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
+    target = Target(still, 0.0, 1.0, lengths, lengths, 1.0, None, setup.vertex_goals)
+
+    def numbers(step):
+        at, none = q + step * moved, ClearanceRows()
+        curve_at = vertices + step * points, torsion + step * turned
+        return linearisation.numbers(
+            QPInput(at, at, *curve_at, target, target.goal(0.0), 0.0, none, True).linear(layout), none
+        )
+
+    here, plus, minus = (numbers(step) for step in (0.0, h, -h))
+    position, turn = here.curve_rows(layout)
+    along = np.concatenate([points.reshape(-1), turned])
+    faces = moved[arm.stations.nodes[layout.tracked]].reshape(len(layout.tracked), 9)
+    gap = arm.stations.centres(moved)[layout.tracked].reshape(-1) - position @ along
+    tilt = np.einsum("kan,kn->ka", here.tangent_face, faces).reshape(-1) + turn @ along
+    wanted = (
+        (plus.position_rhs - minus.position_rhs) / (2.0 * h),
+        (plus.tangent_rhs - minus.tangent_rhs) / (2.0 * h),
+    )
+    np.testing.assert_allclose(gap, wanted[0].reshape(-1), atol=1e-6)
+    np.testing.assert_allclose(tilt, wanted[1].reshape(-1), atol=1e-5)
+
+
 @pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL[:5], ids=str)
 def test_the_rows_of_a_curve_are_the_derivatives_of_its_nodes_frames_and_spacings(
     module, bays, curve, method

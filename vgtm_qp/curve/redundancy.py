@@ -72,7 +72,7 @@ def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
     """Give a curve fewer control vertices, by least squares; `change` says how far it moved.
 
     A B-spline loses the knots that it misses least; once it has no more interior knots, its degree falls. CurveError
-    where `count` is negative, or fewer than three control vertices would be left to keep both ends and the base tangent.
+    where `count` is negative, or fewer than three control vertices would be left for both ends and the base tangent.
     """
     _require_count(count)
     lowered = curve
