@@ -316,8 +316,8 @@ def test_a_wrong_answer_is_refused(hard, monkeypatch):
     with pytest.raises(SolverError):
         solver.solve(numbers)
     monkeypatch.undo()
-    unchanged = type(solver)._nodes
-    monkeypatch.setattr(type(solver), "_nodes", lambda self: unchanged(self) * (1 + 1e-4))
+    unchanged = type(solver).displacements
+    monkeypatch.setattr(type(solver), "displacements", lambda self: unchanged(self) * (1 + 1e-4))
     with pytest.raises(SolverError, match="residual"):
         solver.solve(numbers)
 

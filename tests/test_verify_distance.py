@@ -167,12 +167,7 @@ def test_winding_number_tells_inside_from_outside() -> None:
     shape = mesh(np.asarray(surface.triangles), closed=True)
     ring = Body("ring", np.zeros(3), np.zeros(3), np.eye(3), shape)
     points = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -1.1, 0.05], [1.0, 0.0, 0.29 + 0.05]])
-    assert ring.encloses(points).tolist() == [
-        True,
-        False,
-        True,
-        False,
-    ]
+    assert ring.encloses(points).tolist() == [True, False, True, False]
 
 
 @many

@@ -23,8 +23,7 @@ from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS
-from vgtm_qp.qp.long.staged import StagedSolver
-from vgtm_qp.qp.long.tracked import TrackedSolver
+from vgtm_qp.qp.long.solver import ChainSolver
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
 from vgtm_qp.rotation import rotation_from_vector
@@ -222,7 +221,7 @@ def make_engine(
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
         return FusedEngine(layout)
     chosen = make_solver(solver, layout)
-    if is_quick and isinstance(chosen, (StagedSolver, TrackedSolver)) and ChainEngine.serves(chosen):
+    if is_quick and isinstance(chosen, ChainSolver) and ChainEngine.serves(chosen):
         return ChainEngine(chosen, kinematics, task)
     return GeneralEngine(layout, kinematics, task, chosen, compiled=compiled)
 

@@ -16,9 +16,8 @@ from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import PeriodValues
-from vgtm_qp.qp.long.staged import StagedSolver
+from vgtm_qp.qp.long.solver import ChainSolver
 from vgtm_qp.qp.long.sweep import MOST_STEPS, TOO_FAR
-from vgtm_qp.qp.long.tracked import TrackedSolver
 from vgtm_qp.qp.numbers import RowNumbers
 from vgtm_qp.qp.settle import held
 from vgtm_qp.rows.curve import base_offset
@@ -32,7 +31,7 @@ from vgtm_qp.step.task import TipTask
 class ChainEngine(Engine):
     """See ``engine.Engine``; for arms of `serves`."""
 
-    def __init__(self, solver: StagedSolver | TrackedSolver, kinematics: Kinematics, task: TipTask) -> None:
+    def __init__(self, solver: ChainSolver, kinematics: Kinematics, task: TipTask) -> None:
         super().__init__(solver.layout)
         arm, chain = self.layout.arm, solver.chain
         self._solver, self._task, self._data = solver, task, solver.data
@@ -52,7 +51,7 @@ class ChainEngine(Engine):
         self._any_closing = Closing(self.layout, kinematics)
 
     @staticmethod
-    def serves(solver: StagedSolver | TrackedSolver) -> bool:
+    def serves(solver: ChainSolver) -> bool:
         """Whether the arm with that solver is one whose bays are all alike, with a base face that does not bend."""
         if solver.chain.member_places is None:
             return False

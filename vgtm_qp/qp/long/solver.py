@@ -82,7 +82,7 @@ class ChainSolver(ABC):
             return table.values(*self._least(combined[:-1]), progress)
 
         answer = solve_rows(table, self._size + 1, columns, values, self._active)
-        nodes, vertices = self._nodes(), self.data.vertices(self._free)
+        nodes, vertices = self.displacements(), self.data.vertices(self._free)
         self._check(table, answer, nodes, vertices)
         self._last, (found, multipliers) = (table, answer), answer[:2]
         self._active = {table.key(k) for k in np.flatnonzero(multipliers).tolist() if k >= table.equal}
@@ -136,7 +136,7 @@ class ChainSolver(ABC):
         """
 
     @abstractmethod
-    def _nodes(self) -> Array:
+    def displacements(self) -> Array:
         """Return (N, 3) the nodes' displacements where the Lagrangian is least, m."""
 
     @abstractmethod

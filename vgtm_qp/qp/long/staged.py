@@ -121,7 +121,8 @@ class StagedSolver(ChainSolver):
     def _moved_by(self, nodes: Index) -> Array:
         return self._moved[self._moved_at[nodes]]
 
-    def _nodes(self) -> Array:
+    def displacements(self) -> Array:
+        """See ``ChainSolver``."""
         return self._moved.take(self._moved_at, axis=0)
 
     def _eliminate(self) -> None:

@@ -129,7 +129,8 @@ class TrackedSolver(ChainSolver):
     def _moved_by(self, nodes: Index) -> Array:
         return self._moving.take(self._place[nodes], axis=0) @ self._one
 
-    def _nodes(self) -> Array:
+    def displacements(self) -> Array:
+        """See ``ChainSolver``."""
         moved = self._moving.reshape(-1, len(self._one)) @ self._one
         return moved.reshape(-1, 3).take(self._place, axis=0)
 
