@@ -157,6 +157,10 @@ class Layout:
             pull[drawn] = self.weights.vertex_goal * gap * np.minimum(1.0, reach / np.maximum(apart, 1e-300))
         return pull
 
+    def vertex_gradient(self, vertices: Array, goals: Array | None) -> Array:
+        """Return (V, 3) the gradient of the curve's own objectives at control vertices (V, 3), m, and their goals."""
+        return self.weights.smoothness * (self.polygon_bending @ vertices) + self.goal_pull(vertices, goals)
+
     @cached_property
     def polygon_bending(self) -> Array:
         """(V, V) D'D with D the second difference of the control vertices."""

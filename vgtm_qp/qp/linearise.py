@@ -105,8 +105,7 @@ class Linearisation:
             shift = offset[:3]
             base_rhs = -base_axes @ (vertices[1] - vertices[0])
         if moves:
-            pull = weights.smoothness * (layout.polygon_bending @ vertices)
-            pull += layout.goal_pull(vertices, asked.vertex_goals)
+            pull = layout.vertex_gradient(vertices, asked.vertex_goals)
         if not (moves or layout.hard_tracking):
             gap = np.zeros_like(gap)
         if not (moves or layout.hard_turns):

@@ -75,10 +75,7 @@ class ChainEngine(Engine):
         rotation, spin, offset, normal = ends.outputs
         if layout.vertices:
             self._data.hold_base(offset.reshape(-1, 3), normal)
-        pull = np.zeros_like(vertices)
-        if motion:
-            pull = weights.smoothness * layout.polygon_bending @ vertices
-            pull += layout.goal_pull(vertices, target.vertex_goals)
+        pull = layout.vertex_gradient(vertices, target.vertex_goals) if motion else np.zeros_like(vertices)
         self._data.vertex_gradient = pull
         self._values.fill(X, Y, vertices, moved, motion=motion)
         ahead = goal.over(target.end - target.start)
