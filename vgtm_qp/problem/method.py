@@ -140,9 +140,21 @@ class Method(Table, called="[method]"):
         default_factory=Gains, description="gains of the curve's null-space vector, eq. (38)"
     )
 
+    @property
+    def goes_by_bays(self) -> bool:
+        """Whether the QP is one over the curve alone, which each bay follows exactly."""
+        return self.name == "qp" and self.tracking in ("recursive", "parallel")
+
+    @property
+    def holds_curve(self) -> bool:
+        """Whether stations are kept on the curve by equalities."""
+        return self.hard_tracking or self.goes_by_bays
+
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.hard_tracking and self.tracking == "none":
             yield ("hard_tracking",), 'false, since tracking is "none"'
+        if self.goes_by_bays and self.solver != "daqp":
+            yield ("solver",), f'"daqp", which solves the QP over the curve where tracking is "{self.tracking}"'
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
             yield ("hard_coordinates",), f"the first one, two or three of {quoted(HARD_COORDINATES)}"
         if self.variant == "truncated" and self.algebra == "sparse":
