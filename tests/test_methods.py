@@ -10,7 +10,7 @@ from steps import numbers_at
 import vgtm_qp as vq
 from vgtm_qp.errors import CurveError
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.methods import make_resolver
+from vgtm_qp.methods import Resolver
 from vgtm_qp.methods.conventional import ConventionalResolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.objectives import potential_curvature, potential_field, potential_slope
@@ -30,7 +30,7 @@ ALL_TERMS = ["node_rate", "actuator_rate", "stroke_centring"]
 def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra: str, variant: str) -> None:
     """Equal objective, no obstacle, no limit: one step of eq. (28) is one QP, to 1e-9."""
     corrected = free_problem(module, name="pseudoinverse", correct=True)
-    there = make_resolver(corrected)
+    there = Resolver(corrected)
     run(there, corrected, 12)
 
     problem = corrected.replace(
@@ -84,7 +84,7 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", ["pseudoinverse", "curve-pseudoinverse"])
 def test_corrected_methods_keep_lengths_and_tip(module: str, name: str) -> None:
     problem = free_problem(module, name=name, tracking="recursive", correct=True)
-    resolver = make_resolver(problem)
+    resolver = Resolver(problem)
     run(resolver, problem)
     setup = resolver.setup
     fixed = setup.truss.fixed
@@ -97,7 +97,7 @@ def test_faithful_methods_drift_by_the_square_of_the_step(name: str) -> None:
     drift = []
     for steps in (20, 40):
         problem = free_problem("octahedral", steps=steps, name=name, tracking="recursive")
-        resolver = make_resolver(problem)
+        resolver = Resolver(problem)
         run(resolver, problem)
         fixed = resolver.setup.truss.fixed
         drift.append(np.abs(resolver.state.quantities - resolver.setup.arm.home_quantities)[fixed].max())
@@ -112,7 +112,7 @@ def test_dense_and_sparse_algebra_give_one_maneuver(module: str) -> None:
         ways = []
         for algebra in ("dense", "sparse"):
             problem = free_problem(module, algebra=algebra, **options)
-            ways.append(run(make_resolver(problem), problem))
+            ways.append(run(Resolver(problem), problem))
         np.testing.assert_allclose(ways[0], ways[1], atol=1e-9)
 
 
@@ -161,7 +161,7 @@ def test_pointing_is_tracked_by_three_octahedral_bays_together() -> None:
     for tracking in ("recursive", "parallel"):
         data["method"]["tracking"] = tracking
         pointed = Problem.from_dict(data)
-        resolver = make_resolver(pointed)
+        resolver = Resolver(pointed)
         states.append(run(resolver, pointed))
         direction = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
         np.testing.assert_allclose(resolver.tip()[1][:, 2], direction, atol=1e-9)
@@ -189,10 +189,10 @@ def test_torsion_coordinates_let_the_curve_steer_roll() -> None:
     data["end_effector"] = {"track": ["position", "orientation"]}
     data["maneuver"]["waypoint"][0]["rotation_vector"] = [0.1, 0.05, 0.3]
     with pytest.raises(CurveError, match="torsion_vertices"):
-        make_resolver(Problem.from_dict(data))
+        Resolver(Problem.from_dict(data))
     data["curve"] |= {"torsion_vertices": 2, "control_vertices": 6}
     rolled = Problem.from_dict(data)
-    resolver = make_resolver(rolled)
+    resolver = Resolver(rolled)
     run(resolver, rolled)
     np.testing.assert_allclose(resolver.setup.truss.tip_frame, np.eye(3))
     expected = make_plan(rolled, *resolver.tip()).path.at(1e9).rotation
@@ -288,7 +288,7 @@ def test_a_moving_base_enters_the_conventional_solution() -> None:
     data = problem.to_dict()
     data["truss"]["base_motion"] = [{"time": 1.0, "position": [0.1, 0.0, 0.05]}]
     moving = Problem.from_dict(data)
-    resolver = make_resolver(moving)
+    resolver = Resolver(moving)
     states = run(resolver, moving)
     base = resolver.setup.truss.base
     np.testing.assert_allclose(states[-1][base] - states[0][base], [[0.095, 0.0, 0.0475]] * 3, atol=2e-3)
@@ -298,7 +298,7 @@ def test_a_moving_base_enters_the_conventional_solution() -> None:
     )
     data["method"] |= {"name": "curve-pseudoinverse", "tracking": "recursive"}
     with pytest.raises(CurveError, match="moving base"):
-        make_resolver(Problem.from_dict(data))
+        Resolver(Problem.from_dict(data))
 
 
 METHODS = {
@@ -312,7 +312,7 @@ METHODS = {
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_tells_what_it_cannot_do_through_one_interface(method: str) -> None:
     problem = free_problem("octahedral", **METHODS[method])
-    mover = make_resolver(problem)
+    mover = Resolver(problem)
     plan = make_plan(problem, *mover.tip())
     home = mover.state
     step = mover.follow(plan.path, 0.0, float(plan.marks[0]))

@@ -12,14 +12,13 @@ import numpy as np
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods import make_resolver
+from vgtm_qp.methods import Resolver
 from vgtm_qp.methods.conventional import DenseSolution
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.resolver import StepStatus
 from vgtm_qp.step.state import State
+from vgtm_qp.step.step import StepStatus
 
 
 class Contestant(Protocol):
@@ -72,7 +71,7 @@ class ResolverStep:
 
     def __init__(self, problem: Problem, **changes: Any) -> None:
         changed = problem.replace({f"method.{key}": value for key, value in changes.items()})
-        self.resolver: Mover = make_resolver(changed)
+        self.resolver: Resolver = Resolver(changed)
 
     def place(self, state: State) -> None:
         """See :class:`Contestant`."""

@@ -154,7 +154,10 @@ class Method(Table, called="[method]"):
         if self.hard_tracking and self.tracking == "none":
             yield ("hard_tracking",), 'false, since tracking is "none"'
         if self.goes_by_bays and self.solver != "daqp":
-            yield ("solver",), f'"daqp", which solves the QP over the curve where tracking is "{self.tracking}"'
+            yield (
+                ("solver",),
+                f'"daqp", which solves the QP over the curve where tracking is "{self.tracking}"',
+            )
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
             yield ("hard_coordinates",), f"the first one, two or three of {quoted(HARD_COORDINATES)}"
         if self.variant == "truncated" and self.algebra == "sparse":

@@ -78,8 +78,8 @@ class CondensedSolver:
         return None
 
     def _own(self, bounds: Array) -> Array:
-        """Return the bounds of the unknowns x, from those of all columns; what is no column has none."""
-        return np.where(self._unknown >= 0, bounds[self._unknown], bounds[self.builder.column["nodes"].start])
+        """Return the bounds of the unknowns x, from those of all columns; what is no column has none, like nodes."""
+        return np.asarray(np.where(self._unknown >= 0, bounds[self._unknown], bounds[0]))
 
     def _reduction(self, numbers: StepNumbers, qp: StepQP) -> tuple[Array, Array]:
         """Return Z (n, size) and z_0 (n,) of the unknowns of the full QP."""
