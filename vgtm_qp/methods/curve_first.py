@@ -55,7 +55,7 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
 
     def lock(self, name: str) -> None:  # noqa: ARG002
         """Refuse: a bay whose nodes its rows determine has no motion to spare, and keeps off the curve without one."""
-        self._refuse("cannot hold an actuator")
+        self._refuse("hold an actuator", '"qp", "pseudoinverse"')
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:  # noqa: ARG002
         state, before = self.state, self.curve

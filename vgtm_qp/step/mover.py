@@ -122,7 +122,7 @@ class Resolver:
     @control_vertex_goals.setter
     def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
         if goals:
-            self._refuse("draws no control vertices")
+            self._refuse("draw control vertices")
 
     def set_control_vertex_goal(self, index: int, position: ArrayLike | None) -> None:
         """Draw a control vertex to a place in the null space of the tip's motion; None lets it go.
@@ -157,7 +157,7 @@ class Resolver:
         CurveError
             So few control vertices cannot keep both ends and the base tangent.
         """
-        self._refuse("keeps the number of control vertices")
+        self._refuse("change the number of control vertices")
 
     def step(
         self,
@@ -203,7 +203,7 @@ class Resolver:
         with the same answer the solver is given. Parameters and errors are those of :meth:`step`; GoalError also where
         the method solves no QP.
         """
-        self._refuse("solves no QP of a step")
+        self._refuse("show the QP of a step, since it solves none")
 
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
@@ -259,7 +259,5 @@ class Resolver:
         """
         return None
 
-    def _refuse(self, what: str) -> NoReturn:
-        raise GoalError(
-            f'the method "{self._method}" {what}; the method "qp" does otherwise, with any tracking'
-        )
+    def _refuse(self, what: str, serving: str = '"qp"') -> NoReturn:
+        raise GoalError(f'the method "{self._method}" cannot {what}; methods that can: {serving}')
