@@ -23,11 +23,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.scatter import LengthScatter
 from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants, Frames
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies
+from vgtm_qp.rows.members import LengthScatter
 
 RANK_TOLERANCE = 1e-8
 """Singular values of a Jacobian below this fraction of the greatest one count as zero."""
