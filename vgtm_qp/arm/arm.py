@@ -339,9 +339,19 @@ class Arm(ABC):
     def describe(self) -> Description:
         """Return the arm's counts, and what they allow."""
 
-    @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Return what verification needs to know of the arm, as JSON data."""
+        """Return what verification needs to know of the arm, as JSON data.
+
+        Keys of every arm: ``actuated``, ``stroke`` (M, 2), ``rate`` and ``acceleration`` of its quantities, and the
+        ``radius`` of its bodies. None means no limit.
+        """
+        return {
+            "actuated": self.actuated.tolist(),
+            "stroke": [_or_none(limits) for limits in self.stroke],
+            "rate": _or_none(self.rate),
+            "acceleration": _or_none(self.acceleration),
+            "radius": self.bodies.radius.tolist(),
+        }
 
     @abstractmethod
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
@@ -423,6 +433,6 @@ def has_full_rank(rows: Array) -> bool:
     return 0 < len(rows) <= rows.shape[1] and rank(np.linalg.svd(rows, compute_uv=False)) == len(rows)
 
 
-def or_none(limits: Array) -> list[float | None]:
+def _or_none(limits: Array) -> list[float | None]:
     """Return limits as JSON data, which has no infinity: None where there is none."""
     return [limit if math.isfinite(limit) else None for limit in limits.tolist()]
