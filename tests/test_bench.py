@@ -241,7 +241,7 @@ def test_the_nonlinear_program_is_solved_within_its_limits_and_not_worse_than_th
     assert step.step(plan.path, here, goal, goal - here)
     tip, lengths = tip_and_lengths(problem, step.reached)
     setup = build_arm(problem)
-    fixed, low, high = ~setup.truss.actuated, *setup.truss.stroke.T
+    fixed, low, high = ~setup.arm.actuated, *setup.arm.stroke.T
     assert np.abs(lengths - before.quantities)[fixed].max() < 1e-9
     assert np.abs(tip - plan.path.at(goal).position).max() < 1e-9
     assert np.all((lengths > low - 1e-9) & (lengths < high + 1e-9))

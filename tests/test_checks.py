@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.bounds import longest_ways
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
@@ -44,7 +45,8 @@ def test_no_bundled_problem_is_refused_or_doubted(name: str):
 
 def test_an_obstacle_in_the_arm_is_refused_and_one_beside_it_doubted(free: vq.Problem):
     setup = build_arm(free)
-    ends = setup.truss.home[setup.truss.members[setup.truss.member("L3-1")]]
+    truss = truss_of(setup.arm)
+    ends = truss.home[truss.members[truss.member("L3-1")]]
     out = ends.mean(axis=0) * [1.0, 1.0, 0.0]
     out /= np.linalg.norm(out)
     reach = 0.2 + 0.03
