@@ -94,7 +94,7 @@ def test_a_target_in_an_obstacle_is_refused_where_no_tip_can_surround_it(free: v
 @settings(max_examples=25, deadline=None)
 def test_no_pose_reaches_farther_than_the_longest_ways(seed: int):
     problem = vq.load_problem("five_bay_free")
-    truss = build_arm(problem).truss
+    truss = truss_of(build_arm(problem).arm)
     nodes = truss.home * np.random.default_rng(seed).uniform(0.3, 1.1, 3)
     lengths = np.linalg.norm(np.diff(nodes[truss.members], axis=1)[:, 0], axis=1)
     # Any positions are a pose of a truss whose members may be as long as they are there.

@@ -122,7 +122,7 @@ def test_a_proof_of_the_way_holds_at_every_instant_of_it():
 def test_maneuvers_with_offset_joints_are_certified(module, bays, offset, monkeypatch):
     monkeypatch.setenv("VGTM_CC", "none")
     problem = arm_problem(bays=bays, truss={"module": module, "stroke": None, "joint_offset": offset})
-    home = build_arm(problem).truss
+    home = truss_of(build_arm(problem).arm)
     tip = home.tip_weights @ home.home[home.tip]
     goal = (tip + np.array([0.12, 0.04, -0.05]) * home.height).tolist()
     side = [tip[0] + 0.42 + 0.25 + 0.06 + 0.577 - 0.15, 0.0, 0.5 * home.height]

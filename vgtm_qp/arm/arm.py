@@ -325,7 +325,7 @@ class Arm(ABC):
 
     @abstractmethod
     def reach(self) -> Array:
-        """Return (N_c,) a bound of the distance from each base node to the tip in any pose, m."""
+        """Return (N_c,) a bound of the distance from each base node to the tip in any pose, m; inf where unknown."""
 
     def hollow(self) -> float:
         """Return a bound of the distance from the tip to the nearest point on the axis of a body, m."""

@@ -154,7 +154,8 @@ class JointSpaceArm(Arm):
         return np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
 
     def reach(self) -> Array:
-        return np.full(int(self.base.sum()), self.reaches[0])
+        """See ``arm.Arm``: only that from the base's origin, its first node, is bounded."""
+        return np.array([self.reaches[0], *[np.inf] * (int(self.base.sum()) - 1)])
 
     def describe(self) -> JointSpaceDescription:
         stations, hard = len(self.stations) - 1, "position" in self.stations.trackable

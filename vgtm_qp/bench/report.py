@@ -156,7 +156,9 @@ def load_document(path: Path) -> dict[str, Any]:
     wrong = f"{path} is not what vgtm bench --json prints"
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be read: {(error.strerror or str(error)).lower()}") from None
+    except ValueError as error:
         raise ResultError(f"{wrong}: {error}") from None
     keys = ("schema_version", "commit", "time", "scenes")
     if not isinstance(document, dict) or any(key not in document for key in keys):

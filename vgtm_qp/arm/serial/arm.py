@@ -28,7 +28,7 @@ class SerialArm(JointSpaceArm):
     kind = "serial"
 
     def __init__(self, spec: ArmTable) -> None:
-        joints, stuck = spec.joint, {lock.member for lock in spec.locked if lock.time == 0.0}
+        joints, stuck = spec.joint, {lock.joint for lock in spec.locked if lock.time == 0.0}
         self.segments, self.quantity_names = len(joints), tuple(joint.name for joint in joints)
         self.home_quantities = np.array([joint.home for joint in joints], dtype=float)
         self.home_configuration = np.concatenate([self.home_quantities, np.zeros(6)])
