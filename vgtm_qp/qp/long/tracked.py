@@ -23,8 +23,8 @@ from vgtm_qp.qp.long.working_set import Moved
 class Following:
     """The graphs of a period that follows the curve.
 
-    Where its stations are to be somewhere, the displacements of a period are u = placed + B (gap - C placed): `placed` by
-    its fixed members alone, C the Jacobian of the stations' centres, B of the free motions that shift them.
+    Where its stations are to be somewhere, the displacements of a period are u = placed + B (gap - C placed):
+    `placed` by its fixed members alone, C the Jacobian of the stations' centres, B of the free motions that shift them.
     """
 
     def __init__(self, elimination: Elimination) -> None:
