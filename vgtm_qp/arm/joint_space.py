@@ -5,7 +5,6 @@ A configuration q (J + 6,) holds the joints' values, rad or m, then position, m,
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -86,19 +85,10 @@ class JointSpaceArm(Arm):
 
     bays = None
     leaves_chords = True
+    functions: tuple[ca.Function, ca.Function]
+    constants: Mapping[str, Array]
     revolute: Mask
-
-    @property
-    @abstractmethod
-    def functions(self) -> tuple[ca.Function, ca.Function]: ...
-
-    @property
-    @abstractmethod
-    def constants(self) -> Mapping[str, Array]: ...
-
-    @property
-    @abstractmethod
-    def reaches(self) -> Array: ...
+    reaches: Array
 
     @cached_property
     def motion_pattern(self) -> MotionPattern:

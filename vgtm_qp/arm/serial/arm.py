@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from vgtm_qp.arm.arm import Stations, Tip, has_full_rank
@@ -38,7 +36,8 @@ class SerialArm(JointSpaceArm):
         self.acceleration = _or_infinite([joint.acceleration for joint in joints])
         chain = SerialChain.of(spec)
         self.chain = chain if spec.every else replace(chain, every=self._every(chain))
-        self.revolute = chain.revolute
+        self.functions, self.constants = self.chain.functions, self.chain.constants
+        self.revolute, self.reaches = chain.revolute, self._reaches()
         self.actuator_units = tuple("rad" if turns else "m" for turns in self.revolute[self.actuated])
         self._place_stations()
         self.bodies = self._links(spec.link_radius)
@@ -77,6 +76,13 @@ class SerialArm(JointSpaceArm):
         self.stations = Stations(nodes, weights, frames, trackable, word="joint")
         self.end_effector = Tip(nodes[-1], weights[-1], frames[-1])
 
+    def _reaches(self) -> Array:
+        """Return (J + 1,) what :attr:`reaches` are: all slides as far out as they go, all links in one line."""
+        chain = self.chain
+        slide = np.where(chain.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
+        beyond = np.cumsum((chain.lengths[1:] + slide)[::-1])[::-1] + np.sqrt(2.0) * chain.spread
+        return np.concatenate([[beyond[0] + chain.lengths[0]], beyond])
+
     def _links(self, radius: float) -> Bodies:
         """Return links between successive origins; those of joints in one place are joined as if they were one."""
         chain, count = self.chain, len(self.chain)
@@ -88,21 +94,6 @@ class SerialArm(JointSpaceArm):
         points = np.stack([kept + 1, kept + 2], axis=1)
         names = [self.quantity_names[j] for j in kept]
         return capsules(points, radius, names, joints=place[points], kind="link")
-
-    @property
-    def functions(self) -> tuple[ca.Function, ca.Function]:
-        return self.chain.functions
-
-    @property
-    def constants(self) -> Mapping[str, Array]:
-        return self.chain.constants
-
-    @cached_property
-    def reaches(self) -> Array:
-        chain = self.chain
-        slide = np.where(chain.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
-        beyond = np.cumsum((chain.lengths[1:] + slide)[::-1])[::-1] + np.sqrt(2.0) * chain.spread
-        return np.concatenate([[beyond[0] + chain.lengths[0]], beyond])
 
     def record(self) -> dict[str, Any]:
         """See ``arm.Arm``.
