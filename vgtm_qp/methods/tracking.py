@@ -138,7 +138,16 @@ class _Chain:
         for segment in segments:
             before = segment.start - segment.first
             shapes.setdefault((segment.rows, segment.columns, before, segment.tracks), []).append(segment)
-        self._segments = segments
+        # The number of each segment on others, its columns and those before them.
+        self._links = [
+            (
+                segment.number,
+                slice(segment.start, segment.start + segment.columns),
+                slice(segment.first, segment.start),
+            )
+            for segment in segments
+            if segment.first < segment.start
+        ]
         self.groups = [SegmentGroup(layout, alike, kinematics) for alike in shapes.values()]
         self.evaluate, self.failure = evaluate, failure
         self.is_square = all(group.is_square for group in self.groups)
@@ -159,10 +168,8 @@ class _Chain:
             if not group.is_square:
                 step[group.columns] -= travelled[group.columns]
             passed |= zip(group.numbers.tolist(), answers[:, :, 1:], strict=True)
-        for segment in self._segments:
-            if segment.first < segment.start:
-                end = segment.start + segment.columns
-                step[segment.start : end] -= passed[segment.number] @ step[segment.first : segment.start]
+        for number, own_columns, columns_before in self._links:
+            step[own_columns] -= passed[number] @ step[columns_before]
 
 
 def _least_norm(A: Array, b: Array) -> Array:
