@@ -17,12 +17,11 @@ from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import PeriodValues
 from vgtm_qp.qp.long.solver import ChainSolver
-from vgtm_qp.qp.long.sweep import MOST_STEPS, TOO_FAR
 from vgtm_qp.qp.numbers import RowNumbers
 from vgtm_qp.qp.settle import held
 from vgtm_qp.rows.curve import base_offset
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
-from vgtm_qp.step.closing import Closing, enough_length, within
+from vgtm_qp.step.closing import Closing, Correct, converge, enough_length, within
 from vgtm_qp.step.engine import Engine, enough_tip_error
 from vgtm_qp.step.state import frozen
 from vgtm_qp.step.target import QPInput, Target
@@ -115,26 +114,29 @@ class ChainEngine(Engine):
         closing, solver, bounds = self._closing, self._solver, (target.lower, target.upper)
         enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)
         closing.start(X)
+        first: Array = X.take(self._nodes, axis=0)
         wanted = self._aim(self._strokes, *bounds)
-        own: Array = X.take(self._nodes, axis=0)
-        gain, steers, off = None, solver.knows_gain, np.inf
-        closer, worst = closing.step(own)
-        for _ in range(MOST_STEPS):
-            if (worst <= enough and not (steers and off > enough_tip)) or not worst < TOO_FAR:
-                break
-            own = closer.copy()
-            if solver.knows_gain:
+        gain: Array | None = None
+        steers = solver.knows_gain
+
+        def measure(own: Array) -> tuple[float, Correct | None]:
+            nonlocal wanted, gain, steers
+            is_off = steers
+            if solver.knows_gain and own is not first:
                 error = self._task.error(*self._tip_of(own, turned=self._task.turns is not None), goal)
                 off = float(np.abs(error).max())
                 if off > accuracy.start:
-                    return None
-                if steers and off > enough_tip:
-                    gain = solver.gain(held(*self._answer)) if gain is None else gain
+                    return np.inf, None
+                if steers and gain is None and off > enough_tip:
+                    gain = solver.gain(held(*self._answer))
                     steers = gain is not None
-                if gain is not None and off > enough_tip:
+                if is_off := gain is not None and off > enough_tip:
                     wanted = wanted + gain @ error
                     self._aim(wanted, *bounds)
             closer, worst = closing.step(own)
+            return worst, closer.copy if is_off or not worst <= enough else None
+
+        own, worst = converge(first, measure)
         closed = self._closed(X, own, worst)
         strokes = closed.quantities[self.layout.arm.actuators]
         if not (solver.knows_gain or (worst <= accuracy.member and within(strokes, *bounds, enough))):

@@ -22,13 +22,12 @@ from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.fused_settle import NEAR
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
-from vgtm_qp.qp.long.sweep import MOST_STEPS
 from vgtm_qp.qp.numbers import StepNumbers
 from vgtm_qp.qp.residual import FailedStepError, InfeasibleStepError
 from vgtm_qp.qp.settle import LEFT, SETTLING_STEPS, held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.rows.tip import TipGoal
-from vgtm_qp.step.closing import Closing
+from vgtm_qp.step.closing import MOST_STEPS, Closing
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask, over_all_nodes, tip_response
 
