@@ -11,13 +11,13 @@ import numpy as np
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.frames import frame_function, frame_tables
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.rotation import vector_from_rotation
+from vgtm_qp.rows.members import member_function
 
 
 class CurveNodes(NamedTuple):
@@ -48,7 +48,8 @@ class SegmentKinematics:
         truss, fixed, face = self._truss, segment.fixed, segment.face
         if len(fixed):
             if len(fixed) not in self._members:
-                self._members[len(fixed)] = Kernel(member_function(truss).map(len(fixed)))
+                member = member_function(has_offsets=truss.joints is not None)
+                self._members[len(fixed)] = Kernel(member.map(len(fixed)))
             members = self._members[len(fixed)]
             members.inputs[0][:] = X.take(truss.member_nodes[fixed].ravel(), axis=0).ravel()
             if truss.joints is not None:
@@ -85,7 +86,7 @@ class SegmentGroup:
         self.numbers = np.array([segment.number for segment in segments])
         self._tracks, self._kinematics = one.tracks, kinematics
         self._fixed = np.stack([segment.fixed for segment in segments])
-        self._home = layout.arm.home_quantities[self._fixed]
+        self._home, self._still = layout.arm.home_quantities[self._fixed], np.zeros(self._fixed.shape)
         self._face = np.array([segment.face for segment in segments])
         self._corners, self._weights = truss.faces[self._face], truss.face_weights[self._face][:, None]
         self._centre_rows = np.repeat(self._weights, 3)
@@ -133,7 +134,8 @@ class SegmentGroup:
 
     def displacements(self, moved: Array, turned: Array) -> Array:
         """Return the right-hand sides (K, r) for curve nodes that move and turn, (S, 3) each, m and rad."""
-        return self._stacked(np.zeros(self._fixed.shape), moved[self.numbers], turned[self.numbers])
+        moved, turned = moved.take(self.numbers, axis=0), turned.take(self.numbers, axis=0)
+        return self._stacked(self._still, moved, turned)
 
     def residuals(self, X: Array, nodes: CurveNodes) -> Array:
         """Return (K, r) what is missing in lengths and to the curve nodes at `X`, where kinematics is evaluated."""
@@ -151,6 +153,8 @@ class SegmentGroup:
         return self._stacked(lengths, gap, turn)
 
     def _stacked(self, lengths: Array, moved: Array, turned: Array) -> Array:
+        if self._tracks == "position":
+            return np.concatenate([lengths, moved], axis=1)
         return np.concatenate([lengths, moved, self._tracked(turned[:, :, None])[:, :, 0]], axis=1)
 
     def _tracked(self, turns: Array) -> Array:

@@ -44,6 +44,7 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
             setup.layout, setup.kinematics, segments, parallel=method.tracking == "parallel"
         )
         self._s = self.motion.s[[segment.face for segment in segments]]
+        self._weights = self.motion.home.family.weights(self._s)
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._correct = method.correct
 
@@ -76,4 +77,4 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
         """Return the curve nodes of the segments; their frames are identities where none is tracked."""
         s = self._s
         frame = curve.frame(s) if self._frames else np.broadcast_to(np.eye(3), (len(s), 3, 3))
-        return CurveNodes(curve.position(s), frame)
+        return CurveNodes(self._weights @ curve.control_vertices, frame)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
@@ -33,7 +34,7 @@ class CurveMotion:
     """
 
     def __init__(self, problem: Problem, setup: Setup) -> None:
-        method, spec, truss = problem.method, problem.curve, setup.truss
+        method, spec, truss = problem.method, problem.curve, truss_of(setup.arm)
         if spec is None or not len(truss.faces):
             raise CurveError("this method needs a reference curve and a truss with faces")
         family = setup.layout.family
@@ -52,6 +53,9 @@ class CurveMotion:
         self.home = Curve(
             family, setup.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0]
         )
+        # However the curve bends, its end is the same combination of its vertices.
+        self._end = family.weights(1.0)
+        self._end_rows = self.home.position_jacobian(1.0)[self._task.axes]
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         gains = method.gains
         self._terms = {name: float(getattr(gains, name)) for name in names}
@@ -136,12 +140,12 @@ class CurveMotion:
     def _missing(self, curve: Curve, goal: TipGoal) -> tuple[Array, Array, Array]:
         """Return what x(1) lacks of x_e, eq. (34), and the goal's rates, (n_e,) each; and the turned axes (r, 3)."""
         rotation = curve.frame(1.0) if self._task.turns else np.eye(3)
-        error, rate, across, _ = self._task.residual(curve.position(1.0), rotation, goal)
+        error, rate, across, _ = self._task.residual(self._end @ curve.control_vertices, rotation, goal)
         return error, rate, across
 
     def _rows(self, curve: Curve, across: Array) -> Array:
         """Return J_s(1) of eq. (37), its turns about the axes `across`, then the rows of the base: (n_e + 5, D)."""
-        rows = [curve.position_jacobian(1.0)[self._task.axes]]
+        rows = [self._end_rows]
         if self._task.turns:
             rows.append(across @ curve.orientation_jacobian(1.0))
         return np.concatenate([*rows, self._base_rows])
@@ -154,7 +158,7 @@ class CurveMotion:
         setup = self._setup
         pairs = setup.monitor.near(setup.arm.points(X), time, setup.influence)
         with_obstacle = np.flatnonzero(~pairs.is_self)
-        members = setup.truss.members[pairs.body[with_obstacle]]
+        members = truss_of(setup.arm).members[pairs.body[with_obstacle]]
         t, normal = pairs.weights[with_obstacle, 1], pairs.normal[with_obstacle]
         s = np.clip((1.0 - t) * self._node_s[members[:, 0]] + t * self._node_s[members[:, 1]], 0.0, 1.0)
         witness = (1.0 - t)[:, None] * X[members[:, 0]] + t[:, None] * X[members[:, 1]]
