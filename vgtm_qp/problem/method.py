@@ -93,13 +93,15 @@ class Method(Table, called="[method]"):
         default="coupled",
         description="truss and curve together; curve first, then bay after bay or all bays at once; no curve",
     )
-    hard_tracking: Flag = Field(
-        default=False, description="whether faces stay on the curve exactly; elastic otherwise"
+    tracking_mode: Literal["exact", "hard", "elastic"] = Field(
+        default="exact",
+        description="exact: faces are on the curve wherever they can be, and the gap says where not; hard: always, or "
+        "the arm stops; elastic: as near as the weights tracking and tangent draw them",
     )
     hard_coordinates: tuple[HardCoordinate, ...] = Field(
         default=("position",),
         min_length=1,
-        description="what of each face hard_tracking keeps on the curve: position; position and pointing; or "
+        description="what of each face is kept on the curve unless tracking is elastic: position; position and pointing; or "
         "position, pointing and orientation, as far as the bays of the module have the motions",
     )
     solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
@@ -140,9 +142,14 @@ class Method(Table, called="[method]"):
         default_factory=Gains, description="gains of the curve's null-space vector, eq. (38)"
     )
 
+    @property
+    def holds_curve(self) -> bool:
+        """Whether stations are kept on the curve by equalities."""
+        return self.name == "qp" and self.tracking == "coupled" and self.tracking_mode != "elastic"
+
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
-        if self.hard_tracking and self.tracking == "none":
-            yield ("hard_tracking",), 'false, since tracking is "none"'
+        if self.tracking_mode == "hard" and self.tracking == "none":
+            yield ("tracking_mode",), '"exact" or "elastic", since tracking is "none"'
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
             yield ("hard_coordinates",), f"the first one, two or three of {quoted(HARD_COORDINATES)}"
         if self.variant == "truncated" and self.algebra == "sparse":

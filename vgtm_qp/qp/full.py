@@ -130,7 +130,7 @@ class FullBuilder:
         self.tip_rows = np.arange(starts[1], starts[2])
         self.gap_rows = np.arange(starts[min(3, len(starts) - 1)], self.fixed_rows)
         self.gaps = np.arange(self.column["position"].start, self.column["spacing"].stop)
-        self.hard_gaps = self.gaps[: layout.hard_rows]
+        self.hard_gaps = self.gaps[layout.hard]
         self._pattern: tuple[bytes, ...] | None = None
         self._matrix = sparse.csc_matrix((0, self.size))
         self._order: Index = np.zeros(0, dtype=np.int64)
@@ -187,10 +187,7 @@ class FullBuilder:
         )
         column_lower[self.column["slack"]] = 0.0
         column_lower[-1], column_upper[-1] = numbers.progress_lower, numbers.progress_upper
-        if layout.hard_tracking:
-            column_lower[self.column["position"]] = column_upper[self.column["position"]] = 0.0
-        if layout.hard_turns:
-            column_lower[self.column["tangent"]] = column_upper[self.column["tangent"]] = 0.0
+        column_lower[self.hard_gaps] = column_upper[self.hard_gaps] = 0.0
         equal = np.concatenate([rows.rhs(numbers).reshape(-1) for rows in self._fixed])
         return StepQP(
             self._hessian,
@@ -250,11 +247,11 @@ class FullBuilder:
             ),
             "position": (
                 labels(f"gap: {word} ", "tracking gap", "m", tracked),
-                0.0 if layout.hard_tracking else weights.tracking,
+                sparse.diags(layout.gap_weights.reshape(-1)),
             ),
             "tangent": (
                 labels(f"tilt: {word} ", "tangent gap", "rad", tracked, self._turns),
-                sparse.diags(layout.turn_weights * (not layout.hard_turns)),
+                sparse.diags(layout.tilt_weights.reshape(-1)),
             ),
             "spacing": (
                 labels("stretch: piece ", "spacing gap", "m", range(layout.spacings), " "),

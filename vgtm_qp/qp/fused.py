@@ -52,7 +52,8 @@ class FusedSolver:
         self._torsion = size - 1 - layout.torsion
         self._shape = arm.home_configuration.shape
         self._tip = len(layout.tip_rows)
-        self._hard = layout.hard_rows
+        self._hard = len(layout.hard)
+        self._hard_at = nodes + layout.hard
         out = self._rows.outputs
         self._stack = out[0].reshape(size, -1)
         self._response = self._stack[:, :nodes]
@@ -79,7 +80,7 @@ class FusedSolver:
         self._draw(layout)
         if self._hard:
             self._soft = np.ones(self._stack.shape[1])
-            self._soft[nodes : nodes + self._hard] = 0.0
+            self._soft[self._hard_at] = 0.0
 
     def drawn(self, layout: Layout) -> FusedSolver:
         """Return the solver of a layout that differs in the control vertices with goals alone; buffers are shared."""
@@ -158,7 +159,7 @@ class FusedSolver:
             self._reserve(2 * (size + rows))
         constraint, lower, upper = self._room.constraint[:rows], self._room.lower, self._room.upper
         if hard:
-            block = self._stack[:, self.layout.node_columns : self.layout.node_columns + hard]
+            block = self._stack[:, self._hard_at]
             constraint[self._tip : first, :-1] = block[:-1].T
             upper[size + self._tip : size + first] = lower[size + self._tip : size + first] = -block[-1]
         if near:
@@ -224,7 +225,7 @@ class FusedSolver:
 
     def _settle(self, follows: float) -> None:
         """Settle where the answer leads, or at 0 the configuration that was loaded."""
-        if not self._hard:
+        if not self.layout.hard_tracking:
             response = self._response[: self._actuators]
             np.dot(response, response.T, out=self._gram)
         self._follows[0] = follows

@@ -106,10 +106,8 @@ class Linearisation:
             base_rhs = -base_axes @ (vertices[1] - vertices[0])
         if moves:
             pull = layout.vertex_gradient(vertices, asked.vertex_goals)
-        if not (moves or layout.hard_tracking):
-            gap = np.zeros_like(gap)
-        if not (moves or layout.hard_turns):
-            turn = np.zeros_like(turn)
+        if not moves:
+            gap, turn = gap * layout.hard_gaps, turn * layout.hard_tilts
         face = face.reshape(count, 9, turns).transpose(0, 2, 1)
         curve = curve.reshape(count, curve.size // max(count * turns, 1), turns).transpose(0, 2, 1)
         spacing = np.zeros(0) if asked.curve is None else asked.curve.spacing

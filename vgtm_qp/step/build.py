@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,6 +67,8 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "influence": clearance.influence,
     }
     engine = make_engine(solver, home.layout, kinematics, task, compiled=compiled)
+    gives_way = home.layout.hard_tracking and problem.method.tracking_mode == "exact"
+    elastic = elastic_engine(solver, home.layout, kinematics, task) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
     return Setup(
@@ -73,6 +77,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         layout=home.layout,
         task=task,
         engine=engine,
+        elastic=elastic,
         monitor=monitor,
         solver=solver,
         control_vertices=home.vertices,
@@ -115,19 +120,22 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         tables = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
         layout = Layout(arm, *tables, task.row_names, method.weights, elastic_tip=elastic)
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
-    mistakes = list(_beyond_the_arm(problem, arm, task))
+    is_hard, mistakes = method.holds_curve, list(_beyond_the_arm(problem, arm, task))
+    if method.tracking_mode == "exact" and mistakes and "hard_coordinates" not in method.model_fields_set:
+        # Nobody asked for it by name, and what can hold exactly is the curve's end alone.
+        is_hard, mistakes = False, []
     if mistakes:
         raise problem.error(mistakes)
     options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
     family = make_family(spec.family, spec.control_vertices, **options)
-    stride = stations.stride if method.hard_tracking else 1
+    stride = stations.stride if is_hard else 1
     tracked = np.arange(len(stations) - 1, stride - 1, -stride)[::-1]
     centres = stations.centres(arm.home)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
     fractions = travelled[tracked] / travelled[-1]
     s, vertices = _fitted(family, fractions, centres[0], centres[tracked])
     torsion = np.zeros(spec.torsion_vertices)
-    tracks_roll = bool(torsion.size) or (method.hard_tracking and "orientation" in method.hard_coordinates)
+    tracks_roll = bool(torsion.size) or (is_hard and "orientation" in method.hard_coordinates)
     roll = None
     if tracks_roll:
         frames = Curve(family, vertices, torsion, stations.frames[0]).frame(s)
@@ -156,8 +164,8 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         tracked,
         task.row_names,
         method.weights,
-        hard_tracking=method.hard_tracking,
-        hard_turns=method.hard_tracking and len(method.hard_coordinates) > 1,
+        hard_tracking=is_hard,
+        hard_turns=is_hard and len(method.hard_coordinates) > 1,
         elastic_tip=elastic,
         shape=shape,
         vertex_goals=tuple(sorted(goal.index for goal in spec.control_vertex_goals)),
@@ -187,7 +195,7 @@ def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) 
 def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mistake]:
     """Yield what stations are to keep on the curve although the arm has not the motions for it."""
     method, curve = problem.method, problem.curve
-    if not method.hard_tracking or curve is None:
+    if not method.holds_curve or curve is None:
         return
     wanted = list(method.hard_coordinates)
     if len(wanted) == 2 and curve.torsion_vertices:
@@ -224,6 +232,15 @@ def make_engine(
     if is_quick and isinstance(chosen, ChainSolver) and ChainEngine.serves(chosen):
         return ChainEngine(chosen, kinematics, task)
     return GeneralEngine(layout, kinematics, task, chosen, compiled=compiled)
+
+
+def elastic_engine(
+    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask
+) -> Callable[[], Engine]:
+    """Return what gives the engine of the same layout with elastic tracking, built when it is first asked for."""
+    elastic = replace(layout, hard_tracking=False, hard_turns=False)
+    # It is seldom needed, and no compiler is kept waiting then.
+    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False))
 
 
 def _check_supported(problem: Problem) -> None:
