@@ -241,6 +241,7 @@ def _assemble(
         "schema_version": SCHEMA_VERSION,
         "problem": problem.to_dict(),
         "arm": setup.arm.record(),
+        "curve": attempt.resolver.setup.layout.record(),
         "status": "solved" if stop is None else "blocked",
         # That of the last whole row: an interrupt may have come before the next.
         "reached": float(attempt.rows["progress"][-1]),

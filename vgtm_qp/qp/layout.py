@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -179,6 +180,29 @@ class Layout:
             slope = self.curve_slopes[-1] @ vertices
             missing.append(np.linalg.norm(slope) * rotation[:, 2] - slope)
         return np.asarray(vertices + self._end_gain @ np.array(missing))
+
+    def record(self) -> dict[str, Any] | None:
+        """Return what verification needs to know of the curve and of the stations on it, as JSON data; None without one.
+
+        Keys: ``breaks``, ``extraction``, ``nodes`` and ``by_arc_length`` of the curve, see ``CurveFamily`` and
+        ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``, whether they are kept
+        on the curve; ``ends_at_tip``, ``ends_along_tip``.
+        """
+        if self.shape is None:
+            return None
+        stations, family = self.arm.stations, self.shape.family
+        used = np.flatnonzero(stations.weights[self.tracked].any(axis=0))
+        return {
+            "breaks": family.breaks.tolist(),
+            "extraction": family.extraction.tolist(),
+            "nodes": self.shape.nodes.tolist(),
+            "by_arc_length": self.shape.by_arc_length,
+            "stations": stations.nodes[self.tracked][:, used].tolist(),
+            "weights": stations.weights[self.tracked][:, used].tolist(),
+            "held": self.hard_tracking,
+            "ends_at_tip": self.ends_at_tip,
+            "ends_along_tip": self.ends_along_tip,
+        }
 
     @cached_property
     def vertex_hessian(self) -> Array:

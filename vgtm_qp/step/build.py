@@ -170,6 +170,8 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         shape=shape,
         vertex_goals=tuple(sorted(goal.index for goal in spec.control_vertex_goals)),
     )
+    end = arm.end_effector
+    vertices = layout.ended(vertices, end.position(arm.home), end.frame)
     return HomeCurve(layout, vertices, torsion, goals)
 
 

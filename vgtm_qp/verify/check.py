@@ -25,6 +25,7 @@ from vgtm_qp.verify.clearance import (
     Least,
     RecordedMotion,
 )
+from vgtm_qp.verify.curve import curve_measures
 from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.verify.path import (
     DIRECTION_TOLERANCE,
@@ -100,6 +101,7 @@ def verify(maneuver: Result) -> Certificate:
         array_error=_worst(differences[furthest], "m", ARRAY_TOLERANCE, array=furthest),
         length_singular_value=_least_of(values[:, 0], ""),
         tip_singular_value=_least_of(values[:, 1], "m/m"),
+        **curve_measures(maneuver, rotation),
         tip_error_per_millimetre=_worst(values[:, 2] if len(values) else None, "mm", None),
         contradictions=(
             *wrong,
