@@ -327,7 +327,9 @@ def curve_numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
         found["spacing_rhs"] = asked.motion * given.spacing
     face = [by_face @ row for (by_face, _), row in zip(derivatives, spins, strict=True)]
     names = "tangent_rhs", "tangent_face", "tangent_curve"
-    for name, value in zip(names, ((hard_turns | asked.motion) * np.array(residuals), face, curve), strict=True):
+    for name, value in zip(
+        names, ((hard_turns | asked.motion) * np.array(residuals), face, curve), strict=True
+    ):
         found[name] = np.array(value)
     return found
 
@@ -336,9 +338,12 @@ def hard_tracking_rows(layout: Layout) -> tuple[Array, Array]:
     """Return which gaps (K, 3) and turns (K, R) are equalities: those asked for, and those of the curve's end."""
     gaps_held = np.full((len(layout.tracked), 3), layout.hard_tracking)
     turns_held = np.full((len(layout.tracked), layout.turns), layout.hard_turns)
-    if layout.vertices >= 3:
+    truss = truss_of(layout.arm)
+    if layout.vertices >= 3 and sorted(truss.faces[-1]) == sorted(truss.tip):
         gaps_held[-1] = True
-        if layout.vertices >= 4 and any(" direction " in row or " rotation " in row for row in layout.tip_rows):
+        if layout.vertices >= 4 and any(
+            " direction " in row or " rotation " in row for row in layout.tip_rows
+        ):
             turns_held[-1, :2] = True
     return gaps_held, turns_held
 

@@ -302,7 +302,7 @@ def _coupled_scenes() -> Iterator[Case]:
     yield Case("octahedral 5, elastic tip", _scene(9, "octahedral", 5, end_effector__mode="elastic"))
     yield Case("hexapod 4, elastic tip", _scene(10, "hexapod", 4, end_effector__mode="elastic"))
     yield Case("longeron 5, hard tip", _scene(11, "longeron", 5, end_effector__mode="hard", reach=0.2))
-    hard = {"method__hard_tracking": True, "curve__control_vertices": 5}
+    hard = {"method__tracking_mode": "hard", "curve__control_vertices": 5}
     yield Case("hexapod 5, hard tracking", _scene(12, "hexapod", 5, **hard))
     pointed = {**hard, "method__hard_coordinates": ["position", "pointing"]}
     yield Case("hexapod 4, hard tracking of pointing", _scene(13, "hexapod", 4, **pointed))

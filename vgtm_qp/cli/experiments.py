@@ -130,7 +130,7 @@ def bench(
             help="of the arms between two cubes, 5 or more; 5 to 1000 by default",
         ),
     ] = None,
-    tracking: Annotated[list[TrackingName] | None, _several(help="both by default")] = None,
+    tracking: Annotated[list[TrackingName] | None, _several(help="exact and elastic by default")] = None,
     baselines: Annotated[
         list[BaselineName] | None,
         _several(negative="--no-baselines", help="what else takes the steps; all by default"),

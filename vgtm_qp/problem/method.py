@@ -101,8 +101,8 @@ class Method(Table, called="[method]"):
     hard_coordinates: tuple[HardCoordinate, ...] = Field(
         default=("position",),
         min_length=1,
-        description="what of each face is kept on the curve unless tracking is elastic: position; position and pointing; or "
-        "position, pointing and orientation, as far as the bays of the module have the motions",
+        description="what of each face is kept on the curve unless tracking is elastic: position; position and "
+        "pointing; or position, pointing and orientation, as far as the bays of the module have the motions",
     )
     solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
     retries: Flag = Field(

@@ -110,7 +110,11 @@ def _condensed_station(layout: Layout, actuators: int) -> ca.Function:
     moving = ca.SX.sym("moving", 9, actuators + 1)
     size = 3 * layout.vertices + layout.torsion
     offset = ca.SX.sym("offset", 3, layout.vertices) if layout.general is None else ca.SX.sym("offset", size)
-    normal, gap_on, turn_on = ca.SX.sym("normal", 3), ca.SX.sym("gap_on", 3), ca.SX.sym("turn_on", layout.turns)
+    normal, gap_on, turn_on = (
+        ca.SX.sym("normal", 3),
+        ca.SX.sym("gap_on", 3),
+        ca.SX.sym("turn_on", layout.turns),
+    )
     centre, turned = ca.kron(station.weights.T, ca.SX.eye(3)) @ moving, station.face @ moving
     gap_curve, turn_curve, gap_offset, turn_offset = station.over_curve(offset, normal)
     gap = gap_on * station.gap + centre[:, -1] + gap_offset

@@ -182,11 +182,11 @@ class Layout:
         return np.asarray(vertices + self._end_gain @ np.array(missing))
 
     def record(self) -> dict[str, Any] | None:
-        """Return what verification needs to know of the curve and of the stations on it, as JSON data; None without one.
+        """Return what verification needs to know of the curve and of the stations on it, as JSON data; or None.
 
         Keys: ``breaks``, ``extraction``, ``nodes`` and ``by_arc_length`` of the curve, see ``CurveFamily`` and
-        ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``, whether they are kept
-        on the curve; ``ends_at_tip``, ``ends_along_tip``.
+        ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``, whether they are
+        kept on the curve; ``ends_at_tip``, ``ends_along_tip``.
         """
         if self.shape is None:
             return None

@@ -1,11 +1,12 @@
 """The manifest of a result file: problem, arm, outcome and versions as strict JSON data.
 
-It has `schema_version`; the `problem` in the form of its file; the `arm` as its `record` gives it; `status`, `reached`,
-the share of the path covered, 0 to 1, and `blocked_by`, the names of what stopped the arm; the `stop` as its `to_dict`
-gives it; the `curve` as ``Layout.record`` gives it, null without one; `way_out`, the change of the problem with which a retry came further; `recovered`, pairs below their clearance
-in the home pose and their distances there, m; `method` and `solver`; `setup_time`, s; `directory`, where relative paths
-of the problem start; `meshes`, what `mesh_record` returns for each; `versions`; the `certificate`, null before
-verification; and `jacobian_rank`, that of the last step where the method reveals it.
+It has `schema_version`; the `problem` in the form of its file; the `arm` as its `record` gives it; the `curve` as
+``Layout.record`` gives it, null without one; `status`, `reached`, the share of the path covered, 0 to 1, and
+`blocked_by`, the names of what stopped the arm; the `stop` as its `to_dict` gives it; `way_out`, the change of the
+problem with which a retry came further; `recovered`, pairs below their clearance in the home pose and their distances
+there, m; `method` and `solver`; `setup_time`, s; `directory`, where relative paths of the problem start; `meshes`, what
+`mesh_record` returns for each; `versions`; the `certificate`, null before verification; and `jacobian_rank`, that of
+the last step where the method reveals it.
 """
 
 from __future__ import annotations

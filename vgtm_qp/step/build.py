@@ -35,6 +35,9 @@ from vgtm_qp.step.path import base_motion
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import TipTask
 
+_STRAIGHTENS = 1e-6
+"""Weight that makes a curve as straight as the stations of a bent arm let it be."""
+
 _CONDENSED_ALL_THE_SAME = (
     "elastic end effector: the elimination along the bays does not know its slacks, so the QP is condensed onto the "
     "actuators, which takes longer on an arm of this length"
@@ -121,8 +124,8 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         layout = Layout(arm, *tables, task.row_names, method.weights, elastic_tip=elastic)
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
     is_hard, mistakes = method.holds_curve, list(_beyond_the_arm(problem, arm, task))
-    if method.tracking_mode == "exact" and mistakes and "hard_coordinates" not in method.model_fields_set:
-        # Nobody asked for it by name, and what can hold exactly is the curve's end alone.
+    if method.tracking_mode == "exact" and mistakes and method.hard_coordinates == ("position",):
+        # Nobody asked for more, and what this arm can hold exactly is the curve's end alone.
         is_hard, mistakes = False, []
     if mistakes:
         raise problem.error(mistakes)
@@ -189,8 +192,10 @@ def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) 
         return fractions if even else straight.arc_parameter(fractions), straight.control_vertices
     weights = family.weights(fractions)
     second = np.diff(np.eye(family.control_vertices), n=2, axis=0)
-    system = np.vstack([weights[:, 1:], 1e-3 * second[:, 1:]])
-    known = np.vstack([points - np.outer(weights[:, 0], start), -1e-3 * np.outer(second[:, 0], start)])
+    system = np.vstack([weights[:, 1:], _STRAIGHTENS * second[:, 1:]])
+    known = np.vstack(
+        [points - np.outer(weights[:, 0], start), -_STRAIGHTENS * np.outer(second[:, 0], start)]
+    )
     return fractions, np.vstack([start, np.linalg.lstsq(system, known, rcond=None)[0]])
 
 

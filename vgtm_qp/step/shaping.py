@@ -101,7 +101,9 @@ class Shaping:
             if engine is None:
                 engine = make_engine(setup.solver, layout, setup.kinematics, setup.task)
                 finish_compiling()
-            elastic = None if setup.elastic is None else elastic_engine(setup.solver, layout, setup.kinematics, setup.task)
+            elastic = setup.elastic
+            if elastic is not None:
+                elastic = elastic_engine(setup.solver, layout, setup.kinematics, setup.task)
             self._built[_key(layout)] = replace(setup, layout=layout, engine=engine, elastic=elastic)
         self.setup = self._built[_key(layout)]
 

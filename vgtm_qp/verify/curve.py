@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Measure
 from vgtm_qp.result.result import Result
@@ -41,17 +41,17 @@ class RecordedCurve(NamedTuple):
     extraction: Array
     nodes: Array
     by_arc_length: bool
-    stations: Array
+    stations: Index
     weights: Array
 
     @classmethod
     def of(cls, record: Mapping[str, Any], nodes: int, vertices: int) -> RecordedCurve:
         """Read ``Layout.record``; ResultError where it does not fit so many nodes and control vertices."""
         try:
-            floats = (np.asarray(record[key], dtype=float) for key in ("breaks", "extraction", "nodes"))
+            names = "breaks", "extraction", "nodes", "weights"
+            breaks, extraction, at, weights = (np.asarray(record[name], dtype=float) for name in names)
             stations = np.asarray(record["stations"], dtype=np.int64)
-            weights = np.asarray(record["weights"], dtype=float)
-            curve = cls(*floats, bool(record["by_arc_length"]), stations, weights)
+            curve = cls(breaks, extraction, at, bool(record["by_arc_length"]), stations, weights)
         except (KeyError, TypeError, ValueError) as error:
             raise ResultError(f"manifest.curve is malformed: {error}") from None
         segments = len(curve.breaks) - 1
@@ -67,7 +67,9 @@ class RecordedCurve(NamedTuple):
         u = (s - self.breaks[segment]) / np.diff(self.breaks)[segment]
         degree = self.extraction.shape[1] - 1
         j = np.arange(degree + 1)
-        share = np.array([comb(degree, k) for k in j]) * u[..., None] ** j * (1.0 - u[..., None]) ** (degree - j)
+        share = (
+            np.array([comb(degree, k) for k in j]) * u[..., None] ** j * (1.0 - u[..., None]) ** (degree - j)
+        )
         table = np.einsum("tkj,tkjv->tkv", share, self.extraction[segment])
         return np.asarray(table @ vertices)
 
@@ -86,7 +88,9 @@ class RecordedCurve(NamedTuple):
         arcs = (4.0 * (halves[:, ::2] + halves[:, 1::2]) - whole) / 3.0
         travelled = np.pad(np.cumsum(arcs, axis=1), ((0, 0), (1, 0)))
         wanted = self.nodes * travelled[:, -1:]
-        piece = np.array([np.searchsorted(a[1:-1], w, side="right") for a, w in zip(travelled, wanted, strict=True)])
+        piece = np.array(
+            [np.searchsorted(a[1:-1], w, side="right") for a, w in zip(travelled, wanted, strict=True)]
+        )
         left, start, before = wanted - travelled[states, piece], fine[2 * piece], points[states, 2 * piece]
         s = start + (fine[2 * piece + 2] - start) * left / arcs[states, piece]
         for _ in range(_REFINEMENTS):
@@ -109,7 +113,10 @@ def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
     curve = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices.shape[1])
     stations = np.einsum("kq,tkqc->tkc", curve.weights, maneuver.nodes[:, curve.stations])
     off = np.linalg.norm(stations - curve.points(vertices), axis=2)
-    row, k = np.unravel_index(int(np.argmax(off)), off.shape)
+    # At home the curve is fitted to the arm, however that is bent.
+    moved = off[min(1, len(off) - 1) :]
+    row, k = divmod(int(np.argmax(moved)), moved.shape[1])
+    row += len(off) - len(moved)
     method = maneuver.manifest["problem"].get("method") or {}
     is_hard = method.get("tracking_mode") == "hard" and bool(record["held"])
     found = {
@@ -120,7 +127,7 @@ def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
             "most",
             f"row {row}, station {k + 1}",
         ),
-        "states_off_curve": Measure(float(np.mean(off.max(axis=1) > TRACKING_TOLERANCE)), "of all states"),
+        "states_off_curve": Measure(float(np.mean(moved.max(axis=1) > TRACKING_TOLERANCE)), "of all states"),
     }
     ends = {
         "curve_end_gap": ("ends_at_tip", off[:, -1], "m", TRACKING_TOLERANCE),

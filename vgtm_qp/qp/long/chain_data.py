@@ -141,9 +141,12 @@ class ChainData:
         (k,) = np.flatnonzero(self.faces == len(layout.tracked) - 1)
         free = self._free.reshape(len(self.offset), 3, -1)
         nodes = layout.arm.stations.nodes[layout.tracked[-1]][self.face_order.reshape(-1, 3)[k]]
-        turns, over_slope = (self.part[name].reshape(-1, 2, n)[k] for name, n in (("tangent_face", 9), ("tangent_curve", 3)))
+        turns = self.part["tangent_face"].reshape(-1, 2, 3, 3)[k]
+        over_slope = self.part["tangent_curve"].reshape(-1, 2, 3)[k]
         weights = self._chain.face_weights[-1]
-        coefficients = np.concatenate([weights[None, :, None] * np.eye(3)[:, None, :], turns.reshape(2, 3, 3)])
+        coefficients = np.concatenate(
+            [weights[None, :, None] * np.eye(3)[:, None, :], turns.reshape(2, 3, 3)]
+        )
         curve = np.vstack(
             [-np.tensordot(self.weights[k], free, 1), over_slope @ np.tensordot(self.slopes[k], free, 1)]
         )
@@ -278,7 +281,11 @@ def period_values(chain: Chain) -> ca.Function:
     X, Y = (ca.SX.sym(name, 3, chain.window.shape[1]) for name in "XY")
     home, fixed = ca.SX.sym("home", chain.own), ca.SX.sym("fixed", chain.own)
     angles, alignment = ca.SX.sym("angles", 6 * faces), ca.SX.sym("alignment", 3, 3 * faces)
-    curve, motion, closes = ca.SX.sym("curve", 12 * faces), ca.SX.sym("motion"), ca.SX.sym("closes", 2 * faces)
+    curve, motion, closes = (
+        ca.SX.sym("curve", 12 * faces),
+        ca.SX.sym("motion"),
+        ca.SX.sym("closes", 2 * faces),
+    )
 
     lengths, actuated = member_lengths(chain, X), np.flatnonzero(chain.actuated).tolist()
     jacobian = ca.jacobian(member_lengths(chain, Y), ca.vec(Y))

@@ -74,8 +74,8 @@ class ChainSolver(ABC):
         progress = 0.0
 
         def columns(rows: Index) -> Array:
-            *of_rows, along = table.coefficients(rows)
-            return np.vstack([self._columns(*of_rows), scale * along])
+            nodes, coefficients, curve, along = table.coefficients(rows)
+            return np.vstack([self._columns(nodes, coefficients, curve), scale * along])
 
         def values(combined: Array) -> Array:
             nonlocal progress

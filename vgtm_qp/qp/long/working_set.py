@@ -61,7 +61,11 @@ class RowTable:
         self.end = slice(self.locked.stop, self.equal)
         self.actuators = slice(self.equal + 1, self.equal + 1 + len(numbers.lower))
         self.clearance = slice(self.actuators.stop, self.actuators.stop + near)
-        known, lower, free = [numbers.tip_rhs, held, end.rhs], numbers.clearance.lower, np.full(near, UNBOUNDED)
+        known, lower, free = (
+            [numbers.tip_rhs, held, end.rhs],
+            numbers.clearance.lower,
+            np.full(near, UNBOUNDED),
+        )
         self.lower = np.concatenate([*known, [numbers.progress_lower], numbers.lower, lower])
         self.upper = np.concatenate([*known, [numbers.progress_upper], numbers.upper, free])
         self._members = np.concatenate([locked, np.full(len(end.rhs) + 1, -1), layout.arm.actuators])
@@ -80,9 +84,9 @@ class RowTable:
         return np.concatenate([tip - numbers.tip_rate * progress, held, end, [progress], strokes, near])
 
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array, Array]:
-        """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, those of the curve (R, 3V - 5), of the progress.
+        """Return nodes (R, Q) of rows and what they have over them, (R, Q, 3), zero where spare.
 
-        The last are (R,).
+        Then what they have over the curve's free coordinates (R, 3V - 5) and the progress (R,).
         """
         numbers, clearance, tip_nodes = self.numbers, self.numbers.clearance, self._arm.end_effector.nodes
         progress = (rows == self.equal).astype(float)
