@@ -77,8 +77,12 @@ def study(
     workers: Annotated[int, Parameter(help="processes; studies of run time use one, alone")] = 1,
     dask: Annotated[str | None, Parameter(help="address of a dask.distributed scheduler")] = None,
     short: Annotated[bool, Switch(help="a quick look: fewer and smaller runs")] = False,
-    scenes: Annotated[int | None, Parameter(help="number of random scenes, of robustness")] = None,
-    seed: Annotated[int | None, Parameter(help="seed of the random scenes, of robustness")] = None,
+    scenes: Annotated[
+        int | None, Parameter(help="number of random scenes, of robustness and tracking")
+    ] = None,
+    seed: Annotated[
+        int | None, Parameter(help="seed of the random scenes, of robustness and tracking")
+    ] = None,
     output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
     json: Json = False,
 ) -> None:
