@@ -48,7 +48,8 @@ class CondensedSolver:
         hessian = Z.T @ (qp.P @ Z)
         with np.errstate(invalid="ignore"):  # What is infinite becomes NaN, and is refused with the answer.
             gradient = Z.T @ (qp.P @ start + qp.q)
-        rows = np.concatenate([builder.tip_rows, np.arange(builder.fixed_rows, len(qp.row_lower))])
+        bounded = np.arange(builder.fixed_rows, len(qp.row_lower))
+        rows = np.concatenate([builder.tip_rows, builder.leg_rows, bounded])
         hard = builder.hard_gaps
         constraint = np.concatenate([Z[hard], (qp.A @ Z)[rows]])
         known = np.concatenate([start[hard], (qp.A @ start)[rows]])

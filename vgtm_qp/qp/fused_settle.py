@@ -142,7 +142,7 @@ class _SolvedQP:
         self._layout, count = layout, len(layout.arm.actuators)
         self._size = size = count + layout.free_curve + 1
         self._tip = len(layout.tip_rows)
-        equal = self._tip + len(layout.hard) + NEAR
+        equal = self._tip + len(layout.hard) + len(layout.legs) + NEAR
         self.low, self.high = (ca.MX.sym(name, size + equal) for name in ("low", "high"))
         self.constraint, self.multipliers = (
             ca.MX.sym("C", size, equal),

@@ -14,10 +14,14 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
+from vgtm_qp.rows.curve import legs
 from vgtm_qp.rows.tip import axes as tip_axes
 
 _ENDS_AT_TIP = 3
 """A curve of so many control vertices can begin at the base, along its normal, and end anywhere."""
+
+_LEAST_LEG = 0.1
+"""Shortest that a leg whose direction is given becomes, as a share of one of a straight polygon at home."""
 
 _GOAL_REACH = 0.01
 """Greatest part of the arm's length that a control vertex is drawn towards its goal in one step."""
@@ -177,9 +181,24 @@ class Layout:
             return vertices
         missing = [position - self.curve_weights[-1] @ vertices]
         if self.ends_along_tip:
-            slope = self.curve_slopes[-1] @ vertices
-            missing.append(np.linalg.norm(slope) * rotation[:, 2] - slope)
+            slope, axis = self.curve_slopes[-1] @ vertices, rotation[:, 2]
+            missing.append((slope @ axis) * axis - slope)
         return np.asarray(vertices + self._end_gain @ np.array(missing))
+
+    @cached_property
+    def legs(self) -> Index:
+        """(G, 2) control vertices of the legs whose directions are given: the first, and the last along the tip's."""
+        last = self.vertices - 1
+        legs = [(0, 1), (last - 1, last)][: int(last > 0) + self.ends_along_tip]
+        return np.array(legs, dtype=np.int64).reshape(-1, 2)
+
+    def leg_bounds(self, vertices: Array, normal: Array) -> tuple[Array, Array]:
+        """Return axes (G, 3) of the :attr:`legs`, and what their lengths may change by at least (G,), m."""
+        if not len(self.legs):
+            return np.zeros((0, 3)), np.zeros(0)
+        axes, lengths = legs(vertices, normal, both=len(self.legs) > 1)
+        least = _LEAST_LEG * self.arm.height / (self.vertices - 1)
+        return axes, np.minimum(least - lengths, 0.0)
 
     def record(self) -> dict[str, Any] | None:
         """Return what verification needs to know of the curve and of the stations on it, as JSON data; or None.

@@ -12,7 +12,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.graph import StationSymbols, StepGraph
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
+from vgtm_qp.qp.numbers import ClearanceRows, Legs, StepNumbers
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 
@@ -132,6 +132,7 @@ class Linearisation:
             base_axes=base_axes,
             base_rhs=base_rhs,
             clearance=clearance,
+            legs=Legs(*layout.leg_bounds(vertices, np.cross(base_axes[0], base_axes[1]))),
             spacing_rhs=spacing if moves else 0.0 * spacing,
             curve=asked.curve,
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,6 +59,28 @@ class ClearanceRows:
         )
 
 
+class Legs(NamedTuple):
+    """The legs of the control polygon that may not turn round: axes . (displacement of their ends) >= lower, in m.
+
+    Attributes
+    ----------
+    axes, lower : (G, 3), (G,)
+        Of the legs of ``Layout.legs``.
+    """
+
+    axes: Array
+    lower: Array
+
+    def over_vertices(self, layout: Layout) -> Array:
+        """Return (G, 3 V) the rows over the control vertices."""
+        count = np.zeros((len(layout.legs), layout.vertices))
+        at = np.arange(len(count))
+        count[at, layout.legs[:, 0]], count[at, layout.legs[:, 1]] = -1.0, 1.0
+        return np.asarray(
+            (count[:, :, None] * self.axes[:, None, :]).reshape(len(count), 3 * layout.vertices)
+        )
+
+
 @dataclass
 class RowNumbers:
     """Numbers of the rows with bounds of one QP, and of its progress; see :class:`StepNumbers`.
@@ -70,6 +93,7 @@ class RowNumbers:
     tip_rate, tip_rhs : (n_e,)
     progress_lower, progress_upper, progress_gradient, progress_curvature : float
     clearance : ClearanceRows
+    legs : Legs
     """
 
     lower: Array
@@ -83,6 +107,7 @@ class RowNumbers:
     progress_gradient: float
     progress_curvature: float
     clearance: ClearanceRows
+    legs: Legs
 
 
 @dataclass
@@ -99,7 +124,7 @@ class StepNumbers(RowNumbers):
         tangent = tangent_face d_rho[face] + tangent_curve . (W' d_p) + tangent_rhs   rad
         stretch = spacing rows d_c + spacing_rhs                   m
         d_p[0]  = base_displacement, base_axes (d_p[1] - d_p[0]) = base_rhs            m
-        clearance rows
+        first and last leg of the control polygon; clearance rows
 
     Attributes
     ----------

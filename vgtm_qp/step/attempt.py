@@ -191,12 +191,12 @@ class Attempt:
             if flaw:
                 return blocked(flaw, solver_failed=True)
             q, closed = move.closed.q, move.closed
+            # The linear rows leave a little between the curve's end and the tip.
+            vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
             if tracking is not None:
-                gap = tracking.greatest(q, move.vertices, move.torsion, target.base)
+                gap = tracking.greatest(q, vertices, move.torsion, target.base)
                 if not gap <= self.accuracy.tracking:
                     continue
-            # What the linear rows leave between the curve's end and the tip.
-            vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
             report, after = separation.proof(state, q, target.time, short)
             phases.add("acceptance")
             if after is None:

@@ -18,7 +18,7 @@ from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.elimination import member_lengths
 from vgtm_qp.qp.long.sparse_symbols import dense_function, nonzeros, sparsity_of
-from vgtm_qp.qp.numbers import StepNumbers
+from vgtm_qp.qp.numbers import Legs, StepNumbers
 from vgtm_qp.rows import tracking
 from vgtm_qp.rows.curve import free_basis
 
@@ -153,6 +153,10 @@ class ChainData:
         rhs = -np.concatenate([self.part["gap"].reshape(-1, 3)[k], self.part["tilt"].reshape(-1, 2)[k]])
         kept = np.flatnonzero([gaps] * 3 + [tilts] * 2)
         return EndRows(nodes, coefficients[kept], curve[kept], rhs[kept])
+
+    def leg_rows(self, legs: Legs) -> Array:
+        """Return (G, 3V - 5) the rows of the legs of the control polygon over the curve's free coordinates."""
+        return legs.over_vertices(self._chain.layout) @ self._free
 
     def polygon_terms(self) -> tuple[Array, Array]:
         """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the vertices alone."""

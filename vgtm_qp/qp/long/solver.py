@@ -69,7 +69,8 @@ class ChainSolver(ABC):
         if not numbers.progress_curvature > 0.0:
             raise SolverError(SINGULAR)
         data = self.data
-        table = RowTable(self.layout, numbers, self.chain.locked, data.member_rows, data.end_rows())
+        of_curve = data.end_rows(), data.leg_rows(numbers.legs)
+        table = RowTable(self.layout, numbers, self.chain.locked, data.member_rows, *of_curve)
         scale = 1.0 / np.sqrt(numbers.progress_curvature)
         progress = 0.0
 

@@ -39,7 +39,7 @@ Moved = Callable[[Index], Array]
 
 
 class RowTable:
-    """All rows with bounds of one QP: tip, locked members, curve's end, progress, actuators, clearance, in this order.
+    """All rows with bounds: tip, locked members, curve's end, progress, legs, actuators, clearance; in this order.
 
     Attributes
     ----------
@@ -52,23 +52,33 @@ class RowTable:
     """
 
     def __init__(
-        self, layout: Layout, numbers: RowNumbers, locked: Index, member_rows: MemberRows, end: EndRows
+        self,
+        layout: Layout,
+        numbers: RowNumbers,
+        locked: Index,
+        member_rows: MemberRows,
+        end: EndRows,
+        legs: Array,
     ) -> None:
         self.numbers, self._arm, self._member_rows, self._end = numbers, layout.arm, member_rows, end
+        self._legs = legs
         self._tip, near, held = len(numbers.tip_rhs), len(numbers.clearance), np.zeros(len(locked))
         self.locked = slice(self._tip, self._tip + len(locked))
         self.equal = self.locked.stop + len(end.rhs)
         self.end = slice(self.locked.stop, self.equal)
-        self.actuators = slice(self.equal + 1, self.equal + 1 + len(numbers.lower))
+        self.legs = slice(self.equal + 1, self.equal + 1 + len(legs))
+        self.actuators = slice(self.legs.stop, self.legs.stop + len(numbers.lower))
         self.clearance = slice(self.actuators.stop, self.actuators.stop + near)
         known, lower, free = (
             [numbers.tip_rhs, held, end.rhs],
             numbers.clearance.lower,
             np.full(near, UNBOUNDED),
         )
-        self.lower = np.concatenate([*known, [numbers.progress_lower], numbers.lower, lower])
-        self.upper = np.concatenate([*known, [numbers.progress_upper], numbers.upper, free])
-        self._members = np.concatenate([locked, np.full(len(end.rhs) + 1, -1), layout.arm.actuators])
+        least, any_length = numbers.legs.lower, np.full(len(legs), UNBOUNDED)
+        self.lower = np.concatenate([*known, [numbers.progress_lower], least, numbers.lower, lower])
+        self.upper = np.concatenate([*known, [numbers.progress_upper], any_length, numbers.upper, free])
+        none = np.full(len(end.rhs) + 1 + len(legs), -1)
+        self._members = np.concatenate([locked, none, layout.arm.actuators])
 
     def values(self, moved: Moved, strokes: Array, held: Array, curve: Array, progress: float) -> Array:
         """Return (total,) row values at displacements of the nodes.
@@ -81,7 +91,8 @@ class RowTable:
         near, end = np.einsum("rsc,rsc->r", clearance.coefficients, moved(clearance.nodes)), self._end.rhs
         if len(end):
             end = np.tensordot(self._end.coefficients, moved(self._end.nodes), 2) + self._end.curve @ curve
-        return np.concatenate([tip - numbers.tip_rate * progress, held, end, [progress], strokes, near])
+        legs = self._legs @ curve
+        return np.concatenate([tip - numbers.tip_rate * progress, held, end, [progress], legs, strokes, near])
 
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array, Array]:
         """Return nodes (R, Q) of rows and what they have over them, (R, Q, 3), zero where spare.
@@ -101,7 +112,11 @@ class RowTable:
             which = rows[at_end] - self.end.start
             parts.append((at_end, self._end.nodes[None], self._end.coefficients[which]))
             curve[at_end] = self._end.curve[which]
-        is_member = ((rows >= self._tip) & (rows < self.end.start)) | ((rows > self.equal) & ~is_near)
+        at_legs = np.flatnonzero((rows >= self.legs.start) & (rows < self.legs.stop))
+        curve[at_legs] = self._legs[rows[at_legs] - self.legs.start]
+        is_member = ((rows >= self._tip) & (rows < self.end.start)) | (
+            (rows >= self.actuators.start) & ~is_near
+        )
         at_members = np.flatnonzero(is_member)
         if len(at_members):
             parts.append((at_members, *self._member_rows(self._members[rows[at_members] - self._tip])))
@@ -117,8 +132,8 @@ class RowTable:
         return nodes, coefficients, curve, progress
 
     def curve_forces(self, multipliers: Array) -> Array:
-        """Return (3V - 5,) the multipliers (total,) of the curve's end times its rows over the curve."""
-        return np.asarray(multipliers[self.end] @ self._end.curve)
+        """Return (3V - 5,) the multipliers (total,) of the curve's end and legs times their rows over the curve."""
+        return np.asarray(multipliers[self.end] @ self._end.curve + multipliers[self.legs] @ self._legs)
 
     def nodal_forces(self, multipliers: Array) -> Array:
         """Return (N, 3) the multipliers (total,) of tip, curve's end and clearance times their coefficients."""
