@@ -121,7 +121,10 @@ class Layout:
 
     @cached_property
     def hard_gaps(self) -> Mask:
-        """(K, 3) which gaps are equalities: with hard tracking all, and always that of the curve's end, eq. (34)."""
+        """(K, 3) which gaps are equalities: with hard tracking all, and always that of the curve's end.
+
+        The curve ends in the end effector, eq. (34), as it begins at the base.
+        """
         hard = np.full((len(self.tracked), 3), self.hard_tracking)
         hard[-1:] |= self.ends_at_tip
         return hard

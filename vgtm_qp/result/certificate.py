@@ -117,7 +117,7 @@ class Certificate:
     tip_singular_value: Measure
     tip_error_per_millimetre: Measure
     tracking_gap: Measure = Measure(None, "m")
-    states_off_curve: Measure = Measure(None, "of all states")
+    states_off_curve: Measure = Measure(None, "of the states")
     curve_end_gap: Measure = Measure(None, "m")
     curve_end_angle: Measure = Measure(None, "rad")
     contradictions: tuple[str, ...] = ()

@@ -127,7 +127,7 @@ def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
             "most",
             f"row {row}, station {k + 1}",
         ),
-        "states_off_curve": Measure(float(np.mean(moved.max(axis=1) > TRACKING_TOLERANCE)), "of all states"),
+        "states_off_curve": Measure(float(np.mean(moved.max(axis=1) > TRACKING_TOLERANCE)), "of the states"),
     }
     ends = {
         "curve_end_gap": ("ends_at_tip", off[:, -1], "m", TRACKING_TOLERANCE),
