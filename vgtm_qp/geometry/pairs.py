@@ -10,7 +10,7 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.bodies import Bodies
 
-_COLUMNS = ("distance", "normal", "points", "weights", "is_self", "normal_speed", "body", "other")
+_COLUMNS = ("distance", "normal", "points", "weights", "is_self", "normal_speed", "body", "other", "by_fcl")
 
 
 class Pair(NamedTuple):
@@ -58,6 +58,8 @@ class Contacts:
         Velocity of the obstacle along `normal`, m/s.
     body, other : (R,) int
         `other` is a piece of an obstacle or, where ``is_self``, a body.
+    by_fcl : (R,) bool
+        Whether FCL supplied the row; a closed form did otherwise.
     names : PairNames
         What :meth:`name` reads.
     """
@@ -70,6 +72,7 @@ class Contacts:
     normal_speed: Array
     body: Index
     other: Index
+    by_fcl: Mask
     names: PairNames
 
     def __len__(self) -> int:
