@@ -1,13 +1,14 @@
 """Distances and nearest points by python-fcl, for many pairs at once; nothing here checks its answers.
 
 FCL's distance from a capsule to a box is always too large, and for bodies parallel to edges on round coordinates too
-large by up to a metre (FCL issue 508). So a body is asked about as a capsule of radius zero, and whoever asks proves each
-answer. Of an axis that touches the other, FCL knows no more than that: its penetration depth is not the least one, and
-its signed distance, which is never asked for, can end the process.
+large by up to a metre (FCL issue 508). So a body is asked about as a capsule of radius zero, and each answer has to be
+proven by whoever asks. Of an axis that touches the other, FCL knows no more than that: its penetration depth is not the
+least one, and its signed distance, which is never asked for, can end the process.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import inf, sqrt
 from typing import Any
 
@@ -24,7 +25,7 @@ APART = 1e-3
 """Between an axis and a surface that are nearer than this the normal is mostly rounding: FCL is not asked, m."""
 
 _UNITS = 1e5
-"""FCL's units in a metre. It ends its iterations at 1e-6 units: of a metre, that is too much for the normal at a rim."""
+"""FCL's units in a metre. Its iterations end at 1e-6 units: in metres, that would turn normals at a rim by 1e-3 rad."""
 
 _TRIANGLE = np.array([3, 0, 1, 2, 3, 0, 2, 1])
 """Both sides of a triangle as faces: FCL has no distance to its own triangles, but to a convex set of three points."""
@@ -84,6 +85,7 @@ class FclQueries:
         self.asked += len(pairs)
         ends, body = _UNITS * pairs[:, :12], self._body
         middles, spans = _axes(ends[:, :3], ends[:, 3:6])
+        others: Iterable[fcl.CollisionObject]
         if pieces is None:
             others = map(self._other.placed, *_axes(ends[:, 6:9], ends[:, 9:]))
         else:

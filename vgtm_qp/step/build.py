@@ -65,7 +65,8 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "influence": clearance.influence,
     }
     engine = make_engine(solver, home.layout, kinematics, task, compiled=compiled)
-    monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
+    by_fcl = clearance.distance == "fcl"
+    monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, by_fcl=by_fcl, **options)
     finish_compiling()
     return Setup(
         arm=arm,
@@ -88,7 +89,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         base_motion=base_motion(spec.base_motion) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
-        measure=None if clearance.self_collision else Clearance(arm.bodies, **options),
+        measure=None if clearance.self_collision else Clearance(arm.bodies, by_fcl=False, **options),
     )
 
 
