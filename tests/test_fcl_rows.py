@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 import vgtm_qp as vq
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
-from vgtm_qp.geometry.fcl_queries import APART, PROOF, FclQueries
+from vgtm_qp.geometry.exact import NORMAL_FROM, PROOF
+from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.shapes import box, cylinder, mesh, sphere
 from vgtm_qp.result.certificate import Certificate
 
@@ -81,7 +82,7 @@ def test_every_row_agrees_with_the_closed_form_and_with_finite_differences(seed,
         # Of a body inside a closed mesh there is one row, which leads out, in the place of all others.
         assert monitor.fcl.asked == len(found)
         assert monitor.fcl.refused == np.count_nonzero(~found.by_fcl)
-    touching = exact.distance + np.where(exact.is_self, 2.0, 1.0) * RADIUS <= APART
+    touching = exact.distance + np.where(exact.is_self, 2.0, 1.0) * RADIUS <= NORMAL_FROM
     assert not (found.by_fcl & touching).any()
     # FCL errs at bodies parallel to edges on round coordinates; elsewhere it has an answer to everything.
     assert round_numbers or found.by_fcl[~touching].all()

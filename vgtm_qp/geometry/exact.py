@@ -25,6 +25,12 @@ CONTACT = 9
 NORMAL = slice(5, 8)
 """Which of them are its normal."""
 
+PROOF = 1e-6
+"""An answer of FCL holds if its flaw is no greater, m."""
+
+NORMAL_FROM = 1e-3
+"""Of an axis that is nearer than this to the other, or touches it, the normal would be mostly rounding, m."""
+
 SECOND_CONTACT = 0.2
 """Two contacts of a body with one piece are apart by at least this fraction of the body's length."""
 
@@ -77,17 +83,16 @@ def _weights(shape: str, t: Any, s: Any) -> Any:
 def proof_function(shape: str) -> ca.Function:
     """Return the contact that an answer of FCL about a pair means, and by how much that is not proven.
 
-    Inputs ``pair``, of a body or a part of one; ``part (2,)``, where on the body that part begins and ends, 0 to 1; and
-    ``answer (7,)``: a distance d, a point of the part and one of the other. Output ``contact (9,)``, whose last
-    number is the flaw, m; NaN where a number is not finite or the two points coincide.
+    Inputs ``pair``, whose body may be a point, and ``answer (7,)``: a distance d, a point of the body and one of the
+    other. Output ``contact (9,)``, whose last number is the flaw, m; NaN where a number is not finite or the two
+    points coincide.
 
-    With x the point of the part nearest to the answer's, y the other point, and n = (x - y) / |x - y|, no point of the
-    part is nearer to the other than the gap g between their supporting planes along n, nor are x and y further apart
-    than the two are. The flaw is |d - g| + | |x - y| - d |, how far the answer's point is from x, and y from
-    the other. The distance of the contact is g.
+    With x the point of the body nearest to the answer's, y the other point, and n = (x - y) / |x - y|: the two are no
+    nearer to each other than the gap g between their supporting planes along n, and no further apart than x and y. The
+    flaw is |d - g| + ||x - y| - d|, and how far the answer's point is from x, and y from the other; or ``FAR``
+    where g is not greater than `NORMAL_FROM`. The contact has the distance g, less the radius.
     """
-    pair = ca.SX.sym("pair", 7 + width(shape))
-    part, answer = ca.SX.sym("part", 2), ca.SX.sym("answer", 7)
+    pair, answer = ca.SX.sym("pair", 7 + width(shape)), ca.SX.sym("answer", 7)
     body, other, claimed, y = pair[:6], pair[6:-1], answer[0], answer[4:]
     t, off = _projected(answer[1:4], body)
     away = (1.0 - t) * body[:3] + t * body[3:] - y
@@ -99,14 +104,10 @@ def proof_function(shape: str) -> ca.Function:
         s, stray = 0.0, ca.fmax(APART[shape](ca.vertcat(y, y), other)[0].distance, 0.0)
     gap = ca.fmin(ca.dot(normal, body[:3]), ca.dot(normal, body[3:])) - _support(shape, other, normal)
     flaw = ca.fabs(claimed - gap) + ca.fabs(apart - claimed) + off + stray
-    weights = _weights(shape, part[0] + t * (part[1] - part[0]), s)
-    contact = ca.vertcat(gap - pair[-1], weights, normal, flaw)
+    flaw = ca.if_else(gap > NORMAL_FROM, flaw, FAR)
+    contact = ca.cse(ca.vertcat(gap - pair[-1], _weights(shape, t, s), normal, flaw))
     return ca.Function(
-        f"proof_{shape}",
-        [pair, part, answer],
-        [ca.cse(ca.densify(contact))],
-        ["pair", "part", "answer"],
-        ["contact"],
+        f"proof_{shape}", [pair, answer], [ca.densify(contact)], ["pair", "answer"], ["contact"]
     )
 
 

@@ -18,12 +18,6 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.shapes import ObstaclePieces
 
-PROOF = 1e-6
-"""An answer holds if it is proven to so much, m."""
-
-APART = 1e-3
-"""Between an axis and a surface that are nearer than this the normal is mostly rounding: FCL is not asked, m."""
-
 _UNITS = 1e5
 """FCL's units in a metre. Its iterations end at 1e-6 units: in metres, that would turn normals at a rim by 1e-3 rad."""
 

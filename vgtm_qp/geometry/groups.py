@@ -14,13 +14,14 @@ from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.exact import (
     CONTACT,
     NORMAL,
+    PROOF,
     distance_function,
     follow_function,
     proof_function,
     sweep_function,
     width,
 )
-from vgtm_qp.geometry.fcl_queries import APART, PROOF, FclQueries
+from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.pairs import Contacts, PairNames
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 
@@ -259,17 +260,16 @@ class Group:
         numbers, fcl = self.numbers.take(rows, axis=0), self.scene.fcl
         if fcl is None or not by_fcl or not len(rows):
             return numbers, found
-        pairs, part, alone = self.at(X, time, rows), np.zeros((len(rows), 2)), found[:, -1] > 0.0
-        part[:, 1] = 1.0
-        if not alone.all():
-            t = found[~alone, 2, None]
-            part[~alone] = t
-            pairs[~alone, :6] = np.tile((1.0 - t) * pairs[~alone, :3] + t * pairs[~alone, 3:6], 2)
+        pairs, of_two = self.at(X, time, rows), (found[:, -1] == 0.0).nonzero()[0]
+        if len(of_two):
+            ends, t = pairs[of_two, :6], found[of_two, 2, None]
+            pairs[of_two, :6] = np.tile((1.0 - t) * ends[:, :3] + t * ends[:, 3:], 2)
         answers = fcl.answers(pairs, None if self.is_self else numbers[:, 5].tolist(), time)
-        proven = self.scene.batch(proof_function, self.shape)(pairs, part, answers)
-        # NaN fails the comparisons.
-        holds = (proven[:, -1] <= PROOF) & (proven[:, 0] > APART - pairs[:, -1])
-        numbers[:, -1] = holds
+        proven = self.scene.batch(proof_function, self.shape)(pairs, answers)
+        proven[of_two, 1:3] = found[of_two, 1:3]
+        # NaN fails the comparison.
+        holds = proven[:, -1] <= PROOF
         fcl.refused += len(rows) - int(np.count_nonzero(holds))
         np.copyto(found[:, :-1], proven[:, :-1], where=holds[:, None])
+        numbers[:, -1] = holds
         return numbers, found
