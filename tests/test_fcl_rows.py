@@ -310,6 +310,22 @@ def test_step_certificate_and_summary_say_who_supplied_the_rows(maneuvers):
     np.testing.assert_allclose(fcl.nodes, exact.nodes, atol=1e-6)
 
 
+def test_between_cylinders_the_states_are_those_of_closed_forms_to_what_fcl_leaves_of_a_normal(problem):
+    data = problem.to_dict()
+    for obstacle in data["obstacle"]:
+        obstacle |= {"shape": "cylinder", "radius": 0.45, "height": 0.8}
+        del obstacle["size"]
+    found = []
+    for name in ("fcl", "exact"):
+        data["clearance"]["distance"] = name
+        maneuver = vq.solve(vq.Problem.from_dict(data))
+        assert maneuver.certificate.ok
+        assert maneuver.manifest["clearance_rows"][name] > 20
+        found.append(maneuver)
+    assert found[0].manifest["clearance_rows"]["exact"] == 0
+    np.testing.assert_allclose(found[0].nodes, found[1].nodes, atol=1e-4)
+
+
 def test_every_row_of_a_step_is_proven_and_lies_change_no_step(problem, monkeypatch):
     goal = np.array([0.9, 0.0, 3.6])
     honest, lied, exact = (
