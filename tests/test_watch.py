@@ -162,11 +162,12 @@ def compare(first, second, X, **reach):
     """Compare the contacts that two monitors find; return how many they are."""
     found = [monitor.near(X, **reach, tracked=True) for monitor in (first, second)]
     orders = [np.lexsort((c.weights[:, 1], c.other, c.body, c.is_self)) for c in found]
-    first, second = (c.select(order) for c, order in zip(found, orders, strict=True))
-    assert [first.name(k) for k in range(len(first))] == [second.name(k) for k in range(len(second))]
-    for column in ("distance", "normal", "points", "weights", "normal_speed"):
-        np.testing.assert_allclose(getattr(first, column), getattr(second, column), atol=1e-9)
-    return len(first)
+    names = [[c.name(k) for k in order.tolist()] for c, order in zip(found, orders, strict=True)]
+    assert names[0] == names[1]
+    for column in ("distance", "normal", "points", "weights", "normal_speed", "by_fcl"):
+        first, second = (getattr(c, column)[order] for c, order in zip(found, orders, strict=True))
+        np.testing.assert_allclose(first, second, atol=1e-9)
+    return len(names[0])
 
 
 def test_contacts_are_the_same_whichever_way_they_are_found():

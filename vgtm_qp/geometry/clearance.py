@@ -20,7 +20,6 @@ from vgtm_qp.geometry.watch import Watch, can_be_watched
 
 __all__ = ["BetweenReport", "Clearance", "Contacts", "Pair"]
 
-
 _AMONG = {"all": (False, True), "obstacles": (False,), "members": (True,)}
 
 
@@ -58,7 +57,7 @@ class Clearance:
         watch: bool = True,
         by_fcl: bool = True,
     ) -> None:
-        self.scene = Scene(bodies, obstacles, has_self=self_collision, by_fcl=by_fcl)
+        self.scene = Scene(bodies, obstacles, self_collision, by_fcl)
         self.bodies, self.obstacles, self.self_collision = bodies, self.scene.obstacles, self_collision
         self.pieces, self.names, self.fcl = self.scene.pieces, self.scene.names, self.scene.fcl
         self.safe, self.influence = safe, influence
@@ -129,9 +128,8 @@ class Clearance:
         """Return the nearest of the contacts alike in body, mesh, normal and place on the body."""
         order = np.argsort(found[:, 0], kind="stable")
         bodies, meshes = group.body[rows], self.pieces.obstacle[group.other[rows]]
-        like = np.column_stack(
-            [bodies, meshes, np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2])]
-        )
+        normal, place = np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2])
+        like = np.column_stack([bodies, meshes, normal, place])
         return order[np.sort(np.unique(like[order], axis=0, return_index=True)[1])]
 
     def least(self, X: Array, time: float = 0.0, *, among: str = "all") -> tuple[float, Pair | None]:

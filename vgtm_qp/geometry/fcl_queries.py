@@ -8,7 +8,7 @@ least one, and its signed distance, which is never asked for, can end the proces
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from itertools import repeat
 from math import inf, sqrt
 from typing import Any
 
@@ -79,11 +79,10 @@ class FclQueries:
         self.asked += len(pairs)
         ends, body = _UNITS * pairs[:, :12], self._body
         middles, spans = _axes(ends[:, :3], ends[:, 3:6])
-        others: Iterable[fcl.CollisionObject]
         if pieces is None:
             others = map(self._other.placed, *_axes(ends[:, 6:9], ends[:, 9:]))
         else:
-            others = (self._piece(piece, time) for piece in pieces)
+            others = map(self._piece, pieces, repeat(time))
         found, request, result, ask = list[float](), self._request, self._result, fcl.distance
         for middle, span, other in zip(middles, spans, others, strict=True):
             # What FCL does not overwrite is no answer.

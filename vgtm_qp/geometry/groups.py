@@ -37,7 +37,9 @@ _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0,
 _WATCHED = ((follow_function, (1, 128)), (distance_function, (1,)), (sweep_function, (1,)))
 """What is evaluated in a watched scene, and for how many pairs at once,"""
 _LISTED = ((distance_function, (1, 64, 1024)), (sweep_function, (1, 64)))
-"""and in any other."""
+"""and in any other,"""
+_PROVEN = ((proof_function, (1,)),)
+"""and what FCL answers."""
 
 
 class Scene:
@@ -53,9 +55,7 @@ class Scene:
         No rows.
     """
 
-    def __init__(
-        self, bodies: Bodies, obstacles: Sequence[Obstacle], *, has_self: bool, by_fcl: bool = True
-    ) -> None:
+    def __init__(self, bodies: Bodies, obstacles: Sequence[Obstacle], has_self: bool, by_fcl: bool) -> None:
         self.bodies, self.obstacles, self.has_self = bodies, tuple(obstacles), has_self
         self.pieces = ObstaclePieces(self.obstacles)
         names = tuple(obstacle.name for obstacle in self.obstacles)
@@ -67,8 +67,7 @@ class Scene:
     def prepare(self, *, watched: bool) -> None:
         """Begin to compile what steps need: for a scene that is watched, and else for few and for many pairs."""
         shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
-        proof = ((proof_function, (1,)),) if self.fcl is not None else ()
-        for make, counts in (*(_WATCHED if watched else _LISTED), *proof):
+        for make, counts in (*(_WATCHED if watched else _LISTED), *(_PROVEN if self.fcl else ())):
             for shape in shapes:
                 for count in counts:
                     # A watch rarely needs this: only for a motion that it cannot prove itself.
@@ -166,8 +165,8 @@ class Group:
         other_ends = bodies.points[other] if self.is_self else ends
         if self.is_self:
             self.radius = self.radius + bodies.radius[other]
-        flags = np.tile((int(self.is_self), 0), (len(body), 1))
-        self.numbers = np.column_stack([ends, other_ends, body, other, flags])
+        self.numbers = np.pad(np.column_stack([ends, other_ends, body, other]), ((0, 0), (0, 2)))
+        self.numbers[:, 6] = self.is_self
         self.points, self.body, self.other = self.numbers[:, :4], self.numbers[:, 4], self.numbers[:, 5]
 
     def __len__(self) -> int:
@@ -217,9 +216,8 @@ class Group:
     def at(self, X: Array, time: float, rows: Index) -> Array:
         """Return some pairs as the functions of :mod:`vgtm_qp.geometry.exact` take them, (k, 7 + width)."""
         numbers = self.numbers.take(rows, axis=0)
-        ends = X.take(numbers[:, :4], axis=0).reshape(-1, 12)
         pairs = np.empty((len(rows), 7 + width(self.shape)))
-        pairs[:, :12], pairs[:, -1] = ends, self.radius.take(rows)
+        pairs[:, :12], pairs[:, -1] = X.take(numbers[:, :4], axis=0).reshape(-1, 12), self.radius.take(rows)
         if not self.is_self:
             pairs[:, 6:-1] = self.scene.pieces.at(time).take(numbers[:, 5], axis=0)
         return pairs

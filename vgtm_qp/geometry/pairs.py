@@ -10,8 +10,6 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.bodies import Bodies
 
-_COLUMNS = ("distance", "normal", "points", "weights", "is_self", "normal_speed", "body", "other", "by_fcl")
-
 
 class Pair(NamedTuple):
     """A body and a piece of an obstacle, or another body."""
@@ -85,10 +83,6 @@ class Contacts:
     def pair(self, k: int) -> Pair:
         """Return which pair row `k` is about."""
         return Pair(int(self.body[k]), int(self.other[k]), bool(self.is_self[k]))
-
-    def select(self, rows: Index | Mask) -> Contacts:
-        """Return some of the rows."""
-        return Contacts(**{column: getattr(self, column)[rows] for column in _COLUMNS}, names=self.names)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,9 +87,8 @@ class _WatchedGroup:
     def near(self, X: Array, limit: float, by_fcl: bool) -> Found:
         """Return the contacts nearer than `limit`, m, in the present state `X`."""
         rows = (self.contacts[:, 0] < limit).nonzero()[0]
-        return self.group.contacts(
-            X, 0.0, self._near.take(rows >> 1), self.contacts.take(rows, axis=0), by_fcl
-        )
+        found, pairs = self.contacts.take(rows, axis=0), self._near.take(rows >> 1)
+        return self.group.contacts(X, 0.0, pairs, found, by_fcl)
 
 
 class Watch:

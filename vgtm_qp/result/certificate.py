@@ -90,8 +90,8 @@ class Certificate:
     tip_error_per_millimetre : Measure
         Greatest singular value of the same: mm at the tip for actuator errors whose squares sum to 1 mm^2.
     fcl_rows, exact_rows : Measure
-        How many clearance rows the solver had of FCL, and how many of closed forms, as it reports itself: that of all
-        numbers here cannot be found from the states.
+        How many clearance rows the solver had of FCL, and how many of closed forms: its own count, which the states
+        cannot show.
     contradictions, notes : tuple of str
         What in the file disagrees with itself or with its problem, and what could not be checked, one line each.
     """

@@ -63,10 +63,10 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
         "safe": clearance.safe,
         "influence": clearance.influence,
+        "by_fcl": clearance.distance == "fcl",
     }
     engine = make_engine(solver, home.layout, kinematics, task, compiled=compiled)
-    by_fcl = clearance.distance == "fcl"
-    monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, by_fcl=by_fcl, **options)
+    monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
     return Setup(
         arm=arm,
@@ -89,7 +89,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         base_motion=base_motion(spec.base_motion) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
         jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
-        measure=None if clearance.self_collision else Clearance(arm.bodies, by_fcl=False, **options),
+        measure=None if clearance.self_collision else Clearance(arm.bodies, **options),
     )
 
 
