@@ -22,12 +22,15 @@ class ClearanceRows:
     ``nodes`` (R, 4) are node indices: the two ends of the member, then those of the other member in a self pair
     (repeated with zero coefficients otherwise); with offset joints (R, 12), the triangles of those four ends.
     ``coefficients`` is (R, 4, 3) or (R, 12, 3). Base nodes may occur; their displacement is already part of ``lower``.
+    So many of the rows were supplied ``by_fcl``, and so many ``by_formula``; the others are of angles.
     """
 
     nodes: Index = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))
     coefficients: Array = field(default_factory=lambda: np.zeros((0, 4, 3)))
     lower: Array = field(default_factory=lambda: np.zeros(0))
     name: Callable[[int], str] = str
+    by_fcl: int = 0
+    by_formula: int = 0
 
     def __len__(self) -> int:
         return len(self.lower)
@@ -56,6 +59,8 @@ class ClearanceRows:
             np.concatenate([rows.coefficients for rows in parts]),
             np.concatenate([self.lower, other.lower]),
             lambda k: first(k) if k < count else second(k - count),
+            self.by_fcl + other.by_fcl,
+            self.by_formula + other.by_formula,
         )
 
 

@@ -95,6 +95,9 @@ class Certificate:
     curve_end_gap, curve_end_angle : Measure
         Greatest distance of the curve's end from the end effector, m, and angle between their directions, rad, where
         the method ties them.
+    fcl_rows, exact_rows : Measure
+        How many clearance rows the solver had of FCL, and how many of closed forms: its own count, which the states
+        cannot show.
     contradictions, notes : tuple of str
         What in the file disagrees with itself or with its problem, and what could not be checked, one line each.
     """
@@ -120,6 +123,8 @@ class Certificate:
     states_off_curve: Measure = Measure(None, "of the states")
     curve_end_gap: Measure = Measure(None, "m")
     curve_end_angle: Measure = Measure(None, "rad")
+    fcl_rows: Measure = Measure(None, "")
+    exact_rows: Measure = Measure(None, "")
     contradictions: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -152,7 +157,7 @@ class Certificate:
                 f.name: tuple(data[f.name]) if f.name in texts else Measure(**data[f.name])
                 for f in fields(cls)
                 # Files of earlier versions lack what has a default.
-                if f.name in data or f.default is MISSING
+                if f.name in data or f.default is MISSING or f.name in texts
             }
             return cls(**values)
         except (KeyError, TypeError) as error:

@@ -67,6 +67,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
         "safe": clearance.safe,
         "influence": clearance.influence,
+        "by_fcl": clearance.distance == "fcl",
     }
     engine = make_engine(solver, home.layout, kinematics, task, compiled=compiled)
     gives_way = home.layout.hard_tracking and problem.method.tracking_mode == "exact"

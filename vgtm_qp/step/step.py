@@ -110,6 +110,16 @@ class Step:
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     @property
+    def fcl_rows(self) -> int:
+        """How many clearance rows of that QP FCL supplied, each proven."""
+        return 0 if self.rows is None else self.rows.by_fcl
+
+    @property
+    def exact_rows(self) -> int:
+        """How many of them are by closed forms: FCL was not to be asked, its answer was refused, or an axis touched."""
+        return 0 if self.rows is None else self.rows.by_formula
+
+    @property
     def failed_qp(self) -> StepQP | None:
         """The last QP, where the step was blocked because it had no answer: every row and column with a name."""
         return None if self.failure is None else self.failure.qp

@@ -88,6 +88,7 @@ def verify(maneuver: Result) -> Certificate:
     if maneuver.joints is None:
         differences["member_lengths"] = np.abs(maneuver.member_lengths - arm.quantities(motion.states))
     furthest = max(differences, key=lambda name: float(np.max(differences[name], initial=0.0)))
+    reported = maneuver.manifest.get("clearance_rows") or {}
     return Certificate(
         **_limits(maneuver, arm, arm.quantities(motion.states)),
         **clearances,
@@ -101,6 +102,8 @@ def verify(maneuver: Result) -> Certificate:
         tip_singular_value=_least_of(values[:, 1], "m/m"),
         **curve_measures(maneuver, rotation),
         tip_error_per_millimetre=_worst(values[:, 2] if len(values) else None, "mm", None),
+        fcl_rows=Measure(reported.get("fcl"), ""),
+        exact_rows=Measure(reported.get("exact"), ""),
         contradictions=(
             *wrong,
             *astray,
