@@ -91,12 +91,12 @@ BASELINES: dict[BaselineName, Baseline] = {
     "eq28-sparse": Baseline(
         "eq. (28), banded",
         1000,
-        partial(ResolverStep, name="pseudoinverse", algebra="sparse", tracking="none", hard_tracking=False),
+        partial(ResolverStep, name="pseudoinverse", algebra="sparse", tracking="none"),
     ),
     "curve": Baseline(
         "curve by pseudoinverse, bays after it",
         1000,
-        partial(ResolverStep, name="curve-pseudoinverse", tracking="recursive", hard_tracking=False),
+        partial(ResolverStep, name="curve-pseudoinverse", tracking="recursive"),
     ),
     "ipopt": Baseline("one nonlinear program a step, IPOPT", 20, NonlinearStep),
     "osqp": Baseline("the same QPs, sparse, OSQP", 200, partial(ResolverStep, solver="osqp")),

@@ -37,7 +37,7 @@ _CURVE_OBSTACLES = {
 
 _CHANGES: dict[str, dict[str, Any]] = {
     "qp": {"method.name": "qp", "method.tracking": "coupled"},
-    "qp-none": {"method.name": "qp", "method.tracking": "none", "method.hard_tracking": False},
+    "qp-none": {"method.name": "qp", "method.tracking": "none"},
     "qp-recursive": {"method.name": "qp", "method.tracking": "recursive"},
     "qp-parallel": {"method.name": "qp", "method.tracking": "parallel"},
     "pseudoinverse": _DENSE,

@@ -149,7 +149,7 @@ def arm_without_curve(problem: Problem) -> Setup:
         The arm cannot be built.
     """
     # The solver is never called; this one compiles no kernels.
-    changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
+    changes = {"method.tracking": "none", "method.tracking_mode": "elastic", "method.solver": "piqp"}
     return build_arm(problem.replace(changes))
 
 

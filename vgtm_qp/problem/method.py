@@ -93,14 +93,16 @@ class Method(Table, called="[method]"):
         default="coupled",
         description="truss and curve together; curve first, then bay after bay or all bays at once; no curve",
     )
-    hard_tracking: Flag = Field(
-        default=False, description="whether faces stay on the curve exactly; elastic otherwise"
+    tracking_mode: Literal["exact", "hard", "elastic"] = Field(
+        default="exact",
+        description="exact: faces are on the curve wherever they can be, and the gap says where not; hard: always, or "
+        "the arm stops; elastic: as near as the weights tracking and tangent draw them",
     )
     hard_coordinates: tuple[HardCoordinate, ...] = Field(
         default=("position",),
         min_length=1,
-        description="what of each face hard_tracking keeps on the curve: position; position and pointing; or "
-        "position, pointing and orientation, as far as the bays of the module have the motions",
+        description="what of each face is kept on the curve unless tracking is elastic: position; position and "
+        "pointing; or position, pointing and orientation, as far as the bays of the module have the motions",
     )
     solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
     retries: Flag = Field(
@@ -148,16 +150,17 @@ class Method(Table, called="[method]"):
     @property
     def holds_curve(self) -> bool:
         """Whether stations are kept on the curve by equalities."""
-        return self.hard_tracking or self.goes_by_bays
+        is_held = self.tracking == "coupled" and self.tracking_mode != "elastic"
+        return self.goes_by_bays or (self.name == "qp" and is_held)
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
-        if self.hard_tracking and self.tracking == "none":
-            yield ("hard_tracking",), 'false, since tracking is "none"'
+        if self.tracking_mode == "hard" and self.tracking == "none":
+            yield ("tracking_mode",), '"exact" or "elastic", since tracking is "none"'
+        if self.goes_by_bays and self.tracking_mode == "elastic":
+            yield ("tracking_mode",), f'"exact" or "hard", since tracking is "{self.tracking}"'
         if self.goes_by_bays and self.solver != "daqp":
-            yield (
-                ("solver",),
-                f'"daqp", which solves the QP over the curve where tracking is "{self.tracking}"',
-            )
+            over = f'"daqp", which solves the QP over the curve where tracking is "{self.tracking}"'
+            yield ("solver",), over
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
             yield ("hard_coordinates",), f"the first one, two or three of {quoted(HARD_COORDINATES)}"
         if self.variant == "truncated" and self.algebra == "sparse":
