@@ -55,11 +55,9 @@ def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
     # Where stations gave way and it did not suffice, they are not held from the start; all that follows builds on it.
-    elastic = (
-        {"method.tracking_mode": "elastic"}
-        if problem.method.holds_curve and not problem.method.goes_by_bays
-        else {}
-    )
+    # Bays that follow the curve can do nothing else.
+    held = problem.method.holds_curve and not problem.method.goes_by_bays
+    elastic = {"method.tracking_mode": "elastic"} if held else {}
     if elastic and problem.method.tracking_mode == "exact":
         yield "elastic tracking", problem.replace(elastic)
     for name, changes in _changes(problem, dead_end):
