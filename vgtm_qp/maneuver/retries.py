@@ -64,7 +64,7 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
     vertices = len(dead_end.control_vertices)
     centring, rate = 10.0 * max(weights.stroke_centring, 0.02), 50.0 * max(weights.actuator_rate, 0.02)
     yield "actuators drawn to their home lengths", {"method.weights.stroke_centring": centring}
-    if curve is not None and not curve.control_vertex_goals and vertices >= 4:
+    if not curve.control_vertex_goals and vertices >= 4:
         firm = {"method.weights.tracking": max(weights.tracking, _FIRM_TRACKING)}
         for name, quarter, size in _BULGES:
             bulged = bulge(dead_end, quarter, size)
@@ -78,7 +78,7 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
     # Hard tracking asks for the curve, so there is no retry without it.
     if method.tracking != "none" and not method.hard_tracking:
         yield "no curve", {"method.tracking": "none"}
-    if curve is not None and vertices:
+    if vertices:
         yield "more control vertices", {"curve.control_vertices": curve.control_vertices + _MORE_VERTICES}
 
 

@@ -39,7 +39,7 @@ class CurveMotion:
 
     def __init__(self, problem: Problem, setup: Setup) -> None:
         method, spec, truss = problem.method, problem.curve, setup.truss
-        if spec is None or not len(truss.faces):
+        if not len(truss.faces):
             raise CurveError("this method needs a reference curve and a truss with faces")
         family = setup.layout.family
         assert family is not None, "an arm with faces and a curve is laid out with its family"
