@@ -198,7 +198,7 @@ class ConventionalResolver(MethodResolver):
 
     def __init__(self, problem: Problem) -> None:
         method = problem.method
-        super().__init__(arm_without_curve(problem), method.step_limit)
+        super().__init__(arm_without_curve(problem))
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         self._objective = TrussObjective(names, method.weights, self.setup)
         solution = SparseSolution if method.algebra == "sparse" else DenseSolution

@@ -46,14 +46,13 @@ class MethodResolver(ABC):
 
     draws_vertices = False
 
-    def __init__(self, setup: Setup, step_limit: float | None) -> None:
+    def __init__(self, setup: Setup) -> None:
         self.setup = setup
         self.state: State = setup.home_state()
         self.rank: int | None = None
         self.solver: str | None = None
         self._clock = Phases("kinematics", "solve", "correction", "acceptance")
         self.phases = self._clock.seconds
-        self._limit = step_limit
         self._steps = 0
 
     @property
@@ -133,8 +132,10 @@ class MethodResolver(ABC):
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
         truss, lengths = self.setup.truss, self.setup.arm.home_quantities
+        if too_long := self.setup.too_long(nodes - self.state.nodes):
+            raise SolverError(too_long)
         asked = float(np.linalg.norm(path.at(end).position - path.at(start).position))
-        limit = self._limit or 0.5 * float(lengths.min()) + 3.0 * asked
+        limit = 0.5 * float(lengths.min()) + 3.0 * asked
         moved = float(np.max(np.abs(nodes - self.state.nodes)))
         if not moved <= limit:
             raise SolverError(

@@ -113,7 +113,8 @@ class Method(Table, called="[method]"):
     )
     step_limit: Length | None = Field(
         default=None,
-        description="greatest displacement of a node in one step, m; set from the members where absent",
+        description="greatest displacement of a node in one step, m; longer steps are shortened along the path, or "
+        "refused where the tip stays on time",
     )
     variant: Literal["moore-penrose", "weighted", "damped", "truncated"] = Field(
         default="moore-penrose", description="pseudoinverse of eq. (28)"

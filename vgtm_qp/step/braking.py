@@ -232,7 +232,8 @@ class Brakes:
         if found is None or not report.certified:
             return None
         still = self.shaping.target(state, self.dt, _NOWHERE, 0.0, 1.0, limits)
-        if attempt.acceptance.flaw(closed, state.q, still, None, vertices, state.torsion):
+        flaw = attempt.acceptance.flaw(closed, state.q, still, None, vertices, state.torsion)
+        if flaw or setup.too_long(arm.nodes(closed.q) - state.nodes):
             return None
         return state.next(arm, then, closed, vertices, state.torsion, found)
 

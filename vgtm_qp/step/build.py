@@ -83,6 +83,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         margin=clearance.margin,
         dt=step_duration(problem.maneuver),
         minimum_angle=clearance.minimum_angle,
+        step_limit=problem.method.step_limit or np.inf,
         tip_mode=problem.end_effector.mode,
         base_motion=base_motion(spec.base_motion) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
