@@ -38,7 +38,7 @@ def test_every_arm_keeps_it_and_gets_on(name):
     resolver = vq.Resolver(build_arm(problem, compiled=False))
     free = vq.Resolver(build_arm(problem.replace({"method.step_limit": None}), compiled=False))
     start = resolver.tip()[0]
-    goal = {"position": start + [0.3, 0.05, -0.1]}
+    goal = {"position": start + np.array([0.3, 0.05, -0.1])}
     if name == "five_bay_two_cubes_pointing":
         goal["pointing"] = [0.1, 0.0, 1.0]
     dt = 0.05

@@ -1,8 +1,7 @@
 """Retries after a dead end: the same maneuver once more from home, with the redundancy resolved differently.
 
 A path that is blocked for one shape of the arm may be open for another, and the null-space terms decide which shape it
-takes. The retries stand in the order of their success over random scenes (``vgtm study robustness``; README, section
-Robustness).
+takes. The retries stand in the order of their success over random scenes (``vgtm study robustness``).
 """
 
 from __future__ import annotations
@@ -77,7 +76,7 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
     yield "actuator rates as the metric", {"method.weights.actuator_rate": rate}
     # Hard tracking asks for the curve, so there is no retry without it.
     if method.tracking != "none" and not method.hard_tracking:
-        yield "no curve", {"method.tracking": "none"}
+        yield "no curve", {"method": method.kept_by("qp", "none"), "curve.control_vertex_goals": []}
     if vertices:
         yield "more control vertices", {"curve.control_vertices": curve.control_vertices + _MORE_VERTICES}
 

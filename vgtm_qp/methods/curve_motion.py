@@ -25,7 +25,6 @@ DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 _SAMPLES = 400
 """Pieces of the curve to whose ends nodes are assigned: the nearest point to a few thousandths."""
 _PROGRESS = 1e3
-_MARGIN = 1e-5
 
 
 class CurveMotion:
@@ -168,7 +167,7 @@ class CurveMotion:
         H = np.zeros((size + 1, size + 1))
         H[:size, :size] = objective.hessian
         H[-1, -1] = curvature
-        f, room = np.zeros(size + 1), self._setup.safe + _MARGIN - distance
+        f, room = np.zeros(size + 1), self._setup.safe + self._setup.margin - distance
         bounds = -progress, 0.0
         if progress == 0.0:
             f, bounds = np.append(objective.gradient, -2.0 * curvature), (0.0, 1.0)

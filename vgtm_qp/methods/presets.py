@@ -37,7 +37,7 @@ _CURVE_OBSTACLES = {
 PRESETS: MappingProxyType[str, dict[str, Any]] = MappingProxyType(
     {
         "qp": {"method.name": "qp", "method.tracking": "coupled"},
-        "qp-none": {"method.name": "qp", "method.tracking": "none", "method.hard_tracking": False},
+        "qp-none": {"method.name": "qp", "method.tracking": "none"},
         "qp-recursive": {"method.name": "qp", "method.tracking": "recursive"},
         "qp-parallel": {"method.name": "qp", "method.tracking": "parallel"},
         "pseudoinverse": _DENSE,
@@ -71,7 +71,7 @@ DEFAULT_METHODS = (
 
 
 def with_method(problem: Problem, name: str) -> Problem:
-    """Return the problem with the method called `name`; its own weights, gains and solver stay.
+    """Return the problem with the method called `name`; what that serves of its own weights, gains and keys stays.
 
     Raises
     ------
@@ -81,7 +81,9 @@ def with_method(problem: Problem, name: str) -> Problem:
         The problem contradicts it.
     """
     check_methods([name])
-    return problem.replace(PRESETS[name])
+    changes = PRESETS[name]
+    kept = problem.method.kept_by(changes["method.name"], changes.get("method.tracking", "coupled"))
+    return problem.replace({"method": kept, **changes})
 
 
 def check_methods(names: Sequence[str]) -> None:

@@ -155,8 +155,8 @@ def arm_without_curve(problem: Problem) -> Setup:
         The arm cannot be built.
     """
     # The solver is never called; this one compiles no kernels.
-    changes = {"method.tracking": "none", "method.hard_tracking": False, "method.solver": "piqp"}
-    return build_arm(problem.replace(changes))
+    method = {**problem.method.kept_by("qp", "none"), "solver": "piqp"}
+    return build_arm(problem.replace({"method": method}))
 
 
 def displacement_to(goal: TipGoal, start: TipGoal) -> TipGoal:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -21,6 +21,49 @@ NullSpaceTerm = Literal[
 ]
 HardCoordinate = Literal["position", "pointing", "orientation"]
 HARD_COORDINATES = ("position", "pointing", "orientation")
+_WAYS = {
+    "coupled": '"qp" with tracking "coupled"',
+    "none": '"qp" with tracking "none"',
+    "first": '"qp" with tracking "recursive" or "parallel"',
+    "pseudoinverse": '"pseudoinverse"',
+    "curve-pseudoinverse": '"curve-pseudoinverse"',
+}
+"""The ways in which arms are moved, as messages call them."""
+_QP, _INVERSE, _CURVE = ("coupled", "none"), ("pseudoinverse",), ("first", "curve-pseudoinverse")
+SERVED: dict[str, tuple[str, ...]] = {
+    "name": tuple(_WAYS),
+    "tracking": (*_QP, *_CURVE),
+    "hard_tracking": ("coupled",),
+    "hard_coordinates": ("coupled",),
+    "solver": _QP,
+    "retries": tuple(_WAYS),
+    "slow_approach": _QP,
+    "step_limit": tuple(_WAYS),
+    "variant": _INVERSE,
+    "algebra": _INVERSE,
+    "correct": (*_INVERSE, "curve-pseudoinverse"),
+    "null_space": (*_INVERSE, *_CURVE),
+    "damping": _INVERSE,
+    "truncation": _INVERSE,
+    "weights.node_rate": (*_QP, *_INVERSE),
+    "weights.actuator_rate": (*_QP, *_INVERSE),
+    "weights.stroke_centring": (*_QP, *_INVERSE),
+    "weights.curve_rate": ("coupled",),
+    "weights.tracking": ("coupled",),
+    "weights.tangent": ("coupled",),
+    "weights.roll": ("coupled",),
+    "weights.spacing": ("coupled",),
+    "weights.smoothness": ("coupled",),
+    "weights.vertex_goal": ("coupled",),
+    "weights.obstacle_potential": _INVERSE,
+    "weights.end_effector": _QP,
+    "weights.progress": _QP,
+    "gains.spacing": _CURVE,
+    "gains.smoothness": _CURVE,
+    "gains.curve_rate": _CURVE,
+    "gains.obstacle_potential": _CURVE,
+}
+"""Which of the ways each key has a meaning for; with the others it is refused unless it has its default."""
 TRUSS_TERMS = ("node_rate", "actuator_rate", "stroke_centring", "obstacle_potential")
 CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 
@@ -91,7 +134,8 @@ class Method(Table, called="[method]"):
     )
     tracking: Literal["coupled", "recursive", "parallel", "none"] = Field(
         default="coupled",
-        description="truss and curve together; curve first, then bay after bay or all bays at once; no curve",
+        description="truss and curve together; curve first, then bay after bay or all bays at once; no curve. With "
+        "curve-pseudoinverse coupled means recursive",
     )
     hard_tracking: Flag = Field(
         default=False, description="whether faces stay on the curve exactly; elastic otherwise"
@@ -104,7 +148,9 @@ class Method(Table, called="[method]"):
     )
     solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
     retries: Flag = Field(
-        default=True, description="whether other ways out of a dead end are tried before giving up"
+        default=True,
+        description="whether other ways out of a dead end are tried before giving up; other methods than qp with "
+        "tracking coupled or none know none",
     )
     slow_approach: Flag = Field(
         default=True,
@@ -141,14 +187,69 @@ class Method(Table, called="[method]"):
         default_factory=Gains, description="gains of the curve's null-space vector, eq. (38)"
     )
 
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Modes of the end effector that the method has; the pseudoinverse methods are always on time."""
+        way = _way(self.name, self.tracking)
+        return (
+            ("scaled", "hard", "elastic")
+            if way in _QP
+            else ("scaled",)
+            if way == "first"
+            else ("scaled", "hard")
+        )
+
+    @property
+    def draws_vertices(self) -> bool:
+        """Whether control vertices follow goals of their own."""
+        return _way(self.name, self.tracking) == "coupled"
+
+    @property
+    def moves_curve_first(self) -> bool:
+        """Whether the truss moves after a curve that has moved by itself."""
+        return _way(self.name, self.tracking) in _CURVE
+
+    def kept_by(self, name: str, tracking: str = "coupled") -> dict[str, Any]:
+        """Return the table of another method: those of its keys here that are not as by default."""
+        way = _way(name, tracking)
+        kept: dict[str, Any] = {"name": name, "tracking": tracking}
+        for key, value in self._changed():
+            outer, _, inner = key.partition(".")
+            if way in SERVED[key] and key not in kept:
+                kept.setdefault(outer, {}).update({inner: value}) if inner else kept.update({key: value})
+        return kept
+
+    def _changed(self) -> Iterator[tuple[str, Any]]:
+        """Yield each key that is not as by default, and its value; keys of inner tables as ``weights.tracking``."""
+        for key, value in self.model_dump(mode="json", exclude_defaults=True).items():
+            if isinstance(value, Mapping):
+                yield from ((f"{key}.{inner}", own) for inner, own in value.items())
+            else:
+                yield key, value
+
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
-        if self.hard_tracking and self.tracking == "none":
-            yield ("hard_tracking",), 'false, since tracking is "none"'
+        way = _way(self.name, self.tracking)
+        for key, _ in self._changed():
+            if way not in SERVED[key]:
+                others = " or ".join(_WAYS[other] for other in SERVED[key])
+                yield (
+                    tuple(key.split(".")),
+                    f"its default, since {_WAYS[way]} does without; it belongs to {others}",
+                )
+        if self.name == "curve-pseudoinverse" and self.tracking == "none":
+            yield ("tracking",), '"recursive" or "parallel": the method moves the curve first'
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
             yield ("hard_coordinates",), f"the first one, two or three of {quoted(HARD_COORDINATES)}"
         if self.variant == "truncated" and self.algebra == "sparse":
             yield ("algebra",), '"dense", since the variant truncated needs the singular values'
-        known = {"pseudoinverse": TRUSS_TERMS, "curve-pseudoinverse": CURVE_TERMS}.get(self.name)
-        for i, term in enumerate(self.null_space or ()):
-            if known is not None and term not in known:
+        known = TRUSS_TERMS if way == "pseudoinverse" else CURVE_TERMS
+        for i, term in enumerate(self.null_space or () if way in SERVED["null_space"] else ()):
+            if term not in known:
                 yield ("null_space", i), f"a term of the method {self.name}: {quoted(known)}"
+
+
+def _way(name: str, tracking: str) -> str:
+    """Return which of the ways in which arms are moved a method is."""
+    if name == "qp":
+        return tracking if tracking in _QP else "first"
+    return name

@@ -10,7 +10,7 @@ from pydantic import Field, PrivateAttr, WithJsonSchema
 
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem.arm import ArmTable
-from vgtm_qp.problem.fields import Name, expect
+from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
 from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
@@ -118,6 +118,18 @@ class Problem(Table, called="a problem"):
             yield ("method", "name"), '"qp": the pseudoinverse methods move trusses, not serial arms'
         elif self.arm is not None and self.method.tracking in ("recursive", "parallel"):
             yield ("method", "tracking"), '"coupled" or "none": the others go along the bays of a truss'
+        if self.curve.control_vertex_goals and not self.method.draws_vertices:
+            yield (
+                ("curve", "control_vertex_goals"),
+                'none, since only "qp" with tracking "coupled" draws vertices',
+            )
+        if self.curve.nodes == "arc-length" and self.method.moves_curve_first:
+            yield (
+                ("curve", "nodes"),
+                '"parameter", since a curve that moves first keeps the parameters of its nodes',
+            )
+        if self.end_effector.mode not in self.method.modes:
+            yield ("end_effector", "mode"), f"{quoted(self.method.modes)}: the method has no other mode"
         yield from unique("obstacle", "name", [obstacle.name for obstacle in self.obstacle])
         if isinstance(self.maneuver, WaypointManeuver):
             for i, waypoint in enumerate(self.maneuver.waypoint):
