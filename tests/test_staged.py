@@ -35,6 +35,7 @@ from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.qp.settle import held, settling_gain
 from vgtm_qp.qp.solvers import make_solver
 from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.target import QPInput, Target
 
@@ -414,10 +415,28 @@ def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, m
     solver = LengthSolver(case.layout.arm.bays)
     step = solver.solve(kinematics.gradient, error)
     np.testing.assert_allclose(kinematics.motion().jacobian() @ step.ravel(), error, atol=1e-10)
-    broken = kinematics.gradient.copy()
-    broken[0] = 0.0
-    with pytest.raises(SolverError, match="singular"):
-        solver.solve(broken, error)
+    for wrong in (0.0, np.nan, np.inf):
+        broken = kinematics.gradient.copy()
+        broken[0] = wrong
+        with pytest.raises(SolverError, match="singular"):
+            solver.solve(broken, error)
+
+
+def test_a_configuration_that_does_not_close_is_measured_where_it_is():
+    case = Case(MODULES["octahedral"](), vertices=0)
+    closing, rng, open_ = Closing(case.layout, case.kinematics), np.random.default_rng(4), 0
+    truss, arm = case.truss, case.layout.arm
+    for _ in range(10):
+        wanted = rng.uniform(0.6, 1.5, len(truss.actuators))
+        q = truss.home + 0.5 * rng.normal(size=truss.home.shape) * ~truss.base[:, None]
+        closed = closing.close(q, wanted, wanted, 1e-10, too_far=np.inf)
+        if closed.error < np.inf:
+            aims = truss.home_lengths.copy()
+            aims[truss.actuators] = wanted
+            np.testing.assert_allclose(closed.quantities, arm.measured(closed.q), atol=1e-9)
+            assert abs(closed.error - np.abs(aims - arm.measured(closed.q)).max()) < 1e-9
+            open_ += closed.error > 1e-6
+    assert open_
 
 
 def test_the_gain_is_the_least_motion_of_the_tip():

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import modules
 import numpy as np
 import oracle
 import pytest
 
+from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.rows.tip import TipGoal, row_names, tip_function
+from vgtm_qp.step.task import TipTask
 
 TRACKS = [("position",), ("y",), ("x", "z"), ("position", "pointing"), ("z", "orientation"), ("orientation",)]
 
@@ -33,7 +36,7 @@ def random_pose(rng, turn=1.0):
 
 @pytest.mark.parametrize("track", TRACKS, ids="+".join)
 def test_the_rows_of_a_tip_are_those_of_the_formulas(track):
-    rng = np.random.default_rng(0)
+    rng, task = np.random.default_rng(0), TipTask(track, TrussArm(modules.octahedral(2)))
     for turn in (1e-9, 1e-6, 1e-3, 0.3, 2.0):
         position, rotation = random_pose(rng)
         there, _ = random_pose(rng)
@@ -43,6 +46,7 @@ def test_the_rows_of_a_tip_are_those_of_the_formulas(track):
         rows = row_names(track)
         wanted = oracle.tip_rate(rows, rotation, goal)
         assert_close(error, oracle.tip_error(rows, position, rotation, goal), atol=1e-13)
+        assert_close(task.error(position, rotation, goal), error, atol=1e-13)
         assert_close(rate, wanted, atol=1e-14)
         assert_close(across, oracle.tip_axes(rows, rotation), atol=1e-14)
         assert weight == pytest.approx(oracle.progress_weight(wanted))

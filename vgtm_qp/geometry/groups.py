@@ -177,10 +177,11 @@ class Group:
         displacement = motion[self.place]
         # Only near the head of the sorted list can the motion have mattered.
         count = int(np.searchsorted(self.distance, limit + displacement.greatest))
-        if self.is_self:
-            bound = self.distance[:count] - self._nearer(displacement, count)
-        else:
-            bound = self.distance[:count] - displacement.moved.take(self.points[:count, :2]).max(axis=1)
+        bound = self.distance[:count]
+        if count and self.is_self:
+            bound = bound - self._nearer(displacement, count)
+        elif count:
+            bound = bound - displacement.moved.take(self.points[:count, :2]).max(axis=1)
             if self.moving:
                 bound -= self.scene.pieces.speed[self.other[:count]] * displacement.elapsed
         return bound, float(self.distance[count] - displacement.greatest) if count < len(self) else np.inf

@@ -6,6 +6,8 @@ the arm has not bent there.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -28,11 +30,11 @@ class Parts:
     """
 
     def __init__(self, bodies: Bodies, X: Array, horizon: float) -> None:
-        # The tree's order has bodies side by side that are near each other.
-        order = cKDTree(X[bodies.points].mean(axis=1), leafsize=BODIES).indices
-        self._of = np.empty(len(order), dtype=np.int64)
-        self._of[order] = np.arange(len(order)) // BODIES
-        every = np.arange(-(-len(order) // BODIES))
+        tree = cKDTree(X[bodies.points].mean(axis=1), leafsize=BODIES)
+        first = _leaves(tree.tree)
+        self._of = np.empty(len(bodies), dtype=np.int64)
+        self._of[tree.indices] = np.searchsorted(first, np.arange(len(bodies)), side="right") - 1
+        every = np.arange(len(first))
         self._thickness = np.zeros(len(every))
         np.maximum.at(self._thickness, self._of, bodies.radius)
         # A point is in each part that one of its bodies is in, once.
@@ -92,3 +94,8 @@ class Parts:
         between = center.take(first, axis=0) - center.take(second, axis=0)
         apart = np.sqrt(np.einsum("kc,kc->k", between, between))
         return np.asarray(apart + radius.take(first) + radius.take(second))
+
+
+def _leaves(node: Any) -> list[int]:
+    """Return where the leaves below a node of a tree begin, in the tree's order."""
+    return [node.start_idx] if node.split_dim < 0 else [*_leaves(node.lesser), *_leaves(node.greater)]

@@ -85,7 +85,7 @@ class SegmentGroup:
         self.numbers = np.array([segment.number for segment in segments])
         self._tracks, self._kinematics = one.tracks, kinematics
         self._fixed = np.stack([segment.fixed for segment in segments])
-        self._home = layout.arm.home_quantities[self._fixed]
+        self._home, self._still = layout.arm.home_quantities[self._fixed], np.zeros(self._fixed.shape)
         self._face = np.array([segment.face for segment in segments])
         self._corners, self._weights = truss.faces[self._face], truss.face_weights[self._face][:, None]
         self._centre_rows = np.repeat(self._weights, 3)
@@ -133,7 +133,8 @@ class SegmentGroup:
 
     def displacements(self, moved: Array, turned: Array) -> Array:
         """Return the right-hand sides (K, r) for curve nodes that move and turn, (S, 3) each, m and rad."""
-        return self._stacked(np.zeros(self._fixed.shape), moved[self.numbers], turned[self.numbers])
+        moved, turned = moved.take(self.numbers, axis=0), turned.take(self.numbers, axis=0)
+        return self._stacked(self._still, moved, turned)
 
     def residuals(self, X: Array, nodes: CurveNodes) -> Array:
         """Return (K, r) what is missing in lengths and to the curve nodes at `X`, where kinematics is evaluated."""
@@ -151,6 +152,8 @@ class SegmentGroup:
         return self._stacked(lengths, gap, turn)
 
     def _stacked(self, lengths: Array, moved: Array, turned: Array) -> Array:
+        if self._tracks == "position":
+            return np.concatenate([lengths, moved], axis=1)
         return np.concatenate([lengths, moved, self._tracked(turned[:, :, None])[:, :, 0]], axis=1)
 
     def _tracked(self, turns: Array) -> Array:

@@ -34,6 +34,7 @@ from vgtm_qp.methods.resolver import (
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Method
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.path import Path
 
 _LOWER = np.tril_indices(3)
@@ -210,7 +211,7 @@ class ConventionalResolver(MethodResolver):
         setup, state = self.setup, self.state
         kinematics, truss = setup.kinematics, setup.truss
         X = np.array(state.nodes)
-        system = self._linear(X, path, start, end)
+        system = self._linear(X, displacement_to(path.at(end), path.at(start)))
         gradient, x_g = system.gradient, system.x_g
         if setup.base_motion is not None:
             motion = setup.arm.based(X, setup.base_motion.pose(state.time + dt)) - X
@@ -222,29 +223,29 @@ class ConventionalResolver(MethodResolver):
         self.rank = self._solution.rank
         self._clock.add("solve")
         if self._correct:
-            self._newton(X, path, end)
+            self._newton(X, path.at(end))
             self._clock.add("correction")
         return Moved(X, state.control_vertices, state.torsion)
 
-    def _linear(self, X: Array, path: Path, start: float, end: float) -> Linear:
+    def _linear(self, X: Array, goal: TipGoal) -> Linear:
         """Return the system at nodes `X` (N, 3) whose base rests, J d = x, eqs. (25) and (27).
 
-        The right-hand side is the motion of the goal along the path from `start` to `end`, and none of the fixed
-        lengths; with corrections, what lengths and tip lack of the goal at `end`.
+        The right-hand side is the rates of the `goal`, its motion in the step, and none of the fixed lengths; with
+        corrections, what lengths and tip lack of the goal.
         """
         setup = self.setup
         setup.kinematics.evaluate(X)
-        tip = setup.task.rows(X, setup.kinematics, displacement_to(path.at(end), path.at(start)))
+        tip = setup.task.rows(X, setup.kinematics, goal)
         missing = self._home_fixed - setup.kinematics.quantities[setup.truss.fixed]
         if self._correct:
             return Linear(setup.kinematics.gradient, tip.jacobian, tip.error, missing)
         return Linear(setup.kinematics.gradient, tip.jacobian, tip.rate, np.zeros_like(missing))
 
-    def _newton(self, X: Array, path: Path, end: float) -> None:
+    def _newton(self, X: Array, goal: TipGoal) -> None:
         """Correct fixed members and tip in place: Newton's method by the same pseudoinverse, without gradients."""
         terms = self._objective.without_gradients()
         for _ in range(MAX_CORRECTIONS):
-            system = self._linear(X, path, end, end)
+            system = self._linear(X, goal)
             worst = float(np.max(np.abs(system.x_g), initial=0.0))
             if worst <= LENGTH_TOLERANCE and float(np.max(np.abs(system.x_e))) <= TIP_TOLERANCE:
                 return

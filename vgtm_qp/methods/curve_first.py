@@ -56,6 +56,7 @@ class CurveFirstResolver(MethodResolver):
             setup.layout, setup.kinematics, segments, parallel=method.tracking == "parallel"
         )
         self._s = self.motion.s[[segment.face for segment in segments]]
+        self._weights = self.motion.home.family.weights(self._s)
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._actuation = Actuation(replace(setup, slow_approach=False, jams=()))
         self._correct, self._is_qp = method.correct, method.name == "qp"
@@ -119,7 +120,7 @@ class CurveFirstResolver(MethodResolver):
         """Return the curve nodes of the segments; their frames are identities where none is tracked."""
         s = self._s
         frame = curve.frame(s) if self._frames else np.broadcast_to(np.eye(3), (len(s), 3, 3))
-        return CurveNodes(curve.position(s), frame)
+        return CurveNodes(self._weights @ curve.control_vertices, frame)
 
     def _broken(self, X: Array, dt: float) -> str:
         """Return which limit the step to node positions `X` would break, empty if none."""

@@ -56,6 +56,9 @@ class CurveMotion:
         self.home = Curve(
             family, setup.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0]
         )
+        # However the curve bends, its end is the same combination of its vertices.
+        self._end = family.weights(1.0)
+        self._end_rows = self.home.position_jacobian(1.0)[self._task.axes]
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         gains = method.gains
         self._terms = {name: float(getattr(gains, name)) for name in names}
@@ -191,12 +194,12 @@ class CurveMotion:
     def _missing(self, curve: Curve, goal: TipGoal) -> tuple[Array, Array, Array]:
         """Return what x(1) lacks of x_e, eq. (34), and the goal's rates, (n_e,) each; and the turned axes (r, 3)."""
         rotation = curve.frame(1.0) if self._task.turns else np.eye(3)
-        error, rate, across, _ = self._task.residual(curve.position(1.0), rotation, goal)
+        error, rate, across, _ = self._task.residual(self._end @ curve.control_vertices, rotation, goal)
         return error, rate, across
 
     def _rows(self, curve: Curve, across: Array) -> Array:
         """Return J_s(1) of eq. (37), its turns about the axes `across`, then the rows of the base: (n_e + 5, D)."""
-        rows = [curve.position_jacobian(1.0)[self._task.axes]]
+        rows = [self._end_rows]
         if self._task.turns:
             rows.append(across @ curve.orientation_jacobian(1.0))
         return np.concatenate([*rows, self._base_rows])

@@ -138,7 +138,7 @@ class _Chain:
         for segment in segments:
             before = segment.start - segment.first
             shapes.setdefault((segment.rows, segment.columns, before, segment.tracks), []).append(segment)
-        self._segments = segments
+        self._on_others = [segment for segment in segments if segment.first < segment.start]
         self.groups = [SegmentGroup(layout, alike, kinematics) for alike in shapes.values()]
         self.evaluate, self.failure = evaluate, failure
         self.is_square = all(group.is_square for group in self.groups)
@@ -159,10 +159,9 @@ class _Chain:
             if not group.is_square:
                 step[group.columns] -= travelled[group.columns]
             passed |= zip(group.numbers.tolist(), answers[:, :, 1:], strict=True)
-        for segment in self._segments:
-            if segment.first < segment.start:
-                end = segment.start + segment.columns
-                step[segment.start : end] -= passed[segment.number] @ step[segment.first : segment.start]
+        for segment in self._on_others:
+            end = segment.start + segment.columns
+            step[segment.start : end] -= passed[segment.number] @ step[segment.first : segment.start]
 
 
 def _least_norm(A: Array, b: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import LinAlgError, solve_banded
+from scipy.linalg.lapack import dgbsv
 from scipy.sparse.linalg import splu
 
 from vgtm_qp.arm.arm import Bays
@@ -54,8 +54,9 @@ class LengthSolver:
         self._order = np.argsort(last, kind="stable")
         rows = np.argsort(self._order)[rows]
         self._below, self._above = int((rows - columns).max()), int((columns - rows).max())
-        self._width, self._size = self._below + self._above + 1, size
-        self._entry = (self._above + rows - columns) * size + columns
+        # LAPACK's storage of a band, by columns: rows of its own for what pivoting fills in come first.
+        self._width, self._size = 2 * self._below + self._above + 1, size
+        self._entry = columns * self._width + self._below + self._above + rows - columns
         self._places = rows, columns
 
     def solve(self, gradient: Array, error: Array) -> Array:
@@ -75,14 +76,15 @@ class LengthSolver:
         """
         values = np.concatenate([gradient.reshape(-1)[self._flat], self._weights])
         size, known = self._size, error[self._order]
-        try:
-            if self._width > _WIDEST:
+        if self._below + self._above >= _WIDEST:
+            try:
                 step = splu(sparse.csc_matrix((values, self._places), shape=(size, size))).solve(known)
-            else:
-                band = np.bincount(self._entry, values, self._width * size).reshape(self._width, size)
-                step = solve_banded((self._below, self._above), band, known, overwrite_ab=True)
-        except (LinAlgError, ValueError, RuntimeError) as reason:
-            raise SolverError(_SINGULAR) from reason
-        if not np.isfinite(step).all():
+            except RuntimeError as reason:
+                raise SolverError(_SINGULAR) from reason
+            failed = 0
+        else:
+            band = np.bincount(self._entry, values, self._width * size).reshape(size, self._width).T
+            step, failed = dgbsv(self._below, self._above, band, known, overwrite_ab=1, overwrite_b=1)[2:]
+        if failed or not (np.isfinite(values).all() and np.isfinite(step).all()):
             raise SolverError(_SINGULAR)
         return np.asarray(step).reshape(-1, 3)

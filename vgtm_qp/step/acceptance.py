@@ -92,12 +92,11 @@ class Acceptance:
         return f"{self._arm.quantity_names[k]} {abs(errors[k]):.3g} m or rad"
 
     def _tip_error(self, q: Array, X: Array, goal: TipGoal) -> float:
-        """Return the greatest error of the tip, m or rad."""
-        position, task = self._arm.end_effector.position(X), self._task
-        if task.turns is None:
-            return norm((goal.position - position)[task.axes])
-        self._kinematics.evaluate_quantities(q)
-        return task.error(position, self._kinematics.tip_rotation, goal)
+        """Return the norm of the tip's error, m and rad."""
+        if self._task.turns is not None:
+            self._kinematics.evaluate_quantities(q)
+        position = self._arm.end_effector.position(X)
+        return norm(self._task.error(position, self._kinematics.tip_rotation, goal))
 
 
 class TrackingError:

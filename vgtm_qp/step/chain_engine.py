@@ -17,15 +17,17 @@ from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import PeriodValues
 from vgtm_qp.qp.long.solver import ChainSolver
-from vgtm_qp.qp.long.sweep import MOST_STEPS, TOO_FAR
 from vgtm_qp.qp.numbers import RowNumbers
 from vgtm_qp.qp.settle import held
 from vgtm_qp.rows.curve import base_offset
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
-from vgtm_qp.step.closing import Closing, enough_length, within
+from vgtm_qp.step.closing import Closing, Correct, converge, enough_length, within
 from vgtm_qp.step.engine import Engine, enough_tip_error
+from vgtm_qp.step.state import frozen
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
+
+_UPRIGHT = frozen(np.eye(3))
 
 
 class ChainEngine(Engine):
@@ -110,47 +112,49 @@ class ChainEngine(Engine):
         on the curve they follow from that, as far as bounds allow it.
         """
         closing, solver, bounds = self._closing, self._solver, (target.lower, target.upper)
-
-        def tip_error(position: Array, rotation: Array) -> Array:
-            return self._task.residual(position, rotation, goal)[0]
-
         enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)
         closing.start(X)
-        wanted = np.clip(self._strokes, *bounds)
-        self._aim(wanted)
-        own: Array = X.take(self._nodes, axis=0)
-        gain, steers, off = None, solver.knows_gain, np.inf
-        closer, worst = closing.step(own)
-        for _ in range(MOST_STEPS):
-            if (worst <= enough and not (steers and off > enough_tip)) or not worst < TOO_FAR:
-                break
-            own = closer.copy()
-            if solver.knows_gain:
-                error = tip_error(*self._tip_of(own, turned=self._task.turns is not None))
+        first: Array = X.take(self._nodes, axis=0)
+        wanted = self._aim(self._strokes, *bounds)
+        gain: Array | None = None
+        steers = solver.knows_gain
+
+        def measure(own: Array) -> tuple[float, Correct | None]:
+            nonlocal wanted, gain, steers
+            is_off = steers
+            if solver.knows_gain and own is not first:
+                error = self._task.error(*self._tip_of(own, turned=self._task.turns is not None), goal)
                 off = float(np.abs(error).max())
                 if off > accuracy.start:
-                    return None
-                if steers and off > enough_tip:
-                    gain = solver.gain(held(*self._answer)) if gain is None else gain
+                    return np.inf, None
+                if steers and gain is None and off > enough_tip:
+                    gain = solver.gain(held(*self._answer))
                     steers = gain is not None
-                if gain is not None and off > enough_tip:
+                if is_off := gain is not None and off > enough_tip:
                     wanted = wanted + gain @ error
-                    self._aim(np.clip(wanted, *bounds))
+                    self._aim(wanted, *bounds)
             closer, worst = closing.step(own)
+            return worst, closer.copy if is_off or not worst <= enough else None
+
+        own, worst = converge(first, measure)
         closed = self._closed(X, own, worst)
         strokes = closed.quantities[self.layout.arm.actuators]
         if not (solver.knows_gain or (worst <= accuracy.member and within(strokes, *bounds, enough))):
             closed = self._any_closing.close(X, *bounds, accuracy.member)
-        is_there = float(np.abs(tip_error(closed.tip_position, closed.tip_rotation)).max()) <= accuracy.tip
-        return closed if is_there and closed.error <= accuracy.member else None
+        off = float(np.abs(self._task.error(closed.tip_position, closed.tip_rotation, goal)).max())
+        return closed if off <= accuracy.tip and closed.error <= accuracy.member else None
 
-    def _aim(self, strokes: Array) -> None:
-        """Let actuated members aim at `strokes` (n_a,), m, the others at home lengths, and held faces at the curve."""
+    def _aim(self, strokes: Array, lower: Array, upper: Array) -> Array:
+        """Let actuated members aim at `strokes` (n_a,) in their bounds, m, the others at home, held faces at the curve.
+
+        Return the strokes that are aimed at.
+        """
         lengths, *points = self._closing.aims
-        self._aims[self.layout.arm.actuators] = strokes
-        np.take(self._aims, self._members, out=lengths.reshape(-1), mode="clip")
+        aimed = self._aims[self.layout.arm.actuators] = np.minimum(np.maximum(strokes, lower), upper)
+        self._aims.take(self._members, out=lengths.reshape(-1), mode="clip")
         for faces in points:
             np.matmul(self._curve_weights, self._vertices, out=faces.reshape(-1, 3))
+        return aimed
 
     def _closed(self, X: Array, own: Array, worst: float) -> Closed:
         """Return the configuration whose free nodes are at `own`, in the order of the chain; base nodes as in `X`."""
@@ -160,10 +164,10 @@ class ChainEngine(Engine):
 
     def _tip_of(self, own: Array, *, turned: bool = True) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of the tip where the free nodes are at `own`; if not `turned`, I."""
-        corners, ends = own[self._tip], self._ends
+        corners, ends = own.take(self._tip, axis=0), self._ends
         position = self.layout.arm.end_effector.weights @ corners
         if not turned:
-            return position, np.eye(3)
+            return position, _UPRIGHT
         ends.inputs[0][:] = corners.reshape(-1)
         ends()
         return position, ends.outputs[0].reshape(3, 3).T.copy()

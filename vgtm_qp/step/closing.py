@@ -14,7 +14,7 @@ from vgtm_qp.qp.answer import Closed
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import LengthSolver
 
-_MOST_STEPS = 8
+MOST_STEPS = 12
 
 _TOO_FAR = 1e-2
 """Quantities that are further off than this after a QP are not worth trying."""
@@ -34,6 +34,28 @@ def enough_length(q: Array, tolerance: float) -> float:
 def within(values: Array, lower: Array, upper: Array, spare: float) -> bool:
     """Return whether values (n_a,) are between their bounds, give or take `spare`."""
     return bool(np.all(values >= lower - spare) and np.all(values <= upper + spare))
+
+
+Correct = Callable[[], Array]
+
+
+def converge(
+    q: Array, measure: Callable[[Array], tuple[float, Correct | None]], too_far: float = _TOO_FAR
+) -> tuple[Array, float]:
+    """Return where Newton's method leads from a configuration, and the error there, infinite in a singular pose.
+
+    `measure` gives the error of a configuration, and what makes the next one; None where it serves as it is. Errors
+    from `too_far` on are not worth trying.
+    """
+    for count in range(MOST_STEPS + 1):
+        worst, correct = measure(q)
+        if correct is None or count == MOST_STEPS or not worst < too_far:
+            break
+        try:
+            q = correct()
+        except SolverError:
+            return q, np.inf
+    return q, worst
 
 
 class Closing:
@@ -104,18 +126,14 @@ class Closing:
         tolerance: float,
         too_far: float,
     ) -> Closed:
-        arm, kinematics = self._arm, self._kinematics
-        enough, worst = enough_length(q, tolerance), np.inf
-        for _ in range(_MOST_STEPS):
+        arm, kinematics, enough = self._arm, self._kinematics, enough_length(q, tolerance)
+
+        def measure(q: Array) -> tuple[float, Correct | None]:
             kinematics.evaluate_quantities(q)
             error = missing(q)
-            worst = float(np.max(np.abs(error)))
-            if worst <= enough or not worst < too_far:
-                break
-            try:
-                q = arm.corrected(q, error, partial(solve, error))
-            except SolverError:
-                worst = np.inf
-                break
+            worst = float(np.abs(error).max())
+            return worst, None if worst <= enough else partial(arm.corrected, q, error, partial(solve, error))
+
+        q, worst = converge(q, measure, too_far)
         position = arm.end_effector.position(arm.nodes(q))
         return Closed(q, kinematics.quantities.copy(), worst, position, kinematics.tip_rotation.copy())

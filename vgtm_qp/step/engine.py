@@ -22,13 +22,12 @@ from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.fused_settle import NEAR
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
-from vgtm_qp.qp.long.sweep import MOST_STEPS
 from vgtm_qp.qp.numbers import StepNumbers
 from vgtm_qp.qp.residual import FailedStepError, InfeasibleStepError
 from vgtm_qp.qp.settle import LEFT, SETTLING_STEPS, held, settling_gain
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.rows.tip import TipGoal
-from vgtm_qp.step.closing import Closing
+from vgtm_qp.step.closing import MOST_STEPS, Closing
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask, over_all_nodes, tip_response
 
@@ -181,8 +180,8 @@ class GeneralEngine(Engine):
             points = self.layout.curve_weights @ self._vertices
             on_curve = self._closing.close_on_curve(q, points, *bounds, accuracy.member)
             if on_curve is not None and on_curve.error <= accuracy.member:
-                off = self._task.error(on_curve.tip_position, on_curve.tip_rotation, goal)
-                return on_curve if off <= accuracy.tip else None
+                error = self._task.error(on_curve.tip_position, on_curve.tip_rotation, goal)
+                return on_curve if float(np.abs(error).max()) <= accuracy.tip else None
         by_strokes, gain, box = self._solver.knows_gain, None, bounds
         most = MOST_STEPS if by_strokes else SETTLING_STEPS
         strokes = np.clip(self._strokes, *bounds)
@@ -190,7 +189,7 @@ class GeneralEngine(Engine):
             if by_strokes:
                 box = (np.clip(strokes, *bounds),) * 2
             closed = self._closing.close(q, *box, accuracy.member)
-            error = self._task.residual(closed.tip_position, closed.tip_rotation, goal)[0]
+            error = self._task.error(closed.tip_position, closed.tip_rotation, goal)
             off = float(np.abs(error).max())
             if not (closed.error <= accuracy.member and off <= accuracy.start):
                 return None

@@ -14,7 +14,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError
 from vgtm_qp.rotation import rotation_from_vector, turn_between
-from vgtm_qp.rows.tip import TipGoal, axes, row_names, tip_function
+from vgtm_qp.rows.tip import TipGoal, axes, error, row_names, tip_function
 from vgtm_qp.step.path import Path
 
 _UNCHANGED = "the state of the arm is unchanged"
@@ -70,9 +70,11 @@ class TipTask:
         error, rate, across, weight = self._rows.outputs
         return error.copy(), rate.copy(), across.reshape(3, -1).T.copy(), float(weight[0])
 
-    def error(self, position: Array, rotation: Array, goal: TipGoal) -> float:
-        """Return the greatest error, m or rad."""
-        return float(np.abs(self.residual(position, rotation, goal)[0]).max(initial=0.0))
+    def error(self, position: Array, rotation: Array, goal: TipGoal) -> Array:
+        """Return the error (n_e,) alone, m or rad; it is asked for at every step of settling."""
+        if self.turns is None:
+            return np.asarray(error(self.row_names, position, rotation, goal.position, goal.rotation))
+        return self.residual(position, rotation, goal)[0]
 
     def rows(self, X: Array, kinematics: Kinematics, goal: TipGoal) -> TipRows:
         """Return the rows at nodes `X` (N, 3), at which the kinematics was evaluated, towards `goal`."""

@@ -9,10 +9,6 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
 
-MOST_STEPS = 12
-TOO_FAR = 1e-2
-"""Lengths that are further off than this, m, are not worth trying."""
-
 
 class Sweep(Kernel):
     """A period's function run along the chain: its first argument is its first result for the period before.
