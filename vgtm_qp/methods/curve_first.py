@@ -18,7 +18,6 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.setup import TOO_LONG
 
 _SMALLEST = 1 / 64
 _MAX_QPS = 5
@@ -42,9 +41,8 @@ class CurveFirstResolver(MethodResolver):
 
     def __init__(self, problem: Problem) -> None:
         method = problem.method
-        # The solver is never called; this one compiles no kernels.
-        coupled = {**method.kept_by("qp", "coupled"), "solver": "piqp"}
-        super().__init__(build_arm(problem.replace({"method": coupled})))
+        changes = {"method.tracking": "coupled", "method.solver": "piqp"}
+        super().__init__(build_arm(problem.replace(changes)), method.step_limit)
         setup = self.setup
         if setup.base_motion is not None:
             raise CurveError(
@@ -110,7 +108,7 @@ class CurveFirstResolver(MethodResolver):
                 self._clock.add("acceptance")
                 if not reason and share * progress >= _LEAST_PROGRESS:
                     return Moved(X, curve.control_vertices, curve.torsion, share * progress)
-                if not reason or progress < _LEAST_PROGRESS or reason.startswith(("stroke", TOO_LONG)):
+                if not reason or progress < _LEAST_PROGRESS or reason.startswith("stroke"):
                     reason = reason or ", ".join(active) or "no progress along the path"
                     break
             share /= 2.0
@@ -125,8 +123,6 @@ class CurveFirstResolver(MethodResolver):
     def _broken(self, X: Array, dt: float) -> str:
         """Return which limit the step to node positions `X` would break, empty if none."""
         setup, state = self.setup, self.state
-        if too_long := setup.too_long(X - state.nodes):
-            return too_long
         lower, upper = self._actuation.box(state, dt)
         setup.kinematics.evaluate(X)
         lengths = setup.kinematics.quantities[setup.arm.actuators]

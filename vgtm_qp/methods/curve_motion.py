@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
@@ -25,6 +26,7 @@ DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 _SAMPLES = 400
 """Pieces of the curve to whose ends nodes are assigned: the nearest point to a few thousandths."""
 _PROGRESS = 1e3
+_MARGIN = 1e-5
 
 
 class CurveMotion:
@@ -37,7 +39,7 @@ class CurveMotion:
     """
 
     def __init__(self, problem: Problem, setup: Setup) -> None:
-        method, spec, truss = problem.method, problem.curve, setup.truss
+        method, spec, truss = problem.method, problem.curve, truss_of(setup.arm)
         if not len(truss.faces):
             raise CurveError("this method needs a reference curve and a truss with faces")
         family = setup.layout.family
@@ -170,7 +172,7 @@ class CurveMotion:
         H = np.zeros((size + 1, size + 1))
         H[:size, :size] = objective.hessian
         H[-1, -1] = curvature
-        f, room = np.zeros(size + 1), self._setup.safe + self._setup.margin - distance
+        f, room = np.zeros(size + 1), self._setup.safe + _MARGIN - distance
         bounds = -progress, 0.0
         if progress == 0.0:
             f, bounds = np.append(objective.gradient, -2.0 * curvature), (0.0, 1.0)
@@ -209,7 +211,7 @@ class CurveMotion:
         setup = self._setup
         pairs = setup.monitor.near(setup.arm.points(X), time, setup.influence)
         with_obstacle = np.flatnonzero(~pairs.is_self)
-        members = setup.truss.members[pairs.body[with_obstacle]]
+        members = truss_of(setup.arm).members[pairs.body[with_obstacle]]
         t, normal = pairs.weights[with_obstacle, 1], pairs.normal[with_obstacle]
         s = np.clip((1.0 - t) * self._node_s[members[:, 0]] + t * self._node_s[members[:, 1]], 0.0, 1.0)
         witness = (1.0 - t)[:, None] * X[members[:, 0]] + t[:, None] * X[members[:, 1]]

@@ -175,6 +175,6 @@ def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None
     save_figure(module.draw(counted), place / f"{name}.pdf")
     lines = [f"## {study.title}", "", module.text(counted).strip(), ""]
     lines += [f"Not counted: a run that failed, {row['failed']}" for row in rows if "failed" in row]
-    at = f"Measured at commit {data['commit'][:12]} on" if data["commit"] else "Measured on"
-    lines += [f"{at}: {sentence(found)}. Made again by `{command}`.", ""]
+    at = f", commit {data['commit'][:12]}" if data["commit"] else ""
+    lines += [f"Measured on: {sentence(found)}{at}. Made again by `{command}`.", ""]
     (place / f"{name}.md").write_text("\n".join(lines))
