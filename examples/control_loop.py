@@ -24,7 +24,7 @@ for cycle in range(1, CYCLES + 1):
     step = resolver.step(position=goal, dt=1.0 / RATE)
     computing.append(time.perf_counter() - clock)
 
-    # Here step.state.quantities go to the actuators, in the order of resolver.setup.truss.member_names.
+    # Here step.state.quantities go to the actuators, in the order of resolver.setup.arm.quantity_names.
     if step.status is not vq.StepStatus.REACHED:
         print(f"cycle {cycle}: {step.status}, {step.progress:.0%} of the way; held by {step.blocked_by[:2]}")
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
 from vgtm_qp.arm.arm import Pose
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import GoalError, ProblemError
 from vgtm_qp.problem.truss import BasePose
 from vgtm_qp.qp.numbers import ClearanceRows
@@ -139,7 +140,7 @@ def test_lock_at_run_time_holds_and_is_named():
     assert resolver.state is kept
     other = Resolver(resolver.setup)
     assert other.locked == frozenset()
-    index = [resolver.setup.truss.member(name) for name in ("B1-1", "B2-2")]
+    index = [truss_of(resolver.setup.arm).member(name) for name in ("B1-1", "B2-2")]
     active = set()
     for k in range(2, 8):
         step = resolver.step(position=start + STRIDE * k)
@@ -160,7 +161,7 @@ def test_an_arm_with_every_actuator_locked_stays_and_says_so():
         resolver.lock(name)
     step = resolver.step(position=resolver.tip()[0] + [0.1, 0.0, 0.0])
     assert step.progress < 1e-6
-    np.testing.assert_allclose(resolver.state.nodes, resolver.setup.truss.home, atol=1e-9)
+    np.testing.assert_allclose(resolver.state.nodes, resolver.setup.arm.home, atol=1e-9)
 
 
 @pytest.mark.parametrize("build", [Resolver, vq.solve])

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName, contestants, measure, report, scenes
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
@@ -210,7 +211,7 @@ def midway() -> tuple[vq.Problem, State, State, Plan]:
 
 
 def tip_and_lengths(problem: vq.Problem, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    truss = build_arm(problem.replace({"method.solver": "piqp"})).truss
+    truss = truss_of(build_arm(problem.replace({"method.solver": "piqp"})).arm)
     ends = truss.member_ends(X)
     return truss.tip_weights @ X[truss.tip], np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
@@ -225,7 +226,7 @@ def test_the_bare_pseudoinverse_moves_the_tip_to_first_order(midway: tuple[Any, 
         goal = here + share * float(plan.marks[25] - plan.marks[24])
         assert step.step(plan.path, here, goal, 0.2)
         tip, lengths = tip_and_lengths(problem, step.reached)
-        fixed = ~build_arm(problem).truss.actuated
+        fixed = ~build_arm(problem).arm.actuated
         errors.append(np.abs(lengths - before.quantities)[fixed].max())
         assert np.abs(tip - plan.path.at(goal).position).max() < 1e-12
     assert 3.0 < errors[0] / errors[1] < 5.0
@@ -241,7 +242,7 @@ def test_the_nonlinear_program_is_solved_within_its_limits_and_not_worse_than_th
     assert step.step(plan.path, here, goal, goal - here)
     tip, lengths = tip_and_lengths(problem, step.reached)
     setup = build_arm(problem)
-    fixed, low, high = ~setup.truss.actuated, *setup.truss.stroke.T
+    fixed, low, high = ~setup.arm.actuated, *setup.arm.stroke.T
     assert np.abs(lengths - before.quantities)[fixed].max() < 1e-9
     assert np.abs(tip - plan.path.at(goal).position).max() < 1e-9
     assert np.all((lengths > low - 1e-9) & (lengths < high + 1e-9))
@@ -437,7 +438,7 @@ def test_a_table_shows_every_number_and_the_comparison(
         (["--bays", "20", "0"], ["--bays", "5"]),
         (["--steps", "0"], ["--steps"]),
         (["--seconds", "0"], ["--seconds"]),
-        (["--compare", "none.json"], ["none.json", "vgtm bench --json"]),
+        (["--compare", "none.json"], ["none.json: cannot be read: no such file or directory"]),
     ],
 )
 def test_wrong_usage_gives_2_and_names_the_choices(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.path import Path
 
@@ -58,7 +59,7 @@ def test_a_maneuver_that_is_blocked_ends_where_the_arm_may_rest():
 @pytest.mark.parametrize("obstacles", [[], [CRATE]])
 def test_random_goals_in_a_control_loop_never_trap_a_moving_arm(seed, obstacles):
     resolver = vq.Resolver(problem(0.1, obstacle=obstacles))
-    truss, random = resolver.setup.truss, np.random.default_rng(seed)
+    truss, random = truss_of(resolver.setup.arm), np.random.default_rng(seed)
     steps, goal = [], np.zeros(3)
     for k in range(40):
         if k % 8 == 0:
@@ -87,7 +88,7 @@ def keeps_accelerations(truss, before, after, slack=1e-9):
 
 def drive(resolver, goals, dt=0.2):
     """Send an arm to one goal after another; return its steps, none of which may break a limit or trap it."""
-    truss, steps, before = resolver.setup.truss, [], None
+    truss, steps, before = truss_of(resolver.setup.arm), [], None
     for goal in goals:
         here = resolver.state
         step = resolver.step(position=goal(resolver), dt=dt)
@@ -141,7 +142,8 @@ def test_a_hard_tip_that_is_turned_round_brakes_along_its_path(seed):
             speed = -speed
         steps += drive(resolver, [lambda resolver, speed=speed: resolver.tip()[0] + 0.2 * speed])
         if steps[-1].braked or steps[-1].status is vq.StepStatus.BLOCKED:
-            speed = resolver.setup.truss.tip_weights @ resolver.state.motion[resolver.setup.truss.tip] / 0.2
+            truss = truss_of(resolver.setup.arm)
+            speed = truss.tip_weights @ resolver.state.motion[truss.tip] / 0.2
     braked = [step for step in steps if step.braked]
     assert braked
     assert not any(step.left_path for step in braked)
@@ -249,10 +251,10 @@ def test_a_control_loop_may_bring_its_arm_to_rest_at_any_time(mode):
     before, count = resolver.state, 0
     while (step := resolver.brake()) is not None:
         assert step.braked
-        assert keeps_accelerations(resolver.setup.truss, before, step.state)
+        assert keeps_accelerations(truss_of(resolver.setup.arm), before, step.state)
         last, before, count = before, step.state, count + 1
     assert count >= 1
-    assert may_rest(resolver.setup.truss, last, resolver.state)
+    assert may_rest(truss_of(resolver.setup.arm), last, resolver.state)
 
 
 def test_an_arm_that_is_sent_back_brakes_first_and_says_so():

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.bounds import longest_ways
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
@@ -44,7 +45,8 @@ def test_no_bundled_problem_is_refused_or_doubted(name: str):
 
 def test_an_obstacle_in_the_arm_is_refused_and_one_beside_it_doubted(free: vq.Problem):
     setup = build_arm(free)
-    ends = setup.truss.home[setup.truss.members[setup.truss.member("L3-1")]]
+    truss = truss_of(setup.arm)
+    ends = truss.home[truss.members[truss.member("L3-1")]]
     out = ends.mean(axis=0) * [1.0, 1.0, 0.0]
     out /= np.linalg.norm(out)
     reach = 0.2 + 0.03
@@ -92,7 +94,7 @@ def test_a_target_in_an_obstacle_is_refused_where_no_tip_can_surround_it(free: v
 @settings(max_examples=25, deadline=None)
 def test_no_pose_reaches_farther_than_the_longest_ways(seed: int):
     problem = vq.load_problem("five_bay_free")
-    truss = build_arm(problem).truss
+    truss = truss_of(build_arm(problem).arm)
     nodes = truss.home * np.random.default_rng(seed).uniform(0.3, 1.1, 3)
     lengths = np.linalg.norm(np.diff(nodes[truss.members], axis=1)[:, 0], axis=1)
     # Any positions are a pose of a truss whose members may be as long as they are there.

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
 from vgtm_qp.arm.build import make_arm
+from vgtm_qp.cli import main
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import sphere
 from vgtm_qp.problem import Problem
@@ -21,6 +22,7 @@ from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.clearance import clearance_rows
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.engine import FusedEngine, GeneralEngine
 from vgtm_qp.step.path import Path
 
@@ -582,3 +584,43 @@ def test_stations_of_joints_in_one_place_have_an_attitude():
 def test_a_method_that_moves_trusses_alone_is_refused_by_its_key(key, value):
     with pytest.raises(vq.ProblemError, match=rf'method\.{key}: found "{value}"'):
         vq.load_problem("snake_past_a_cube").replace({f"method.{key}": value})
+
+
+def test_a_locked_joint_is_named_as_one_and_the_key_of_trusses_is_read_too():
+    tables = [["p2", {"joint": "y4", "time": 4.0}], [{"member": "p2"}, {"member": "y4", "time": 4.0}]]
+    problems = [serial_problem(chain(locked=locked)) for locked in tables]
+    assert problems[0] == problems[1] == Problem.from_dict(problems[1].to_dict())
+    assert build_arm(problems[0], compiled=False).jams == (("y4", 4.0),)
+    for wrong, key in (({"joint": "p9"}, "arm.locked[0].joint"), ({"link": "p2"}, "arm.locked[0].link")):
+        with pytest.raises(vq.ProblemError) as raised:
+            serial_problem(chain(locked=[wrong]))
+        assert key in str(raised.value)
+
+
+def test_a_joint_that_jams_on_the_way_is_held_and_certified():
+    problem = serial_problem(chain(locked=[{"joint": "y4", "time": 4.0}]), curve={"control_vertices": 4})
+    maneuver = vq.solve(problem)
+    later = maneuver.joints[maneuver.time >= 4.0 - 1e-9, maneuver.joint_names.tolist().index("y4")]
+    assert len(later) > 1
+    np.testing.assert_allclose(later, later[0], atol=1e-9)
+    assert vq.verify(maneuver).ok
+
+
+def test_a_goal_out_of_reach_is_measured_from_the_base_itself():
+    problem = serial_problem(chain()).replace({"maneuver.waypoint": [{"time": 1.0, "position": [0, 0, 9]}]})
+    mistakes = check_problem(problem, build_arm(problem, compiled=False))
+    assert any('from base node "base", all links' in str(mistake) for mistake in mistakes)
+
+
+def test_one_station_is_told_of_in_the_singular():
+    text = str(make_arm(serial_problem(chain(every=10))).describe())
+    assert "\n1 station tracks the curve; it " in text
+    assert "stations" not in text
+
+
+@pytest.mark.parametrize("command", [["replay"], ["export", "--to", "mjcf"]])
+def test_what_reads_trusses_alone_names_the_file_of_a_serial_arm(command, tmp_path, capsys):
+    pytest.importorskip("mujoco")
+    file = vq.solve(serial_problem(chain(), curve={"control_vertices": 4})).save(tmp_path / "arm.npz")
+    assert main([command[0], str(file), *command[1:]]) == 2
+    assert f"{file}: this is the result of a serial arm; expected that of a truss" in capsys.readouterr().err

@@ -8,6 +8,7 @@ from method_problems import MODULES, free_problem, run
 from steps import numbers_at
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import CurveError
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import make_resolver
@@ -49,7 +50,7 @@ def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra:
     step = resolver.follow(plan.path, start, end)
     assert step.progress == 1.0, step.reason
 
-    unlimited = np.full(len(setup.truss.actuators), 1e9)
+    unlimited = np.full(len(setup.arm.actuators), 1e9)
     target = Target(plan.path, start, end, -unlimited, unlimited, there.state.time + 0.05)
     q = np.array(there.state.nodes)
     numbers = numbers_at(setup, q, np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True)
@@ -87,7 +88,7 @@ def test_corrected_methods_keep_lengths_and_tip(module: str, name: str) -> None:
     resolver = make_resolver(problem)
     run(resolver, problem)
     setup = resolver.setup
-    fixed = setup.truss.fixed
+    fixed = truss_of(setup.arm).fixed
     np.testing.assert_allclose(resolver.state.quantities[fixed], setup.arm.home_quantities[fixed], atol=1e-10)
     np.testing.assert_allclose(resolver.tip()[0], problem.maneuver.waypoint[0].position, atol=1e-9)
 
@@ -99,7 +100,7 @@ def test_faithful_methods_drift_by_the_square_of_the_step(name: str) -> None:
         problem = free_problem("octahedral", steps=steps, name=name, tracking="recursive")
         resolver = make_resolver(problem)
         run(resolver, problem)
-        fixed = resolver.setup.truss.fixed
+        fixed = truss_of(resolver.setup.arm).fixed
         drift.append(np.abs(resolver.state.quantities - resolver.setup.arm.home_quantities)[fixed].max())
     # Squares of half the displacement, twice as often.
     assert drift[0] / drift[1] == pytest.approx(2.0, abs=0.2)
@@ -124,7 +125,7 @@ def test_damping_and_truncation_change_the_answer_and_the_rank() -> None:
         return found
 
     plain = resolver()
-    rows = len(plain.setup.truss.fixed) + 3
+    rows = len(truss_of(plain.setup.arm).fixed) + 3
     assert plain.rank == rows
     damped = resolver(variant="damped", damping=0.3)
     assert np.abs(damped.state.nodes - plain.state.nodes).max() > 1e-4
@@ -194,7 +195,7 @@ def test_torsion_coordinates_let_the_curve_steer_roll() -> None:
     rolled = Problem.from_dict(data)
     resolver = make_resolver(rolled)
     run(resolver, rolled)
-    np.testing.assert_allclose(resolver.setup.truss.tip_frame, np.eye(3))
+    np.testing.assert_allclose(truss_of(resolver.setup.arm).tip_frame, np.eye(3))
     expected = make_plan(rolled, *resolver.tip()).path.at(1e9).rotation
     np.testing.assert_allclose(resolver.tip()[1], expected, atol=1e-9)
 
@@ -240,7 +241,7 @@ def test_the_potential_gradient_is_that_of_the_potential() -> None:
     problem = vq.load_problem("five_bay_two_cubes").replace({"method.solver": "piqp"})
     setup = build_arm(problem)
     random = np.random.default_rng(0)
-    X = setup.truss.home + random.normal(scale=0.02, size=setup.truss.home.shape)
+    X = setup.arm.home + random.normal(scale=0.02, size=setup.arm.home.shape)
 
     def potential(nodes: np.ndarray) -> float:
         distance = setup.monitor.near(nodes, 0.0, setup.influence).distance
@@ -290,9 +291,9 @@ def test_a_moving_base_enters_the_conventional_solution() -> None:
     moving = Problem.from_dict(data)
     resolver = make_resolver(moving)
     states = run(resolver, moving)
-    base = resolver.setup.truss.base
+    base = resolver.setup.arm.base
     np.testing.assert_allclose(states[-1][base] - states[0][base], [[0.095, 0.0, 0.0475]] * 3, atol=2e-3)
-    fixed = resolver.setup.truss.fixed
+    fixed = truss_of(resolver.setup.arm).fixed
     np.testing.assert_allclose(
         resolver.state.quantities[fixed], resolver.setup.arm.home_quantities[fixed], atol=1e-10
     )

@@ -9,6 +9,7 @@ import pytest
 from arms import TRUSSES, arm_problem, central_differences, random_pose
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.kinematics import EndKinematics
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.build import build_arm
@@ -49,7 +50,7 @@ def test_clearance_rows_are_the_derivatives_of_the_distances():
     """Distances by their definition at moved nodes, against the rows: the joints' rotation is part of both."""
     rng = np.random.default_rng(2)
     setup = build_arm(beside_a_cube())
-    truss, monitor = setup.truss, setup.monitor
+    truss, monitor = truss_of(setup.arm), setup.monitor
     X = truss.home + 0.02 * rng.normal(size=truss.home.shape)
     rows = separation_of(setup).rows(X, 0.0, 0.0, 1.0, {}, 0.0)
     assert rows.nodes.shape[1] == 12
@@ -87,7 +88,7 @@ def test_rows_of_different_widths_join():
 def test_a_proof_of_the_way_holds_at_every_instant_of_it():
     rng = np.random.default_rng(4)
     setup = build_arm(beside_a_cube())
-    separation, truss, monitor = separation_of(setup), setup.truss, setup.monitor
+    separation, truss, monitor = separation_of(setup), truss_of(setup.arm), setup.monitor
     certified = 0
     for _ in range(12):
         start, end = (truss.home + 0.05 * rng.normal(size=truss.home.shape) for _ in range(2))
@@ -121,7 +122,7 @@ def test_a_proof_of_the_way_holds_at_every_instant_of_it():
 def test_maneuvers_with_offset_joints_are_certified(module, bays, offset, monkeypatch):
     monkeypatch.setenv("VGTM_CC", "none")
     problem = arm_problem(bays=bays, truss={"module": module, "stroke": None, "joint_offset": offset})
-    home = build_arm(problem).truss
+    home = truss_of(build_arm(problem).arm)
     tip = home.tip_weights @ home.home[home.tip]
     goal = (tip + np.array([0.12, 0.04, -0.05]) * home.height).tolist()
     side = [tip[0] + 0.42 + 0.25 + 0.06 + 0.577 - 0.15, 0.0, 0.5 * home.height]

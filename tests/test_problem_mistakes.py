@@ -266,7 +266,7 @@ WRONG_ARM = [
     (
         "[[arm.joint]]",
         '[arm]\nlocked = ["bas"]\n[[arm.joint]]',
-        "arm.locked[0].member",
+        "arm.locked[0].joint",
         '"bas"',
         'mean "base"?',
     ),

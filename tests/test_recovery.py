@@ -12,6 +12,7 @@ from arms import mast
 from recovery_problems import BASE, box, problem
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.bounds import chord_deviation
 from vgtm_qp.cli import main
 from vgtm_qp.step.resolver import Resolver
@@ -20,7 +21,7 @@ from vgtm_qp.step.separation import Separation
 
 def beside(gap):
     """Return a box whose face is `gap` from the surface of the home arm, on the side of x."""
-    home = Resolver(problem()).setup.truss
+    home = truss_of(Resolver(problem()).setup.arm)
     reach = float(home.home[:, 0].max()) + float(home.radius.max())
     return box("crate", [reach + gap + 0.25, 0.0, 1.2], [0.5, 2.0, 2.0])
 

@@ -11,17 +11,17 @@ def test_a_scene_is_the_same_each_time_and_its_goal_is_a_clear_shape_of_its_arm(
     scene, again = random_scene(0, number), random_scene(0, number)
     assert scene.problem == again.problem
     setup = build_arm(scene.problem, compiled=False)
-    states = [setup.truss.home]
+    states = [setup.arm.home]
     if scene.reachable:
         states.append(scene.shape)
         goal = scene.problem.maneuver.waypoint[0]
         setup.kinematics.evaluate(scene.shape)
         np.testing.assert_allclose(setup.arm.end_effector.position(scene.shape), goal.position, atol=1e-12)
-        actuated = setup.truss.actuated
+        actuated = setup.arm.actuated
         lengths = setup.kinematics.quantities
         np.testing.assert_allclose(lengths[~actuated], setup.arm.home_quantities[~actuated], atol=1e-9)
-        assert np.all(lengths >= setup.truss.stroke[:, 0] - 1e-9)
-        assert np.all(lengths <= setup.truss.stroke[:, 1] + 1e-9)
+        assert np.all(lengths >= setup.arm.stroke[:, 0] - 1e-9)
+        assert np.all(lengths <= setup.arm.stroke[:, 1] + 1e-9)
     for X in states:
         assert setup.least_clearance(X, 0.0, "members") >= setup.self_safe
         assert setup.least_clearance(X, 0.0, "obstacles") >= SAFE

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
 from vgtm_qp.arm.arm import Pose
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.errors import CurveError, GoalError, ProblemError
 from vgtm_qp.qp.linearise import Linearisation
@@ -50,7 +51,7 @@ def walk(resolver, count=6, stride=STRIDE, **goal):
 def gaps(resolver):
     """Positions and turns between the tracked faces and the curve, by the curve's own class and the oracle."""
     setup, state = resolver.setup, resolver.state
-    layout, truss = setup.layout, setup.truss
+    layout, truss = setup.layout, truss_of(setup.arm)
     rows = layout.shape.rows(state.control_vertices, state.torsion, truss.face_frames[0])
     rotations = oracle.face_rotations(truss, state.nodes)[layout.tracked]
     turns = [oracle.turns(R, F, layout.turns) for R, F in zip(rotations, rows.frame, strict=True)]
@@ -129,7 +130,7 @@ def test_the_rows_of_a_general_curve_are_those_of_the_equations(module, bays, cu
         based = np.where(setup.arm.base[:, None], setup.arm.home @ pose.rotation.T + pose.position, q)
         np.testing.assert_allclose(asked.base, based, atol=1e-15)
         if layout.general is not None:
-            begins = oracle.face_rotations(setup.truss, based)[0]
+            begins = oracle.face_rotations(truss_of(setup.arm), based)[0]
             for table, known in zip(asked.curve, layout.shape.rows(vertices, torsion, begins), strict=True):
                 np.testing.assert_allclose(table, known, atol=1e-10)
         found = linearisation.numbers(asked, none)
@@ -291,7 +292,7 @@ def test_torsion_takes_up_the_roll_of_the_tip(module, bays):
     for _ in range(20):
         resolver.step(position=here)
     assert 0.15 < resolver.state.torsion[0] < 0.45
-    truss = resolver.setup.truss
+    truss = truss_of(resolver.setup.arm)
     roll = [
         Rotation.from_matrix(frame @ home.T).as_rotvec()[2]
         for frame, home in zip(
@@ -310,7 +311,7 @@ def test_spacing_keeps_the_curve_nodes_apart_as_at_home():
         family = resolver.setup.layout.family
         points = Curve(family, resolver.state.control_vertices).position(np.linspace(0, 1, 5))
         spread.append(
-            np.abs(np.linalg.norm(np.diff(points, axis=0), axis=1) - resolver.setup.truss.height / 4).max()
+            np.abs(np.linalg.norm(np.diff(points, axis=0), axis=1) - resolver.setup.arm.height / 4).max()
         )
     assert spread[1] < 0.8 * spread[0]
 
@@ -330,7 +331,7 @@ def test_a_vertex_goes_to_its_goal_and_the_arm_follows_while_the_tip_stays(solve
         before.control_vertices[3] - goal
     )
     np.testing.assert_allclose(resolver.tip()[0], tip, atol=1e-6)
-    faces = resolver.setup.truss.faces
+    faces = truss_of(resolver.setup.arm).faces
     middle = [state.nodes[faces[3]].mean(axis=0) for state in (before, after)]
     assert middle[1][0] - middle[0][0] > 0.05
     resolver.set_control_vertex_goal(3, None)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
 from vgtm_qp.arm.arm import Pose
-from vgtm_qp.arm.truss.arm import TrussArm
+from vgtm_qp.arm.truss.arm import TrussArm, truss_of
 from vgtm_qp.errors import GoalError, ProblemError, VgtmError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
@@ -409,7 +409,7 @@ def walk(resolver, targets, dt=None):
 
 def check_step(resolver, before, target, step, dt):
     """Recompute from the nodes alone everything that an accepted step has to keep."""
-    truss, state = resolver.setup.truss, step.state
+    truss, state = truss_of(resolver.setup.arm), step.state
     if step.status is StepStatus.BLOCKED:
         assert step.state is before
         assert resolver.state is before
@@ -567,7 +567,7 @@ def test_blocked_says_why_and_leaves_the_state(crate_problem):
 def test_active_rows_are_named_with_their_multipliers(crate_problem):
     resolver = Resolver(crate_problem)
     start, goal = resolver.tip()[0], np.array([1.05, 0.0, 1.25])
-    members = set(resolver.setup.truss.member_names)
+    members = set(resolver.setup.arm.quantity_names)
     seen = set()
     for _, _, step in walk(resolver, targets_to(goal, start, 14), 0.5):
         assert set(step.active) == set(step.multipliers)

@@ -119,7 +119,7 @@ def test_a_clutter_scene_is_the_same_each_time_and_clear_at_home() -> None:
     from vgtm_qp.step.build import build_arm
 
     setup = build_arm(first.replace({"method.solver": "piqp"}))
-    assert setup.monitor.least(setup.truss.home, 0.0, among="obstacles")[0] > 0.08
+    assert setup.monitor.least(setup.arm.home, 0.0, among="obstacles")[0] > 0.08
 
 
 def test_wilson_intervals_and_exponents() -> None:

@@ -23,11 +23,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.scatter import LengthScatter
 from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants, Frames
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies
+from vgtm_qp.rows.members import LengthScatter
 
 RANK_TOLERANCE = 1e-8
 """Singular values of a Jacobian below this fraction of the greatest one count as zero."""
@@ -325,7 +325,7 @@ class Arm(ABC):
 
     @abstractmethod
     def reach(self) -> Array:
-        """Return (N_c,) a bound of the distance from each base node to the tip in any pose, m."""
+        """Return (N_c,) a bound of the distance from each base node to the tip in any pose, m; inf where unknown."""
 
     def hollow(self) -> float:
         """Return a bound of the distance from the tip to the nearest point on the axis of a body, m."""
@@ -339,9 +339,19 @@ class Arm(ABC):
     def describe(self) -> Description:
         """Return the arm's counts, and what they allow."""
 
-    @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Return what verification needs to know of the arm, as JSON data."""
+        """Return what verification needs to know of the arm, as JSON data.
+
+        Keys of every arm: ``actuated``, ``stroke`` (M, 2), ``rate`` and ``acceleration`` of its quantities, and the
+        ``radius`` of its bodies. None means no limit.
+        """
+        return {
+            "actuated": self.actuated.tolist(),
+            "stroke": [_or_none(limits) for limits in self.stroke],
+            "rate": _or_none(self.rate),
+            "acceleration": _or_none(self.acceleration),
+            "radius": self.bodies.radius.tolist(),
+        }
 
     @abstractmethod
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
@@ -423,6 +433,6 @@ def has_full_rank(rows: Array) -> bool:
     return 0 < len(rows) <= rows.shape[1] and rank(np.linalg.svd(rows, compute_uv=False)) == len(rows)
 
 
-def or_none(limits: Array) -> list[float | None]:
+def _or_none(limits: Array) -> list[float | None]:
     """Return limits as JSON data, which has no infinity: None where there is none."""
     return [limit if math.isfinite(limit) else None for limit in limits.tolist()]

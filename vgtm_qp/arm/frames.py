@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 
 from vgtm_qp.arrays import Array, Index
+from vgtm_qp.rotation import rotation_from_vector, turn_between
 
 
 def fitted_frame(nodes: ca.SX, cosines: ca.SX, sines: ca.SX) -> ca.SX:
@@ -34,6 +37,19 @@ def turning(fitted: ca.SX, nodes: ca.SX, axes: ca.SX) -> ca.SX:
     """
     across = [-ca.skew(fitted[:, c]) @ axes.T / 2 for c in range(3)]
     return ca.jtimes(ca.vec(fitted), ca.vec(nodes), ca.vertcat(*across), True).T
+
+
+def frames_along(points: Array) -> Array:
+    """Return (F, 3, 3) frames at `points` (F, 3) on a way, the first upright; each turns no more than its z-axis does.
+
+    The z-axes point from the point before. Of two points in one place the second has the attitude of the first.
+    """
+    frames = [np.eye(3)]
+    for before, after in pairwise(points):
+        way, length = after - before, float(np.linalg.norm(after - before))
+        turn = turn_between(frames[-1][:, 2], way / length) if length > 0.0 else np.zeros(3)
+        frames.append(rotation_from_vector(turn) @ frames[-1])
+    return np.stack(frames)
 
 
 def frame_function(count: int) -> ca.Function:

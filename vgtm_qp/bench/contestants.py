@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.errors import SolverError
@@ -48,7 +49,7 @@ class BarePseudoinverse:
     def __init__(self, problem: Problem) -> None:
         self._setup = setup = arm_without_curve(problem)
         self._solution = DenseSolution(setup.layout, problem.method)
-        self._nodes = self.reached = setup.truss.home
+        self._nodes = self.reached = setup.arm.home
 
     def place(self, state: State) -> None:
         """See :class:`Contestant`."""
@@ -56,7 +57,7 @@ class BarePseudoinverse:
 
     def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
         """See :class:`Contestant`."""
-        setup, truss = self._setup, self._setup.truss
+        setup, truss = self._setup, truss_of(self._setup.arm)
         setup.kinematics.evaluate(self._nodes)
         tip = setup.task.rows(self._nodes, setup.kinematics, path.at(end))
         J, _ = self._solution.jacobians(setup.kinematics.gradient, tip.jacobian)

@@ -11,6 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
@@ -42,7 +43,8 @@ class NonlinearStep:
 
     def __init__(self, problem: Problem) -> None:
         self._setup = setup = arm_without_curve(problem)
-        truss, weights, actuators = setup.truss, problem.method.weights, setup.truss.actuators.tolist()
+        truss, weights = truss_of(setup.arm), problem.method.weights
+        actuators = truss.actuators.tolist()
         free = 3 * len(truss.free)
         x, x0 = ca.SX.sym("x", free), ca.SX.sym("x0", free)
         goal, across = ca.SX.sym("goal", 3), ca.SX.sym("across", 2, 3)
@@ -79,7 +81,7 @@ class NonlinearStep:
     def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
         """See :class:`~vgtm_qp.bench.contestants.Contestant`; False where IPOPT fails."""
         setup, state = self._setup, self._state
-        truss, actuators = setup.truss, setup.truss.actuators
+        truss, actuators = truss_of(setup.arm), setup.arm.actuators
         here, goal = state.nodes[truss.free].reshape(-1), path.at(end)
         lower, upper = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
         limits = truss.stroke[actuators], truss.rate[actuators], truss.acceleration[actuators]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.contestants import BASELINES, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
@@ -46,7 +47,7 @@ def measure_scene(
     plan = make_plan(problem, *resolver.tip())
     alone = run_alone(resolver, plan, seconds=seconds, steps=steps)
     baselines = {name: _against(scene, name, resolver, plan, seconds=seconds, steps=steps) for name in names}
-    data, truss = problem.to_dict(), resolver.setup.truss
+    data, truss = problem.to_dict(), truss_of(resolver.setup.arm)
     return {
         "name": scene.name,
         "kind": scene.kind,
@@ -155,7 +156,9 @@ def load_document(path: Path) -> dict[str, Any]:
     wrong = f"{path} is not what vgtm bench --json prints"
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be read: {(error.strerror or str(error)).lower()}") from None
+    except ValueError as error:
         raise ResultError(f"{wrong}: {error}") from None
     keys = ("schema_version", "commit", "time", "scenes")
     if not isinstance(document, dict) or any(key not in document for key in keys):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -124,9 +126,22 @@ def export(
     suffix = FORMATS[to].suffix
     path = result.with_suffix(suffix) if output is None else output
     check_writable(path, "--output", (suffix,))
-    file = export_maneuver(load_result(result), path, to=to)
+    maneuver = load_result(result)
+    with _about(result):
+        file = export_maneuver(maneuver, path, to=to)
     written = {"result": str(result), "format": to, "file": str(file), "bytes": file.stat().st_size}
     answer(written, f"{to}: {file}", as_json=json)
+
+
+@contextmanager
+def _about(result: Path) -> Iterator[None]:
+    """Name the result file in what is raised about its content."""
+    from vgtm_qp.errors import ResultError
+
+    try:
+        yield
+    except ResultError as error:
+        raise ResultError(f"{result}: {error}") from None
 
 
 def replay(result: ResultFile, /, *, json: Json = False) -> None:
@@ -134,6 +149,8 @@ def replay(result: ResultFile, /, *, json: Json = False) -> None:
     from vgtm_qp.export.replay import replay as run
     from vgtm_qp.maneuver.maneuver import load_result
 
-    replayed = run(load_result(result))
+    maneuver = load_result(result)
+    with _about(result):
+        replayed = run(maneuver)
     rows = [("", "certificate", "kinematic", "physics"), *replayed.rows()]
     answer({"result": str(result), **replayed.to_dict()}, table(rows, indent="  "), as_json=json)

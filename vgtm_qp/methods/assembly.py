@@ -11,13 +11,13 @@ import numpy as np
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.frames import frame_function, frame_tables
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.rotation import vector_from_rotation
+from vgtm_qp.rows.members import member_function
 
 
 class CurveNodes(NamedTuple):
@@ -48,7 +48,8 @@ class SegmentKinematics:
         truss, fixed, face = self._truss, segment.fixed, segment.face
         if len(fixed):
             if len(fixed) not in self._members:
-                self._members[len(fixed)] = Kernel(member_function(truss).map(len(fixed)))
+                member = member_function(has_offsets=truss.joints is not None)
+                self._members[len(fixed)] = Kernel(member.map(len(fixed)))
             members = self._members[len(fixed)]
             members.inputs[0][:] = X.take(truss.member_nodes[fixed].ravel(), axis=0).ravel()
             if truss.joints is not None:

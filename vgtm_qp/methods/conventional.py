@@ -205,11 +205,11 @@ class ConventionalResolver(MethodResolver):
         solution = SparseSolution if method.algebra == "sparse" else DenseSolution
         self._solution = solution(self.setup.layout, method)
         self._correct = method.correct
-        self._home_fixed = self.setup.arm.home_quantities[self.setup.truss.fixed]
+        self._home_fixed = self.setup.arm.home_quantities[truss_of(self.setup.arm).fixed]
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         setup, state = self.setup, self.state
-        kinematics, truss = setup.kinematics, setup.truss
+        kinematics, truss = setup.kinematics, truss_of(setup.arm)
         X = np.array(state.nodes)
         system = self._linear(X, displacement_to(path.at(end), path.at(start)))
         gradient, x_g = system.gradient, system.x_g
@@ -236,7 +236,7 @@ class ConventionalResolver(MethodResolver):
         setup = self.setup
         setup.kinematics.evaluate(X)
         tip = setup.task.rows(X, setup.kinematics, goal)
-        missing = self._home_fixed - setup.kinematics.quantities[setup.truss.fixed]
+        missing = self._home_fixed - setup.kinematics.quantities[truss_of(setup.arm).fixed]
         if self._correct:
             return Linear(setup.kinematics.gradient, tip.jacobian, tip.error, missing)
         return Linear(setup.kinematics.gradient, tip.jacobian, tip.rate, np.zeros_like(missing))
@@ -251,7 +251,7 @@ class ConventionalResolver(MethodResolver):
                 return
             if not worst < 1e3:
                 break
-            X[self.setup.truss.free] += self._solution.displacement(system, terms).reshape(-1, 3)
+            X[self.setup.arm.free] += self._solution.displacement(system, terms).reshape(-1, 3)
         raise SolverError("Newton's method on lengths and tip does not converge")
 
 

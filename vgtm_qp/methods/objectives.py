@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.step.setup import Setup
@@ -47,8 +48,9 @@ class TrussObjective:
 
     def at(self, X: Array, lengths: Array, time: float) -> Terms:
         """Return the terms at node positions `X` (N, 3) with member `lengths` (M,)."""
-        setup, actuators, free = self._setup, self._setup.truss.actuators, self._setup.truss.free
-        centring = self._centring * (lengths[actuators] - setup.arm.home_quantities[actuators])
+        setup, arm = self._setup, self._setup.arm
+        actuators, free = arm.actuators, arm.free
+        centring = self._centring * (lengths[actuators] - arm.home_quantities[actuators])
         terms = self.without_gradients()._replace(actuator_gradient=centring)
         if not self._potential:
             return terms
@@ -58,7 +60,7 @@ class TrussObjective:
 
     def without_gradients(self) -> Terms:
         """Return the terms that are squares of displacements alone."""
-        truss = self._setup.truss
+        truss = truss_of(self._setup.arm)
         return Terms(
             self._node,
             self._actuator,

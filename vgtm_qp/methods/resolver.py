@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import CurveError, GoalError, SolverError
 from vgtm_qp.problem import Problem
@@ -131,7 +132,7 @@ class MethodResolver(ABC):
         """Return where the step leads, or raise SolverError."""
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
-        truss, lengths = self.setup.truss, self.setup.arm.home_quantities
+        truss, lengths = truss_of(self.setup.arm), self.setup.arm.home_quantities
         if too_long := self.setup.too_long(nodes - self.state.nodes):
             raise SolverError(too_long)
         asked = float(np.linalg.norm(path.at(end).position - path.at(start).position))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Annotated, Literal
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from vgtm_qp.problem.fields import (
     ORIGIN,
@@ -14,12 +14,13 @@ from vgtm_qp.problem.fields import (
     Limit,
     Name,
     Number,
+    Onset,
     Vector,
     count,
     exactly,
 )
 from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
-from vgtm_qp.problem.truss import BasePose, Lock
+from vgtm_qp.problem.truss import BasePose, LockTable
 
 
 class Joint(Table, called="a joint"):
@@ -48,6 +49,23 @@ class Joint(Table, called="a joint"):
             yield ("home",), f"a value within the limits, {self.limits[0]:g} to {self.limits[1]:g}"
 
 
+class JointLock(LockTable, called="a locked joint"):
+    """A joint that is stuck at its value, from the start or from a time on."""
+
+    key = "joint"
+
+    joint: Name = Field(description="name of the joint")
+    time: Onset = Field(default=0.0, description="time at which it jams, s; 0 is from the start")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_member(cls, data: Any) -> Any:
+        """Read `member`, the key of a truss, which files of serial arms had."""
+        if not isinstance(data, Mapping) or "member" not in data or "joint" in data:
+            return data
+        return {"joint" if key == "member" else key: value for key, value in data.items()}
+
+
 class ArmTable(Table, called="an arm"):
     """A serial arm."""
 
@@ -65,8 +83,8 @@ class ArmTable(Table, called="an arm"):
         default=None,
         description="which joints' frames track the curve: every so many; where absent, as few as keep to it exactly",
     )
-    locked: tuple[Lock, ...] = Field(
-        default=(), description="joints that are stuck: names, or tables of member and time"
+    locked: tuple[JointLock, ...] = Field(
+        default=(), description="joints that are stuck: names, or tables of joint and time"
     )
     base_motion: tuple[BasePose, ...] = Field(
         default=(), description="poses of a moving base, in the order of time"
@@ -74,10 +92,10 @@ class ArmTable(Table, called="an arm"):
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from increasing("base_motion", [pose.time for pose in self.base_motion])
-        yield from unique("locked", "member", [lock.member for lock in self.locked])
+        yield from unique("locked", "joint", [lock.joint for lock in self.locked])
         if not self.joint:
             yield ("joint",), "a list of joints [[arm.joint]]"
         yield from unique("joint", "name", [joint.name for joint in self.joint])
         names = {joint.name: joint for joint in self.joint}
         for i, lock in enumerate(self.locked):
-            yield from known_names(("locked", i), (lock.member,), names, key="member")
+            yield from known_names(("locked", i), (lock.joint,), names, key="joint")

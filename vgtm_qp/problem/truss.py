@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
@@ -34,20 +34,25 @@ _NodePair = Annotated[tuple[Name, Name], exactly(2, "the names of two nodes")]
 _Positions = Annotated[tuple[Vector, Vector], exactly(2, "two positions [[x, y, z], [x, y, z]]")]
 
 
-class Lock(Table, called="a locked member"):
-    """An actuator that is stuck at its length, from the start or from a time on."""
+class LockTable(Table):
+    """An actuator that is stuck, from the start or from a time on: its name, or a table of that and the time."""
 
-    member: Name = Field(description="name of the actuated member")
-    time: Onset = Field(default=0.0, description="time at which it jams, s; 0 is from the start")
+    key: ClassVar[str]
+    """Key of the name."""
+
+    @property
+    def actuator(self) -> str:
+        """Name of the actuator."""
+        return str(getattr(self, self.key))
 
     @model_validator(mode="before")
     @classmethod
     def _from_name(cls, data: Any) -> Any:
         if isinstance(data, str):
-            return {"member": data}
-        if isinstance(data, Mapping | Lock):
+            return {cls.key: data}
+        if isinstance(data, Mapping | LockTable):
             return data
-        raise unexpected("the name of an actuated member, or a table of member and time")
+        raise unexpected(f"the name of an actuated {cls.key}, or a table of {cls.key} and time")
 
     @classmethod
     def __get_pydantic_json_schema__(
@@ -55,6 +60,15 @@ class Lock(Table, called="a locked member"):
     ) -> JsonSchemaValue:
         table = handler.resolve_ref_schema(handler(schema))
         return {"anyOf": [{"type": "string", "minLength": 1}, dict(table)]}
+
+
+class Lock(LockTable, called="a locked member"):
+    """A member that is stuck at its length, from the start or from a time on."""
+
+    key = "member"
+
+    member: Name = Field(description="name of the actuated member")
+    time: Onset = Field(default=0.0, description="time at which it jams, s; 0 is from the start")
 
 
 class BasePose(Table, called="a base pose"):

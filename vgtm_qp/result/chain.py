@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.poses import rotations
+from vgtm_qp.result.poses import rotation_matrix, rotations
 
 
 class RecordedChain:
@@ -36,9 +36,11 @@ class RecordedChain:
         Links that are drawn as changing their lengths: none.
     """
 
-    unit, body, rigid_body = "rad or m", "link", "link"
+    kind, unit, body, rigid_body = "serial", "rad or m", "link", "link"
 
     def __init__(self, record: Mapping[str, Any]) -> None:
+        if record.get("kind") != self.kind:
+            raise ResultError("manifest.arm is not the record of a serial arm")
         try:
             self.quantity_names = tuple(str(name) for name in record["joint_names"])
             self.member_names = tuple(str(name) for name in record["body_names"])
@@ -73,6 +75,39 @@ class RecordedChain:
         self.home, self._home_tip = points[0], frames[0]
         self.length = self.lengths(self.home)
         self._reaches = self._greatest_reaches()
+
+    def contradictions(self, problem: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[str]:
+        """Return where the record disagrees with the arrays of the result file or with the problem."""
+        found = []
+        for name, recorded in (("joint_names", self.quantity_names), ("body_names", self.member_names)):
+            if name not in arrays or tuple(arrays[name].tolist()) != recorded:
+                found.append(f"array {name} differs from the arm record")
+        table = problem.get("arm") or {}
+        joints = {str(joint["name"]): joint for joint in table.get("joint") or ()}
+        if tuple(joints) != self.quantity_names:
+            return [*found, "the joints of the arm record are not those of the problem"]
+        origin = (0.0, 0.0, 0.0)
+        for k, (name, joint) in enumerate(joints.items()):
+            axis = np.array(joint["axis"], dtype=float)
+            turn = np.array(joint.get("rotation_vector") or origin, dtype=float)
+            wanted = {
+                "axis": (self.axis[k], axis / np.linalg.norm(axis)),
+                "position": (self.position[k], joint.get("position") or origin),
+                "rotation": (self.rotation[k], rotation_matrix(turn)),
+                "home": (self.home_quantities[k], joint.get("home") or 0.0),
+                "limits": (self.stroke[k], joint.get("limits") or (-np.inf, np.inf)),
+                "rate": (self.rate[k], joint.get("rate") or np.inf),
+                "acceleration": (self.acceleration[k], joint.get("acceleration") or np.inf),
+                "kind": (float(self.revolute[k]), float(joint.get("kind", "revolute") == "revolute")),
+            }
+            for key, (recorded, given) in wanted.items():
+                if not same(recorded, given):
+                    found.append(f"the arm record's {key} of joint {name} differs from the problem's")
+        if not same(self.tip, table.get("tip") or origin):
+            found.append("the arm record's tip differs from the problem's")
+        if table.get("link_radius") is not None and not same(self.radius, table["link_radius"]):
+            found.append("the arm record's link radius differs from the problem's")
+        return found
 
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
         """Return points (P, J + 2, 3), m, axes (P, J, 3) and last frames (P, 3, 3) at configurations (P, J + 6)."""
@@ -153,6 +188,11 @@ class RecordedChain:
         return np.concatenate([[after[0] + ways[0]], after])
 
 
+def same(recorded: ArrayLike, given: ArrayLike) -> bool:
+    """Whether the numbers of a record are those of the problem, to 1e-9."""
+    return bool(np.allclose(recorded, given, rtol=0.0, atol=1e-9))
+
+
 def numbers(record: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
     """Return ``record[key]`` as floats of that shape, inf for None."""
     array = np.asarray(record[key], dtype=np.float64)
@@ -162,11 +202,6 @@ def numbers(record: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) 
     ):
         raise ResultError(f"manifest.arm.{key} has shape {array.shape}; expected {shape}")
     return array
-
-
-def is_serial(record: Mapping[str, Any]) -> bool:
-    """Whether the arm is a serial one."""
-    return record.get("kind") == "serial"
 
 
 def extreme_values(jacobian: NDArray[Any]) -> tuple[float, float]:

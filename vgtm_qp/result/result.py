@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate
-from vgtm_qp.result.chain import RecordedChain, is_serial
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.file import check_arrays, frozen, names_of, plain, read_result, write_result
 from vgtm_qp.result.manifest import check_manifest
 from vgtm_qp.result.poses import base_poses
@@ -88,8 +88,6 @@ class Result:
         arrays = {name: plain(array) for name, array in self.arrays.items()}
         check_arrays(arrays)
         if self.joints is not None:
-            if not is_serial(manifest["arm"]):
-                raise ResultError("there are joints in it, but manifest.arm is not that of a serial arm")
             arrays |= _links(RecordedChain(manifest["arm"]), self.configurations)
         for name, array in arrays.items():
             object.__setattr__(self, name, frozen(array))

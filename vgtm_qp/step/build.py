@@ -22,8 +22,7 @@ from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.long.select import STAGED_ACTUATORS
-from vgtm_qp.qp.long.solver import ChainSolver
+from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
 from vgtm_qp.rotation import rotation_from_vector
@@ -87,7 +86,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         tip_mode=problem.end_effector.mode,
         base_motion=base_motion(spec.base_motion) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
-        jams=tuple((lock.member, lock.time) for lock in spec.locked if lock.time > 0.0),
+        jams=tuple((lock.actuator, lock.time) for lock in spec.locked if lock.time > 0.0),
         measure=None if clearance.self_collision else Clearance(arm.bodies, **options),
     )
 
@@ -220,10 +219,10 @@ def make_engine(
     is_quick = is_default and compiled and not layout.elastic_tip
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
         return FusedEngine(layout)
-    chosen = make_solver(solver, layout)
-    if is_quick and isinstance(chosen, ChainSolver) and ChainEngine.serves(chosen):
-        return ChainEngine(chosen, kinematics, task)
-    return GeneralEngine(layout, kinematics, task, chosen, compiled=compiled)
+    along = chain_solver(layout) if is_quick and prefers_staged(layout) else None
+    if along is not None and ChainEngine.serves(along):
+        return ChainEngine(along, kinematics, task)
+    return GeneralEngine(layout, kinematics, task, along or make_solver(solver, layout), compiled=compiled)
 
 
 def check_solver(problem: Problem) -> None:

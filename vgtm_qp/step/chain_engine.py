@@ -49,7 +49,7 @@ class ChainEngine(Engine):
         self._strokes = arm.home_quantities[arm.actuators]
         self._answer = (self._strokes, self._strokes, self._strokes)
         self._vertices: Array = np.zeros((self.layout.vertices, 3))
-        self._curve_weights = self.layout.curve_weights[chain.faces.reshape(-1)]
+        self._curve_weights = self.layout.curve_weights[chain.stations.reshape(-1)]
         self._any_closing = Closing(self.layout, kinematics)
 
     @staticmethod

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Kinematics, Pose
-from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.layout import Layout
@@ -77,11 +75,6 @@ class Setup:
     slow_approach: bool
     jams: tuple[tuple[str, float], ...]
     measure: Clearance | None
-
-    @property
-    def truss(self) -> Truss:
-        """The truss, for what knows trusses alone; TrussError for any other arm."""
-        return truss_of(self.arm)
 
     def too_long(self, displacements: Array) -> str:
         """Return why nodes (N, 3) may not be displaced so far in one step, m; empty where they may."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.build import build_truss
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array
@@ -102,14 +103,14 @@ def bring_lengths(
             return True
         if singular and least_singular_value(setup) < singular:
             return False
-        jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
-        X[setup.truss.free] += min(1.0, longest / worst) * np.linalg.solve(jacobian, error).reshape(-1, 3)
+        jacobian = truss_of(setup.arm).scatter.dense(setup.kinematics.gradient)
+        X[setup.arm.free] += min(1.0, longest / worst) * np.linalg.solve(jacobian, error).reshape(-1, 3)
     return False
 
 
 def least_singular_value(setup: Setup) -> float:
     """Return that of the length Jacobian where the kinematics was evaluated last, 0 where it is not finite."""
-    jacobian = setup.truss.scatter.dense(setup.kinematics.gradient)
+    jacobian = truss_of(setup.arm).scatter.dense(setup.kinematics.gradient)
     if not np.all(np.isfinite(jacobian)):
         return 0.0
     return float(np.linalg.svd(jacobian, compute_uv=False)[-1])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.comparison.tables import crossed_table, exponent
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.study.arms import bending_problem, furthest, moving_curve
@@ -41,7 +42,7 @@ def run(module: str, bays: int, steps: int) -> Row:
     }
     problem = bending_problem(bays, steps=steps, goal=(0.3, 0.1, -0.1), module=module, vertices=5, **sizes)
     *_, resolver = moving_curve(with_method(problem, "curve-pseudoinverse-obstacles"))
-    nodes, truss, curve = resolver.state.nodes, resolver.setup.truss, resolver.curve
+    nodes, truss, curve = resolver.state.nodes, truss_of(resolver.setup.arm), resolver.curve
     points = curve.position(np.linspace(0.0, 1.0, 4001))
     centres = resolver.setup.arm.stations.centres(nodes)
     middle = np.linspace(0.0, 1.0, 9)[None, :, None]

@@ -31,7 +31,7 @@ def run(problem: str, offset: float) -> Row:
     setup = build_arm(
         loaded.replace({"truss.joint_offset": offset, "truss.stroke": None, "method.solver": "piqp"})
     )
-    X = np.array(setup.truss.home)
+    X = np.array(setup.arm.home)
     errors = []
     for lengths, tip in zip(maneuver.member_lengths, maneuver.tip_position, strict=True):
         wanted = setup.arm.home_quantities + (lengths - maneuver.member_lengths[0])

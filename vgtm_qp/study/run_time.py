@@ -8,6 +8,7 @@ from time import thread_time
 import numpy as np
 from matplotlib.figure import Figure
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.comparison.tables import crossed_table, exponent
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import make_resolver, with_method
@@ -69,7 +70,7 @@ def run(bays: int, method: str, cubes: bool) -> Row:
             value = (
                 float(mark) if step.progress >= 1.0 - 1e-9 else value + step.progress * (float(mark) - value)
             )
-    fixed = resolver.setup.truss.fixed
+    fixed = truss_of(resolver.setup.arm).fixed
     drift = np.abs(resolver.state.quantities - resolver.setup.arm.home_quantities)[fixed].max()
     return {
         "time": _STEPS * float(np.median(times)),

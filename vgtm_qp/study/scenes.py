@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry import shapes
@@ -54,12 +55,12 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
     }
     setup = build_arm(Problem.from_dict(problem))
     shape = random_shape(setup, random)
-    setup.kinematics.evaluate(shape if reachable else setup.truss.home)
+    setup.kinematics.evaluate(shape if reachable else setup.arm.home)
     position, pointing = setup.arm.end_effector.position(shape), setup.kinematics.tip_rotation[:, 2]
     if not reachable:
         aim = random.normal(size=3)
         aim[2] = abs(aim[2])
-        reach = setup.truss.height * random.uniform(0.3, 1.2)
+        reach = setup.arm.height * random.uniform(0.3, 1.2)
         position = aim * (reach / np.linalg.norm(aim))
     waypoint["position"] = position.tolist()
     if directed:
@@ -87,7 +88,7 @@ def random_shape(setup: Setup, random: np.random.Generator) -> Array:
     Actuator lengths vary smoothly along and around the arm; they are approached from home by Newton's method, and
     the result is the furthest shape that is neither nearly singular nor in self-collision.
     """
-    truss, kinematics = setup.truss, setup.kinematics
+    truss, kinematics = truss_of(setup.arm), setup.kinematics
     actuators = truss.actuators
     least, most = 0.15 * truss.height, random.uniform(0.3, 0.9) * truss.height
     furthest = truss.home
@@ -117,12 +118,12 @@ def random_shape(setup: Setup, random: np.random.Generator) -> Array:
 
 def _tip_motion(setup: Setup, X: Array) -> float:
     tip = setup.arm.end_effector
-    return float(np.linalg.norm(tip.position(X) - tip.position(setup.truss.home)))
+    return float(np.linalg.norm(tip.position(X) - tip.position(setup.arm.home)))
 
 
 def _random_lengths(setup: Setup, random: np.random.Generator) -> Array:
     """Return (n_a,) lengths that change smoothly along and around the arm, m."""
-    truss = setup.truss
+    truss = truss_of(setup.arm)
     actuators = truss.actuators
     middle = truss.home[truss.members[actuators]].mean(axis=1)
     z = middle[:, 2] / truss.height
@@ -144,7 +145,7 @@ def _cubes(
 
     The straight path of the tip to a goal that can be reached is kept free of them, for the tip's face at least.
     """
-    truss = setup.truss
+    truss = truss_of(setup.arm)
     states = [truss.home] if shape is None else [truss.home, shape]
     tips = np.stack([state[truss.tip] for state in states])
     share = np.linspace(0.0, 1.0, 21)[:, None, None]

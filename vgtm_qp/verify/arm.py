@@ -6,10 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.chain import RecordedChain, extreme_values, is_serial, numbers
+from vgtm_qp.result.chain import RecordedChain, extreme_values, numbers, same
+
+_TOLERANCE = 1e-9
+"""Of recorded lengths against those of the home nodes, m."""
 
 _DENSE_UNKNOWNS = 300
 """Above this many free coordinates singular values come from a sparse factorisation."""
@@ -41,8 +45,8 @@ class RecordedArm:
 
     def __init__(self, record: Mapping[str, Any], members: Index) -> None:
         count = len(members)
-        if is_serial(record):
-            raise ResultError("this is the result of a serial arm; expected that of a truss")
+        if kind := record.get("kind"):
+            raise ResultError(f"this is the result of a {kind} arm; expected that of a truss")
         try:
             self.home = numbers(record, "home", (None, 3))
             nodes = len(self.home)
@@ -75,6 +79,42 @@ class RecordedArm:
         self.free = np.setdiff1d(np.arange(nodes), self.base)
         # Fewer than three nodes have no attitude.
         self._tip_fit = polygon_frame(self.home[self.tip], None) if len(self.tip) >= 3 else None
+
+    def contradictions(self, problem: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[str]:
+        """Return where the record disagrees with the arrays of the result file, with itself or with the problem."""
+        found = []
+        if tuple(arrays["member_names"].tolist()) != self.member_names:
+            found.append("array member_names differs from the arm record")
+        if not np.array_equal(arrays["member_actuated"], self.actuated):
+            found.append("array member_actuated differs from the arm record")
+        off = np.abs(self.lengths(self.home) - self.length)
+        if off.max(initial=0.0) > _TOLERANCE:
+            k = int(np.argmax(off))
+            found.append(
+                f"the arm record's length of {self.member_names[k]} is {off[k]:.3g} m off its home nodes"
+            )
+        truss = problem.get("truss") or {}
+        entries = {str(entry["name"]): entry for entry in truss.get("member") or ()}
+        if entries and set(entries) != set(self.member_names):
+            found.append("the members of the arm record are not those of the problem")
+        for name, recorded in (
+            ("member_radius", self.radius),
+            ("stroke", self.stroke),
+            ("rate", self.rate),
+            ("acceleration", self.acceleration),
+        ):
+            differing = []
+            for k, member in enumerate(self.member_names):
+                if name != "member_radius" and not self.actuated[k]:
+                    continue
+                given = entries.get(member, {}).get(name.removeprefix("member_"))
+                wanted = truss.get(name) if given is None else given
+                if wanted is not None and not same(recorded[k], wanted):
+                    differing.append(f"{member} (problem: {wanted})")
+            if differing:
+                more = f" and {len(differing) - 1} more members" if len(differing) > 1 else ""
+                found.append(f"the arm record's {name} differs from the problem's at {differing[0]}{more}")
+        return found
 
     @property
     def has_pin_joints(self) -> bool:
@@ -215,8 +255,8 @@ Arm = RecordedArm | RecordedChain
 
 
 def recorded_arm(record: Mapping[str, Any], members: Index) -> Arm:
-    """Return the arm of a manifest's record; `members` (M, 2) are the nodes of each."""
-    return RecordedChain(record) if is_serial(record) else RecordedArm(record, members)
+    """Return the arm of a manifest's record; `members` (M, 2) are the nodes of each member of a truss."""
+    return RecordedChain(record) if record.get("kind") == RecordedChain.kind else RecordedArm(record, members)
 
 
 def polygon_frame(points: Array, angles: Array | None) -> tuple[Array, Array]:

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate, Measure
-from vgtm_qp.result.chain import RecordedChain
-from vgtm_qp.result.poses import base_poses, rotation_matrix, rotations
+from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm, recorded_arm
 from vgtm_qp.verify.clearance import (
@@ -104,7 +102,7 @@ def verify(maneuver: Result) -> Certificate:
         contradictions=(
             *wrong,
             *astray,
-            *_record_contradictions(maneuver, arm),
+            *arm.contradictions(maneuver.manifest["problem"], maneuver.arrays),
             *_jams_between_rows(maneuver),
             *_outcome_contradictions(maneuver),
         ),
@@ -209,7 +207,7 @@ def _locks(maneuver: Result) -> list[tuple[str, float]]:
     problem = maneuver.manifest["problem"]
     entries = (problem.get("truss") or problem.get("arm") or {}).get("locked") or ()
     tables = ({"member": entry} if isinstance(entry, str) else entry for entry in entries)
-    return [(table["member"], float(table.get("time", 0.0))) for table in tables]
+    return [(table.get("joint") or table["member"], float(table.get("time", 0.0))) for table in tables]
 
 
 def _jams_between_rows(maneuver: Result) -> list[str]:
@@ -273,84 +271,6 @@ def _least(found: Least, bound: float, unit: str = "m") -> Measure:
 
 def _least_of(values: Array, unit: str) -> Measure:
     return Measure(float(values.min()) if len(values) else None, unit, None, "least")
-
-
-def _record_contradictions(maneuver: Result, arm: Arm) -> list[str]:
-    """Return where the arm record disagrees with the arrays, with itself or with the problem."""
-    if isinstance(arm, RecordedChain):
-        return _chain_contradictions(maneuver, arm)
-    found = []
-    if tuple(maneuver.member_names.tolist()) != arm.member_names:
-        found.append("array member_names differs from the arm record")
-    if not np.array_equal(maneuver.member_actuated, arm.actuated):
-        found.append("array member_actuated differs from the arm record")
-    off = np.abs(arm.lengths(arm.home) - arm.length)
-    if off.max(initial=0.0) > MEMBER_TOLERANCE:
-        k = int(np.argmax(off))
-        found.append(f"the arm record's length of {arm.member_names[k]} is {off[k]:.3g} m off its home nodes")
-    truss = maneuver.manifest["problem"].get("truss") or {}
-    entries = {str(entry["name"]): entry for entry in truss.get("member") or ()}
-    if entries and set(entries) != set(arm.member_names):
-        found.append("the members of the arm record are not those of the problem")
-    for name, recorded in (
-        ("member_radius", arm.radius),
-        ("stroke", arm.stroke),
-        ("rate", arm.rate),
-        ("acceleration", arm.acceleration),
-    ):
-        differing = []
-        for k, member in enumerate(arm.member_names):
-            if name != "member_radius" and not arm.actuated[k]:
-                continue
-            given = entries.get(member, {}).get(name.removeprefix("member_"))
-            wanted = truss.get(name) if given is None else given
-            if wanted is not None and not _same(recorded[k], wanted):
-                differing.append(f"{member} (problem: {wanted})")
-        if differing:
-            more = f" and {len(differing) - 1} more members" if len(differing) > 1 else ""
-            found.append(f"the arm record's {name} differs from the problem's at {differing[0]}{more}")
-    return found
-
-
-def _chain_contradictions(maneuver: Result, arm: RecordedChain) -> list[str]:
-    """Return where the record of a serial arm disagrees with the arrays or with the problem."""
-    found = []
-    for name, given, recorded in (
-        ("joint_names", maneuver.joint_names, arm.quantity_names),
-        ("body_names", maneuver.body_names, arm.member_names),
-    ):
-        if given is None or tuple(given.tolist()) != recorded:
-            found.append(f"array {name} differs from the arm record")
-    table = maneuver.manifest["problem"].get("arm") or {}
-    joints = {str(joint["name"]): joint for joint in table.get("joint") or ()}
-    if tuple(joints) != arm.quantity_names:
-        return [*found, "the joints of the arm record are not those of the problem"]
-    origin = (0.0, 0.0, 0.0)
-    for k, (name, joint) in enumerate(joints.items()):
-        axis = np.array(joint["axis"], dtype=float)
-        turn = np.array(joint.get("rotation_vector") or origin, dtype=float)
-        wanted = {
-            "axis": (arm.axis[k], axis / np.linalg.norm(axis)),
-            "position": (arm.position[k], joint.get("position") or origin),
-            "rotation": (arm.rotation[k], rotation_matrix(turn)),
-            "home": (arm.home_quantities[k], joint.get("home") or 0.0),
-            "limits": (arm.stroke[k], joint.get("limits") or (-np.inf, np.inf)),
-            "rate": (arm.rate[k], joint.get("rate") or np.inf),
-            "acceleration": (arm.acceleration[k], joint.get("acceleration") or np.inf),
-            "kind": (float(arm.revolute[k]), float(joint.get("kind", "revolute") == "revolute")),
-        }
-        for key, (recorded, given) in wanted.items():
-            if not _same(recorded, given):
-                found.append(f"the arm record's {key} of joint {name} differs from the problem's")
-    if not _same(arm.tip, table.get("tip") or origin):
-        found.append("the arm record's tip differs from the problem's")
-    if table.get("link_radius") is not None and not _same(arm.radius, table["link_radius"]):
-        found.append("the arm record's link radius differs from the problem's")
-    return found
-
-
-def _same(recorded: ArrayLike, given: ArrayLike) -> bool:
-    return bool(np.allclose(recorded, given, rtol=0.0, atol=LIMIT_TOLERANCE))
 
 
 def _outcome_contradictions(maneuver: Result) -> list[str]:

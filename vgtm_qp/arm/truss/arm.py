@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip, or_none
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_ways
 from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
@@ -127,24 +127,19 @@ class TrussArm(Arm):
         """See ``arm.Arm``.
 
         Keys: ``module``, ``bays``, ``node_names``, ``home`` (N, 3), ``base`` (indices of given nodes),
-        ``member_names``, ``actuated``, ``length`` (M, at home), ``stroke`` (M, 2), ``rate``, ``acceleration``,
-        ``radius`` (M), ``tip`` (``nodes``, ``weights``, ``frame`` at home) and ``joints`` (``triangle``, ``offset``,
-        see ``truss.Joints``; None for pin joints). Lengths in m; None means no limit.
+        ``member_names``, ``length`` (M, at home), ``tip`` (``nodes``, ``weights``, ``frame`` at home) and ``joints``
+        (``triangle``, ``offset``, see ``truss.Joints``; None for pin joints). Lengths in m.
         """
         truss, joints = self.truss, self.truss.joints
         return {
+            **super().record(),
             "module": truss.module,
             "bays": truss.bays,
             "node_names": list(truss.node_names),
             "home": truss.home.tolist(),
             "base": np.flatnonzero(truss.base).tolist(),
             "member_names": list(truss.member_names),
-            "actuated": truss.actuated.tolist(),
             "length": truss.home_lengths.tolist(),
-            "stroke": truss.stroke.tolist(),
-            "rate": or_none(truss.rate),
-            "acceleration": or_none(truss.acceleration),
-            "radius": truss.radius.tolist(),
             "tip": {key: getattr(self.end_effector, key).tolist() for key in ("nodes", "weights", "frame")},
             "joints": joints and {"triangle": joints.triangle.tolist(), "offset": joints.offset.tolist()},
         }

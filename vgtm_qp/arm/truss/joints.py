@@ -1,4 +1,4 @@
-"""Offset joints, eqs. (12)-(13): which triangle orients the joint at each node, where members end in it."""
+"""Offset joints: which triangle orients the joint at each node, where members end in it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
+from vgtm_qp.rows.members import joint_frames
 
 _LEAST_SINE = 0.1
 """A triangle with a smaller sine at the node does not orient a joint: its normal would turn too fast."""
@@ -17,7 +18,7 @@ _LEAST_SINE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Joints:
-    """Offset joints, eqs. (12)-(13): where each member's two ends stand in the frames of their nodes' joints.
+    """Offset joints: where each member's two ends stand in the frames of their nodes' joints.
 
     Attributes
     ----------
@@ -34,27 +35,11 @@ class Joints:
 
 def axial_joints(home: Array, members: Index, triangle: Index, offset: Array) -> Joints:
     """Return joints whose members end `offset` (M, 2), m, from their nodes, on the members' axes at home."""
-    direction = _unit(home[members[:, 1]] - home[members[:, 0]])
+    way = home[members[:, 1]] - home[members[:, 0]]
+    direction = way / np.linalg.norm(way, axis=1, keepdims=True)
     outward = np.stack([direction, -direction], axis=1) * offset[:, :, None]
     frames = joint_frames(home, triangle)
     return Joints(triangle, np.einsum("mexy,mex->mey", frames[members], outward))
-
-
-def joint_frames(X: Array, triangle: Index) -> Array:
-    """Return (N, 3, 3) joint rotations: z the triangle's normal, x its outward bisector at the node."""
-    corner = X[triangle]
-    first, second = _unit(corner[:, 1] - corner[:, 0]), _unit(corner[:, 2] - corner[:, 0])
-    z, x = _unit(np.cross(first, second)), _unit(-(first + second))
-    return np.stack([x, np.cross(z, x), z], axis=-1)
-
-
-def joint_ends(X: Array, members: Index, joints: Joints | None) -> Array:
-    """Return (M, 2, 3) where each member's ends r_ik are, eq. (13), for node positions `X` (N, 3), m."""
-    ends = X[members]
-    if joints is None:
-        return np.asarray(ends)
-    frames = joint_frames(X, joints.triangle)
-    return np.asarray(ends + np.einsum("mexy,mey->mex", frames[members], joints.offset))
 
 
 def joint_triangles(
@@ -113,7 +98,3 @@ def _normal(home: Array, i: int, a: int, b: int) -> tuple[Array, float]:
     first, second = home[a] - home[i], home[b] - home[i]
     normal = np.cross(first, second) / (np.linalg.norm(first) * np.linalg.norm(second))
     return normal, float(np.linalg.norm(normal))
-
-
-def _unit(vectors: Array) -> Array:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

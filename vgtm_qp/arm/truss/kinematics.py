@@ -1,8 +1,7 @@
-"""Lengths of members and their gradients by CasADi, one member mapped over the truss; how nodes follow."""
+"""Rows of all members of a truss at one configuration, and how nodes follow."""
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 from scipy.sparse.linalg import splu
 
@@ -11,6 +10,7 @@ from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
+from vgtm_qp.rows.members import end_function, member_function
 
 _DENSE = 150
 """Up to so many node coordinates LAPACK is faster than any use of the structure."""
@@ -18,51 +18,18 @@ _DENSE = 150
 _SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
 
-def joint_frame(node: ca.SX, first: ca.SX, second: ca.SX) -> ca.SX:
-    """Return the (3, 3) rotation of an offset joint from its triangle's nodes (see ``truss.Joints``).
-
-    z is the triangle's normal, x the outward bisector of the two members that meet at the node.
-    """
-    to_first, to_second = _unit(first - node), _unit(second - node)
-    z, x = _unit(ca.cross(to_first, to_second)), _unit(-(to_first + to_second))
-    return ca.horzcat(x, ca.cross(z, x), z)
-
-
-def _unit(vector: ca.SX) -> ca.SX:
-    return vector / ca.norm_2(vector)
-
-
-def member_function(truss: Truss) -> ca.Function:
-    """Return a member as a CasADi function: nodes and end offsets -> length, eq. (12), and gradient, eq. (19).
-
-    Ideal pin joints: (3, 2) positions of the two nodes. Offset joints, eq. (13): (3, 6) positions of both
-    joints' triangles and (3, 2) offsets in the joint frames.
-    """
-    if truss.joints is None:
-        nodes = ca.SX.sym("nodes", 3, 2)
-        length = ca.norm_2(nodes[:, 0] - nodes[:, 1])
-        return ca.Function("member", [nodes], [length, ca.gradient(length, nodes)])
-    nodes, offsets = ca.SX.sym("nodes", 3, 6), ca.SX.sym("offsets", 3, 2)
-    length = ca.norm_2(_end(nodes[:, :3], offsets[:, 0]) - _end(nodes[:, 3:], offsets[:, 1]))
-    return ca.Function("member", [nodes, offsets], [length, ca.gradient(length, nodes)])
-
-
 def length_gradients(truss: Truss, X: Array) -> Array:
     """Return (M, Q, 3) the gradients of the lengths by the nodes of ``Truss.member_nodes`` at positions `X` (N, 3)."""
     arguments = [X[truss.member_nodes].reshape(-1, 3).T]
     if truss.joints is not None:
         arguments.append(truss.joints.offset.reshape(-1, 3).T)
-    _, gradients = member_function(truss).map(truss.member_count)(*arguments)
+    function = member_function(has_offsets=truss.joints is not None)
+    _, gradients = function.map(truss.member_count)(*arguments)
     return np.asarray(gradients).T.reshape(truss.member_count, -1, 3)
 
 
-def _end(corners: ca.SX, offset: ca.SX) -> ca.SX:
-    """Return a member's end at `offset` (3,) in the joint at `corners` (3, 3), see ``joints.joint_ends``."""
-    return corners[:, 0] + joint_frame(*ca.horzsplit(corners)) @ offset
-
-
 class EndKinematics:
-    """The ends r_ik of members in offset joints and their Jacobians, eqs. (13), (20) and (21), at one configuration.
+    """The ends r_ik of members in offset joints and their Jacobians, at one configuration.
 
     Attributes
     ----------
@@ -76,16 +43,13 @@ class EndKinematics:
 
     def __init__(self, members: Index, joints: Joints, *, compiled: bool = True) -> None:
         self.nodes = joints.triangle[members]
-        corners, offset = ca.SX.sym("corners", 3, 3), ca.SX.sym("offset", 3)
-        end = _end(corners, offset)
-        one = ca.Function("end", [corners, offset], [end, ca.densify(ca.jacobian(end, ca.vec(corners)))])
-        self._kernel = Kernel(one.map(2 * len(members)), compiled=compiled)
+        self._kernel = Kernel(end_function().map(2 * len(members)), compiled=compiled)
         self._kernel.inputs[1][:] = joints.offset.reshape(-1)
         self.ends = self._kernel.outputs[0].reshape(-1, 2, 3)
         self.jacobian = self._kernel.outputs[1].reshape(-1, 2, 9, 3).transpose(0, 1, 3, 2)
 
     def evaluate(self, X: Array) -> None:
-        """Overwrite ends and their Jacobians, eqs. (20)-(21), with those at node positions `X` (N, 3), m."""
+        """Overwrite ends and their Jacobians with those at node positions `X` (N, 3), m."""
         self._kernel.inputs[0][:] = X[self.nodes].reshape(-1)
         self._kernel()
 

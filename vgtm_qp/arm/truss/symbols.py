@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 
 from vgtm_qp.arm.symbols import ArmSymbols, Constants
-from vgtm_qp.arm.truss.kinematics import member_function
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Index
+from vgtm_qp.rows.members import fixed_error, length_rhs, member_function
 
 _Layers = list[tuple[Index, ca.Sparsity]]
 """Terms whose sum is a block: places in the gradients, and the sparsity that they fill."""
@@ -74,7 +74,7 @@ class TrussSymbols(ArmSymbols):
         self._offsets: list[ca.MX] = []
         if truss.joints is not None:
             self._offsets = [constants.add("offsets", truss.joints.offset.reshape(-1, 3))]
-        self._member = member_function(truss)
+        self._member = member_function(has_offsets=truss.joints is not None)
         self._solvers: dict[object, ca.Function] = {}
         self._columns = truss.member_nodes.reshape(-1).tolist()
         self._place = {int(node): 3 * k for k, node in enumerate(truss.free)}
@@ -109,17 +109,11 @@ class TrussSymbols(ArmSymbols):
         return lengths.T, ca.vec(gradients)
 
     def motion(self, X: ca.MX, at: ca.MX, moved: ca.MX) -> list[ca.MX]:
-        """See ``arm.ArmSymbols``: gradients and the rows' right-hand sides, eq. (22)."""
+        """See ``arm.ArmSymbols``: gradients and the rows' right-hand sides."""
         lengths, _ = self._lengths(X)
         _, gradients = self._lengths(at)
-        return [gradients, self._missing(lengths, gradients, moved)]
-
-    def _missing(self, lengths: ca.MX, gradients: ca.MX, moved: ca.MX) -> ca.MX:
-        """Return (M, 1) what fixed lengths lack, less what the base's displacement (3, N) gives them."""
-        corners = self._truss.member_nodes
-        terms = gradients * ca.vec(moved[:, corners.reshape(-1).tolist()])
-        base_rate = ca.sum1(ca.reshape(terms, 3 * corners.shape[1], len(corners))).T
-        return ca.DM((~self._truss.actuated).astype(float)) * (self.home - lengths) - base_rate
+        error = fixed_error(lengths, self.home, self._truss.actuated)
+        return [gradients, length_rhs(error, gradients, moved, self._truss.member_nodes)]
 
     def coordinates(self, nodes: Any, strokes: Any) -> Any:  # noqa: ARG002
         """See ``arm.ArmSymbols``: the nodes themselves."""

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from vgtm_qp.arm.scatter import LengthScatter
-from vgtm_qp.arm.truss.joints import Joints, joint_ends
+from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.errors import TrussError, nearest
+from vgtm_qp.rows.members import LengthScatter, length_nodes, member_ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,15 +114,13 @@ class Truss:
 
     @cached_property
     def fixed(self) -> Index:
-        """(n_l,) indices of the fixed members, eq. (14)."""
+        """(n_l,) indices of the fixed members."""
         return np.flatnonzero(~self.actuated)
 
     @cached_property
     def member_nodes(self) -> Index:
-        """(M, Q) nodes that each length depends on, eq. (15): two for pin joints, six for offset joints."""
-        if self.joints is None:
-            return self.members
-        return self.joints.triangle[self.members].reshape(self.member_count, 6)
+        """(M, Q) nodes that each length depends on."""
+        return length_nodes(self.members, None if self.joints is None else self.joints.triangle)
 
     @cached_property
     def scatter(self) -> LengthScatter:
@@ -131,7 +129,9 @@ class Truss:
 
     def member_ends(self, X: Array) -> Array:
         """Return (M, 2, 3) where each member's ends r_ik are for node positions `X` (N, 3), m."""
-        return joint_ends(X, self.members, self.joints)
+        if self.joints is None:
+            return np.asarray(X[self.members])
+        return member_ends(X, self.members, self.joints.triangle, self.joints.offset)
 
     @cached_property
     def home_lengths(self) -> Array:

@@ -20,7 +20,7 @@ _MOST_BASE_NODES = 4
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Periods of p stages; its members and tracked faces use nodes of it and of the period before.
+    """Periods of p stages; its members and tracked stations use nodes of it and of the period before.
 
     Places within a period: first the w nodes that it uses of the one before, then its own m by stage. Where the arm
     allows it, the nodes and members of every period are put in the order in which all periods are alike.
@@ -47,12 +47,12 @@ class Chain:
         The places of actuated members.
     locked : (l,) int
         Fixed members that stand where other periods have an actuated one.
-    faces : (n, f) int
-        Positions in ``layout.tracked`` of the faces that each period completes.
-    face_places, face_weights : (f, 3) int, (f, 3)
-        Places of those faces' nodes, in rising order, and their weights.
-    face_order : (n, f, 3) int
-        Which of a face's nodes stand at those places.
+    stations : (n, f) int
+        Positions in ``layout.tracked`` of the stations that each period completes.
+    station_places, station_weights : (f, 3) int, (f, 3)
+        Places of those stations' nodes, in rising order, and their weights.
+    station_order : (n, f, 3) int
+        Which of a station's nodes stand at those places.
     """
 
     layout: Layout
@@ -68,10 +68,10 @@ class Chain:
     member_places: Index | None
     actuated: Mask
     locked: Index
-    faces: Index
-    face_places: Index
-    face_order: Index
-    face_weights: Array
+    stations: Index
+    station_places: Index
+    station_order: Index
+    station_weights: Array
 
     @property
     def periods(self) -> int:
@@ -107,9 +107,9 @@ class Chain:
 
     @property
     def is_square(self) -> bool:
-        """Whether a period's fixed members and its faces' positions determine its nodes, given the curve."""
-        faces = self.faces.shape[1]
-        return faces > 0 and int(self.actuated.sum()) == 3 * faces and not len(self.locked)
+        """Whether a period's fixed members and its stations' positions determine its nodes, given the curve."""
+        stations = self.stations.shape[1]
+        return stations > 0 and int(self.actuated.sum()) == 3 * stations and not len(self.locked)
 
 
 @lru_cache(maxsize=4)
@@ -213,30 +213,34 @@ def _of_ordered(
     layout: Layout, bays: Bays, sizes: tuple[int, ...], base: Index, nodes: Index, members: Index
 ) -> Chain | None:
     """Return the chain of these periods behind the nodes `base`, None where they are none."""
-    stations, (periods, own) = layout.arm.stations, nodes.shape
+    poses, (periods, own) = layout.arm.stations, nodes.shape
     period, place = np.full(bays.node_count, -2, dtype=np.int64), np.zeros(bays.node_count, dtype=np.int64)
     period[base], place[base] = -1, np.arange(len(base))
     period[nodes], place[nodes] = np.arange(periods)[:, None], np.arange(own)
     here = np.arange(periods)[:, None, None]
-    completed = period[stations.nodes[layout.tracked]].max(axis=1, initial=-2)
+    completed = period[poses.nodes[layout.tracked]].max(axis=1, initial=-2)
     order = np.argsort(completed, kind="stable")
     count = len(order) // periods
     if not np.array_equal(completed[order], np.repeat(np.arange(periods), count)):
         return None
-    faces = order.reshape(periods, count)
-    face_used, used = stations.nodes[layout.tracked[faces]], bays.member_nodes[members]
-    face_order = np.argsort(place[face_used] + np.where(period[face_used] == here, own, 0), axis=2)
-    face_used = np.take_along_axis(face_used, face_order, axis=2)
+    stations = order.reshape(periods, count)
+    station_used, used = poses.nodes[layout.tracked[stations]], bays.member_nodes[members]
+    station_order = np.argsort(place[station_used] + np.where(period[station_used] == here, own, 0), axis=2)
+    station_used = np.take_along_axis(station_used, station_order, axis=2)
     carried: set[int] = set()
-    for nodes_used in (used, face_used):
+    for nodes_used in (used, station_used):
         if ((period[nodes_used] >= 0) & (period[nodes_used] < here - 1)).any():
             return None
         carried |= set(place[nodes_used][period[nodes_used] == here - 1].tolist())
     handed = np.array(sorted(carried), dtype=np.int64)
     places = np.sort(_places(period[used], place[used], here, handed), axis=2)
-    face_places = _places(period[face_used], place[face_used], here, handed)
-    weights = np.take_along_axis(stations.weights[layout.tracked[faces]], face_order, axis=2)
-    if (face_places != face_places[0]).any() or (face_places < 0).any() or (weights != weights[0]).any():
+    station_places = _places(period[station_used], place[station_used], here, handed)
+    weights = np.take_along_axis(poses.weights[layout.tracked[stations]], station_order, axis=2)
+    if (
+        (station_places != station_places[0]).any()
+        or (station_places < 0).any()
+        or (weights != weights[0]).any()
+    ):
         return None
     pattern = np.zeros((3 * own, len(handed) + own), dtype=bool)
     pattern[np.nonzero(places >= 0)[1], places[places >= 0]] = True
@@ -262,8 +266,8 @@ def _of_ordered(
         member_places=places[0] if is_alike else None,
         actuated=actuated,
         locked=locked,
-        faces=faces,
-        face_places=face_places[0],
-        face_order=face_order,
-        face_weights=weights[0],
+        stations=stations,
+        station_places=station_places[0],
+        station_order=station_order,
+        station_weights=weights[0],
     )

@@ -33,15 +33,15 @@ class ChainData:
     part : dict
         Their parts by name.
     turn_squares : (n, 9f)
-        Products t t' of the rows t of ``tangent_curve``, summed over the two angles of a face.
-    window, members, face_order : (n, w + m), (n, 3m), (n, f, 3) int
+        Products t t' of the rows t of ``tangent_curve``, summed over the two angles of a station.
+    window, members, station_order : (n, w + m), (n, 3m), (n, f, 3) int
         Those of the chain, by row.
     at : (M,) int
         Places of the members in `members`.
-    faces : (K,) int
-        Positions in ``layout.tracked`` of the faces by row.
+    stations : (K,) int
+        Positions in ``layout.tracked`` of the stations by row.
     weights, slopes : (K, V)
-        Of the control vertices at those faces.
+        Of the control vertices at those stations.
     offset : (V, 3)
         Displacements of the control vertices where the free coordinates are zero, m.
     normal : (3,)
@@ -59,15 +59,15 @@ class ChainData:
             for (name, size), end in zip(parts.items(), ends, strict=True):
                 self.part[name] = arrays[-1][:, end - size : end]
         self.head, self.tail, self.table = arrays
-        self.turn_squares: Array = np.zeros((chain.periods, 9 * chain.faces.shape[1]))
+        self.turn_squares: Array = np.zeros((chain.periods, 9 * chain.stations.shape[1]))
         self.window, self.members = chain.window[order], chain.members[order]
         self.at = np.argsort(self.members.reshape(-1))
-        self.faces, self.face_order = chain.faces[order].reshape(-1), chain.face_order[order]
-        self.weights, self.slopes = layout.curve_weights[self.faces], layout.curve_slopes[self.faces]
+        self.stations, self.station_order = chain.stations[order].reshape(-1), chain.station_order[order]
+        self.weights, self.slopes = layout.curve_weights[self.stations], layout.curve_slopes[self.stations]
         self.part["weights"][:] = self.weights.reshape(self.part["weights"].shape)
         self.part["slopes"][:] = self.slopes.reshape(self.part["slopes"].shape)
         self._slope_products = (self.slopes[:, :, None] * self.slopes[:, None, :]).reshape(
-            len(self.faces), layout.vertices**2
+            len(self.stations), layout.vertices**2
         )
         self._actuated = self.members[:, chain.actuated]
         self.offset, self.normal = np.zeros((layout.vertices, 3)), np.zeros(3)
@@ -97,11 +97,11 @@ class ChainData:
         self.offset[1] += numbers.base_rhs @ axes
         self.hold_base(self.offset, np.cross(*axes))
         self.vertex_gradient = numbers.vertex_gradient
-        turns = numbers.tangent_face[self.faces].reshape(-1, 2, 3, 3)
-        order = self.face_order.reshape(-1, 1, 3, 1)
-        over_slope = numbers.tangent_curve[self.faces]
-        gap = numbers.position_rhs[self.faces] - self.weights @ self.offset
-        tilt = numbers.tangent_rhs[self.faces]
+        turns = numbers.tangent_face[self.stations].reshape(-1, 2, 3, 3)
+        order = self.station_order.reshape(-1, 1, 3, 1)
+        over_slope = numbers.tangent_curve[self.stations]
+        gap = numbers.position_rhs[self.stations] - self.weights @ self.offset
+        tilt = numbers.tangent_rhs[self.stations]
         tilt = tilt + np.einsum("kac,kc->ka", over_slope, self.slopes @ self.offset)
         filled = {
             "tangent_face": np.take_along_axis(turns, order, axis=2),
@@ -142,7 +142,7 @@ class ChainData:
         return np.asarray(gradient.reshape(-1) @ self._free)
 
     def curve_terms(self) -> tuple[Array, Array]:
-        """Return Hessian and gradient of all terms in the curve's coordinates while the faces stay."""
+        """Return Hessian and gradient of all terms in the curve's coordinates while the stations stay."""
         count = len(self.offset)
         turning = self._slope_products.T @ self.turn_squares.reshape(-1, 9)
         turning = turning.reshape(count, count, 3, 3).transpose(0, 2, 1, 3).reshape(3 * count, 3 * count)
@@ -158,13 +158,13 @@ class ChainData:
         gradient -= self._tracking * self.weights.T @ gap
         return self.polygon_gradient(vertices) + gradient.reshape(-1) @ self._free
 
-    def misfit(self, vertices: Array, faces: Array) -> tuple[Array, Array]:
-        """Return gap (K, 3) and tilt (K, 2) for displaced vertices and the faces' own parts (K, 5)."""
+    def misfit(self, vertices: Array, stations: Array) -> tuple[Array, Array]:
+        """Return gap (K, 3) and tilt (K, 2) for displaced vertices and the stations' own parts (K, 5)."""
         moved = vertices - self.offset
         over_slope = self.part["tangent_curve"].reshape(-1, 2, 3)
         gap = self.part["gap"].reshape(-1, 3) - self.weights @ moved
         tilt = self.part["tilt"].reshape(-1, 2) + np.einsum("kac,kc->ka", over_slope, self.slopes @ moved)
-        return gap + faces[:, :3], tilt + faces[:, 3:]
+        return gap + stations[:, :3], tilt + stations[:, 3:]
 
 
 class PeriodValues:
@@ -205,7 +205,7 @@ class PeriodValues:
         np.take(X, window, axis=0, out=self._X, mode="clip")
         np.take(Y, window, axis=0, out=self._Y, mode="clip")
         self._switches[:] = motion, motion or chain.layout.hard_tracking
-        if len(data.faces):
+        if len(data.stations):
             both = np.hstack([vertices, data.offset])
             np.matmul(data.weights, both, out=self._curve[:, 0])
             np.matmul(data.slopes, both, out=self._curve[:, 1])
@@ -222,17 +222,17 @@ def period_values(chain: Chain) -> ca.Function:
     """Return one period's numbers as a function of where its nodes are.
 
     Arguments: X, Y (3, w + m), where residuals and where Jacobians are evaluated; home (3m), lengths, and fixed (3m),
-    1 where a member keeps it; angles (6f), polar angles' cosines and sines of each face; alignment (3, 3f); curve
-    (12f), for each face its point, the point's displacement with the base, the slope and that slope's displacement;
+    1 where a member keeps it; angles (6f), polar angles' cosines and sines of each station; alignment (3, 3f); curve
+    (12f), for each station its point, the point's displacement with the base, the slope and that slope's displacement;
     switches (2), motion and gap.
 
     Results: ``head`` and ``tail`` of ``elimination.Inputs``, ``ChainData.turn_squares`` and the lengths (3m) at X.
     """
-    layout, faces = chain.layout, chain.faces.shape[1]
+    layout, stations = chain.layout, chain.stations.shape[1]
     X, Y = (ca.SX.sym(name, 3, chain.window.shape[1]) for name in "XY")
     home, fixed = ca.SX.sym("home", chain.own), ca.SX.sym("fixed", chain.own)
-    angles, alignment = ca.SX.sym("angles", 6 * faces), ca.SX.sym("alignment", 3, 3 * faces)
-    curve, switches = ca.SX.sym("curve", 12 * faces), ca.SX.sym("switches", 2)
+    angles, alignment = ca.SX.sym("angles", 6 * stations), ca.SX.sym("alignment", 3, 3 * stations)
+    curve, switches = ca.SX.sym("curve", 12 * stations), ca.SX.sym("switches", 2)
     motion, gap_on = switches[0], switches[1]
 
     lengths, actuated = member_lengths(chain, X), np.flatnonzero(chain.actuated).tolist()
@@ -240,7 +240,7 @@ def period_values(chain: Chain) -> ca.Function:
     head = [nonzeros(ca.project(jacobian, sparsity_of(chain.pattern))), fixed * (home - lengths)]
     tail = [motion * layout.weights.stroke_centring * ((1.0 - fixed) * (lengths - home))[actuated]]
     turns, turn_curves, gaps, tilts, products = [], [], [], [], []
-    for k, places in enumerate(chain.face_places.tolist()):
+    for k, places in enumerate(chain.station_places.tolist()):
         polar, nodes = ca.vertsplit(angles[6 * k : 6 * k + 6], 3), Y[:, places]
         rotation = fitted_frame(X[:, places], *polar) @ alignment[:, 3 * k : 3 * k + 3]
         point, moved, slope, slope_moved = ca.vertsplit(curve[12 * k : 12 * k + 12], 3)
@@ -248,7 +248,7 @@ def period_values(chain: Chain) -> ca.Function:
         turns.append(ca.vec(turning(fitted_frame(nodes, *polar), nodes, c).T))
         turn_curves.append(ca.vec(over_slope.T))
         products.append(ca.vec(over_slope.T @ over_slope))
-        centre = X[:, places] @ ca.DM(chain.face_weights[k])
+        centre = X[:, places] @ ca.DM(chain.station_weights[k])
         gaps.append(gap_on * tracking.gap(centre, point) - moved)
         tilts.append(motion * tilt + over_slope @ slope_moved)
     outputs = [
@@ -261,15 +261,15 @@ def period_values(chain: Chain) -> ca.Function:
 
 
 def _frame_constants(chain: Chain, data: ChainData) -> tuple[Array, Array]:
-    """Return angles (K, 6) and alignments (K, 3, 3), columns first, of the faces in the order of `data`.
+    """Return angles (K, 6) and alignments (K, 3, 3), columns first, of the stations in the order of `data`.
 
-    A face whose nodes are named the other way round has y- and z-axis of its fitted frame reversed.
+    A station whose nodes are named the other way round has y- and z-axis of its fitted frame reversed.
     """
     arm, angles, alignments = chain.layout.arm, [], []
-    for face, order in zip(
-        chain.layout.tracked[data.faces].tolist(), data.face_order.reshape(-1, 3), strict=True
+    for station, order in zip(
+        chain.layout.tracked[data.stations].tolist(), data.station_order.reshape(-1, 3), strict=True
     ):
-        home, frame = arm.home[arm.stations.nodes[face]], arm.stations.frames[face]
+        home, frame = arm.home[arm.stations.nodes[station]], arm.stations.frames[station]
         cosines, sines, alignment = frame_constants(home, frame)
         sense = 1.0 if (np.roll(order, -int(order.argmin())) == np.arange(3)).all() else -1.0
         angles.append(np.concatenate([cosines[order], sense * sines[order]]))

@@ -64,7 +64,7 @@ class Inputs:
         What all sweeps read, what the factorisation alone reads, and what depends on the curve's base alone.
     jacobian : (3m, 3w + 3m), rhs : (3m,), actuator_gradient : (actuated,)
     weights, slopes : lists of (V,)
-        Of the control vertices, by face.
+        Of the control vertices, by station.
     tangent_face, tangent_curve, gap, tilt : lists of (2, 9), (2, 3), (3,), (2,)
         Gap and angles are as they are where no unknown moves.
     normal : (3,)
@@ -74,21 +74,25 @@ class Inputs:
     """
 
     def __init__(self, chain: Chain) -> None:
-        faces, vertices = chain.faces.shape[1], chain.layout.vertices
+        stations, vertices = chain.stations.shape[1], chain.layout.vertices
         # Number of matrices, and their rows and columns; each is stored row by row.
         shapes = {
             "head": {
                 "jacobian": (1, int(chain.pattern.sum()), 1),
                 "rhs": (1, chain.own, 1),
-                "tangent_face": (faces, 2, 9),
+                "tangent_face": (stations, 2, 9),
             },
             "tail": {
                 "actuator_gradient": (1, int(chain.actuated.sum()), 1),
-                "tangent_curve": (faces, 2, 3),
-                "gap": (faces, 3, 1),
-                "tilt": (faces, 2, 1),
+                "tangent_curve": (stations, 2, 3),
+                "gap": (stations, 3, 1),
+                "tilt": (stations, 2, 1),
             },
-            "table": {"weights": (faces, vertices, 1), "slopes": (faces, vertices, 1), "normal": (1, 3, 1)},
+            "table": {
+                "weights": (stations, vertices, 1),
+                "slopes": (stations, vertices, 1),
+                "normal": (1, 3, 1),
+            },
         }
         self.sizes = {
             name: {part: int(np.prod(shape)) for part, shape in parts.items()}
@@ -153,21 +157,21 @@ class Elimination:
         self._gain_parts: list[ca.SX] = []
 
     def centre_row(self, k: int) -> ca.SX:
-        """Return the constant (3, 3w + 3m) Jacobian of the centre of face `k`."""
+        """Return the constant (3, 3w + 3m) Jacobian of the centre of station `k`."""
         row = ca.SX(1, self.size // 3)
-        row[self.chain.face_places[k].tolist()] = self.chain.face_weights[k].tolist()
+        row[self.chain.station_places[k].tolist()] = self.chain.station_weights[k].tolist()
         return ca.kron(row, ca.SX.eye(3))
 
     def tangent_row(self, k: int) -> ca.SX:
-        """Return the (2, 3w + 3m) rows of the angles of face `k`."""
+        """Return the (2, 3w + 3m) rows of the angles of station `k`."""
         row = ca.SX(2, self.size)
-        row[:, [3 * place + axis for place in self.chain.face_places[k].tolist() for axis in range(3)]] = (
+        row[:, [3 * place + axis for place in self.chain.station_places[k].tolist() for axis in range(3)]] = (
             self.inputs.tangent_face[k]
         )
         return row
 
     def curve_columns(self, k: int) -> tuple[ca.SX, ca.SX]:
-        """Return the (3, 3V - 5) and (2, 3V - 5) derivatives of face `k`'s point on the curve, and of its angles."""
+        """Return the (3, 3V - 5) and (2, 3V - 5) derivatives of station `k`'s point on the curve, and of its angles."""
         inputs = self.inputs
         point = curve_rows.weighted_columns(inputs.weights[k], inputs.normal, ca.SX.eye(3))
         turned = curve_rows.weighted_columns(inputs.slopes[k], inputs.normal, inputs.tangent_curve[k])
@@ -195,7 +199,7 @@ class Elimination:
             stiffness = weights.actuator_rate + weights.stroke_centring
             H += symmetric(stiffness * (J.T @ J))
             V[:, -1] += J.T @ (inputs.actuator_gradient - stiffness * inputs.rhs[self.actuated])
-        for k in range(self.chain.faces.shape[1]):
+        for k in range(self.chain.stations.shape[1]):
             centre, tangent = self.centre_row(k), self.tangent_row(k)
             point, turned = self.curve_columns(k)
             H += symmetric(weights.tracking * (centre.T @ centre) + weights.tangent * (tangent.T @ tangent))
@@ -246,22 +250,22 @@ class Elimination:
         return dense_function("columns", [carry, self.inputs.head, vector, rows], [V, Z.T])
 
     def balance(self) -> ca.Function:
-        """Return (carry, head, gains, nodal (3m,), actuator (actuated,), faces (5f,)) -> (carry, residual).
+        """Return (carry, head, gains, nodal (3m,), actuator (actuated,), stations (5f,)) -> (carry, residual).
 
         The costates of given gradients; the residual (freedom,) is what is left of stationarity.
         """
         vector, gains = self._gains()
         carry, nodal = ca.SX.sym("carry", len(self.live)), ca.SX.sym("nodal", self.chain.own)
-        faces = range(self.chain.faces.shape[1])
-        actuator, face = ca.SX.sym("actuator", len(self.actuated)), ca.SX.sym("face", 5 * len(faces))
+        stations = range(self.chain.stations.shape[1])
+        actuator, station = ca.SX.sym("actuator", len(self.actuated)), ca.SX.sym("station", 5 * len(stations))
         V = ca.vertcat(ca.SX.zeros(self.chain.before), nodal)
         V[self.live] += carry
         V += self.inputs.jacobian[self.actuated, :].T @ actuator
-        V += self._face_rows().T @ face
+        V += self._station_rows().T @ station
         unmoved = [[free, G, ca.SX(*W.shape), ca.SX(*Wb.shape), S] for free, G, W, Wb, S in gains]
         V, residual = self._costates(V, unmoved)
         return dense_function(
-            "balance", [carry, self.inputs.head, vector, nodal, actuator, face], [V, residual]
+            "balance", [carry, self.inputs.head, vector, nodal, actuator, station], [V, residual]
         )
 
     def _costates(self, V: ca.SX, gains: list[list[ca.SX]]) -> tuple[ca.SX, ca.SX]:
@@ -275,12 +279,12 @@ class Elimination:
         return V, ca.vertcat(*outer)
 
     def forward(self) -> ca.Function:
-        """Return (carry, head, gains, z) -> (carry, u, J u - rhs, centres and angles of the faces)."""
+        """Return (carry, head, gains, z) -> (carry, u, J u - rhs, centres and angles of the stations)."""
         vector, gains = self._gains()
         carry, z = ca.SX.sym("carry", len(self.live)), ca.SX.sym("z", self.freedom)
         u = self._moved(carry, z, gains, [stage.rhs for stage in self.stages])
         changed = self.inputs.jacobian @ u - self.inputs.rhs
-        outputs = [u[self.live], u[self.chain.before :], changed, self._face_rows() @ u]
+        outputs = [u[self.live], u[self.chain.before :], changed, self._station_rows() @ u]
         return dense_function("forward", [carry, self.inputs.head, vector, z], outputs)
 
     def strokes(self, count: int) -> ca.Function:
@@ -338,15 +342,15 @@ class Elimination:
         return dense_function(name, [carry, self.inputs.head, gains, own, *aims], outputs)
 
     def changes(self) -> ca.Function:
-        """Return (carry, head, u (3m,)) -> (carry, J u - rhs, centres and angles of the faces) of displacements u."""
+        """Return (carry, head, u (3m,)) -> (carry, J u - rhs, centres and angles of the stations) of displacements."""
         carry, own = ca.SX.sym("carry", len(self.live)), ca.SX.sym("u", self.chain.own)
         u = ca.vertcat(carry, own)
-        outputs = [u[self.live], self.inputs.jacobian @ u - self.inputs.rhs, self._face_rows() @ u]
+        outputs = [u[self.live], self.inputs.jacobian @ u - self.inputs.rhs, self._station_rows() @ u]
         return dense_function("changes", [carry, self.inputs.head, own], outputs)
 
-    def _face_rows(self) -> ca.SX:
-        """Return the (5f, 3w + 3m) rows of the centres and the angles of a period's faces."""
-        rows = [(self.centre_row(k), self.tangent_row(k)) for k in range(self.chain.faces.shape[1])]
+    def _station_rows(self) -> ca.SX:
+        """Return the (5f, 3w + 3m) rows of the centres and the angles of a period's stations."""
+        rows = [(self.centre_row(k), self.tangent_row(k)) for k in range(self.chain.stations.shape[1])]
         return ca.vertcat(ca.SX(0, self.size), *[row for pair in rows for row in pair])
 
 

@@ -151,14 +151,14 @@ class StagedSolver(ChainSolver):
         forces: Array,
     ) -> tuple[Array, Array]:
         chain = self.chain
-        gradient, force, face = self._balance.inputs[3:]
+        gradient, force, station = self._balance.inputs[3:]
         nodal.take(chain.nodes[::-1].reshape(-1), axis=0, out=gradient.reshape(-1, 3), mode="clip")
         force[:] = forces[::-1, chain.actuated].reshape(-1)
         dual = [self._balance.outputs[1]]
         if self._curve:
             weights, parts = self.layout.weights, self._forward.outputs[3].reshape(chain.periods, -1)[::-1]
             gap, tilt = self.data.misfit(vertices, parts.reshape(-1, 5))
-            face[:] = np.hstack([weights.tracking * gap, weights.tangent * tilt]).reshape(-1)
+            station[:] = np.hstack([weights.tracking * gap, weights.tangent * tilt]).reshape(-1)
             dual.append(self.data.curve_gradient(vertices, gap, tilt))
         self._balance()
         return self._forward.outputs[2][self._fixed], np.concatenate(dual)

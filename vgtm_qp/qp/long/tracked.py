@@ -1,6 +1,6 @@
-"""The step's QP of a long arm whose faces stay on the curve exactly: only the curve's coordinates are free.
+"""The step's QP of a long arm whose stations stay on the curve exactly: only the curve's coordinates are free.
 
-Where a period's fixed members and its faces' positions are as many as its coordinates, one pass from the base
+Where a period's fixed members and its stations' positions are as many as its coordinates, one pass from the base
 to the tip gives all nodes as a linear function of the control vertices.
 """
 
@@ -23,8 +23,8 @@ from vgtm_qp.qp.long.working_set import Moved
 class Following:
     """The graphs of a period that follows the curve.
 
-    Where its faces are to be somewhere, a period's displacements are u = placed + B (gap - C placed): `placed` by its
-    fixed members alone, C the Jacobian of the faces' centres, B of the free motions that shift them.
+    Where its stations are to be somewhere, the displacements of a period are u = placed + B (gap - C placed):
+    `placed` by its fixed members alone, C the Jacobian of the stations' centres, B of the free motions that shift them.
     """
 
     def __init__(self, elimination: Elimination) -> None:
@@ -34,8 +34,8 @@ class Following:
             free = ca.SX(motions.shape[0], stage.freedom)
             followed = stage.G @ (stage.T @ motions)
             motions = ca.vertcat(ca.horzcat(motions, free), ca.horzcat(followed, stage.N))
-        self._faces = range(chain.faces.shape[1])
-        self._centre = ca.vertcat(*[elimination.centre_row(k) for k in self._faces])
+        self._stations = range(chain.stations.shape[1])
+        self._centre = ca.vertcat(*[elimination.centre_row(k) for k in self._stations])
         inverse = small_inverse(self._centre @ motions)
         self._gains = [*(stage.G for stage in elimination.stages), ca.sparsify(motions @ inverse)]
 
@@ -57,14 +57,14 @@ class Following:
         columns = elimination.curve + 1
         before = ca.SX.sym("carry", columns, len(elimination.live))
         rhs = [ca.horzcat(ca.SX(len(stage.hard), columns - 1), stage.rhs) for stage in elimination.stages]
-        on_curve = [elimination.curve_columns(k) for k in self._faces]
-        gap = ca.vertcat(*[ca.horzcat(on_curve[k][0], -inputs.gap[k]) for k in self._faces])
+        on_curve = [elimination.curve_columns(k) for k in self._stations]
+        gap = ca.vertcat(*[ca.horzcat(on_curve[k][0], -inputs.gap[k]) for k in self._stations])
         moved = self._placed(before.T, rhs, self._gains, gap)
         strokes = inputs.jacobian[elimination.actuated, :] @ moved
         strokes[:, -1] -= inputs.rhs[elimination.actuated]
         angles = [
             elimination.tangent_row(k) @ moved + ca.horzcat(on_curve[k][1], inputs.tilt[k])
-            for k in self._faces
+            for k in self._stations
         ]
         own = list(range(elimination.chain.before, elimination.size))
         gains = ca.vertcat(*[nonzeros(part) for part in self._gains])
@@ -74,13 +74,13 @@ class Following:
         return dense_function("following", [before, inputs.head, inputs.tail, inputs.table], outputs)
 
     def hold(self) -> ca.Function:
-        """Return ``Elimination.newton`` towards lengths `aim` (3m,) and points `curve` (3f,) of the faces' centres.
+        """Return ``Elimination.newton`` towards lengths `aim` (3m,) and points `curve` (3f,) of the stations' centres.
 
         Only fixed members are aimed at their lengths; actuated members take the lengths that follow.
         """
         elimination = self._elimination
         vector, gains = symbols_like([part.sparsity() for part in self._gains], "gains")
-        aim, curve = ca.SX.sym("aim", elimination.chain.own), ca.SX.sym("curve", 3 * len(self._faces))
+        aim, curve = ca.SX.sym("aim", elimination.chain.own), ca.SX.sym("curve", 3 * len(self._stations))
 
         def step(moved: ca.SX, X: ca.SX, lengths: ca.SX) -> tuple[ca.SX, ca.SX]:
             rhs = [aim[stage.hard] - lengths[stage.hard] for stage in elimination.stages]
@@ -113,7 +113,7 @@ class TrackedSolver(ChainSolver):
         self._one = np.ones(columns)
 
     def closing(self) -> ChainClosing:
-        """See :class:`ChainSolver`: keeps the faces on the curve, too."""
+        """See :class:`ChainSolver`: keeps the stations on the curve, too."""
         return ChainClosing(self.chain, self._graphs.hold(), self.data.head, self._following.outputs[1])
 
     def _columns(self, nodes: Index, coefficients: Array) -> Array:

@@ -1,0 +1,197 @@
+"""Arms in joint space: joint values and the pose of the base are the configuration, and nothing is to be eliminated.
+
+A configuration q (J + 6,) holds the joints' values, rad or m, then position, m, and rotation vector, rad, of the base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose
+from vgtm_qp.arm.symbols import ArmSymbols, Constants
+from vgtm_qp.arrays import Array, Mask
+from vgtm_qp.rotation import vector_near
+
+
+@dataclass(frozen=True)
+class JointSpaceDescription:
+    """What `vgtm check` tells of an arm.
+
+    Attributes
+    ----------
+    kind : str
+    joints, actuated, links, stations : int
+    length : float
+        Of the way from the base over the joints to the tip at home, m.
+    hard : bool
+        Whether all stations can keep their positions on the curve at home.
+    """
+
+    kind: str
+    joints: int
+    actuated: int
+    links: int
+    stations: int
+    length: float
+    hard: bool
+
+    def __str__(self) -> str:
+        can = "can" if self.hard else "cannot"
+        several = self.stations != 1
+        tracking = "stations track the curve; they" if several else "station tracks the curve; it"
+        return (
+            f"{self.kind} arm of {self.joints} joints, {self.actuated} of them actuated, {self.links} links, "
+            f"{self.length:.6g} m long\n"
+            f"{self.stations} {tracking} {can} keep {'their positions' if several else 'its position'} on it exactly"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class JacobianRows:
+    """d_rho - K d_a = rhs; see ``arm.MotionRows``. `jacobian` is K."""
+
+    jacobian: Array
+    rhs: Array
+
+    @property
+    def values(self) -> Array:
+        return np.concatenate([np.ones(len(self.rhs)), -self.jacobian.reshape(-1)])
+
+    def response(self) -> tuple[Array, Array]:
+        """Return K and r."""
+        return self.jacobian, self.rhs
+
+
+class JointSpaceArm(Arm):
+    """See ``arm.Arm``; all that follows from the nodes as functions of the joints, base first.
+
+    Attributes
+    ----------
+    functions : (casadi.Function, casadi.Function)
+        (q, *constants) -> nodes (3, N), m; the same and their Jacobian (3 N, J).
+    constants : mapping
+        What these take beside the configuration, the columns of each as rows.
+    revolute : (J,) bool
+        True for joints that turn, False for those that slide.
+    reaches : (J + 1,)
+        Bounds of the distance from the base, and from each joint, to any node beyond it in any pose, m.
+    """
+
+    bays = None
+    leaves_chords = True
+    functions: tuple[ca.Function, ca.Function]
+    constants: Mapping[str, Array]
+    revolute: Mask
+    reaches: Array
+
+    @cached_property
+    def motion_pattern(self) -> MotionPattern:
+        """d_rho - K d_a, dense in the actuators."""
+        rows, count = 3 * len(self.free), len(self.actuators)
+        grid, own = np.indices((rows, count)).reshape(2, -1), np.arange(rows)
+        names = [f"node: {self.node_names[n]} {axis}" for n in self.free for axis in "xyz"]
+        labels = tuple(Label(name, "kinematics", "m") for name in names)
+        return MotionPattern(np.concatenate([own, grid[0]]), np.concatenate([own, rows + grid[1]]), labels)
+
+    def symbols(self, constants: Constants) -> JointSpaceSymbols:
+        return JointSpaceSymbols(self, constants)
+
+    def motion_rows(self, *values: Array) -> JacobianRows:
+        """See ``arm.Arm``: K column by column, and r."""
+        response, rhs = values
+        return JacobianRows(response.reshape(len(self.actuators), len(rhs)).T, rhs)
+
+    def measured(self, q: Array) -> Array:
+        return np.array(q[:-6])
+
+    def based(self, q: Array, pose: Pose) -> Array:
+        return np.concatenate([q[:-6], pose.position, vector_near(pose.rotation, q[-3:])])
+
+    def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:  # noqa: ARG002
+        q = q.copy()
+        q[self.actuators] += strokes
+        return q
+
+    def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
+        return np.concatenate([q[:-6] + missing, q[-6:]])
+
+    def travel(self, motion: Array) -> float:
+        turn, slide = self._motions(motion)
+        return float(turn @ self.reaches + slide.sum() + np.abs(motion[-6:-3]).max(initial=0.0))
+
+    def deviation(self, start: Array, end: Array) -> float:
+        """See ``arm.Arm``: an eighth of a bound of the nodes' second derivative on the way, for both of a pair.
+
+        A point's velocity is sum w_j a_j x (X - o_j) + sum d_j a_j, the axes a_j turn with all joints before them, and
+        what is beyond a joint moves against it by no more than its own joints make it.
+        """
+        turn, slide = self._motions(end - start)
+        before = np.concatenate([[0.0], np.cumsum(turn)[:-1]])
+        beyond = np.cumsum((turn * self.reaches + slide)[::-1])[::-1]
+        bend = turn @ (2.0 * before * self.reaches + beyond) + slide @ before
+        return 2.0 * float(bend) / 8.0
+
+    def _motions(self, motion: Array) -> tuple[Array, Array]:
+        """Return turns (J + 1,), rad, the base's first and counted twice, and slides (J + 1,), m."""
+        joints, base = np.abs(motion[:-6]), 2.0 * float(np.linalg.norm(motion[-3:]))
+        turn, slide = np.where(self.revolute, joints, 0.0), np.where(self.revolute, 0.0, joints)
+        return np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
+
+    def reach(self) -> Array:
+        """See ``arm.Arm``: only that from the base's origin, its first node, is bounded."""
+        return np.array([self.reaches[0], *[np.inf] * (int(self.base.sum()) - 1)])
+
+    def describe(self) -> JointSpaceDescription:
+        stations, hard = len(self.stations) - 1, "position" in self.stations.trackable
+        counts = self.segments, len(self.actuators), len(self.bodies), stations
+        return JointSpaceDescription(self.kind, *counts, self.height, hard)
+
+    def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:  # noqa: ARG002
+        """See ``arm.Arm``: the base's pose follows from the problem."""
+        names = {"joint_names": np.array(self.quantity_names), "body_names": np.array(self.bodies.names)}
+        return {"joints": quantities, **names}
+
+
+class JointSpaceSymbols(ArmSymbols):
+    """See ``arm.ArmSymbols``: K is the geometric Jacobian."""
+
+    def __init__(self, arm: JointSpaceArm, constants: Constants) -> None:
+        super().__init__(arm.home_quantities, arm.actuators, constants)
+        self._joints, self._free = len(arm.quantity_names), arm.free.tolist()
+        self._nodes, self._moving = arm.functions
+        self.shape, self.given = (self._joints + 6, 1), list(range(len(arm.home)))
+        self._constants = [constants.add(name, value) for name, value in arm.constants.items()]
+
+    def nodes(self, q: ca.MX) -> ca.MX:
+        return self._nodes(q, *self._constants)
+
+    def quantities(self, q: ca.MX) -> ca.MX:
+        """See ``arm.ArmSymbols``: the joints' values."""
+        return q[: self._joints]
+
+    def motion(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> list[ca.MX]:  # noqa: ARG002
+        """See ``arm.ArmSymbols``: K and r."""
+        rows = [3 * node + axis for node in self._free for axis in range(3)]
+        _, jacobian = self._moving(at, *self._constants)
+        return [jacobian[rows, self._actuators], ca.vec(moved[:, self._free])]
+
+    def response(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
+        return ca.horzcat(*self.motion(q, at, moved))
+
+    def coordinates(self, nodes: Any, strokes: Any) -> Any:  # noqa: ARG002
+        """See ``arm.ArmSymbols``: the actuators."""
+        return strokes
+
+    def along(self, q: ca.MX, coordinates: ca.MX) -> ca.MX:
+        q = q * 1.0
+        q[self._actuators] = q[self._actuators] + coordinates
+        return q
+
+    def closed(self, q: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
+        return ca.vertcat(self.aims(self.quantities(q), lower, upper), q[self._joints :])
