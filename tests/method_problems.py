@@ -8,8 +8,8 @@ import numpy as np
 
 from vgtm_qp.arm.truss.build import build_truss
 from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.mover import Mover
 
 MODULES: dict[str, dict[str, Any]] = {
     "octahedral": {"module": "octahedral", "bays": 5},
@@ -25,6 +25,8 @@ MODULES: dict[str, dict[str, Any]] = {
 
 def free_problem(module: str, *, steps: int = 20, **method: Any) -> Problem:
     """A maneuver that bends the arm a little, with no obstacle and no limit that is met."""
+    if method.get("name") == "pseudoinverse":
+        method.pop("tracking", None)
     truss = {"stroke": [0.2, 3.0], **MODULES[module]}
     data: dict[str, Any] = {
         "truss": truss,
@@ -40,7 +42,7 @@ def free_problem(module: str, *, steps: int = 20, **method: Any) -> Problem:
     return Problem.from_dict(data)
 
 
-def run(resolver: Mover, problem: Problem, steps: int | None = None) -> list[np.ndarray]:
+def run(resolver: Resolver, problem: Problem, steps: int | None = None) -> list[np.ndarray]:
     """Move along the problem's path; return the node positions after each step."""
     plan = make_plan(problem, *resolver.tip())
     value, states = plan.path.start, []

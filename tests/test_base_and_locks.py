@@ -12,10 +12,11 @@ import vgtm_qp as vq
 from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.errors import GoalError, ProblemError
+from vgtm_qp.methods import Resolver
 from vgtm_qp.problem.truss import BasePose
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.path import base_motion
-from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.step import StepStatus
 
 POSES = (
     {"time": 2.0, "position": [0.2, 0.0, 0.1], "rotation_vector": [0.0, 0.2, 0.3]},

@@ -12,6 +12,7 @@ from steps import assert_same_answer, make_step, pressing
 
 from vgtm_qp.arm.truss.build import lock_members
 from vgtm_qp.bench.scenes import make_scenes
+from vgtm_qp.methods import Resolver
 from vgtm_qp.qp.answer import Accuracy
 from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.chain_data import ChainData, PeriodValues
@@ -20,7 +21,7 @@ from vgtm_qp.qp.long.select import chain_solver
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import GeneralEngine
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.step import StepStatus
 from vgtm_qp.step.target import QPInput
 
 MODULES = {

@@ -291,7 +291,7 @@ def test_an_internal_error_gives_1_and_one_document(capsys, monkeypatch):
 
 
 def test_an_interrupt_between_steps_gives_130_and_keeps_them(capsys, monkeypatch):
-    from vgtm_qp.step.resolver import Resolver
+    from vgtm_qp.methods import Resolver
 
     follow, calls = Resolver.follow, []
 

@@ -15,7 +15,7 @@ import vgtm_qp as vq
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.bounds import chord_deviation
 from vgtm_qp.cli import main
-from vgtm_qp.step.resolver import Resolver
+from vgtm_qp.methods import Resolver
 from vgtm_qp.step.separation import Separation
 
 

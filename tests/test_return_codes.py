@@ -18,12 +18,13 @@ import vgtm_qp as vq
 from vgtm_qp.arm.truss.kinematics import LengthRows
 from vgtm_qp.compiled import Kernel, compiler, finish_compiling
 from vgtm_qp.errors import EvaluationError, SolverError
+from vgtm_qp.methods import Resolver
 from vgtm_qp.qp.answer import Accuracy
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.step import StepStatus
 from vgtm_qp.step.stops import StopKind
 from vgtm_qp.step.target import QPInput, Target
 

@@ -16,13 +16,14 @@ from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.errors import CurveError, GoalError, ProblemError
+from vgtm_qp.methods import Resolver
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.step.acceptance import TrackingError
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import find_warnings
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.step import StepStatus
 from vgtm_qp.step.target import QPInput, Target
 
 STRIDE = np.array([0.05, 0.02, -0.02])

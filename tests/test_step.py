@@ -15,13 +15,14 @@ from vgtm_qp.arm.truss.arm import TrussArm, truss_of
 from vgtm_qp.errors import GoalError, ProblemError, VgtmError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.methods import Resolver
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rotation import rotation_from_vector, turn_between, vector_from_rotation
 from vgtm_qp.rows.clearance import clearance_rows
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.step.step import StepStatus
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vgtm_qp as vq
-from vgtm_qp.methods import make_resolver, with_method
+from vgtm_qp.methods import with_method
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.stops import StopKind
 
@@ -91,7 +91,7 @@ def test_a_base_that_moves_further_is_refused_by_name():
 @pytest.mark.parametrize("method", ["qp-recursive", "pseudoinverse-sparse", "curve-pseudoinverse"])
 def test_other_methods_keep_it(method):
     problem = with_method(limited("five_bay_free", 0.05), method)
-    resolver = make_resolver(problem)
+    resolver = vq.Resolver(problem)
     path = resolver.setup.task.path_to(resolver.tip(), resolver.tip()[0] + [0.4, 0.0, 0.0], None, None)
     before = resolver.state
     step = resolver.follow(path, 0.0, 1.0)

@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     from vgtm_qp.export import export_maneuver
     from vgtm_qp.maneuver.maneuver import Maneuver, load_result
     from vgtm_qp.maneuver.solve import solve, solve_many
+    from vgtm_qp.methods import Resolver
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
     from vgtm_qp.result.certificate import Certificate, Measure
-    from vgtm_qp.step.resolver import Resolver, Step, StepStatus
+    from vgtm_qp.step.step import Step, StepStatus
     from vgtm_qp.verify import verify, verify_file
 
 _HOMES = {
@@ -40,7 +41,8 @@ _HOMES = {
     "vgtm_qp.maneuver.solve": ("solve", "solve_many"),
     "vgtm_qp.comparison.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
-    "vgtm_qp.step.resolver": ("Resolver", "Step", "StepStatus"),
+    "vgtm_qp.methods": ("Resolver",),
+    "vgtm_qp.step.step": ("Step", "StepStatus"),
     "vgtm_qp.arm.truss.build": ("build_truss",),
     "vgtm_qp.arm.truss.mobility": ("describe",),
     "vgtm_qp.arm.truss.truss": ("Truss",),

@@ -13,14 +13,13 @@ from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods import make_resolver, with_method
+from vgtm_qp.methods import Resolver, with_method
 from vgtm_qp.methods.conventional import DenseSolution
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.resolver import StepStatus
 from vgtm_qp.step.state import State
+from vgtm_qp.step.step import StepStatus
 
 
 class Contestant(Protocol):
@@ -74,7 +73,7 @@ class ResolverStep:
     def __init__(self, problem: Problem, *, method: str | None = None, solver: str | None = None) -> None:
         changed = problem if method is None else with_method(problem, method)
         changed = changed if solver is None else changed.replace({"method.solver": solver})
-        self.resolver: Mover = make_resolver(changed)
+        self.resolver: Resolver = Resolver(changed)
 
     def place(self, state: State) -> None:
         """See :class:`Contestant`."""

@@ -66,8 +66,8 @@ def _measured(problem: dict[str, Any]) -> dict[str, float]:
     """Set a problem up in this process, take some steps, and return the measures."""
     started = perf_counter()
     from vgtm_qp.maneuver.plan import make_plan
+    from vgtm_qp.methods import Resolver
     from vgtm_qp.problem import Problem
-    from vgtm_qp.step.resolver import Resolver
 
     loaded = Problem.from_dict(problem)
     imports, imported = perf_counter() - started, _peak_memory()

@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike
 from vgtm_qp.bench.contestants import Contestant
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.maneuver.plan import Plan
-from vgtm_qp.step.resolver import Resolver, StepStatus
+from vgtm_qp.methods import Resolver
 from vgtm_qp.step.state import State
+from vgtm_qp.step.step import StepStatus
 
 _Answer = TypeVar("_Answer")
 

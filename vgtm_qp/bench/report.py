@@ -20,7 +20,7 @@ from vgtm_qp.comparison.tables import exponent
 from vgtm_qp.errors import ResultError, VgtmError
 from vgtm_qp.machine import commit, machine_record, versions
 from vgtm_qp.maneuver.plan import Plan, make_plan
-from vgtm_qp.step.resolver import Resolver
+from vgtm_qp.methods import Resolver
 
 _PACKAGES = ("vgtm-qp", "numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl")
 

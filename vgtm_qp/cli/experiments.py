@@ -13,7 +13,7 @@ from vgtm_qp.bench import BaselineName, SceneKind, TrackingName
 from vgtm_qp.cli.output import Json, Output, Switch, answer, bar, document, following, note, say
 
 if TYPE_CHECKING:
-    from vgtm_qp.step.resolver import Step
+    from vgtm_qp.step.step import Step
 
 _several = partial(Switch, consume_multiple=True)
 

@@ -21,7 +21,7 @@ from vgtm_qp.errors import Mistake, ProblemError
 
 if TYPE_CHECKING:
     from vgtm_qp.maneuver.solve import Progress
-    from vgtm_qp.step.resolver import Step
+    from vgtm_qp.step.step import Step
 
 Output = partial(Parameter, name=["--output", "-o"])
 Switch = partial(Parameter, negative="")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -23,8 +23,6 @@ from vgtm_qp.cli.results import outcome_code
 if TYPE_CHECKING:
     from vgtm_qp.problem import Problem
 
-MethodName = Literal["qp", "pseudoinverse", "curve-pseudoinverse"]
-
 _KEYS = {"method.name": "--method", "method.solver": "--solver", "maneuver.steps": "--steps"}
 
 
@@ -33,7 +31,9 @@ def solve(
     /,
     *,
     output: Annotated[Path | None, Output(help="result file; NAME.npz in this folder by default")] = None,
-    method: Annotated[MethodName | None, Parameter(help="in the place of the problem's method")] = None,
+    method: Annotated[
+        str | None, Parameter(help="in the place of the problem's, by its name in compare")
+    ] = None,
     solver: Annotated[str | None, Parameter(help="QP solver, in the place of the problem's")] = None,
     steps: Annotated[int | None, Parameter(help="number of steps, in the place of the problem's")] = None,
     figure: Annotated[
@@ -53,9 +53,7 @@ def solve(
     from vgtm_qp.problem import load_problem
     from vgtm_qp.verify import verify as certify
 
-    loaded = _changed(
-        load_problem(problem), {"method.name": method, "method.solver": solver, "maneuver.steps": steps}
-    )
+    loaded = _changed(load_problem(problem), method, {"method.solver": solver, "maneuver.steps": steps})
     name = loaded.source.stem if loaded.source else "result"
     result = Path(f"{name}.npz") if output is None else output
     check_writable(result, "--output", (".npz",))
@@ -92,15 +90,17 @@ def solve(
     return outcome_code(maneuver)
 
 
-def _changed(problem: Problem, changes: dict[str, Any]) -> Problem:
+def _changed(problem: Problem, method: str | None, changes: dict[str, Any]) -> Problem:
     """Return the problem with the options of the command line, which name their own mistakes."""
     from dataclasses import replace
 
     from vgtm_qp.errors import ProblemError
+    from vgtm_qp.methods.presets import with_method
 
     wanted = {key: value for key, value in changes.items() if value is not None}
     try:
-        changed = problem.replace(wanted) if wanted else problem
+        changed = problem if method is None else with_method(problem, method)
+        changed = changed.replace(wanted) if wanted else changed
         if "method.solver" in wanted:
             from vgtm_qp.step.build import check_solver
 

@@ -16,7 +16,7 @@ from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.methods.presets import DEFAULT_METHODS, check_methods, with_method
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
-from vgtm_qp.step.resolver import Step
+from vgtm_qp.step.step import Step
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,7 +8,7 @@ from html import escape
 from queue import SimpleQueue
 from threading import Event
 from time import perf_counter
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -18,15 +18,14 @@ from vgtm_qp.live.session import Session
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
+from vgtm_qp.methods import PRESETS, method_name, methods_for
 from vgtm_qp.problem import Problem
-from vgtm_qp.problem.method import Method
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled, stroke_colours
 from vgtm_qp.view.scene import ArmScene, viser_server
 
 _PERIOD = 1.0 / 30.0
 _READ_OUT_PERIOD = 0.1
 _LEAST_EXPONENT = -4.0
-_METHODS = get_args(Method.model_fields["name"].annotation)
 _HINT = "Drag the red ball: the tip follows. Hold a green one: the curve is drawn there, the tip stays."
 _TARGET_COLOUR = (214, 39, 40)
 _SLIDERS = (
@@ -73,7 +72,7 @@ class _Page:
         self._settings: dict[str, Any] = {}
         self._playing, self._moment, self._message = False, 0.0, ""
         state = session.state
-        self._scene = ArmScene(server, session.drawing, session.nodes, state.control_vertices)
+        self._scene = ArmScene(server, session.drawing, session.nodes, session.control_vertices)
         path = make_plan(session.problem, *session.pose()).path.positions
         self._scene.add_path("/path", path)
         nodes = maneuver.nodes if maneuver else session.nodes[None]
@@ -128,10 +127,10 @@ class _Page:
 
     def _draw(self) -> None:
         session = self._session
-        self._scene.move(session.nodes, session.state.control_vertices, session.state.time)
+        self._scene.move(session.nodes, session.control_vertices, session.state.time)
         self._target.position = session.target
         for i, handle in self._vertices.items():
-            handle.position = session.vertex_goals.get(i, session.state.control_vertices[i])
+            handle.position = session.vertex_goals.get(i, session.control_vertices[i])
 
     def _add_handle(self, name: str, position: Array, radius: float, colour: Any, moved: Any) -> Any:
         """Draw a ball; where it is dragged to, and whether it was let go there, is told to `moved`."""
@@ -148,7 +147,7 @@ class _Page:
         if self._session.vertices_can_be_wanted:
             self._session.want_vertex(index, None if released else position)
         else:
-            method = self._session.problem.method.name
+            method = method_name(self._session.problem)
             self._message = f"the method {method} takes no goals of control vertices"
 
     def _add_widgets(self) -> None:
@@ -166,7 +165,8 @@ class _Page:
         with gui.add_folder("By hand"):
             gui.add_markdown(_HINT)
             home = gui.add_button("Home")
-            method = gui.add_dropdown("method", _METHODS, initial_value=session.problem.method.name)
+            shown = method_name(session.problem)
+            method = gui.add_dropdown("method", tuple(methods_for(session.problem)), initial_value=shown)
             least = min(0.3, session.problem.clearance.safe)
             safe = gui.add_slider("safe [m]", min=0.0, max=0.3, step=0.005, initial_value=least)
         with gui.add_folder("Weights, powers of ten", expand_by_default=False):
@@ -176,7 +176,7 @@ class _Page:
         self._on(self._slider.on_update, self._scrub)
         self._on(again.on_click, lambda _: self._solve())
         self._on(home.on_click, lambda _: self._go_home())
-        self._set_by(method, "method.name", str)
+        self._on(method.on_update, lambda _: self._settings.update(PRESETS[method.value]))
         self._set_by(safe, "clearance.safe", float)
 
     def _add_weight(self, name: str) -> None:
@@ -276,7 +276,7 @@ def read_out(session: Session, message: str) -> str:
         ("clearance", _distance(reading.clearance, safe), reading.nearest),
         (f"{session.drawing.arm.body}s apart", _distance(reading.self_clearance, -np.inf), ""),
         ("tip to target", f"{1000 * float(np.linalg.norm(session.target - session.tip)):.1f} mm", ""),
-        ("step", step_time, session.problem.method.name),
+        ("step", step_time, method_name(session.problem)),
     ]
     cells = "".join(
         f"<tr><td style='color:#6b7280;padding-right:0.8em'>{name}</td>"

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.methods import make_resolver
+from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.mover import Mover
+from vgtm_qp.rows.curve import free_basis
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.resolver import Resolver
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.verify.arm import recorded_arm
@@ -25,6 +25,9 @@ OUTCOMES = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatu
 _REACHED = 1e-4
 _STRIDE = 0.06
 _RETRY_AFTER = 10
+
+_STRAIGHTENS = 1e-6
+"""Weight that makes a fitted curve as straight as the stations let it be."""
 
 
 class Reading(NamedTuple):
@@ -48,11 +51,12 @@ class Session:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self._resolver = _make_resolver(problem)
+        self._resolver = Resolver(problem)
         arm = self._resolver.setup.arm
         directory = problem.source.parent if problem.source else "."
         recorded = recorded_arm(arm.record(), arm.bodies.joints)
         vertices = len(self.state.control_vertices)
+        self._drawn = self._resolver.setup
         self.drawing = make_drawing(problem.to_dict(), recorded, vertices, directory)
         self._step_time = 0.0
         self._put(self.state)
@@ -66,6 +70,11 @@ class Session:
     def state(self) -> State:
         """Where the arm is."""
         return self._resolver.state
+
+    @property
+    def control_vertices(self) -> Array:
+        """(V, 3) those that are drawn, m: fitted to the stations while the method has no curve."""
+        return _with_curve(self.state, self._drawn).control_vertices
 
     @property
     def tip(self) -> Array:
@@ -112,7 +121,7 @@ class Session:
         self._put(state)
 
     def _put(self, state: State) -> None:
-        self._resolver.state = state
+        self._resolver.state = _with_curve(state, self._resolver.setup)
         self.target = self.tip
         self.vertex_goals: dict[int, Array] = {}
         self._waiting = 0
@@ -125,8 +134,8 @@ class Session:
         VgtmError, and no change, where a value is wrong or the method cannot serve this problem.
         """
         problem = self.problem.replace(settings)
-        resolver = _make_resolver(problem)
-        resolver.state = self.state
+        resolver = Resolver(problem)
+        resolver.state = _with_curve(self.state, resolver.setup)
         self.problem, self._resolver = problem, resolver
         self._waiting, self._held_by = 0, ()
 
@@ -178,6 +187,18 @@ class Session:
         )
 
 
-def _make_resolver(problem: Problem) -> Mover:
-    # A hand may draw control vertices, which the coupled QP alone follows.
-    return Resolver(problem) if problem.method.name == "qp" else make_resolver(problem)
+def _with_curve(state: State, setup: Setup) -> State:
+    """Return a state with as many control vertices as a setup has, where need be of a curve fitted to the stations."""
+    layout, stations = setup.layout, setup.arm.stations
+    if len(state.control_vertices) == layout.vertices:
+        return state
+    if not layout.vertices:
+        return replace(state, control_vertices=np.zeros((0, 3)), torsion=np.zeros(0))
+    centres = stations.centres(state.nodes)
+    basis = free_basis(stations.frames[0][:, 2], 3 * layout.vertices)
+    second = np.diff(np.eye(layout.vertices), n=2, axis=0)
+    rows = np.kron(np.vstack([layout.curve_weights, _STRAIGHTENS * second]), np.eye(3)) @ basis
+    away = np.vstack([centres[layout.tracked] - centres[0], np.zeros((len(second), 3))])
+    free = np.linalg.lstsq(rows, away.ravel(), rcond=None)[0]
+    vertices = centres[0] + (basis @ free).reshape(-1, 3)
+    return replace(state, control_vertices=frozen(vertices), torsion=frozen(setup.torsion))

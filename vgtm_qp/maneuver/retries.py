@@ -75,7 +75,7 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
         yield "shorter steps", {"maneuver.steps": 3 * problem.maneuver.steps}
     yield "actuator rates as the metric", {"method.weights.actuator_rate": rate}
     # Hard tracking asks for the curve, so there is no retry without it.
-    if method.tracking != "none" and not method.hard_tracking:
+    if method.tracking != "none" and not method.holds_curve:
         yield "no curve", {"method": method.kept_by("qp", "none"), "curve.control_vertex_goals": []}
     if vertices:
         yield "more control vertices", {"curve.control_vertices": curve.control_vertices + _MORE_VERTICES}

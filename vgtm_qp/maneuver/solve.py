@@ -16,12 +16,11 @@ from vgtm_qp.machine import THREADS, environment
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.retries import DeadEnd, retries
-from vgtm_qp.methods import make_resolver
+from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, recorded_versions
 from vgtm_qp.step.checks import check_problem
-from vgtm_qp.step.mover import Mover
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
@@ -53,7 +52,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     """
     check_is_problem(problem)
     started = perf_counter()
-    resolver = make_resolver(problem)
+    resolver = Resolver(problem)
     mistakes = check_problem(problem, resolver.setup)
     if mistakes:
         raise problem.error(mistakes)
@@ -110,7 +109,7 @@ def solve_many(
 class _Attempt:
     """A resolver on its way along the path of a problem, and the rows of the result, grown step by step."""
 
-    def __init__(self, problem: Problem, resolver: Mover) -> None:
+    def __init__(self, problem: Problem, resolver: Resolver) -> None:
         self.resolver, self.plan = resolver, make_plan(problem, *resolver.tip())
         self.value = self.plan.path.start
         self.rows: dict[str, list[Any]] = {}
@@ -229,7 +228,7 @@ def _retry(
 
 
 def _assemble(
-    problem: Problem, resolver: Mover, attempt: _Attempt, stop: Stop | None, setup_time: float, way: str
+    problem: Problem, resolver: Resolver, attempt: _Attempt, stop: Stop | None, setup_time: float, way: str
 ) -> Maneuver:
     setup = resolver.setup
     meshes = {
@@ -273,7 +272,7 @@ def _assemble(
     )
 
 
-def _too_near(resolver: Mover) -> dict[str, float]:
+def _too_near(resolver: Resolver) -> dict[str, float]:
     """Return the pairs below their clearance in the home pose that the method drives apart, and their distances, m."""
     names, kind = resolver.setup.monitor.names, resolver.setup.arm.bodies.kind
     found: dict[str, float] = {}

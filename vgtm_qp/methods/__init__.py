@@ -1,26 +1,19 @@
-"""Every method of the paper behind one interface, ``step.mover.Mover``."""
+"""Every method of the paper behind one class, ``Resolver``, whose subclasses are named here."""
 
 from vgtm_qp.methods.conventional import ConventionalResolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
-from vgtm_qp.methods.presets import DEFAULT_METHODS, PRESETS, with_method
-from vgtm_qp.problem import Problem
-from vgtm_qp.step.mover import Mover
-from vgtm_qp.step.resolver import Resolver
+from vgtm_qp.methods.presets import DEFAULT_METHODS, PRESETS, method_name, methods_for, with_method
+from vgtm_qp.step.mover import Resolver
+from vgtm_qp.step.resolver import QPResolver
 
-__all__ = ["DEFAULT_METHODS", "PRESETS", "make_resolver", "with_method"]
-
-
-def make_resolver(problem: Problem) -> Mover:
-    """Return what moves the arm of a problem by the method that ``problem.method`` asks for.
-
-    Raises
-    ------
-    CurveError, ProblemError, SolverError, TrussError
-        The arm cannot be built, or not moved by that method.
-    """
-    method = problem.method
-    if method.name == "pseudoinverse":
-        return ConventionalResolver(problem)
-    if method.name == "curve-pseudoinverse" or method.tracking in ("recursive", "parallel"):
-        return CurveFirstResolver(problem)
-    return Resolver(problem)
+__all__ = [
+    "DEFAULT_METHODS",
+    "PRESETS",
+    "ConventionalResolver",
+    "CurveFirstResolver",
+    "QPResolver",
+    "Resolver",
+    "method_name",
+    "methods_for",
+    "with_method",
+]

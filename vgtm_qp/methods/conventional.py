@@ -11,7 +11,7 @@ from scipy.linalg.lapack import dgbsv
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arrays import Array, Index
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.objectives import DEFAULT_TERMS, Terms, TrussObjective
 from vgtm_qp.methods.pseudoinverse import (
@@ -59,8 +59,13 @@ class DenseSolution:
     def __init__(self, layout: Layout, method: Method) -> None:
         self._layout, self._truss, self._method = layout, truss_of(layout.arm), method
         self._lengths = np.zeros((self._truss.member_count, layout.node_columns))
+        self._fixed = self._truss.fixed
         self._tip, self._present = _tip_columns(layout)
         self.rank: int | None = None
+
+    def hold(self, members: Index, held: Mask) -> None:  # noqa: ARG002
+        """Let some actuated members (h,), which `held` (n_a,) marks, count as fixed ones after those."""
+        self._fixed = np.concatenate([self._truss.fixed, members])
 
     def displacement(self, system: Linear, terms: Terms) -> Array:
         """Return the node displacements (3 (N - N_c),), m: eq. (28) with the null-space vector of `terms`."""
@@ -90,9 +95,9 @@ class DenseSolution:
         """Return J (n_e + n_l, 3 (N - N_c)), eq. (26), of tip and fixed lengths, and the rows of actuated lengths."""
         truss = self._truss
         lengths = truss.scatter.dense(gradient, self._lengths)
-        J = np.zeros((len(tip) + len(truss.fixed), lengths.shape[1]))
+        J = np.zeros((len(tip) + len(self._fixed), lengths.shape[1]))
         J[: len(tip), self._tip] = tip[:, self._present]
-        J[len(tip) :] = lengths[truss.fixed]
+        J[len(tip) :] = lengths[self._fixed]
         return J, lengths[truss.actuators]
 
 
@@ -128,19 +133,30 @@ class SparseSolution:
         damped = np.zeros(members + len(tips))
         if method.variant == "damped":
             damped[truss.fixed] = damped[members:] = -(method.damping**2)
-        self._damped = damped
+        self._damped, self._free = damped, np.ones(len(actuators))
+        self._damping = -(method.damping**2) if method.variant == "damped" else 0.0
         self.rank: int | None = members - len(actuators) + len(tips)
+
+    def hold(self, members: Index, held: Mask) -> None:
+        """See :meth:`DenseSolution.hold`: the displacement of a held actuator has no part in its length's row."""
+        assert self.rank is not None
+        self.rank += int(held.sum()) - int((self._free == 0.0).sum())
+        self._fixed = np.concatenate(
+            [self._fixed[: self._fixed.size - int((self._free == 0.0).sum())], members]
+        )
+        self._free = np.where(held, 0.0, 1.0)
+        self._damped[members] = self._damping
 
     def displacement(self, system: Linear, terms: Terms) -> Array:
         """Return the node displacements, as :meth:`DenseSolution.displacement` does."""
         a, y, u = self._parts
         values = [
             np.full(a, terms.node),
-            np.full(y - a, terms.actuator),
+            np.where(self._free, terms.actuator, 1.0),
             self._damped,
             terms.blocks[:, *_LOWER].ravel(),
             system.gradient.reshape(-1)[self._flat],
-            np.full(y - a, -1.0),
+            -self._free,
             system.tip[:, self._present].ravel(),
         ]
         lengths = np.zeros(u - y)
@@ -188,7 +204,7 @@ class BandedSystem:
         return x
 
 
-class ConventionalResolver(MethodResolver):
+class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
     """Moves an arm by the conventional solution.
 
     Raises
@@ -200,12 +216,21 @@ class ConventionalResolver(MethodResolver):
     def __init__(self, problem: Problem) -> None:
         method = problem.method
         super().__init__(arm_without_curve(problem))
+        self._fixed = truss_of(self.setup.arm).fixed
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         self._objective = TrussObjective(names, method.weights, self.setup)
         solution = SparseSolution if method.algebra == "sparse" else DenseSolution
         self._solution = solution(self.setup.layout, method)
         self._correct = method.correct
-        self._home_fixed = self.setup.arm.home_quantities[truss_of(self.setup.arm).fixed]
+        self._lengths = self.setup.arm.home_quantities[self._fixed]
+
+    def _hold(self, members: Index, held: Mask) -> None:
+        self._solution.hold(members, held)
+        fixed = truss_of(self.setup.arm).fixed
+        kept = dict(zip(self._fixed.tolist(), self._lengths.tolist(), strict=True))
+        self._fixed = np.concatenate([fixed, members])
+        now = self.state.quantities
+        self._lengths = np.array([kept.get(k, float(now[k])) for k in self._fixed.tolist()])
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         setup, state = self.setup, self.state
@@ -215,7 +240,7 @@ class ConventionalResolver(MethodResolver):
         gradient, x_g = system.gradient, system.x_g
         if setup.base_motion is not None:
             motion = setup.arm.based(X, setup.base_motion.pose(state.time + dt)) - X
-            x_g = x_g - truss.scatter.base_rate(gradient, motion)[truss.fixed]
+            x_g = x_g - truss.scatter.base_rate(gradient, motion)[self._fixed]
             X += motion
         terms = self._objective.at(X, kinematics.quantities, state.time)
         self._clock.add("kinematics")
@@ -236,7 +261,7 @@ class ConventionalResolver(MethodResolver):
         setup = self.setup
         setup.kinematics.evaluate(X)
         tip = setup.task.rows(X, setup.kinematics, goal)
-        missing = self._home_fixed - setup.kinematics.quantities[truss_of(setup.arm).fixed]
+        missing = self._lengths - setup.kinematics.quantities[self._fixed]
         if self._correct:
             return Linear(setup.kinematics.gradient, tip.jacobian, tip.error, missing)
         return Linear(setup.kinematics.gradient, tip.jacobian, tip.rate, np.zeros_like(missing))

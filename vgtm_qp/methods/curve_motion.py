@@ -1,4 +1,4 @@
-"""The curve on its own, section 4.4: eqs. (37)-(38) with base conditions, or the same terms as a QP with clearance."""
+"""The curve on its own, section 4.4: eqs. (37)-(38) with base conditions."""
 
 from __future__ import annotations
 
@@ -15,9 +15,6 @@ from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE
 from vgtm_qp.problem import Problem
-from vgtm_qp.qp.daqp import EQUALITY, ask
-from vgtm_qp.qp.numbers import UNBOUNDED
-from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 
@@ -25,8 +22,6 @@ DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 
 _SAMPLES = 400
 """Pieces of the curve to whose ends nodes are assigned: the nearest point to a few thousandths."""
-_PROGRESS = 1e3
-_MARGIN = 1e-5
 
 
 class CurveMotion:
@@ -136,62 +131,11 @@ class CurveMotion:
             hessian[:vertices, :vertices] += gain * self._bending
             gradient[:vertices] += gain * self._bending @ p.ravel()
         if gain := self._terms.get("obstacle_potential"):
-            rows, distance, _ = self._near(curve, X, time)
+            rows, distance = self._near(curve, X, time)
             stiffness = gain * potential_curvature(distance, self._setup.influence)
             hessian[:vertices, :vertices] += (rows.T * stiffness) @ rows
             gradient[:vertices] += gain * potential_slope(distance, self._setup.influence) @ rows
         return Objective(hessian, gradient)
-
-    def follow_qp(
-        self, curve: Curve, now: TipGoal, progress: float, time: float, X: Array
-    ) -> tuple[Curve, float, tuple[str, ...]]:
-        """Return the curve after one QP with clearance, the change of progress, and the active rows.
-
-        From `progress` 0 it is the step's motion, with the terms of :meth:`objective`. From another it corrects what
-        the first one, linear as it is, left over: without gradients, and back along the path if need be. A member
-        near an obstacle moves with the curve where it stands: that is all a curve can know of the truss.
-
-        `now` is the pose at `progress`, 0 to 1, on a piece of path, its rates the displacement over the piece.
-        Obstacles are met at `time`, s, by nodes at `X` (N, 3), m.
-
-        Raises
-        ------
-        SolverError
-            The QP has no solution.
-        """
-        objective = self.objective(curve, X, time)
-        error, rate, across = self._missing(curve, now)
-        near, distance, names = self._near(curve, X, time)
-        size, tips = curve.coordinates, len(rate)
-        J = self._rows(curve, across)
-        A = np.zeros((len(J) + len(near), size + 1))
-        A[: len(J), :size] = J
-        A[:tips, -1] = -rate
-        A[len(J) :, : near.shape[1]] = near
-        curvature = _PROGRESS * max(float(rate @ rate), 1e-12)
-        H = np.zeros((size + 1, size + 1))
-        H[:size, :size] = objective.hessian
-        H[-1, -1] = curvature
-        f, room = np.zeros(size + 1), self._setup.safe + _MARGIN - distance
-        bounds = -progress, 0.0
-        if progress == 0.0:
-            f, bounds = np.append(objective.gradient, -2.0 * curvature), (0.0, 1.0)
-            room = np.minimum(room, 0.0)
-        equal = np.concatenate([error, np.zeros(BASE_ROWS)])
-        free = np.full(size, UNBOUNDED)
-        lower = np.concatenate([-free, bounds[:1], equal, room])
-        upper = np.concatenate([free, bounds[1:], equal, np.full(len(near), UNBOUNDED)])
-        sense = np.zeros(len(lower), dtype=np.int32)
-        sense[size + 1 : size + 1 + len(J)] = EQUALITY
-        try:
-            answer = ask(H, f, A, lower, upper, sense)
-        except InfeasibleStepError:
-            answer = None
-        if answer is None or answer.flag < 1:
-            raise SolverError("the QP of the curve has no solution")
-        pressing = answer.multipliers[size + 1 + len(J) :] < -1e-9
-        active = tuple(names[k] for k in np.flatnonzero(pressing))
-        return displaced(curve, answer.x[:size]), float(answer.x[-1]), active
 
     def _missing(self, curve: Curve, goal: TipGoal) -> tuple[Array, Array, Array]:
         """Return what x(1) lacks of x_e, eq. (34), and the goal's rates, (n_e,) each; and the turned axes (r, 3)."""
@@ -206,8 +150,11 @@ class CurveMotion:
             rows.append(across @ curve.orientation_jacobian(1.0))
         return np.concatenate([*rows, self._base_rows])
 
-    def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array, list[str]]:
-        """Return rows (R, 3 V) of d distance / d p, distances (R,), m, and names of the members near obstacles."""
+    def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array]:
+        """Return rows (R, 3 V) of d distance / d p, and distances (R,), m, of the members near obstacles.
+
+        A member moves with the curve where it stands: that is all a curve can know of the truss.
+        """
         setup = self._setup
         pairs = setup.monitor.near(setup.arm.points(X), time, setup.influence)
         with_obstacle = np.flatnonzero(~pairs.is_self)
@@ -225,8 +172,7 @@ class CurveMotion:
             first, axis=1, keepdims=True
         )
         rows = np.einsum("rv,rc->rvc", table, normal) + np.einsum("rv,rc->rvc", slope, across)
-        names = [pairs.name(int(k)) for k in with_obstacle]
-        return rows.reshape(len(s), 3 * table.shape[1]), pairs.distance[with_obstacle], names
+        return rows.reshape(len(s), 3 * table.shape[1]), pairs.distance[with_obstacle]
 
 
 def displaced(curve: Curve, d: Array) -> Curve:

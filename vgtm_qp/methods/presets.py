@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from types import MappingProxyType
 from typing import Any
 
-from vgtm_qp.errors import GoalError, nearest
+from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.problem import Problem
 
 _OBSTACLES = {
@@ -84,6 +85,22 @@ def with_method(problem: Problem, name: str) -> Problem:
     changes = PRESETS[name]
     kept = problem.method.kept_by(changes["method.name"], changes.get("method.tracking", "coupled"))
     return problem.replace({"method": kept, **changes})
+
+
+def methods_for(problem: Problem) -> dict[str, Problem]:
+    """Return the methods that can move the arm of a problem, by name, each with the problem that asks for it."""
+    found = {}
+    for name in PRESETS:
+        with suppress(ProblemError):
+            found[name] = with_method(problem, name)
+    return found
+
+
+def method_name(problem: Problem) -> str:
+    """Return the name of the method that a problem asks for; that of ``method.name`` where its keys are of no other."""
+    own = problem.method
+    same = [name for name, other in methods_for(problem).items() if other.method == own]
+    return next(iter(same), own.name)
 
 
 def check_methods(names: Sequence[str]) -> None:

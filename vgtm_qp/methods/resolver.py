@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arrays import Array
-from vgtm_qp.errors import CurveError, GoalError, SolverError
+from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal
+from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.mover import Mover
+from vgtm_qp.step.mover import Resolver
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.state import Shortfall, State, frozen
+from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
+from vgtm_qp.step.task import duration
 
 _COLLAPSED = 1e-3
 LENGTH_TOLERANCE = 1e-11
@@ -31,50 +30,54 @@ MAX_CORRECTIONS = 30
 
 
 class Moved(NamedTuple):
-    """Where a step leads: nodes (N, 3), control vertices (V, 3), m, torsion (T,), rad, and progress, 0 to 1."""
+    """Where a step leads: nodes (N, 3), control vertices (V, 3), m, and torsion (T,), rad."""
 
     nodes: Array
     control_vertices: Array
     torsion: Array
-    progress: float = 1.0
 
 
-class MethodResolver(ABC):
-    """Moves an arm step by step, see ``step.mover.Mover``, by one of the other methods.
+class MethodResolver(Resolver):
+    """Moves an arm step by step by one of the other methods.
 
     It knows the arm's state after a step alone: nothing that brakes, drives pairs apart or follows control vertices.
     """
 
-    draws_vertices = False
-
     def __init__(self, setup: Setup) -> None:
-        self.setup = setup
-        self.state: State = setup.home_state()
-        self.rank: int | None = None
-        self.solver: str | None = None
+        self._setup = setup
+        self._state = setup.home_state()
+        self._actuation = Actuation(setup)
         self._clock = Phases("kinematics", "solve", "correction", "acceptance")
-        self.phases = self._clock.seconds
         self._steps = 0
 
     @property
-    def control_vertex_goals(self) -> dict[int, Array]:
-        """Where control vertices are drawn to: nowhere."""
-        return {}
+    def setup(self) -> Setup:
+        """What was built for the problem; its engine is never called."""
+        return self._setup
 
-    @control_vertex_goals.setter
-    def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
-        if goals:
-            raise GoalError("this method draws no control vertices; the QP does")
+    @property
+    def phases(self) -> dict[str, float]:
+        """Seconds spent so far in each phase."""
+        return self._clock.seconds
 
-    def tip(self) -> tuple[Array, Array]:
-        """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
-        kinematics = self.setup.kinematics
-        kinematics.evaluate(self.state.nodes)
-        return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
+    @property
+    def locked(self) -> frozenset[str]:
+        """Names of the actuators that are stuck by now; members stuck from the start are fixed ones."""
+        return frozenset(self._actuation.locked)
+
+    def lock(self, name: str) -> None:
+        """See :class:`Resolver`: what is held counts as a fixed member from then on."""
+        self._actuation.lock(name, self.state)
+        held = np.isin(self._actuation.names, list(self._actuation.locked))
+        self._hold(self.setup.arm.actuators[held], held)
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
-        """Move along `path` from its value `start` to `end` in one step; a blocked step has its reason."""
-        dt = self.setup.dt if dt is None else dt
+        """See :class:`Resolver`; a blocked step has its reason."""
+        dt = duration(self.setup.dt if dt is None else dt)
+        for name in self._actuation.jammed(self.state.time):
+            self.lock(name)
+        whole = self._actuation.until_jam(self.state.time, dt)
+        dt, end = whole * dt, start + whole * (end - start)
         self._steps += 1
         self._clock.start()
         try:
@@ -97,12 +100,7 @@ class MethodResolver(ABC):
             duration=dt,
         )
         self._clock.add("kinematics")
-        status = StepStatus.REACHED if moved.progress >= 1.0 - 1e-9 else StepStatus.SLOWED
-        return Step(status, moved.progress, self.state, "", 0)
-
-    def brake(self, path: Path, start: float, end: float) -> Step | None:  # noqa: ARG002
-        """Return None: every state is one of rest."""
-        return None
+        return Step(StepStatus.REACHED, 1.0, self.state, "", 0).over(whole, None)
 
     def explain(
         self,
@@ -119,17 +117,13 @@ class MethodResolver(ABC):
             return Stop(StopKind.NONLINEAR)
         return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
 
-    def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
-        """Return no pairs: none is driven apart."""
-        return {}
-
-    def again(self, problem: Problem) -> Mover | None:  # noqa: ARG002
-        """Return None: there is no other attempt."""
-        return None
-
-    @abstractmethod
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         """Return where the step leads, or raise SolverError."""
+        raise NotImplementedError
+
+    def _hold(self, members: Index, held: Mask) -> None:
+        """Keep the present lengths of some members (h,), the actuators that `held` (n_a,) marks."""
+        raise NotImplementedError
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
         truss, lengths = truss_of(self.setup.arm), self.setup.arm.home_quantities

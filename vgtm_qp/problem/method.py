@@ -24,37 +24,42 @@ HARD_COORDINATES = ("position", "pointing", "orientation")
 _WAYS = {
     "coupled": '"qp" with tracking "coupled"',
     "none": '"qp" with tracking "none"',
-    "first": '"qp" with tracking "recursive" or "parallel"',
+    "bays": '"qp" with tracking "recursive" or "parallel"',
     "pseudoinverse": '"pseudoinverse"',
     "curve-pseudoinverse": '"curve-pseudoinverse"',
 }
 """The ways in which arms are moved, as messages call them."""
-_QP, _INVERSE, _CURVE = ("coupled", "none"), ("pseudoinverse",), ("first", "curve-pseudoinverse")
+_QP, _COUPLED, _INVERSE, _CURVE = (
+    ("coupled", "bays", "none"),
+    ("coupled", "bays"),
+    ("pseudoinverse",),
+    ("curve-pseudoinverse",),
+)
 SERVED: dict[str, tuple[str, ...]] = {
     "name": tuple(_WAYS),
     "tracking": (*_QP, *_CURVE),
     "hard_tracking": ("coupled",),
-    "hard_coordinates": ("coupled",),
-    "solver": _QP,
+    "hard_coordinates": _COUPLED,
+    "solver": ("coupled", "none"),
     "retries": tuple(_WAYS),
     "slow_approach": _QP,
     "step_limit": tuple(_WAYS),
     "variant": _INVERSE,
     "algebra": _INVERSE,
-    "correct": (*_INVERSE, "curve-pseudoinverse"),
+    "correct": (*_INVERSE, *_CURVE),
     "null_space": (*_INVERSE, *_CURVE),
     "damping": _INVERSE,
     "truncation": _INVERSE,
     "weights.node_rate": (*_QP, *_INVERSE),
     "weights.actuator_rate": (*_QP, *_INVERSE),
     "weights.stroke_centring": (*_QP, *_INVERSE),
-    "weights.curve_rate": ("coupled",),
+    "weights.curve_rate": _COUPLED,
     "weights.tracking": ("coupled",),
-    "weights.tangent": ("coupled",),
-    "weights.roll": ("coupled",),
-    "weights.spacing": ("coupled",),
-    "weights.smoothness": ("coupled",),
-    "weights.vertex_goal": ("coupled",),
+    "weights.tangent": _COUPLED,
+    "weights.roll": _COUPLED,
+    "weights.spacing": _COUPLED,
+    "weights.smoothness": _COUPLED,
+    "weights.vertex_goal": _COUPLED,
     "weights.obstacle_potential": _INVERSE,
     "weights.end_effector": _QP,
     "weights.progress": _QP,
@@ -149,8 +154,7 @@ class Method(Table, called="[method]"):
     solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
     retries: Flag = Field(
         default=True,
-        description="whether other ways out of a dead end are tried before giving up; other methods than qp with "
-        "tracking coupled or none know none",
+        description="whether other ways out of a dead end are tried before giving up; pseudoinverse methods know none",
     )
     slow_approach: Flag = Field(
         default=True,
@@ -190,24 +194,27 @@ class Method(Table, called="[method]"):
     @property
     def modes(self) -> tuple[str, ...]:
         """Modes of the end effector that the method has; the pseudoinverse methods are always on time."""
-        way = _way(self.name, self.tracking)
-        return (
-            ("scaled", "hard", "elastic")
-            if way in _QP
-            else ("scaled",)
-            if way == "first"
-            else ("scaled", "hard")
-        )
+        return ("scaled", "hard", "elastic") if self.name == "qp" else ("scaled", "hard")
+
+    @property
+    def goes_by_bays(self) -> bool:
+        """Whether the QP is one over the curve alone, which each bay follows exactly."""
+        return self.name == "qp" and self.tracking in ("recursive", "parallel")
+
+    @property
+    def holds_curve(self) -> bool:
+        """Whether stations are kept on the curve by equalities."""
+        return self.hard_tracking or self.goes_by_bays
 
     @property
     def draws_vertices(self) -> bool:
         """Whether control vertices follow goals of their own."""
-        return _way(self.name, self.tracking) == "coupled"
+        return _way(self.name, self.tracking) in _COUPLED
 
     @property
     def moves_curve_first(self) -> bool:
         """Whether the truss moves after a curve that has moved by itself."""
-        return _way(self.name, self.tracking) in _CURVE
+        return self.name == "curve-pseudoinverse"
 
     def kept_by(self, name: str, tracking: str = "coupled") -> dict[str, Any]:
         """Return the table of another method: those of its keys here that are not as by default."""
@@ -251,5 +258,5 @@ class Method(Table, called="[method]"):
 def _way(name: str, tracking: str) -> str:
     """Return which of the ways in which arms are moved a method is."""
     if name == "qp":
-        return tracking if tracking in _QP else "first"
+        return tracking if tracking in ("coupled", "none") else "bays"
     return name

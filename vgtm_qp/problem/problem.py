@@ -121,7 +121,7 @@ class Problem(Table, called="a problem"):
         if self.curve.control_vertex_goals and not self.method.draws_vertices:
             yield (
                 ("curve", "control_vertex_goals"),
-                'none, since only "qp" with tracking "coupled" draws vertices',
+                'none, since only "qp" with a curve draws control vertices',
             )
         if self.curve.nodes == "arc-length" and self.method.moves_curve_first:
             yield (

@@ -31,7 +31,10 @@ class CondensedSolver:
         # The columns that are unknowns of the condensed QP themselves, around the free coordinates of the curve.
         self._before = np.arange(actuators.start, actuators.stop)
         self._after = np.array([builder.size - 1, *range(slack.start, slack.stop)])
-        self._size = len(self._before) + layout.free_curve + len(self._after)
+        # Which column of the full QP each unknown is, -1 for those that are none.
+        self._unknown = np.concatenate([self._before, np.full(layout.free_curve, -1), self._after])
+        # Columns that are no unknowns and have bounds: so many of the first are equalities.
+        self._bounded, self._equal = builder.hard_gaps, len(builder.hard_gaps)
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Solve one QP.
@@ -49,21 +52,25 @@ class CondensedSolver:
         with np.errstate(invalid="ignore"):  # What is infinite becomes NaN, and is refused with the answer.
             gradient = Z.T @ (qp.P @ start + qp.q)
         rows = np.concatenate([builder.tip_rows, np.arange(builder.fixed_rows, len(qp.row_lower))])
-        hard = builder.hard_gaps
-        constraint = np.concatenate([Z[hard], (qp.A @ Z)[rows]])
-        known = np.concatenate([start[hard], (qp.A @ start)[rows]])
+        bounded, size = self._bounded, len(self._unknown)
+        constraint = np.concatenate([Z[bounded], (qp.A @ Z)[rows]])
+        known = np.concatenate([start[bounded], (qp.A @ start)[rows]])
         bounds = []
         for columns, own in ((qp.column_lower, qp.row_lower), (qp.column_upper, qp.row_upper)):
-            of_rows = np.concatenate([columns[hard], own[rows]]) - known
+            of_rows = np.concatenate([columns[bounded], own[rows]]) - known
             bounds.append(np.concatenate([self._own(columns), of_rows]))
         lower, upper = np.maximum(bounds[0], -UNBOUNDED), np.minimum(bounds[1], UNBOUNDED)
         sense = np.zeros(len(lower), dtype=np.int32)
-        sense[self._size : self._size + len(hard) + len(builder.tip_rows)] = daqp.EQUALITY
+        sense[size : size + self._equal] = daqp.EQUALITY
+        tips = size + len(bounded)
+        sense[tips : tips + len(builder.tip_rows)] = daqp.EQUALITY
         answer = daqp.ask(hessian, gradient, constraint, lower, upper, sense)
         daqp.check(answer, hessian, gradient, constraint, lower, upper)
         y, w = np.zeros(len(qp.row_lower)), np.zeros(builder.size)
-        y[rows] = answer.multipliers[self._size + len(hard) :]
-        w[self._before] = answer.multipliers[: len(self._before)]
+        y[rows] = answer.multipliers[tips:]
+        w[bounded] = answer.multipliers[size:tips]
+        is_column = self._unknown >= 0
+        w[self._unknown[is_column]] = answer.multipliers[:size][is_column]
         return builder.solution(Z @ answer.x + start, y, w, answer.iterations)
 
     def gain(self, held: NDArray[np.bool_]) -> Array | None:  # noqa: ARG002
@@ -71,27 +78,30 @@ class CondensedSolver:
         return None
 
     def _own(self, bounds: Array) -> Array:
-        """Return the bounds of the unknowns x, from those of all columns; free coordinates of the curve have none."""
-        free = np.full(self.layout.free_curve, bounds[0])
-        return np.concatenate([bounds[self._before], free, bounds[self._after]])
+        """Return the bounds of the unknowns x, from those of all columns; what is no column has none, like nodes."""
+        return np.asarray(np.where(self._unknown >= 0, bounds[self._unknown], bounds[0]))
 
     def _reduction(self, numbers: StepNumbers, qp: StepQP) -> tuple[Array, Array]:
         """Return Z (n, size) and z_0 (n,) of the unknowns of the full QP."""
         layout, builder, column = self.layout, self.builder, self.builder.column
-        count, size = len(self._before), self._size
+        count, size = len(self._before), len(self._unknown)
         Z, start = np.zeros((builder.size, size)), np.zeros(builder.size)
         Z[column["nodes"], :count], start[column["nodes"]] = numbers.motion.response()
         Z[self._before, np.arange(count)] = 1.0
         Z[self._after, np.arange(size - len(self._after), size)] = 1.0
         if layout.vertices:
-            first = column["vertices"].start
-            axes, shift = numbers.base_axes, numbers.base_displacement
-            start[first : first + 3] = shift
-            start[first + 3 : first + 6] = shift + numbers.base_rhs @ axes
-            curve = slice(first, column["torsion"].stop)
-            basis = free_basis(np.cross(axes[0], axes[1]), curve.stop - first)
+            curve, basis, start[curve] = self._on_base(numbers)
             Z[curve, count : count + layout.free_curve] = basis
             gaps, rows = builder.gaps, builder.gap_rows
             Z[gaps] = (qp.A @ Z)[rows]
             start[gaps] = (qp.A @ start)[rows] - qp.row_lower[rows]
         return Z, start
+
+    def _on_base(self, numbers: StepNumbers) -> tuple[slice, Array, Array]:
+        """Return columns of the curve (D), and their displacements by the free coordinates (D, q) and the base (D,)."""
+        column, axes, shift = self.builder.column, numbers.base_axes, numbers.base_displacement
+        curve = slice(column["vertices"].start, column["torsion"].stop)
+        start = np.zeros(curve.stop - curve.start)
+        start[:3] = shift
+        start[3:6] = shift + numbers.base_rhs @ axes
+        return curve, free_basis(np.cross(axes[0], axes[1]), len(start)), start

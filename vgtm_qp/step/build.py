@@ -21,6 +21,7 @@ from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
+from vgtm_qp.qp.bays import BaySolver
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
 from vgtm_qp.qp.shape import CurveShape
@@ -55,14 +56,15 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
     kinematics.evaluate(arm.home_configuration)
     task = TipTask(problem.end_effector.track, arm)
     home = home_curve(problem, arm, task)
-    clearance, solver, spec = problem.clearance, problem.method.solver, problem.truss or problem.arm
+    clearance, spec = problem.clearance, problem.truss or problem.arm
+    solver, tracking = problem.method.solver, problem.method.tracking
     assert spec is not None
     options: dict[str, Any] = {
         "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
         "safe": clearance.safe,
         "influence": clearance.influence,
     }
-    engine = make_engine(solver, home.layout, kinematics, task, compiled=compiled)
+    engine = make_engine(solver, home.layout, kinematics, task, tracking, compiled=compiled)
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
     return Setup(
@@ -73,6 +75,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         engine=engine,
         monitor=monitor,
         solver=solver,
+        tracking=tracking,
         control_vertices=home.vertices,
         torsion=home.torsion,
         vertex_goals=home.vertex_goals,
@@ -119,14 +122,14 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         raise problem.error(mistakes)
     options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
     family = make_family(spec.family, spec.control_vertices, **options)
-    stride = stations.stride if method.hard_tracking else 1
+    stride = stations.stride if method.holds_curve else 1
     tracked = np.arange(len(stations) - 1, stride - 1, -stride)[::-1]
     centres = stations.centres(arm.home)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
     fractions = travelled[tracked] / travelled[-1]
     s, vertices = _fitted(family, fractions, centres[0], centres[tracked])
     torsion = np.zeros(spec.torsion_vertices)
-    tracks_roll = bool(torsion.size) or (method.hard_tracking and "orientation" in method.hard_coordinates)
+    tracks_roll = bool(torsion.size) or (method.holds_curve and "orientation" in method.hard_coordinates)
     roll = None
     if tracks_roll:
         frames = Curve(family, vertices, torsion, stations.frames[0]).frame(s)
@@ -155,8 +158,8 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         tracked,
         task.row_names,
         method.weights,
-        hard_tracking=method.hard_tracking,
-        hard_turns=method.hard_tracking and len(method.hard_coordinates) > 1,
+        hard_tracking=method.holds_curve,
+        hard_turns=method.holds_curve and len(method.hard_coordinates) > 1,
         elastic_tip=elastic,
         shape=shape,
         vertex_goals=tuple(sorted(goal.index for goal in spec.control_vertex_goals)),
@@ -186,7 +189,7 @@ def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) 
 def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mistake]:
     """Yield what stations are to keep on the curve although the arm has not the motions for it."""
     method, curve = problem.method, problem.curve
-    if not method.hard_tracking:
+    if not method.holds_curve:
         return
     wanted = list(method.hard_coordinates)
     if len(wanted) == 2 and curve.torsion_vertices:
@@ -204,15 +207,24 @@ def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mista
 
 
 def make_engine(
-    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask, *, compiled: bool = True
+    solver: str,
+    layout: Layout,
+    kinematics: Kinematics,
+    task: TipTask,
+    tracking: str = "coupled",
+    *,
+    compiled: bool = True,
 ) -> Engine:
-    """Return the engine that solves the steps of an arm with the solver of that name.
+    """Return the engine that solves the steps of an arm with the solver of that name, or by its bays.
 
     Raises
     ------
     SolverError
         There is no such solver, or it is not installed.
     """
+    if tracking in ("recursive", "parallel"):
+        by_bays = BaySolver(layout, parallel=tracking == "parallel")
+        return GeneralEngine(layout, kinematics, task, by_bays, compiled=compiled)
     is_short, is_default = len(layout.arm.actuators) < STAGED_ACTUATORS, solver == DEFAULT_SOLVER
     if layout.elastic_tip and is_default and not is_short:
         warnings.warn(_CONDENSED_ALL_THE_SAME, stacklevel=2)

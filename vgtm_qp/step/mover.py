@@ -1,14 +1,17 @@
-"""What moves an arm step by step, whatever the method: all that a maneuver and the live page know of it."""
+"""What moves an arm step by step, whatever the method: the interface of a control loop, a maneuver and the page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import ClassVar, NoReturn, Self
 
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
+from vgtm_qp.problem.problem import check_is_problem
+from vgtm_qp.qp.full import StepQP
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
@@ -16,8 +19,11 @@ from vgtm_qp.step.step import Step
 from vgtm_qp.step.stops import Stop
 
 
-class Mover(Protocol):
-    """The interface that all methods meet: ``Resolver``, and those that are compared with it.
+class Resolver:
+    """Moves one arm step by step by the method of its problem. Not to be shared by threads: use one per thread.
+
+    ``Resolver(problem)`` is of the class that serves ``problem.method``, each a subclass of this one. What a method
+    cannot do raises GoalError, and says which can.
 
     Attributes
     ----------
@@ -31,35 +37,199 @@ class Mover(Protocol):
         Rank of the Jacobian of eq. (26) in the last step; None where the method does not reveal it.
     draws_vertices : bool
         Whether control vertices follow goals of their own.
-    control_vertex_goals : dict of int to (3,)
-        Where control vertices are drawn to, m, by their index; may be set as a whole where the method draws any.
+
+    Raises
+    ------
+    CurveError, ProblemError, SolverError, TrussError
+        The arm cannot be built, or not moved by that method.
     """
 
-    state: State
+    rank: int | None = None
+    draws_vertices = False
+    _method = ""
+    _served: ClassVar[dict[str, type[Resolver]]] = {}
+
+    def __init_subclass__(cls, *, serves: str = "") -> None:
+        if serves:
+            cls._method = serves
+            Resolver._served[serves] = cls
+
+    def __new__(cls, problem: Problem | Setup) -> Self:
+        """Return an instance of the class that serves the problem's method; of the QP's for a ``Setup``."""
+        chosen: type = cls
+        if cls is Resolver:
+            if isinstance(problem, Setup):
+                chosen = Resolver._served["qp"]
+            else:
+                check_is_problem(problem)
+                chosen = Resolver._served[problem.method.name]
+        return object.__new__(chosen)
+
+    def __init__(self, problem: Problem | Setup) -> None:
+        """See the class."""
+        raise NotImplementedError
 
     @property
-    def setup(self) -> Setup: ...
+    def setup(self) -> Setup:
+        """What was built for the problem: arm, curve, task, engine and clearance monitor."""
+        raise NotImplementedError
+
     @property
-    def phases(self) -> dict[str, float]: ...
+    def solver(self) -> str | None:
+        """Name of the QP solver."""
+        return None
+
     @property
-    def solver(self) -> str | None: ...
+    def phases(self) -> dict[str, float]:
+        """Seconds spent so far in each phase."""
+        raise NotImplementedError
+
     @property
-    def rank(self) -> int | None: ...
+    def state(self) -> State:
+        """Where the arm is; may be set to another state of this arm."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        vertices, nodes = self.setup.layout.vertices, len(self.setup.arm.node_names)
+        if len(state.control_vertices) != vertices or len(state.nodes) != nodes:
+            raise GoalError(
+                f"this state has {len(state.nodes)} nodes and {len(state.control_vertices)} control vertices; the arm "
+                f"has {nodes} and its curve {vertices}"
+            )
+        self._state = state
+
     @property
-    def draws_vertices(self) -> bool: ...
+    def locked(self) -> frozenset[str]:
+        """Names of the actuators that are stuck by now; members stuck from the start are fixed ones."""
+        raise NotImplementedError
+
+    def lock(self, name: str) -> None:
+        """Hold an actuator at its present length or value from now on.
+
+        Raises
+        ------
+        GoalError
+            No actuator has that name, or the method cannot hold one.
+        """
+        raise NotImplementedError
+
     @property
-    def control_vertex_goals(self) -> dict[int, Array]: ...
+    def control_vertex_goals(self) -> dict[int, Array]:
+        """Where control vertices are drawn to, m, by their index; may be set as a whole where the method draws any."""
+        return {}
+
     @control_vertex_goals.setter
-    def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None: ...
+    def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
+        if goals:
+            self._refuse("draw control vertices")
+
+    def set_control_vertex_goal(self, index: int, position: ArrayLike | None) -> None:
+        """Draw a control vertex to a place in the null space of the tip's motion; None lets it go.
+
+        The arm follows as far as the tip's goal, limits and clearance let it.
+
+        Parameters
+        ----------
+        index
+            Control vertex, 0 at the base; p_0 and the direction of p_1 belong to the base.
+        position
+            (3,) where it should go, m, or None.
+
+        Raises
+        ------
+        GoalError
+            There is no such control vertex, the position is not three finite numbers, or the method draws none.
+        """
+        goals: dict[int, ArrayLike] = dict(self.control_vertex_goals)
+        goals.pop(index, None)
+        self.control_vertex_goals = goals if position is None else {**goals, index: position}
+
+    def set_control_vertices(self, count: int) -> float:  # noqa: ARG002
+        """Give the curve another number of control vertices where it is; return how far it moved, m.
+
+        More of them move a Bezier curve or B-spline by rounding only; fewer are fitted. Goals of control vertices end.
+
+        Raises
+        ------
+        GoalError
+            The arm has no curve, or the method keeps the number.
+        CurveError
+            So few control vertices cannot keep both ends and the base tangent.
+        """
+        self._refuse("change the number of control vertices")
+
+    def step(
+        self,
+        *,
+        position: ArrayLike | None = None,
+        pointing: ArrayLike | None = None,
+        rotation_vector: ArrayLike | None = None,
+        dt: float | None = None,
+    ) -> Step:
+        """Move towards a goal of the end effector in one step and return what was done.
+
+        Parameters
+        ----------
+        position
+            (3,) wanted position, m; where the tip is, by default.
+        pointing
+            (3,) wanted direction of the tip's z-axis.
+        rotation_vector
+            (3,) wanted orientation, rad.
+        dt
+            Duration of the step, s; the problem's by default.
+
+        Raises
+        ------
+        GoalError
+            The goal is not three finite numbers, names a coordinate that is not tracked or the direction twice, or
+            `dt` is not a positive number; the state is unchanged.
+        """
+        path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
+        return self.follow(path, 0.0, 1.0, dt=dt)
+
+    def build(
+        self,
+        *,
+        position: ArrayLike | None = None,  # noqa: ARG002
+        pointing: ArrayLike | None = None,  # noqa: ARG002
+        rotation_vector: ArrayLike | None = None,  # noqa: ARG002
+        dt: float | None = None,  # noqa: ARG002
+    ) -> StepQP:
+        """Return the QP that a step to a goal starts with, to read, to print or to solve elsewhere; nothing moves.
+
+        Every row and column has a name, a kind and a unit. It is the QP that the step solves, whatever smaller one
+        with the same answer the solver is given. Parameters and errors are those of :meth:`step`; GoalError also where
+        the method solves no QP.
+        """
+        self._refuse("show the QP of a step, since it solves none")
 
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
+        kinematics = self.setup.kinematics
+        kinematics.evaluate(self.state.q)
+        return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
-        """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's."""
+        """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's.
 
-    def brake(self, path: Path, start: float, end: float) -> Step | None:
-        """Do the next of the steps that bring the arm to rest; None where it may stay as it is, and nothing moves."""
+        A step in which an actuator of the problem jams ends at that time, with the share of the path until then.
+
+        Raises
+        ------
+        GoalError
+            `dt` is not a positive number; the state is unchanged.
+        """
+        raise NotImplementedError
+
+    def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:  # noqa: ARG002
+        """Do the next of the steps that bring a moving arm with limited accelerations to rest.
+
+        They were known before the last step was done, each within the limits and clear. None where the arm may stay
+        as it is; nothing moves then. Progress is counted from `start` to `end` of a `path` that it brakes on.
+        """
+        return None
 
     def explain(
         self,
@@ -71,16 +241,23 @@ class Mover(Protocol):
         last: Step | None = None,
         state: State | None = None,
     ) -> Stop:
-        """Return why the arm does not get on along `path` from a state, the present one by default; nothing moves.
+        """Return why the arm does not get on from a state along `path` from its value `start` to `end`.
 
-        Worth asking after a `last` step that was blocked, hardly moved or braked.
+        Worth asking after a `last` step that was blocked, hardly moved or braked. The state is the present one by
+        default; nothing moves.
         """
+        raise NotImplementedError
 
-    def too_near(self, state: State) -> Shortfall:
+    def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
         """Return the pairs below their clearance in a state that the method drives apart, with their distances, m."""
+        return {}
 
-    def again(self, problem: Problem) -> Mover | None:
+    def again(self, problem: Problem) -> Resolver | None:  # noqa: ARG002
         """Return what tries a maneuver once more from home, for a problem that resolves the redundancy differently.
 
         None where the method leaves no choice.
         """
+        return None
+
+    def _refuse(self, what: str, serving: str = '"qp"') -> NoReturn:
+        raise GoalError(f'the method "{self._method}" cannot {what}; methods that can: {serving}')

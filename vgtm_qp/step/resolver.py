@@ -8,7 +8,6 @@ from dataclasses import replace
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.step.actuation import Actuation
@@ -17,6 +16,7 @@ from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.braking import ANY_RANK, Braking
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import checked_arm
+from vgtm_qp.step.mover import Resolver
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
@@ -26,15 +26,12 @@ from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, explain
 from vgtm_qp.step.task import duration
 
-__all__ = ["Resolver", "Step", "StepStatus"]
-
-
 _SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
 """The least shares of a piece of path that are tried: by any arm, and by one that can brake instead."""
 
 
-class Resolver:
-    """Moves one arm step by step, see ``step.mover.Mover``. Not to be shared by threads: use one per thread.
+class QPResolver(Resolver, serves="qp"):
+    """Moves one arm by the QP of a step; see :class:`vgtm_qp.step.mover.Resolver`.
 
     Raises
     ------
@@ -42,10 +39,7 @@ class Resolver:
         The end effector is asked for coordinates that no actuator can start to change.
     """
 
-    rank: int | None = None
-    """None: a QP does not reveal the rank of a Jacobian."""
     draws_vertices = True
-    """Whether control vertices follow goals of their own."""
 
     def __init__(self, problem: Problem | Setup) -> None:
         setup = problem if isinstance(problem, Setup) else checked_arm(problem)
@@ -73,34 +67,14 @@ class Resolver:
         return self._attempt.phases.seconds
 
     @property
-    def state(self) -> State:
-        """Where the arm is; may be set to another state of this arm."""
-        return self._state
-
-    @state.setter
-    def state(self, state: State) -> None:
-        vertices, nodes = self.setup.layout.vertices, len(self.setup.arm.node_names)
-        if len(state.control_vertices) != vertices or len(state.nodes) != nodes:
-            raise GoalError(
-                f"this state has {len(state.nodes)} nodes and {len(state.control_vertices)} control vertices; the arm "
-                f"has {nodes} and its curve {vertices}"
-            )
-        self._state = state
-
-    @property
     def locked(self) -> frozenset[str]:
         """Names of the actuators that are stuck by now; members stuck from the start are fixed ones."""
         return frozenset(self._actuation.locked)
 
     def lock(self, name: str) -> None:
-        """Hold an actuator at its present length or value from now on.
+        """See :class:`Resolver`.
 
         The QP keeps its shape: an actuator whose least and greatest values are one is fixed.
-
-        Raises
-        ------
-        GoalError
-            No actuator has that name.
         """
         self._actuation.lock(name, self.state)
         before, self._braking = self._known_braking(), None
@@ -119,39 +93,8 @@ class Resolver:
         self._shaping.draw(goals)
         self._attempt.use(self.setup)
 
-    def set_control_vertex_goal(self, index: int, position: ArrayLike | None) -> None:
-        """Draw a control vertex to a place in the null space of the tip's motion; None lets it go.
-
-        The arm follows as far as the tip's goal, limits and clearance let it.
-
-        Parameters
-        ----------
-        index
-            Control vertex, 0 at the base; p_0 and the direction of p_1 belong to the base.
-        position
-            (3,) where it should go, m, or None.
-
-        Raises
-        ------
-        GoalError
-            There is no such control vertex, or the position is not three finite numbers.
-        """
-        goals: dict[int, ArrayLike] = dict(self.control_vertex_goals)
-        goals.pop(index, None)
-        self.control_vertex_goals = goals if position is None else {**goals, index: position}
-
     def set_control_vertices(self, count: int) -> float:
-        """Give the curve another number of control vertices where it is; return how far it moved, m.
-
-        More of them move a Bezier curve or B-spline by rounding only; fewer are fitted. Goals of control vertices end.
-
-        Raises
-        ------
-        GoalError
-            The arm has no curve.
-        CurveError
-            So few control vertices cannot keep both ends and the base tangent.
-        """
+        """See :class:`Resolver`."""
         state, braking, family = self.state, self._known_braking(), self.setup.layout.family
         more = count - len(state.control_vertices)
         change = self._shaping.change(state, more)
@@ -164,36 +107,6 @@ class Resolver:
                 )
         return change.change
 
-    def step(
-        self,
-        *,
-        position: ArrayLike | None = None,
-        pointing: ArrayLike | None = None,
-        rotation_vector: ArrayLike | None = None,
-        dt: float | None = None,
-    ) -> Step:
-        """Move towards a goal of the end effector in one step and return what was done.
-
-        Parameters
-        ----------
-        position
-            (3,) wanted position, m; where the tip is, by default.
-        pointing
-            (3,) wanted direction of the tip's z-axis.
-        rotation_vector
-            (3,) wanted orientation, rad.
-        dt
-            Duration of the step, s; the problem's by default.
-
-        Raises
-        ------
-        GoalError
-            The goal is not three finite numbers, names a coordinate that is not tracked or the direction twice, or
-            `dt` is not a positive number; the state is unchanged.
-        """
-        path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
-        return self.follow(path, 0.0, 1.0, dt=dt)
-
     def build(
         self,
         *,
@@ -202,33 +115,15 @@ class Resolver:
         rotation_vector: ArrayLike | None = None,
         dt: float | None = None,
     ) -> StepQP:
-        """Return the QP that a step to a goal starts with, to read, to print or to solve elsewhere; nothing moves.
-
-        Every row and column has a name, a kind and a unit. It is the QP that the step solves, whatever smaller one
-        with the same answer the solver is given. Parameters and errors are those of :meth:`step`.
-        """
+        """See :class:`Resolver`."""
         path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
         dt = duration(self.setup.dt if dt is None else dt)
         limits = self._actuation.limits(self.state, dt, slowing=True)
         target = self._shaping.target(self.state, dt, path, 0.0, 1.0, limits[:2])
         return self.setup.engine.qp(self._attempt.first_input(self.state, target))
 
-    def tip(self) -> tuple[Array, Array]:
-        """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
-        kinematics = self.setup.kinematics
-        kinematics.evaluate(self.state.q)
-        return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
-
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
-        """Move along `path` from its value `start` towards `end` in one step; pieces are halved until one is safe.
-
-        A step in which an actuator of the problem jams ends at that time, with the share of the path until then.
-
-        Raises
-        ------
-        GoalError
-            `dt` is not a positive number; the state is unchanged.
-        """
+        """See :class:`Resolver`; pieces are halved until one is safe."""
         dt = duration(self.setup.dt if dt is None else dt)
         state, actuation = self._state, self._actuation
         for name in actuation.jammed(state.time):
@@ -248,11 +143,7 @@ class Resolver:
         return step if brake is None else self._brake(brake, path, start, end, step)
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:
-        """Do the next of the steps that bring a moving arm with limited accelerations to rest.
-
-        They were known before the last step was done, each within the limits and clear. None where the arm may stay
-        as it is; nothing moves then. Progress is counted from `start` to `end` of a `path` that it brakes on.
-        """
+        """See :class:`Resolver`."""
         braking = self._known_braking()
         if braking is None:
             return None
@@ -279,11 +170,7 @@ class Resolver:
         last: Step | None = None,
         state: State | None = None,
     ) -> Stop:
-        """Return why the arm does not get on from a state along `path` from its value `start` to `end`.
-
-        Worth asking after a `last` step that was blocked, hardly moved or braked. The state is the present one by
-        default; nothing moves.
-        """
+        """See :class:`Resolver`."""
         state = state or self.state
         limits = self._actuation.limits(state, self.setup.dt if dt is None else dt).of_stop()
         goal = path.at(start).over(end - start)
@@ -293,7 +180,7 @@ class Resolver:
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
         return self._separation.shortfall(state.q, state.time)
 
-    def again(self, problem: Problem) -> Resolver:
-        """Return what tries a maneuver once more from home, for a problem that resolves the redundancy differently."""
+    def again(self, problem: Problem) -> QPResolver:
+        """See :class:`Resolver`."""
         # A kernel takes longer to compile than a maneuver to solve without it.
-        return Resolver(build_arm(problem, compiled=False))
+        return QPResolver(build_arm(problem, compiled=False))

@@ -29,8 +29,8 @@ class Setup:
         Of the arm; overwritten by whoever evaluates it.
     layout, task, engine, monitor
         The QP, the end effector's rows, what solves a step, and what measures clearance.
-    solver : str
-        Name of the QP solver.
+    solver, tracking : str
+        Names of the QP solver, and of how stations track the curve.
     control_vertices, torsion : (V, 3), (T,)
         The curve at home, m and rad.
     vertex_goals : (V, 3) or None
@@ -60,6 +60,7 @@ class Setup:
     engine: Engine
     monitor: Clearance
     solver: str
+    tracking: str
     control_vertices: Array
     torsion: Array
     vertex_goals: Array | None

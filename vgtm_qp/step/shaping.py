@@ -99,7 +99,7 @@ class Shaping:
         if _key(layout) not in self._built:
             engine = setup.engine.drawn(layout) if layout.family is setup.layout.family else None
             if engine is None:
-                engine = make_engine(setup.solver, layout, setup.kinematics, setup.task)
+                engine = make_engine(setup.solver, layout, setup.kinematics, setup.task, setup.tracking)
                 finish_compiling()
             self._built[_key(layout)] = replace(setup, layout=layout, engine=engine)
         self.setup = self._built[_key(layout)]
