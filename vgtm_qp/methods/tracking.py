@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -17,9 +15,6 @@ from vgtm_qp.methods.assembly import CurveNodes, SegmentGroup, SegmentKinematics
 from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
 from vgtm_qp.methods.segments import Segment
 from vgtm_qp.qp.layout import Layout
-
-THREADED = 2000
-"""Bays from which factorisations are shared out to threads: a few milliseconds of work; for less it does not pay."""
 
 _STILL = 1e-11
 
@@ -169,18 +164,8 @@ def _least_norm(A: Array, b: Array) -> Array:
     rows, columns = A.shape[1:]
     try:
         if rows == columns:
-            return _solve(A, b)
+            return np.asarray(np.linalg.solve(A, b))
         At = np.swapaxes(A, 1, 2)
-        return np.asarray(At @ _solve(A @ At, b))
+        return np.asarray(At @ np.linalg.solve(A @ At, b))
     except np.linalg.LinAlgError:
         raise SolverError("tracking: a bay is in a singular pose") from None
-
-
-def _solve(A: Array, b: Array) -> Array:
-    """Solve a stack of systems; many bays are shared out to threads, which LAPACK lets run side by side."""
-    if len(A) < THREADED:
-        return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
-    cores = os.cpu_count() or 1
-    pieces = np.array_split(np.arange(len(A)), cores)
-    with ThreadPoolExecutor(cores) as pool:
-        return np.concatenate(list(pool.map(lambda piece: np.linalg.solve(A[piece], b[piece]), pieces)))
