@@ -440,7 +440,9 @@ def test_a_key_of_the_method_does_something_in_every_way_or_is_refused(key, way)
         assert_something_changes(*base(f"method.{key}", way), f"method.{key}")
         return
     problem, (_, changes) = with_method(Problem(**BASE), WAYS[way]), CASES[f"method.{key}"]
-    with pytest.raises(vq.ProblemError, match=f"method.{key}.*: found .*; expected its default"):
+    with pytest.raises(
+        vq.ProblemError, match=f"method.{key}.*: found .*; expected .*, since .* does without this key"
+    ):
         problem.replace(changes)
 
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from vgtm_qp.problem.fields import Factor, Flag, Length, Name, Weight, quoted
-from vgtm_qp.problem.table import Place, Table
+from vgtm_qp.problem.table import Place, Table, shown
 
 NullSpaceTerm = Literal[
     "node_rate",
@@ -239,10 +239,10 @@ class Method(Table, called="[method]"):
         for key, _ in self._changed():
             if way not in SERVED[key]:
                 others = " or ".join(_WAYS[other] for other in SERVED[key])
-                yield (
-                    tuple(key.split(".")),
-                    f"its default, since {_WAYS[way]} does without; it belongs to {others}",
-                )
+                place = tuple(key.split("."))
+                table = type(self) if len(place) == 1 else type(getattr(self, place[0]))
+                default = shown(table.model_fields[place[-1]].default)
+                yield place, f"{default}, since {_WAYS[way]} does without this key; it belongs to {others}"
         if self.name == "curve-pseudoinverse" and self.tracking == "none":
             yield ("tracking",), '"recursive" or "parallel": the method moves the curve first'
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
