@@ -298,7 +298,7 @@ def curve_numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
     truss, tracked, vertices, given = truss_of(layout.arm), layout.tracked, asked.vertices, asked.curve
     if not layout.vertices:
         return {}
-    closes_gaps, closes_turns = asked.motion or layout.hard_tracking, asked.motion or layout.hard_turns
+    hard_gaps, hard_turns = hard_tracking_rows(layout)
     shift, axes, base_rhs = base_conditions(truss, asked.base, vertices)
     pull = bending_gradient(vertices, layout.weights.smoothness)
     pull += goal_gradient(layout, vertices, asked.vertex_goals)
@@ -309,7 +309,7 @@ def curve_numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
         "base_axes": axes,
         "base_rhs": base_rhs,
         "vertex_gradient": asked.motion * pull,
-        "position_rhs": closes_gaps * gaps(truss, asked.q, tracked, points),
+        "position_rhs": (hard_gaps | asked.motion) * gaps(truss, asked.q, tracked, points),
     }
     if given is None:
         slopes = layout.curve_slopes @ vertices
@@ -327,9 +327,25 @@ def curve_numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
         found["spacing_rhs"] = asked.motion * given.spacing
     face = [by_face @ row for (by_face, _), row in zip(derivatives, spins, strict=True)]
     names = "tangent_rhs", "tangent_face", "tangent_curve"
-    for name, value in zip(names, (closes_turns * np.array(residuals), face, curve), strict=True):
+    for name, value in zip(
+        names, ((hard_turns | asked.motion) * np.array(residuals), face, curve), strict=True
+    ):
         found[name] = np.array(value)
     return found
+
+
+def hard_tracking_rows(layout: Layout) -> tuple[Array, Array]:
+    """Return which gaps (K, 3) and turns (K, R) are equalities: those asked for, and those of the curve's end."""
+    gaps_held = np.full((len(layout.tracked), 3), layout.hard_tracking)
+    turns_held = np.full((len(layout.tracked), layout.turns), layout.hard_turns)
+    truss = truss_of(layout.arm)
+    if layout.vertices >= 3 and sorted(truss.faces[-1]) == sorted(truss.tip):
+        gaps_held[-1] = True
+        if layout.vertices >= 4 and any(
+            " direction " in row or " rotation " in row for row in layout.tip_rows
+        ):
+            turns_held[-1, :2] = True
+    return gaps_held, turns_held
 
 
 def tracking_error(layout: Layout, X: Array, vertices: Array, frames: Array | None, points: Array) -> float:
@@ -414,12 +430,12 @@ def condensed(layout: Layout, asked: StepInput, given: dict[str, Array]) -> dict
         centres = np.einsum("kf,kfcn->kcn", truss.face_weights[tracked], corners).reshape(3 * K, -1)
         turned = np.einsum("krf,kfn->krn", face, corners.reshape(K, 9, -1)).reshape(R * K, -1)
         position = given["curve.position_rows"].reshape(3 * K, size)
-        tracking = 1.0 if layout.hard_tracking else weights.tracking
-        turning = np.ones(R) if layout.hard_turns else [weights.tangent, weights.tangent, weights.roll][:R]
-        parts.append(np.sqrt(tracking) * stacked(centres, -position, given["position_rhs"]))
-        parts.append(
-            np.tile(np.sqrt(turning), K)[:, None] * stacked(turned, curve.reshape(-1, size), residual)
-        )
+        hard_gaps, hard_turns = hard_tracking_rows(layout)
+        tracking = np.where(hard_gaps, 1.0, weights.tracking)
+        turning = np.where(hard_turns, 1.0, [weights.tangent, weights.tangent, weights.roll][:R])
+        gap_rows = stacked(centres, -position, given["position_rhs"])
+        parts.append(np.sqrt(tracking).reshape(-1, 1) * gap_rows)
+        parts.append(np.sqrt(turning).reshape(-1, 1) * stacked(turned, curve.reshape(-1, size), residual))
         if layout.spacings:
             still = np.zeros((layout.spacings, count + 1))
             stretch = stacked(still, given["curve.spacing_rows"], given["spacing_rhs"])

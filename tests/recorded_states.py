@@ -49,6 +49,22 @@ MEASURED = 1e-6
 KEPT = 6
 """States of a maneuver or loop that are recorded, the first and the last among them."""
 
+BY_CLOSED_FORMS = (
+    "bundled five_bay_blocked_by_wall",
+    "octahedral 5",
+    "longeron 5, hard tip",
+    "octahedral 6, pointing",
+    "octahedral 6, jams",
+    "hexapod 5, jams",
+    "hexapod 5, no curve",
+    "longeron 4, far goal, hard tip",
+    "loop octahedral 5",
+    "loop hexapod 4, vertex goals",
+    "loop octahedral 6, locks",
+)
+"""Cases with no rows by FCL: its iterations at the rim of a cylinder end at some 1e-5 of the normal, wherever rounding
+leads them, and which of two members that touch in one node is named first is rounding too."""
+
 HEIGHT = {
     "octahedral": 0.8165,
     "double-octahedral": 1.6330,
@@ -84,9 +100,10 @@ class Case:
 
     def load(self) -> vq.Problem:
         """Return the problem."""
+        changes = {"clearance.distance": "exact"} if self.name in BY_CLOSED_FORMS else {}
         if self.file:
-            return vq.load_problem(PROBLEMS / f"{self.file}.toml").replace(self.problem)
-        return vq.Problem.from_dict(self.problem)
+            return vq.load_problem(PROBLEMS / f"{self.file}.toml").replace(self.problem | changes)
+        return vq.Problem.from_dict(self.problem).replace(changes)
 
 
 @dataclass(frozen=True)
@@ -302,7 +319,7 @@ def _coupled_scenes() -> Iterator[Case]:
     yield Case("octahedral 5, elastic tip", _scene(9, "octahedral", 5, end_effector__mode="elastic"))
     yield Case("hexapod 4, elastic tip", _scene(10, "hexapod", 4, end_effector__mode="elastic"))
     yield Case("longeron 5, hard tip", _scene(11, "longeron", 5, end_effector__mode="hard", reach=0.2))
-    hard = {"method__hard_tracking": True, "curve__control_vertices": 5}
+    hard = {"method__tracking_mode": "hard", "curve__control_vertices": 5}
     yield Case("hexapod 5, hard tracking", _scene(12, "hexapod", 5, **hard))
     pointed = {**hard, "method__hard_coordinates": ["position", "pointing"]}
     yield Case("hexapod 4, hard tracking of pointing", _scene(13, "hexapod", 4, **pointed))

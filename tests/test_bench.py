@@ -282,12 +282,12 @@ def test_a_baseline_is_not_tried_on_longer_arms_than_it_says(free: vq.Problem) -
 
 
 def test_scenes_have_names_of_their_own_and_the_bays_that_were_asked_for() -> None:
-    found = scenes.make_scenes(("cubes", "pointing", "free"), (5, 12, 12), ("elastic", "hard"))
+    found = scenes.make_scenes(("cubes", "pointing", "free"), (5, 12, 12), ("exact", "hard"))
     assert [scene.name for scene in found] == [
-        "cubes-5", "cubes-5-hard", "cubes-12", "cubes-12-hard", "pointing-5", "free-5", "free-5-hard",
+        "cubes-5", "cubes-5-hard", "cubes-12", "cubes-12-hard", "pointing-5-elastic", "free-5", "free-5-hard",
     ]  # fmt: skip
     assert [scene.problem.truss.bays for scene in found if scene.kind == "cubes"] == [5, 5, 12, 12]
-    assert [scene.problem.method.hard_tracking for scene in found[:2]] == [False, True]
+    assert [scene.problem.method.tracking_mode for scene in found[:2]] == ["exact", "hard"]
 
 
 @pytest.mark.parametrize(
@@ -356,7 +356,7 @@ def scene_document(bays: int, cpu: float, ratio: float | None = None, kind: str 
     baseline = {"step": theirs, "ours": cpu, "ratio": ratio, "failed": 0, "skipped": ""}
     fresh = {"imports": 1.0, "setup": cpu, "first_step": 1.0, "peak_memory": 100, "imported_memory": 50}
     return {
-        "name": f"{kind}-{bays}", "kind": kind, "bays": bays, "tracking": "elastic", "step": step,
+        "name": f"{kind}-{bays}-elastic", "kind": kind, "bays": bays, "tracking": "elastic", "step": step,
         "warm": fresh, "baselines": {"eq28-sparse": baseline},
     }  # fmt: skip
 

@@ -14,6 +14,8 @@ from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.qp.answer import Accuracy
 from vgtm_qp.qp.linearise import Linearisation
+from vgtm_qp.qp.long.chain import find_chain
+from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import make_solver
@@ -266,3 +268,30 @@ def test_names_of_general_rows_are_unique_and_measured():
     same = fused.qp(asked)
     assert (same.rows, same.columns) == (qp.rows, qp.columns)
     np.testing.assert_allclose(same.A.toarray(), qp.A.toarray(), atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["longeron", "hexapod"])
+def test_all_engines_keep_legs_of_the_control_polygon_from_turning_round(name):
+    """Goals draw the second control vertex behind the base, and the last but one beyond the tip."""
+    layout, task = make_layout(TRUSSES[name](), ("position", "pointing"), vertices=6)
+    heavy = layout.weights.model_copy(update={"vertex_goal": 1e3})
+    layout = replace(layout, vertex_goals=(1, 4), weights=heavy)
+    kinematics = layout.arm.kinematics()
+    X, _, vertices, target, rows = make_step(layout, kinematics, np.random.default_rng(3))
+    kinematics.evaluate(X)
+    base, tip = np.array([0.0, 0.0, 1.0]), kinematics.tip_rotation[:, 2]
+    vertices[5] = layout.arm.end_effector.position(X)
+    vertices[1], vertices[4] = vertices[0] + 0.02 * base, vertices[5] - 0.02 * tip
+    goals = np.full(vertices.shape, np.nan)
+    goals[1], goals[4] = vertices[0] - base, vertices[5] + tip
+    target = replace(target, vertex_goals=goals)
+    asked = QPInput(X, X, vertices, np.zeros(0), target, target.path.at(0.0), 0.0, rows, True)
+    plain = general(layout, kinematics, task)
+    chain = GeneralEngine(layout, kinematics, task, StagedSolver(find_chain(layout)))
+    wanted = plain.solve(asked)
+    for engine in (FusedEngine(layout), chain):
+        assert_same_answer(engine.solve(asked), wanted, 1e-9)
+    qp, legs = plain.qp(asked), np.diff(wanted.vertices, axis=0)
+    least = [bound for label, bound in zip(qp.rows, qp.row_lower, strict=True) if label.kind == "curve leg"]
+    assert least == [0.0, 0.0], "legs that are too short may not become shorter"
+    np.testing.assert_allclose([base @ legs[0], tip @ legs[-1]], 0.0, atol=1e-9)

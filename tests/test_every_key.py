@@ -130,6 +130,7 @@ TETRAHEDRAL = {
     "maneuver.waypoint": [{"time": 3.0, "position": [0.5, 0.2, 1.2]}],
     "obstacle": [],
 }
+ELASTIC = {"method.tracking_mode": "elastic"}
 PULLED = {"truss.base_motion": MOVED}
 POINTED = {"end_effector.track": ["position", "pointing"]}
 CASES: dict[str, tuple[Changes, Changes]] = {
@@ -212,15 +213,16 @@ CASES: dict[str, tuple[Changes, Changes]] = {
     ),
     "clearance.safe": ({}, {"clearance.safe": 0.1}),
     "clearance.influence": ({}, {"clearance.influence": 0.06}),
+    "clearance.distance": (NEAR, {"clearance.distance": "exact"}),
     "clearance.margin": (NEAR, {"clearance.margin": 0.02}),
     "clearance.self_collision": ({}, {"clearance.self_collision": False}),
     "clearance.self_safe": ({}, {"clearance.self_safe": 0.3}),
     "clearance.minimum_angle": ({}, {"clearance.minimum_angle": 0.9}),
     "method.name": ({}, {"method.name": "pseudoinverse"}),
     "method.tracking": ({}, {"method.tracking": "recursive"}),
-    "method.hard_tracking": ({}, {"method.hard_tracking": True}),
+    "method.tracking_mode": ({}, {"method.tracking_mode": "elastic"}),
     "method.hard_coordinates": (
-        {"truss.module": "hexapod", "method.hard_tracking": True},
+        {"truss.module": "hexapod", "method.tracking_mode": "hard"},
         {"method.hard_coordinates": ["position", "pointing"]},
     ),
     "method.solver": ({}, {"method.solver": "piqp"}),
@@ -240,9 +242,9 @@ CASES: dict[str, tuple[Changes, Changes]] = {
     "method.weights.actuator_rate": ({}, {"method.weights.actuator_rate": 1.0}),
     "method.weights.stroke_centring": ({}, {"method.weights.stroke_centring": 1.0}),
     "method.weights.curve_rate": ({}, {"method.weights.curve_rate": 1.0}),
-    "method.weights.tracking": ({}, {"method.weights.tracking": 1.0}),
-    "method.weights.tangent": ({}, {"method.weights.tangent": 1.0}),
-    "method.weights.roll": ({"curve.torsion_vertices": 1}, {"method.weights.roll": 1.0}),
+    "method.weights.tracking": (ELASTIC, {"method.weights.tracking": 1.0}),
+    "method.weights.tangent": (ELASTIC, {"method.weights.tangent": 1.0}),
+    "method.weights.roll": ({"curve.torsion_vertices": 1, **ELASTIC}, {"method.weights.roll": 1.0}),
     "method.weights.spacing": ({}, {"method.weights.spacing": 1.0}),
     "method.weights.smoothness": ({}, {"method.weights.smoothness": 1.0}),
     "method.weights.vertex_goal": (
@@ -394,7 +396,7 @@ def base(key: str, way: str) -> tuple[Problem, Changes]:
     condition, changes = table[key]
     if way == "bays":
         # Bays follow the curve exactly whether or not they are told to.
-        condition = {name: value for name, value in condition.items() if name != "method.hard_tracking"}
+        condition = {name: value for name, value in condition.items() if name != "method.tracking_mode"}
     found = with_method(Problem(**problem), WAYS[way])
     if way in TERMS and key.startswith(("method.weights.", "method.gains.")):
         found = found.replace({"method.null_space": TERMS[way]})

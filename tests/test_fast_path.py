@@ -13,7 +13,7 @@ from vgtm_qp.step.engine import FusedEngine, GeneralEngine
 
 SCENES = [
     ("five_bay_two_cubes", {}),
-    ("five_bay_two_cubes", {"method.hard_tracking": True}),
+    ("five_bay_two_cubes", {"method.tracking_mode": "hard"}),
     ("five_bay_two_cubes", {"method.slow_approach": False}),
     ("five_bay_two_cubes_pointing", {}),
     ("hexapod_past_a_cube", {}),

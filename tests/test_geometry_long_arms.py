@@ -100,7 +100,7 @@ def test_no_near_pair_of_what_bends_is_missed(seed, rods):
     for state in states:
         exact = every_distance(monitor, state)
         reach, self_reach = rng.choice([0.2, 0.5]), rng.choice([0.1, 0.22, 0.5])
-        near = monitor.near(state, 0.0, reach, fcl_reach=0.0, self_reach=self_reach)
+        near = monitor.near(state, 0.0, reach, self_reach=self_reach)
         found = [key(*row) for row in zip(near.body, near.other, near.is_self, strict=True)]
         expected = {pair for pair, distance in exact.items() if distance < (self_reach if pair[2] else reach)}
         assert set(found) == expected
@@ -189,7 +189,7 @@ def test_an_arm_that_is_carried_or_bends_in_one_place_is_compared_once(hinge):
         check_bounds(candidates, motion, exact)
         assert min(candidates.beyond(motion)) >= 0.22
         assert sum(map(len, candidates.groups)) < 5000
-        near = monitor.near(state, fcl_reach=0.0)
+        near = monitor.near(state)
         found = {key(*row) for row in zip(near.body, near.other, near.is_self, strict=True)}
         assert found == {pair for pair, d in exact.items() if d < (0.22 if pair[2] else 0.5)}
         nearer += int(near.is_self.sum())

@@ -222,7 +222,7 @@ def test_the_qp_by_bays_is_the_coupled_one_with_stations_held_on_the_curve(
 ) -> None:
     """Recursive, parallel and dense elimination of one QP, over ten bays of every module: one maneuver."""
     monkeypatch.setitem(MODULES, module, BAYS[module])
-    coupled = free_problem(module, steps=12, hard_tracking=True, solver="piqp")
+    coupled = free_problem(module, steps=12, tracking_mode="hard", solver="piqp")
     dense = coupled.replace({"method.solver": "daqp"})
     by_bays = [free_problem(module, steps=12, tracking=way) for way in WAYS]
     recursive, parallel = (states_of(problem) for problem in by_bays)

@@ -59,7 +59,7 @@ def test_clearance_rows_are_the_derivatives_of_the_distances():
     change = np.einsum("rsc,rsc->r", rows.coefficients, step[rows.nodes])
 
     def distances(Y):
-        pairs = monitor.near(setup.arm.points(Y), 0.0, 0.6, fcl_reach=0.0)
+        pairs = monitor.near(setup.arm.points(Y), 0.0, 0.6)
         found = {}
         for k in range(len(pairs)):
             found[pairs.name(k)] = min(found.get(pairs.name(k), np.inf), float(pairs.distance[k]))

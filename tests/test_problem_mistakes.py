@@ -179,10 +179,10 @@ WRONG = [
     ('name = "qp"', 'tracking = "paralel"', "method.tracking", '"paralel"', 'did you mean "parallel"?'),
     (
         'name = "qp"',
-        'tracking = "none"\nhard_tracking = true',
-        "method.hard_tracking",
-        "true",
-        "false, since",
+        'tracking = "none"\ntracking_mode = "hard"',
+        "method.tracking_mode",
+        '"hard"',
+        '"exact", since',
     ),
     (
         "actuator_rate = 0.5",

@@ -19,7 +19,7 @@ from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.linearise import Linearisation, StepInput
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
+from vgtm_qp.qp.numbers import ClearanceRows, Legs, StepNumbers
 from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.qp.solvers import FullSolver, available_solvers, make_solver
 from vgtm_qp.rows.tip import TipGoal
@@ -71,6 +71,10 @@ def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
     if vertices:
         curve_step[0] = shift
         curve_step[1] = shift + 0.01 * np.cross(axes[0], axes[1]) + base_rhs @ axes
+    leg_axes = np.zeros((len(layout.legs), 3))
+    leg_axes[:1] = np.cross(axes[0], axes[1])
+    leg_axes[1:, 2] = 1.0
+    leg_change = curve_step[layout.legs[:, 1]] - curve_step[layout.legs[:, 0]]
     centres = np.einsum("kf,kfc->kc", truss.face_weights[layout.tracked], nodes[truss.faces[layout.tracked]])
     tip_jacobian = np.kron(truss.tip_weights, np.eye(3))[task.axes]
     tip_rate = rng.normal(size=len(layout.tip_rows))
@@ -116,6 +120,7 @@ def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
             value - rng.uniform(0.0, 0.01, rows),
             lambda k: f"clearance: row {k}",
         ),
+        legs=Legs(leg_axes, np.einsum("gc,gc->g", leg_axes, leg_change) - rng.uniform(0.0, 0.02)),
     )
     return layout, numbers
 
@@ -157,8 +162,10 @@ def stationarity(builder, qp, z, solution):
     pinned = np.flatnonzero((qp.column_upper - z < 1e-9) | (z - qp.column_lower < 1e-9))
     actuators = builder.column["actuators"]
     pinned = pinned[(pinned < actuators.start) | (pinned >= actuators.stop)]
-    columns = np.hstack([qp.A[equal].toarray().T, np.eye(len(z))[:, pinned]])
+    legs = builder.leg_rows[(qp.A @ z - qp.row_lower)[builder.leg_rows] < 1e-9]
+    columns = np.hstack([qp.A[legs].toarray().T, qp.A[equal].toarray().T, np.eye(len(z))[:, pinned]])
     best = np.linalg.lstsq(columns, -gradient, rcond=None)[0]
+    assert (best[: len(legs)] < 1e-9).all(), "a leg is held although it would grow"
     return float(np.max(np.abs(gradient + columns @ best)))
 
 

@@ -86,12 +86,12 @@ GENERAL = [
     ("octahedral", 4, {"nodes": "arc-length"}, {}),
     ("hexapod", 3, {"torsion_vertices": 2}, {"weights": {"spacing": 0.4, "roll": 0.2}}),
     ("longeron", 4, {"nodes": "arc-length", "torsion_vertices": 1}, {"weights": {"spacing": 1.0}}),
-    ("hexapod", 3, {"family": "b-spline"}, {"hard_tracking": True, "hard_coordinates": POSE}),
+    ("hexapod", 3, {"family": "b-spline"}, {"tracking_mode": "hard", "hard_coordinates": POSE}),
     (
         "hexapod",
         3,
         {"nodes": "arc-length"},
-        {"hard_tracking": True, "hard_coordinates": ["position", "pointing"]},
+        {"tracking_mode": "hard", "hard_coordinates": ["position", "pointing"]},
     ),
     ("octahedral", 4, {"control_vertex_goals": [{"index": 3, "position": [0.4, 0.1, 1.8]}]}, {}),
 ]
@@ -233,7 +233,7 @@ HARD = [
 @pytest.mark.parametrize(("module", "bays", "coordinates", "curve"), HARD, ids=str)
 def test_hard_tracking_holds_at_every_state(module, bays, coordinates, curve):
     problem = shaped_problem(
-        module, bays, curve, method={"hard_tracking": True, "hard_coordinates": coordinates}
+        module, bays, curve, method={"tracking_mode": "hard", "hard_coordinates": coordinates}
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -270,7 +270,7 @@ def test_what_the_bays_cannot_keep_is_refused(module, coordinates, curve, messag
                 curve,
                 waypoint=point,
                 end_effector={"track": track},
-                method={"hard_tracking": True, "hard_coordinates": coordinates},
+                method={"tracking_mode": "hard", "hard_coordinates": coordinates},
             )
         )
 

@@ -21,6 +21,7 @@ from PIL import Image
 import vgtm_qp as vq
 from vgtm_qp.live.page import read_out, view
 from vgtm_qp.live.session import Session
+from vgtm_qp.methods import method_name, methods_for
 
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = [
@@ -120,6 +121,24 @@ def test_the_older_methods_enter_the_cube_where_the_qp_keeps_out(session: Sessio
         session.advance(PERIOD)
     assert session.reading().clearance < 0.0
     assert "#b91c1c" in read_out(session, "")
+
+
+def test_the_hand_changes_between_all_methods_and_back(session: Session):
+    shape, given = session.control_vertices.shape, session.problem.method
+    for name in [*methods_for(session.problem), "qp"]:
+        session.use_method(name)
+        assert method_name(session.problem) == name
+        session.want_tip(session.tip + np.array([0.01, 0.0, -0.005]))
+        assert session.advance(PERIOD), name
+        assert session.control_vertices.shape == shape
+        assert np.linalg.norm(session.control_vertices[-1] - session.tip) < 0.1
+        assert f">{name}<" in read_out(session, "")
+        session.go_home()
+    assert session.problem.method == given
+
+
+def test_a_serial_arm_is_offered_what_can_move_it():
+    assert list(methods_for(vq.load_problem("snake_past_a_cube"))) == ["qp", "qp-none"]
 
 
 def test_a_changed_setting_keeps_the_state_and_a_wrong_one_changes_nothing(session: Session):

@@ -3,5 +3,5 @@
 from typing import Literal
 
 SceneKind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral"]
-TrackingName = Literal["elastic", "hard"]
+TrackingName = Literal["exact", "elastic", "hard"]
 BaselineName = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp"]

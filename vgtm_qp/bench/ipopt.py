@@ -110,7 +110,7 @@ class NonlinearStep:
     def _clearances(self, state: State) -> Array:
         """Write the rows of the nearest pairs; return their lower bounds (24,), m. Unused rows are zero."""
         setup = self._setup
-        near = setup.monitor.near(setup.arm.points(state.q), state.time, setup.influence, fcl_reach=0.0)
+        near = setup.monitor.near(setup.arm.points(state.q), state.time, setup.influence)
         coefficients, lower = clearance_rows(
             near.distance, near.normal, near.weights, near.is_self, setup.safe, setup.self_safe
         )

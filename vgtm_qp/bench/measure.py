@@ -22,7 +22,7 @@ from vgtm_qp.errors import VgtmError
 from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.methods import Resolver
 from vgtm_qp.step.state import State
-from vgtm_qp.step.step import StepStatus
+from vgtm_qp.step.step import Step, StepStatus
 
 _Answer = TypeVar("_Answer")
 
@@ -63,7 +63,7 @@ def breakdown(seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> dict[str, 
 
 @dataclass
 class Steps:
-    """Steps that the resolver took by itself: seconds of each in every phase, and its QPs.
+    """Steps that the resolver took by itself: seconds of each in every phase, its QPs, and rows by FCL and exact ones.
 
     ``covered`` is the greatest share of the maneuver that one pass covered, 0 to 1; ``stopped_by`` what blocked the
     arm, empty if nothing did.
@@ -72,6 +72,8 @@ class Steps:
     spent: list[Spent] = field(default_factory=list)
     phases: dict[str, list[float]] = field(default_factory=dict)
     qps: list[int] = field(default_factory=list)
+    fcl_rows: list[int] = field(default_factory=list)
+    exact_rows: list[int] = field(default_factory=list)
     covered: float = 0.0
     stopped_by: str = ""
 
@@ -122,8 +124,8 @@ class _Walk:
         """Where the next step begins."""
         return _Place(self._resolver.state, self._value, *self._plan.next_mark(self._value))
 
-    def step(self) -> tuple[Spent, int]:
-        """Take a step; return what it took and its QPs."""
+    def step(self) -> tuple[Spent, Step]:
+        """Take a step; return what it took, and the step."""
         _, start, end, dt = self.place
         spent, step = _timed(lambda: self._resolver.follow(self._plan.path, start, end, dt=dt))
         self._stalled = self._stalled + 1 if step.progress < _STALLED_PROGRESS else 0
@@ -133,7 +135,7 @@ class _Walk:
             self._value += step.progress * (end - start)
         else:
             self._value = end
-        return spent, step.qps
+        return spent, step
 
     def repeat(self, seconds: float, steps: int) -> Iterator[int]:
         """Count steps to take, from home again where the plan ends, until there are so many or `seconds` have passed.
@@ -160,9 +162,11 @@ def run_alone(resolver: Resolver, plan: Plan, *, seconds: float, steps: int) -> 
     walk.restart()
     before = dict(resolver.phases)
     for _ in walk.repeat(seconds, steps):
-        spent, qps = walk.step()
+        spent, step = walk.step()
         found.spent.append(spent)
-        found.qps.append(qps)
+        found.qps.append(step.qps)
+        found.fcl_rows.append(step.fcl_rows)
+        found.exact_rows.append(step.exact_rows)
         now = dict(resolver.phases)
         for name, total in now.items():
             found.phases.setdefault(name, []).append(total - before[name])

@@ -37,7 +37,8 @@ def measure_scene(
     Keys of what is returned: ``name``, ``kind``, ``bays`` and ``tracking`` of the scene; the numbers of ``members``,
     ``actuators`` and ``obstacles``; ``covered``, the share of the maneuver that the measured steps covered, 0 to 1;
     ``stopped_by``, what blocked the arm, empty where nothing did; ``step`` and ``breakdown``, see `measure.py`;
-    ``qps``, QPs a step; ``warm`` and ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
+    ``qps``, QPs a step; ``fcl_rows`` and ``exact_rows``, clearance rows a step by FCL and by closed forms; ``warm`` and
+    ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
     ``baselines``, what `_against` returns, by name.
 
     Each run, alone and in turn with each baseline, ends after so many `steps` or when so many `seconds` have passed.
@@ -61,6 +62,8 @@ def measure_scene(
         "step": timing(alone.spent),
         "breakdown": breakdown([spent.wall for spent in alone.spent], alone.phases),
         "qps": float(np.mean(alone.qps)),
+        "fcl_rows": float(np.mean(alone.fcl_rows)),
+        "exact_rows": float(np.mean(alone.exact_rows)),
         "warm": measure_fresh(data),
         "cold": measure_fresh(data, cold=True) if cold else None,
         "baselines": baselines,

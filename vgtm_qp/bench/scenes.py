@@ -10,7 +10,7 @@ from vgtm_qp.bench import SceneKind, TrackingName
 from vgtm_qp.problem import Problem, load_problem
 
 KINDS: tuple[SceneKind, ...] = get_args(SceneKind)
-TRACKINGS: tuple[TrackingName, ...] = get_args(TrackingName)
+TRACKINGS: tuple[TrackingName, ...] = ("exact", "elastic")
 BAYS = (5, 10, 20, 50, 100, 200, 500, 1000)
 CLUTTERED_BAYS = 50
 CLUTTER = 100
@@ -32,7 +32,7 @@ _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 class BenchScene(NamedTuple):
-    """A problem to be measured; `tracking` is "elastic", "hard", or "none" where there is no curve."""
+    """A problem to be measured; `tracking` is its mode, "none" where there is no curve."""
 
     name: str
     kind: SceneKind
@@ -59,11 +59,9 @@ def make_scenes(
         for count in dict.fromkeys(counts):
             problem = _problem(kind, count)
             for tracking in ("elastic",) if kind == "pointing" else dict.fromkeys(trackings):
-                hard = tracking == "hard"
-                name = f"{kind}-{count}" + ("-hard" if hard else "")
-                scenes.append(
-                    BenchScene(name, kind, count, tracking, problem.replace({"method.hard_tracking": hard}))
-                )
+                name = f"{kind}-{count}" + ("" if tracking == "exact" else f"-{tracking}")
+                changed = problem.replace({"method.tracking_mode": tracking})
+                scenes.append(BenchScene(name, kind, count, tracking, changed))
     return scenes
 
 

@@ -40,7 +40,8 @@ def _parts(document: dict[str, Any]) -> Iterator[str]:
 def _steps(scenes: Sequence[dict[str, Any]]) -> str:
     known = [name for scene in scenes for name in scene["breakdown"]["phases"]]
     phases = sorted(dict.fromkeys(known), key=lambda name: _PHASES.index(name) if name in _PHASES else -1)
-    heads = ("steps", "QPs", "median", "p95", "p99", "CPU", *phases, "set-up", "cold", "memory", "covered")
+    timed = ("median", "p95", "p99", "CPU", *phases)
+    heads = ("steps", "QPs", "FCL + exact rows", *timed, "set-up", "cold", "memory", "covered")
     rows = []
     for scene in scenes:
         step, cold = scene["step"], scene["cold"]
@@ -49,6 +50,7 @@ def _steps(scenes: Sequence[dict[str, Any]]) -> str:
                 scene["name"],
                 str(step["steps"]),
                 f"{scene['qps']:.2f}",
+                f"{scene.get('fcl_rows', 0.0):.1f} + {scene.get('exact_rows', 0.0):.1f}",
                 *(_time(step[key]) for key in ("median", "p95", "p99", "cpu")),
                 *(_time(scene["breakdown"]["phases"].get(name)) for name in phases),
                 _setup(scene["warm"]),

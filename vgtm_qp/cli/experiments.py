@@ -77,8 +77,12 @@ def study(
     workers: Annotated[int, Parameter(help="processes; studies of run time use one, alone")] = 1,
     dask: Annotated[str | None, Parameter(help="address of a dask.distributed scheduler")] = None,
     short: Annotated[bool, Switch(help="a quick look: fewer and smaller runs")] = False,
-    scenes: Annotated[int | None, Parameter(help="number of random scenes, of robustness")] = None,
-    seed: Annotated[int | None, Parameter(help="seed of the random scenes, of robustness")] = None,
+    scenes: Annotated[
+        int | None, Parameter(help="number of random scenes, of robustness and tracking")
+    ] = None,
+    seed: Annotated[
+        int | None, Parameter(help="seed of the random scenes, of robustness and tracking")
+    ] = None,
     output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
     json: Json = False,
 ) -> None:
@@ -130,7 +134,7 @@ def bench(
             help="of the arms between two cubes, 5 or more; 5 to 1000 by default",
         ),
     ] = None,
-    tracking: Annotated[list[TrackingName] | None, _several(help="both by default")] = None,
+    tracking: Annotated[list[TrackingName] | None, _several(help="exact and elastic by default")] = None,
     baselines: Annotated[
         list[BaselineName] | None,
         _several(negative="--no-baselines", help="what else takes the steps; all by default"),

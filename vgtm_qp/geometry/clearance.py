@@ -9,6 +9,7 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.candidates import Candidates
+from vgtm_qp.geometry.exact import NORMAL
 from vgtm_qp.geometry.formulas import FAR
 from vgtm_qp.geometry.groups import Found, Group, Scene
 from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair
@@ -18,7 +19,6 @@ from vgtm_qp.geometry.sweep import sweep_group
 from vgtm_qp.geometry.watch import Watch, can_be_watched
 
 __all__ = ["BetweenReport", "Clearance", "Contacts", "Pair"]
-
 
 _AMONG = {"all": (False, True), "obstacles": (False,), "members": (True,)}
 
@@ -42,6 +42,8 @@ class Clearance:
         Whether pairs of bodies that are not neighbours count.
     watch : bool
         Whether small scenes at rest are watched; the answers are the same.
+    by_fcl : bool
+        Whether :meth:`near` has python-fcl supply the contacts where it is asked to.
     """
 
     def __init__(
@@ -53,8 +55,9 @@ class Clearance:
         influence: float,
         self_collision: bool = True,
         watch: bool = True,
+        by_fcl: bool = True,
     ) -> None:
-        self.scene = Scene(bodies, obstacles, has_self=self_collision)
+        self.scene = Scene(bodies, obstacles, self_collision, by_fcl)
         self.bodies, self.obstacles, self.self_collision = bodies, self.scene.obstacles, self_collision
         self.pieces, self.names, self.fcl = self.scene.pieces, self.scene.names, self.scene.fcl
         self.safe, self.influence = safe, influence
@@ -72,10 +75,10 @@ class Clearance:
         reach: float | None = None,
         *,
         self_reach: float | None = None,
-        fcl_reach: float | None = None,
+        by_fcl: bool = False,
         tracked: bool = False,
     ) -> Contacts:
-        """Return all contacts of surfaces nearer than `reach`, exact.
+        """Return all contacts of surfaces nearer than `reach`, exact; to 1e-6 m where FCL supplies them.
 
         A pair has two rows where the nearest point of a body is not unique. Of the triangles of a mesh
         only those stay that differ in normal or in the part of the body they face.
@@ -88,18 +91,16 @@ class Clearance:
             s.
         reach, self_reach : float or None
             m; by default `influence`, and for two bodies no more than twice `safe` and the largest radius together.
-        fcl_reach : float or None
-            Pairs nearer than this, m, are asked of python-fcl too, and each answer is checked; by default 2.5 `safe`.
-            Zero asks for none.
+        by_fcl : bool
+            Whether python-fcl supplies the contacts, each proven; see ``Contacts.by_fcl`` for those that it did not.
         tracked : bool
             Whether `X` is a state of a motion, which :meth:`between` is asked to go on from. A watched scene is then
             evaluated from state to state. Positions that are only tried would make the watch go there and back.
         """
         reach = self.influence if reach is None else reach
-        fcl_reach = 2.5 * self.safe if fcl_reach is None else fcl_reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
         if tracked and self._watch is not None:
-            watched = self._watch.near(X, reach, self_reach, fcl_reach)
+            watched = self._watch.near(X, reach, self_reach, by_fcl=by_fcl)
             if watched is not None:
                 return watched
         candidates = self._candidates
@@ -116,14 +117,10 @@ class Clearance:
                 which, k = np.nonzero(~(distance >= min(limit, FAR)))
                 found, pairs = both[k, which], rows[k]
                 candidates.count_unneeded(group, len(rows) - int(np.count_nonzero(which == 0)))
-                if group.asks_fcl and fcl_reach > 0.0:
-                    unique = (which == 0) & (both[k, 1, 0] >= FAR)
-                    asked = np.flatnonzero(unique & (found[:, 0] < fcl_reach))
-                    group.ask_fcl(X, time, pairs, found, asked.tolist())
                 if group.shape == "triangle":
                     kept = self._distinct(group, pairs, found)
                     found, pairs = found[kept], pairs[kept]
-                parts.append((group.numbers[pairs], found))
+                parts.append(group.contacts(X, time, pairs, found, by_fcl))
         candidates.refresh_where_due(X, time)
         return self.scene.contacts(self._solids.with_enclosed(parts, X, time))
 
@@ -131,7 +128,8 @@ class Clearance:
         """Return the nearest of the contacts alike in body, mesh, normal and place on the body."""
         order = np.argsort(found[:, 0], kind="stable")
         bodies, meshes = group.body[rows], self.pieces.obstacle[group.other[rows]]
-        like = np.column_stack([bodies, meshes, np.round(2.0 * found[:, 5:]), np.round(4.0 * found[:, 2])])
+        normal, place = np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2])
+        like = np.column_stack([bodies, meshes, normal, place])
         return order[np.sort(np.unique(like[order], axis=0, return_index=True)[1])]
 
     def least(self, X: Array, time: float = 0.0, *, among: str = "all") -> tuple[float, Pair | None]:

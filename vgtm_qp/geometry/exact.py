@@ -2,8 +2,9 @@
 
 A pair is one vector: both ends of the body's axis (6), the piece (15) or the ends of the other body (6), and the radius
 of the body or the sum of both radii. Distances are from surface to surface, m. A contact is ``CONTACT`` numbers: signed
-distance, weights (4) of the four ends in its change (of the body, then of the other body, zero for a piece), and the
-unit normal (3) from the piece to the body, or the way out where the two intersect.
+distance, weights (4) of the four ends in its change (of the body, then of the other body, zero for a piece), the
+unit normal (3) from the piece to the body, or the way out where the two intersect, and 1 where it is the only contact
+of its pair, else 0.
 """
 
 from __future__ import annotations
@@ -13,13 +14,22 @@ from typing import Any
 
 import casadi as ca
 
-from vgtm_qp.geometry.formulas import APART, FAR, FORMULAS, SymbolicContact, norm, ratio
+from vgtm_qp.geometry.formulas import APART, FAR, FORMULAS, SymbolicContact, clip, norm, ratio
 
 WIDTH = 15
 """Numbers that describe an obstacle piece, see :class:`vgtm_qp.geometry.shapes.Obstacle`."""
 
-CONTACT = 8
+CONTACT = 9
 """Numbers that describe a contact."""
+
+NORMAL = slice(5, 8)
+"""Which of them are its normal."""
+
+PROOF = 1e-6
+"""An answer of FCL holds if its flaw is no greater, m."""
+
+NORMAL_FROM = 1e-3
+"""Of an axis that is nearer than this to the other, or touches it, the normal would be mostly rounding, m."""
 
 SECOND_CONTACT = 0.2
 """Two contacts of a body with one piece are apart by at least this fraction of the body's length."""
@@ -37,7 +47,7 @@ def width(shape: str) -> int:
 def distance_function(shape: str) -> ca.Function:
     """Return the exact contacts of a pair.
 
-    Input ``pair``, output ``contacts (16,)``: the nearest points, and those at the other end of a contact interval,
+    Input ``pair``, output ``contacts (18,)``: the nearest points, and those at the other end of a contact interval,
     where the distance is larger by less than ``PARALLEL`` times the body's length. The second distance is ``FAR`` where
     that contact needs no row. Where axis and piece intersect, the distance of the axis is minus the depth (the least
     translation that parts them) for boxes and spheres, zero for the other shapes. It changes by no more than the
@@ -54,14 +64,58 @@ def distance_function(shape: str) -> ca.Function:
 
 
 def _rows(contacts: tuple[SymbolicContact, SymbolicContact], radius: Any, shape: str) -> Any:
-    """Return both contacts of a body of that radius as numbers (16,)."""
-    share = 1.0 if shape == "segment" else 0.0
-    rows = [
-        ca.vertcat(c.distance - radius, 1.0 - c.t, c.t, share * (c.s - 1.0), -share * c.s, c.normal)
-        for c in contacts
-    ]
+    """Return both contacts of a body of that radius as numbers (18,)."""
     needed = ca.fabs(contacts[1].t - contacts[0].t) >= SECOND_CONTACT
-    return ca.vertcat(rows[0], ca.if_else(needed, rows[1][0], FAR), rows[1][1:])
+    first, second = (
+        ca.vertcat(c.distance - radius, _weights(shape, c.t, c.s), c.normal, ca.logic_not(needed))
+        for c in contacts
+    )
+    return ca.vertcat(first, ca.if_else(needed, second[0], FAR), second[1:])
+
+
+def _weights(shape: str, t: Any, s: Any) -> Any:
+    """Return the weights (4,) of the ends, for the parameters on the body and on the other body."""
+    share = 1.0 if shape == "segment" else 0.0
+    return ca.vertcat(1.0 - t, t, share * (s - 1.0), -share * s)
+
+
+@cache
+def proof_function(shape: str) -> ca.Function:
+    """Return the contact that an answer of FCL about a pair means, and by how much that is not proven.
+
+    Inputs ``pair``, whose body may be a point, and ``answer (7,)``: a distance d, a point of the body and one of the
+    other. Output ``contact (9,)``, whose last number is the flaw, m; NaN where a number is not finite or the two
+    points coincide.
+
+    With x the point of the body nearest to the answer's, y the other point, and n = (x - y) / |x - y|: the two are no
+    nearer to each other than the gap g between their supporting planes along n, and no further apart than x and y. The
+    flaw is |d - g| + ||x - y| - d|, and how far the answer's point is from x, and y from the other; or ``FAR``
+    where g is not greater than `NORMAL_FROM`. The contact has the distance g, less the radius.
+    """
+    pair, answer = ca.SX.sym("pair", 7 + width(shape)), ca.SX.sym("answer", 7)
+    body, other, claimed, y = pair[:6], pair[6:-1], answer[0], answer[4:]
+    t, off = _projected(answer[1:4], body)
+    away = (1.0 - t) * body[:3] + t * body[3:] - y
+    apart = norm(away)
+    normal = away / apart
+    if shape == "segment":
+        s, stray = _projected(y, other)
+    else:
+        s, stray = 0.0, ca.fmax(APART[shape](ca.vertcat(y, y), other)[0].distance, 0.0)
+    gap = ca.fmin(ca.dot(normal, body[:3]), ca.dot(normal, body[3:])) - _support(shape, other, normal)
+    flaw = ca.fabs(claimed - gap) + ca.fabs(apart - claimed) + off + stray
+    flaw = ca.if_else(gap > NORMAL_FROM, flaw, FAR)
+    contact = ca.cse(ca.vertcat(gap - pair[-1], _weights(shape, t, s), normal, flaw))
+    return ca.Function(
+        f"proof_{shape}", [pair, answer], [ca.densify(contact)], ["pair", "answer"], ["contact"]
+    )
+
+
+def _projected(x: Any, segment: Any) -> tuple[Any, Any]:
+    """Return the parameter of the point of a segment that is nearest to x (3,), and how far that is."""
+    along = segment[3:] - segment[:3]
+    t = clip(ratio(ca.dot(x - segment[:3], along), ca.dot(along, along)))
+    return t, norm(x - (1.0 - t) * segment[:3] - t * segment[3:])
 
 
 @cache
@@ -100,7 +154,7 @@ def follow_function(shape: str) -> ca.Function:
     then after it; and ``known (19,)``: the piece (15; ignored for two bodies), the radius or sum of radii, and
     a unit normal (3), best that of the contact before.
 
-    Output ``contacts (17,)``: those of :func:`distance_function` after the motion, and the bound over the motion of
+    Output ``contacts (19,)``: those of :func:`distance_function` after the motion, and the bound over the motion of
     :func:`_turning_gap`. Where axis and piece intersect, the distance is minus the radius and the other numbers mean
     nothing.
     """
@@ -155,6 +209,8 @@ def _turning_gap(shape: str, bodies: list[Any], others: list[Any], normals: list
 
 def _support(shape: str, piece: Any, normal: Any) -> Any:
     """Return the greatest n.x over the points x of the piece."""
+    if shape == "segment":
+        return ca.fmax(ca.dot(normal, piece[:3]), ca.dot(normal, piece[3:]))
     if shape == "triangle":
         heights = [ca.dot(normal, piece[i : i + 3]) for i in (0, 3, 6)]
         return ca.fmax(ca.fmax(heights[0], heights[1]), heights[2])

@@ -1,99 +1,128 @@
-"""Distances by python-fcl, each compared with the exact one; an answer that differs from it is not used.
+"""Distances and nearest points by python-fcl, for many pairs at once; nothing here checks its answers.
 
-FCL's distance from a capsule to a box is always too large, and for bodies parallel to edges on round
-coordinates too large by up to a metre (FCL issue 508). So the capsule has radius zero, the radius is subtracted,
-and an answer counts only where the closed form agrees and the two are apart. FCL's signed distance is never asked for:
-it can end the process.
+FCL's distance from a capsule to a box is always too large, and for bodies parallel to edges on round coordinates too
+large by up to a metre (FCL issue 508). So a body is asked about as a capsule of radius zero, and each answer has to be
+proven by whoever asks. Of an axis that touches the other, FCL knows no more than that: its penetration depth is not the
+least one, and its signed distance, which is never asked for, can end the process.
 """
 
 from __future__ import annotations
 
-from math import sqrt
-from typing import Any, ClassVar
+from itertools import repeat
+from math import inf, sqrt
+from typing import Any
 
+import fcl
 import numpy as np
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.shapes import ObstaclePieces
 
-_AGREEMENT = 1e-9
-"""How far FCL and the closed form may be apart, m."""
+_UNITS = 1e5
+"""FCL's units in a metre. Its iterations end at 1e-6 units: in metres, that would turn normals at a rim by 1e-3 rad."""
 
-_APART = 1e-3
-"""The normal is the way between FCL's two nearest points, which are as exact as its distance. Of an axis that is nearer
-than this to a surface, or touches it, the way is mostly rounding, and the answer is refused, m."""
+_TRIANGLE = np.array([3, 0, 1, 2, 3, 0, 2, 1])
+"""Both sides of a triangle as faces: FCL has no distance to its own triangles, but to a convex set of three points."""
 
-_UNIT = 1e-6
-"""How far the length of FCL's normal may be from 1."""
+
+class _Axis:
+    """The axis of a body, or of a part of one, as FCL sees it: a capsule of radius zero, or a point; moved in place."""
+
+    def __init__(self) -> None:
+        self._capsule = fcl.Capsule(0.0, 1.0)
+        self._segment = fcl.CollisionObject(self._capsule, fcl.Transform())
+        self._point = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform())
+
+    def placed(self, middle: Array, span: list[float]) -> fcl.CollisionObject:
+        """Return it with its middle (3,) there, and `span` (3) from end to end; in FCL's units."""
+        x, y, z = span
+        length = sqrt(x * x + y * y + z * z)
+        if not length > 0.0:
+            self._point.setTranslation(middle)
+            return self._point
+        self._capsule.lz = length
+        self._segment.setQuatRotation(_quaternion(x, y, z, length))
+        self._segment.setTranslation(middle)
+        return self._segment
 
 
 class FclQueries:
-    """FCL objects of all pieces and one capsule, built once and moved in place.
+    """FCL objects of all pieces, and two axes that are moved in place.
 
     Attributes
     ----------
-    asked, replaced : int
-        Queries so far, and those whose answer the guard refused.
+    asked, refused : int
+        Queries so far, and those whose answer was not proven.
     """
 
-    SHAPES: ClassVar[tuple[str, ...]] = ("box", "sphere", "cylinder")
-
     def __init__(self, pieces: ObstaclePieces) -> None:
-        self.asked = self.replaced = 0
+        self.asked = self.refused = 0
         self._pieces = pieces
         self._objects: dict[int, Any] = {}
+        self._body, self._other = _Axis(), _Axis()
+        self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
+        self._result = fcl.DistanceResult()
+        self._result.nearest_points = [np.full(3, np.nan)] * 2
 
-    def _object(self, piece: int) -> Any:
-        if piece not in self._objects:
-            import fcl
+    def answers(self, pairs: Array, pieces: list[int] | None, time: float) -> Array:
+        """Return FCL's distance of each of K pairs, m, and its nearest points (3) of the body and of the other: (K, 7).
 
-            if not self._objects:
-                self._fcl, self._capsule = fcl, fcl.Capsule(0.0, 1.0)
-                self._body = fcl.CollisionObject(self._capsule, fcl.Transform())
-                self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
-            shape, row = self._pieces.shape[piece], self._pieces.parameters[piece]
-            if shape == "sphere":
-                geometry = fcl.Sphere(row[12])
-            elif shape == "box":
-                geometry = fcl.Box(*(2.0 * row[12:]))
-            else:
-                geometry = fcl.Cylinder(row[12], 2.0 * row[13])
-            turn = row[3:12].reshape(3, 3)
-            self._objects[piece] = fcl.CollisionObject(geometry, fcl.Transform(turn, row[:3]))
-        return self._objects[piece]
-
-    def witness(
-        self, piece: int, time: float, ends: list[float], distance: float
-    ) -> tuple[float, tuple[float, float, float]] | None:
-        """Return where FCL finds a segment nearest to a piece at `time`: the parameter on it, and the normal (3).
-
-        None where its answer is refused: its distance is not the `distance`, m, of the closed form, or the segment is
-        too near for the points to have a direction.
+        Parameters
+        ----------
+        pairs : (K, 6 or more)
+            Ends of the body's axis, or twice the same point, m; for two bodies then those of the other.
+        pieces : list of int or None
+            Which pieces the others are; None for two bodies.
+        time : float
+            s, at which moving pieces are where they are asked about.
         """
-        other = self._object(piece)
+        self.asked += len(pairs)
+        ends, body = _UNITS * pairs[:, :12], self._body
+        middles, spans = _axes(ends[:, :3], ends[:, 3:6])
+        if pieces is None:
+            others = map(self._other.placed, *_axes(ends[:, 6:9], ends[:, 9:]))
+        else:
+            others = map(self._piece, pieces, repeat(time))
+        found, request, result, ask = list[float](), self._request, self._result, fcl.distance
+        for middle, span, other in zip(middles, spans, others, strict=True):
+            # What FCL does not overwrite is no answer.
+            result.min_distance = inf
+            found.append(ask(body.placed(middle, span), other, request, result))
+            here, there = result.nearest_points
+            found += here.tolist()
+            found += there.tolist()
+        return np.array(found).reshape(len(pairs), 7) / _UNITS
+
+    def _piece(self, piece: int, time: float) -> fcl.CollisionObject:
+        """Return the object of a piece, where it is at `time`, s."""
+        known = self._objects.get(piece)
+        if known is None:
+            known = self._objects[piece] = _object(self._pieces.shape[piece], self._pieces.parameters[piece])
         if self._pieces.moving:
-            other.setTranslation(self._pieces.at(time)[piece, :3])
-        ax, ay, az, bx, by, bz = ends
-        x, y, z = bx - ax, by - ay, bz - az
-        length = sqrt(x * x + y * y + z * z)
-        if not length > 0.0:
-            return None
-        self._capsule.lz = length
-        self._body.setQuatRotation(_quaternion(x, y, z, length))
-        self._body.setTranslation(np.array((0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz))))
-        result = self._fcl.DistanceResult()
-        found = self._fcl.distance(self._body, other, self._request, result)
-        self.asked += 1
-        if not (found > _APART and abs(found - distance) <= _AGREEMENT):
-            self.replaced += 1
-            return None
-        point, witness = result.nearest_points
-        (px, py, pz), (wx, wy, wz) = point.tolist(), witness.tolist()
-        nx, ny, nz = (px - wx) / found, (py - wy) / found, (pz - wz) / found
-        if not abs(sqrt(nx * nx + ny * ny + nz * nz) - 1.0) <= _UNIT:
-            self.replaced += 1
-            return None
-        along = (x * (px - ax) + y * (py - ay) + z * (pz - az)) / (length * length)
-        return min(max(along, 0.0), 1.0), (nx, ny, nz)
+            at = time * self._pieces.velocity[piece]
+            if self._pieces.shape[piece] != "triangle":
+                at += self._pieces.center[piece]
+            known.setTranslation(_UNITS * at)
+        return known
+
+
+def _axes(first: Array, second: Array) -> tuple[list[Array], list[list[float]]]:
+    """Return middles (3,) of axes between two ends each (K, 3), and vectors (3) from the first end to the second."""
+    return list(0.5 * (first + second)), (second - first).tolist()
+
+
+def _object(shape: str, row: Array) -> fcl.CollisionObject:
+    """Return a piece at time 0; see ``Obstacle.pieces`` for its numbers (15,)."""
+    if shape == "triangle":
+        return fcl.CollisionObject(fcl.Convex(_UNITS * row[:9].reshape(3, 3), 2, _TRIANGLE), fcl.Transform())
+    first, second, third = _UNITS * row[12:]
+    if shape == "sphere":
+        geometry = fcl.Sphere(first)
+    elif shape == "box":
+        geometry = fcl.Box(2.0 * first, 2.0 * second, 2.0 * third)
+    else:
+        geometry = fcl.Cylinder(first, 2.0 * second)
+    return fcl.CollisionObject(geometry, fcl.Transform(row[3:12].reshape(3, 3), _UNITS * row[:3]))
 
 
 def _quaternion(x: float, y: float, z: float, length: float) -> list[float]:

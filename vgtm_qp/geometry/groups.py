@@ -11,13 +11,22 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.batch import Batch
 from vgtm_qp.geometry.bodies import Bodies
-from vgtm_qp.geometry.exact import CONTACT, distance_function, follow_function, sweep_function
+from vgtm_qp.geometry.exact import (
+    CONTACT,
+    NORMAL,
+    PROOF,
+    distance_function,
+    follow_function,
+    proof_function,
+    sweep_function,
+    width,
+)
 from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.pairs import Contacts, PairNames
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 
 Found = tuple[Index, Array]
-"""Contacts (R, ``CONTACT``) and before them the ``Group.numbers`` (R, 7) of their pairs."""
+"""Contacts (R, ``CONTACT``) and before them the ``Group.numbers`` (R, 8) of their pairs."""
 
 _FIRST = 16
 """The least distance is searched for among so many pairs first: those that were nearest at the reference."""
@@ -28,7 +37,9 @@ _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0,
 _WATCHED = ((follow_function, (1, 128)), (distance_function, (1,)), (sweep_function, (1,)))
 """What is evaluated in a watched scene, and for how many pairs at once,"""
 _LISTED = ((distance_function, (1, 64, 1024)), (sweep_function, (1, 64)))
-"""and in any other."""
+"""and in any other,"""
+_PROVEN = ((proof_function, (1,)),)
+"""and what FCL answers."""
 
 
 class Scene:
@@ -38,23 +49,25 @@ class Scene:
     ----------
     has_self : bool
         Whether pairs of bodies that are not neighbours count.
+    fcl : FclQueries or None
+        What supplies contacts; None where closed forms do alone.
     nothing : Contacts
         No rows.
     """
 
-    def __init__(self, bodies: Bodies, obstacles: Sequence[Obstacle], *, has_self: bool) -> None:
+    def __init__(self, bodies: Bodies, obstacles: Sequence[Obstacle], has_self: bool, by_fcl: bool) -> None:
         self.bodies, self.obstacles, self.has_self = bodies, tuple(obstacles), has_self
         self.pieces = ObstaclePieces(self.obstacles)
         names = tuple(obstacle.name for obstacle in self.obstacles)
         self.names = PairNames(bodies, names, tuple(self.pieces.obstacle.tolist()))
-        self.fcl = FclQueries(self.pieces)
-        self.nothing = self._contacts(np.zeros((0, 7), dtype=np.int64), np.zeros((0, CONTACT)))
+        self.fcl = FclQueries(self.pieces) if by_fcl else None
+        self.nothing = self._contacts(np.zeros((0, 8), dtype=np.int64), np.zeros((0, CONTACT)))
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
 
     def prepare(self, *, watched: bool) -> None:
         """Begin to compile what steps need: for a scene that is watched, and else for few and for many pairs."""
         shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
-        for make, counts in _WATCHED if watched else _LISTED:
+        for make, counts in (*(_WATCHED if watched else _LISTED), *(_PROVEN if self.fcl else ())):
             for shape in shapes:
                 for count in counts:
                     # A watch rarely needs this: only for a motion that it cannot prove itself.
@@ -70,7 +83,7 @@ class Scene:
         return self._contacts(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _contacts(self, numbers: Index, found: Array) -> Contacts:
-        normal, other, is_self = found[:, 5:], numbers[:, 5], numbers[:, 6] > 0
+        normal, other, is_self = found[:, NORMAL], numbers[:, 5], numbers[:, 6] > 0
         speed = np.zeros(len(found))
         if self.pieces.moving:
             piece = ~is_self
@@ -84,6 +97,7 @@ class Scene:
             normal_speed=speed,
             body=numbers[:, 4],
             other=other,
+            by_fcl=numbers[:, 7] > 0,
             names=self.names,
         )
 
@@ -125,14 +139,14 @@ class Group:
         `other` is a piece or, for ``"segment"``, a body.
     points : (C, 4) int
         The points that span `body`, then those of `other`, or the same again for a piece.
-    numbers : (C, 7) int
-        These, `body`, `other` and `is_self`.
+    numbers : (C, 8) int
+        These, `body`, `other`, `is_self`, and zero: 1 in those of a contact that FCL supplied.
     radius : (C,)
         Of the body, or the sum of both radii, m.
     distance : (C,)
         Surface distance at the reference configuration, m, ascending once :meth:`keep_near` was called.
-    is_self, moving, asks_fcl : bool
-        Whether these are pairs of bodies; whether they are not and some obstacle moves; whether FCL knows the shape.
+    is_self, moving : bool
+        Whether these are pairs of bodies; whether they are not and some obstacle moves.
     place : int
         Which list of :class:`vgtm_qp.geometry.candidates.Candidates` they are in.
     """
@@ -141,7 +155,6 @@ class Group:
         self.scene, self.shape, self.place = scene, shape, place
         self.is_self = shape == "segment"
         self.moving = scene.pieces.moving and not self.is_self
-        self.asks_fcl = shape in FclQueries.SHAPES
         self._distances = scene.batch(distance_function, shape)
         self._set(body, other, np.zeros(len(body)))
 
@@ -152,7 +165,8 @@ class Group:
         other_ends = bodies.points[other] if self.is_self else ends
         if self.is_self:
             self.radius = self.radius + bodies.radius[other]
-        self.numbers = np.column_stack([ends, other_ends, body, other, np.full(len(body), self.is_self)])
+        self.numbers = np.pad(np.column_stack([ends, other_ends, body, other]), ((0, 0), (0, 2)))
+        self.numbers[:, 6] = self.is_self
         self.points, self.body, self.other = self.numbers[:, :4], self.numbers[:, 4], self.numbers[:, 5]
 
     def __len__(self) -> int:
@@ -201,11 +215,12 @@ class Group:
 
     def at(self, X: Array, time: float, rows: Index) -> Array:
         """Return some pairs as the functions of :mod:`vgtm_qp.geometry.exact` take them, (k, 7 + width)."""
-        points = self.points[rows]
-        bodies, radius = X[points[:, :2]].reshape(-1, 6), self.radius[rows, None]
-        if self.is_self:
-            return np.concatenate([bodies, X[points[:, 2:]].reshape(-1, 6), radius], axis=1)
-        return np.concatenate([bodies, self.scene.pieces.at(time)[self.other[rows]], radius], axis=1)
+        numbers = self.numbers.take(rows, axis=0)
+        pairs = np.empty((len(rows), 7 + width(self.shape)))
+        pairs[:, :12], pairs[:, -1] = X.take(numbers[:, :4], axis=0).reshape(-1, 12), self.radius.take(rows)
+        if not self.is_self:
+            pairs[:, 6:-1] = self.scene.pieces.at(time).take(numbers[:, 5], axis=0)
+        return pairs
 
     def evaluate(self, pairs: Array) -> Array:
         """Return two contacts (k, 2, ``CONTACT``) for each of `pairs`, as given by :meth:`at`."""
@@ -235,16 +250,25 @@ class Group:
                 rows = rows[rows >= _FIRST]
         return best, row, len(rows)
 
-    def ask_fcl(self, X: Array, time: float, rows: Index, found: Array, asked: list[int]) -> None:
-        """Write FCL's answers for the rows `asked` of the contacts `found` (R, ``CONTACT``) of `rows` into these.
+    def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> Found:
+        """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`, where `by_fcl` as FCL has them.
 
-        Those should be few, and contacts that are unique: FCL may give one between the two ends of a contact.
+        Of a pair with two contacts FCL is asked about the points of the body that these are at. A contact stays as
+        it was found where an axis touches the other, and where FCL's answer is not proven: see ``proof_function``.
         """
-        for k in asked:
-            row = int(rows[k])
-            ends = X.take(self.points[row, :2], axis=0).ravel().tolist()
-            distance = float(found[k, 0] + self.radius[row])
-            answer = self.scene.fcl.witness(int(self.other[row]), time, ends, distance)
-            if answer is not None:
-                t, normal = answer
-                found[k, 1:] = 1.0 - t, t, 0.0, 0.0, *normal
+        numbers, fcl = self.numbers.take(rows, axis=0), self.scene.fcl
+        if fcl is None or not by_fcl or not len(rows):
+            return numbers, found
+        pairs, of_two = self.at(X, time, rows), (found[:, -1] == 0.0).nonzero()[0]
+        if len(of_two):
+            ends, t = pairs[of_two, :6], found[of_two, 2, None]
+            pairs[of_two, :6] = np.tile((1.0 - t) * ends[:, :3] + t * ends[:, 3:], 2)
+        answers = fcl.answers(pairs, None if self.is_self else numbers[:, 5].tolist(), time)
+        proven = self.scene.batch(proof_function, self.shape)(pairs, answers)
+        proven[of_two, 1:3] = found[of_two, 1:3]
+        # NaN fails the comparison.
+        holds = proven[:, -1] <= PROOF
+        fcl.refused += len(rows) - int(np.count_nonzero(holds))
+        np.copyto(found[:, :-1], proven[:, :-1], where=holds[:, None])
+        numbers[:, -1] = holds
+        return numbers, found

@@ -10,8 +10,6 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.bodies import Bodies
 
-_COLUMNS = ("distance", "normal", "points", "weights", "is_self", "normal_speed", "body", "other")
-
 
 class Pair(NamedTuple):
     """A body and a piece of an obstacle, or another body."""
@@ -58,6 +56,8 @@ class Contacts:
         Velocity of the obstacle along `normal`, m/s.
     body, other : (R,) int
         `other` is a piece of an obstacle or, where ``is_self``, a body.
+    by_fcl : (R,) bool
+        Whether FCL supplied the row; a closed form did otherwise.
     names : PairNames
         What :meth:`name` reads.
     """
@@ -70,6 +70,7 @@ class Contacts:
     normal_speed: Array
     body: Index
     other: Index
+    by_fcl: Mask
     names: PairNames
 
     def __len__(self) -> int:
@@ -82,10 +83,6 @@ class Contacts:
     def pair(self, k: int) -> Pair:
         """Return which pair row `k` is about."""
         return Pair(int(self.body[k]), int(self.other[k]), bool(self.is_self[k]))
-
-    def select(self, rows: Index | Mask) -> Contacts:
-        """Return some of the rows."""
-        return Contacts(**{column: getattr(self, column)[rows] for column in _COLUMNS}, names=self.names)
 
 
 @dataclass(frozen=True, eq=False)

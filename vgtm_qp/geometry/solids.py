@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.geometry.exact import NORMAL
 from vgtm_qp.geometry.groups import Found, Group, Scene
 
 _ROWS = 200_000
@@ -42,7 +43,7 @@ class Solids:
             depth = found[:, 0] + radius
             found[:, 0] = -depth - radius
             # The way out, where the axis does not touch the surface.
-            found[:, 5:] *= np.where(depth > 0.0, -1.0, 1.0)[:, None]
+            found[:, NORMAL] *= np.where(depth > 0.0, -1.0, 1.0)[:, None]
             parts.append((group.numbers[nearest], found))
         return parts
 

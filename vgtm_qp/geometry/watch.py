@@ -14,8 +14,8 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.candidates import every_pair
-from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
-from vgtm_qp.geometry.formulas import FAR, FURTHEST
+from vgtm_qp.geometry.exact import CONTACT, NORMAL, WIDTH, follow_function
+from vgtm_qp.geometry.formulas import FURTHEST
 from vgtm_qp.geometry.groups import Found, Group, Scene
 from vgtm_qp.geometry.pairs import Contacts
 from vgtm_qp.geometry.shapes import GeometryError
@@ -74,7 +74,7 @@ class _WatchedGroup:
         least = float(found[:, 0].min())
         self._is_close, self.overlaps = least < limit, not least > 0.0
         self.contacts = found[:, :-1].reshape(2 * size, CONTACT)
-        self._known[near, WIDTH + 1 :] = found[:, 5:CONTACT]
+        self._known[near, WIDTH + 1 :] = found[:, NORMAL]
         self._lower[near] = found[:, 0]
         # The bound from the motion alone holds as well.
         self.lowest = float(np.maximum(found[:, -1], lowest).min())
@@ -84,16 +84,11 @@ class _WatchedGroup:
         self._near, self.contacts = self._near[:0], self.contacts[:0]
         self._is_close, self.overlaps, self.lowest = False, False, np.inf
 
-    def near(self, X: Array, limit: float, fcl_reach: float) -> Found:
+    def near(self, X: Array, limit: float, by_fcl: bool) -> Found:
         """Return the contacts nearer than `limit`, m, in the present state `X`."""
         rows = (self.contacts[:, 0] < limit).nonzero()[0]
         found, pairs = self.contacts.take(rows, axis=0), self._near.take(rows >> 1)
-        if self.group.asks_fcl and fcl_reach > 0.0:
-            asked = (found[:, 0] < fcl_reach).nonzero()[0].tolist()
-            # Where there is a second contact, the nearest point is not unique.
-            unique = [k for k in asked if rows[k] % 2 == 0 and self.contacts[rows[k] + 1, 0] >= FAR]
-            self.group.ask_fcl(X, 0.0, pairs, found, unique)
-        return self.group.numbers.take(pairs, axis=0), found
+        return self.group.contacts(X, 0.0, pairs, found, by_fcl)
 
 
 class Watch:
@@ -106,10 +101,10 @@ class Watch:
         self._at, self._places = b"", np.zeros((0, 3))
         self._limits = self._wanted = (-np.inf, -np.inf)
 
-    def near(self, X: Array, limit: float, self_limit: float, fcl_reach: float) -> Contacts | None:
+    def near(self, X: Array, limit: float, self_limit: float, *, by_fcl: bool = False) -> Contacts | None:
         """Return all contacts nearer than `limit`, or `self_limit` between bodies, m; None where surfaces overlap.
 
-        `X` (P, 3) are positions of the points, and FCL is asked about obstacles nearer than `fcl_reach` too, m.
+        `X` (P, 3) are positions of the points; `by_fcl` says whether FCL supplies the contacts.
         """
         if limit > self._limits[0] or self_limit > self._limits[1] or not self._is_at(X):
             self._move_to(X, (limit, self_limit))
@@ -117,7 +112,7 @@ class Watch:
         limits, near = (limit, self_limit), [pairs for pairs in self._groups if len(pairs.contacts)]
         if any(pairs.overlaps for pairs in near):
             return None
-        return self._scene.contacts([pairs.near(X, limits[pairs.group.is_self], fcl_reach) for pairs in near])
+        return self._scene.contacts([pairs.near(X, limits[pairs.group.is_self], by_fcl) for pairs in near])
 
     def follow(self, start: Array, end: Array, floor: float, self_floor: float) -> bool:
         """Return whether no surface distance falls below its floor, m, while points move straight to `end`.

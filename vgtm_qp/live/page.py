@@ -18,7 +18,7 @@ from vgtm_qp.live.session import Session
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
-from vgtm_qp.methods import PRESETS, method_name, methods_for
+from vgtm_qp.methods import method_name, methods_for
 from vgtm_qp.problem import Problem
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled, stroke_colours
 from vgtm_qp.view.scene import ArmScene, viser_server
@@ -176,7 +176,7 @@ class _Page:
         self._on(self._slider.on_update, self._scrub)
         self._on(again.on_click, lambda _: self._solve())
         self._on(home.on_click, lambda _: self._go_home())
-        self._on(method.on_update, lambda _: self._settings.update(PRESETS[method.value]))
+        self._on(method.on_update, lambda _: self._try(lambda: session.use_method(method.value)))
         self._set_by(safe, "clearance.safe", float)
 
     def _add_weight(self, name: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.methods import Resolver
+from vgtm_qp.methods import PRESETS, Resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.curve import free_basis
 from vgtm_qp.step.path import Path
@@ -25,6 +25,9 @@ OUTCOMES = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatu
 _REACHED = 1e-4
 _STRIDE = 0.06
 _RETRY_AFTER = 10
+
+_WEIGHTS = {key for changes in PRESETS.values() for key in changes if key.count(".") == 2}
+"""Keys of the weights and gains that some methods bring with them."""
 
 _STRAIGHTENS = 1e-6
 """Weight that makes a fitted curve as straight as the stations let it be."""
@@ -50,7 +53,7 @@ class Session:
     """One arm, its resolver, and what is wanted of it. Not to be shared by threads."""
 
     def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+        self.problem = self._given = problem
         self._resolver = Resolver(problem)
         arm = self._resolver.setup.arm
         directory = problem.source.parent if problem.source else "."
@@ -138,6 +141,17 @@ class Session:
         resolver.state = _with_curve(self.state, resolver.setup)
         self.problem, self._resolver = problem, resolver
         self._waiting, self._held_by = 0, ()
+
+    def use_method(self, name: str) -> None:
+        """Change to the method called `name`, with the weights and gains of the problem that was given.
+
+        VgtmError, and no change, where it cannot move this arm.
+        """
+        own = {
+            key: getattr(getattr(self._given.method, key.split(".")[1]), key.split(".")[2])
+            for key in _WEIGHTS
+        }
+        self.change({**own, **PRESETS[name]})
 
     def advance(self, dt: float) -> bool:
         """Make one step of duration `dt`, s, towards what is wanted; return whether the arm moved.

@@ -53,9 +53,17 @@ def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]
     """Yield name and changed problem of each retry that applies; nothing if retries are off."""
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
+    # Where stations gave way and it did not suffice, they are not held from the start; all that follows builds on it.
+    elastic = (
+        {"method.tracking_mode": "elastic"}
+        if problem.method.holds_curve and not problem.method.goes_by_bays
+        else {}
+    )
+    if elastic and problem.method.tracking_mode == "exact":
+        yield "elastic tracking", problem.replace(elastic)
     for name, changes in _changes(problem, dead_end):
         with suppress(ProblemError):
-            yield name, problem.replace(changes)
+            yield name, problem.replace(elastic | changes)
 
 
 def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -75,7 +83,7 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
         yield "shorter steps", {"maneuver.steps": 3 * problem.maneuver.steps}
     yield "actuator rates as the metric", {"method.weights.actuator_rate": rate}
     # Hard tracking asks for the curve, so there is no retry without it.
-    if method.tracking != "none" and not method.holds_curve:
+    if method.tracking == "coupled" and method.tracking_mode != "hard":
         yield "no curve", {"method": method.kept_by("qp", "none"), "curve.control_vertex_goals": []}
     if vertices:
         yield "more control vertices", {"curve.control_vertices": curve.control_vertices + _MORE_VERTICES}

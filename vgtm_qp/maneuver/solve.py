@@ -114,6 +114,7 @@ class _Attempt:
         self.value = self.plan.path.start
         self.rows: dict[str, list[Any]] = {}
         self._seconds, self._phases = 0.0, [0.0] * len(resolver.phases)
+        self.clearance_rows = {"fcl": 0, "exact": 0}
         self._add_row()
 
     @property
@@ -182,6 +183,8 @@ class _Attempt:
         """Count the step that was taken towards `aim`."""
         reached = step.status is StepStatus.REACHED
         self.value = aim if reached else self.value + step.progress * (aim - self.value)
+        self.clearance_rows["fcl"] += step.fcl_rows
+        self.clearance_rows["exact"] += step.exact_rows
         self._add_row()
 
     def _add_row(self) -> None:
@@ -240,6 +243,7 @@ def _assemble(
         "schema_version": SCHEMA_VERSION,
         "problem": problem.to_dict(),
         "arm": setup.arm.record(),
+        "curve": attempt.resolver.setup.layout.record(),
         "status": "solved" if stop is None else "blocked",
         # That of the last whole row: an interrupt may have come before the next.
         "reached": float(attempt.rows["progress"][-1]),
@@ -258,6 +262,7 @@ def _assemble(
         "certificate": None,
         # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank.
         "jacobian_rank": resolver.rank,
+        "clearance_rows": attempt.clearance_rows,
     }
     arrays: dict[str, Any] = {name: np.asarray(rows, dtype=float) for name, rows in attempt.rows.items()}
     rotation = arrays.pop("tip_target_rotation")

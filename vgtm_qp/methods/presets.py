@@ -35,27 +35,34 @@ _CURVE_OBSTACLES = {
     "method.gains.obstacle_potential": 1e-4,
 }
 
-PRESETS: MappingProxyType[str, dict[str, Any]] = MappingProxyType(
-    {
-        "qp": {"method.name": "qp", "method.tracking": "coupled"},
-        "qp-none": {"method.name": "qp", "method.tracking": "none"},
-        "qp-recursive": {"method.name": "qp", "method.tracking": "recursive"},
-        "qp-parallel": {"method.name": "qp", "method.tracking": "parallel"},
-        "pseudoinverse": _DENSE,
-        "pseudoinverse-plain": {**_DENSE, "method.null_space": []},
-        "pseudoinverse-weighted": {**_DENSE, "method.variant": "weighted"},
-        "pseudoinverse-damped": {**_DENSE, "method.variant": "damped"},
-        "pseudoinverse-truncated": {**_DENSE, "method.variant": "truncated"},
-        "pseudoinverse-sparse": _SPARSE,
-        "pseudoinverse-corrected": {**_SPARSE, **_CORRECTED},
-        "pseudoinverse-obstacles": {**_SPARSE, **_CORRECTED, **_OBSTACLES},
-        "curve-pseudoinverse": _CURVE,
-        "curve-pseudoinverse-plain": {**_CURVE, "method.null_space": []},
-        "curve-pseudoinverse-parallel": {**_CURVE, "method.tracking": "parallel"},
-        "curve-pseudoinverse-corrected": {**_CURVE, **_CORRECTED},
-        "curve-pseudoinverse-obstacles": {**_CURVE, **_CORRECTED, **_CURVE_OBSTACLES},
-    }
-)
+_CHANGES: dict[str, dict[str, Any]] = {
+    "qp": {"method.name": "qp", "method.tracking": "coupled"},
+    "qp-none": {"method.name": "qp", "method.tracking": "none"},
+    "qp-recursive": {"method.name": "qp", "method.tracking": "recursive"},
+    "qp-parallel": {"method.name": "qp", "method.tracking": "parallel"},
+    "pseudoinverse": _DENSE,
+    "pseudoinverse-plain": {**_DENSE, "method.null_space": []},
+    "pseudoinverse-weighted": {**_DENSE, "method.variant": "weighted"},
+    "pseudoinverse-damped": {**_DENSE, "method.variant": "damped"},
+    "pseudoinverse-truncated": {**_DENSE, "method.variant": "truncated"},
+    "pseudoinverse-sparse": _SPARSE,
+    "pseudoinverse-corrected": {**_SPARSE, **_CORRECTED},
+    "pseudoinverse-obstacles": {**_SPARSE, **_CORRECTED, **_OBSTACLES},
+    "curve-pseudoinverse": _CURVE,
+    "curve-pseudoinverse-plain": {**_CURVE, "method.null_space": []},
+    "curve-pseudoinverse-parallel": {**_CURVE, "method.tracking": "parallel"},
+    "curve-pseudoinverse-corrected": {**_CURVE, **_CORRECTED},
+    "curve-pseudoinverse-obstacles": {**_CURVE, **_CORRECTED, **_CURVE_OBSTACLES},
+}
+_PLAIN = {
+    "method.tracking": "coupled",
+    "method.variant": "moore-penrose",
+    "method.algebra": "dense",
+    "method.correct": False,
+    "method.null_space": None,
+}
+
+PRESETS = MappingProxyType({name: {**_PLAIN, **changes} for name, changes in _CHANGES.items()})
 """What each name changes. ``-plain`` has no null-space vector; ``-corrected`` and ``-obstacles`` correct the drift."""
 
 DEFAULT_METHODS = (

@@ -38,7 +38,7 @@ _QP, _COUPLED, _INVERSE, _CURVE = (
 SERVED: dict[str, tuple[str, ...]] = {
     "name": tuple(_WAYS),
     "tracking": (*_QP, *_CURVE),
-    "hard_tracking": ("coupled",),
+    "tracking_mode": ("coupled",),
     "hard_coordinates": _COUPLED,
     "solver": ("coupled", "none"),
     "retries": tuple(_WAYS),
@@ -142,14 +142,16 @@ class Method(Table, called="[method]"):
         description="truss and curve together; curve first, then bay after bay or all bays at once; no curve. With "
         "curve-pseudoinverse coupled means recursive",
     )
-    hard_tracking: Flag = Field(
-        default=False, description="whether faces stay on the curve exactly; elastic otherwise"
+    tracking_mode: Literal["exact", "hard", "elastic"] = Field(
+        default="exact",
+        description="exact: faces are on the curve wherever they can be, and the gap says where not; hard: always, or "
+        "the arm stops; elastic: as near as the weights tracking and tangent draw them",
     )
     hard_coordinates: tuple[HardCoordinate, ...] = Field(
         default=("position",),
         min_length=1,
-        description="what of each face hard_tracking keeps on the curve: position; position and pointing; or "
-        "position, pointing and orientation, as far as the bays of the module have the motions",
+        description="what of each face is kept on the curve unless tracking is elastic: position; position and "
+        "pointing; or position, pointing and orientation, as far as the bays of the module have the motions",
     )
     solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
     retries: Flag = Field(
@@ -204,7 +206,8 @@ class Method(Table, called="[method]"):
     @property
     def holds_curve(self) -> bool:
         """Whether stations are kept on the curve by equalities."""
-        return self.hard_tracking or self.goes_by_bays
+        is_held = self.tracking == "coupled" and self.tracking_mode != "elastic"
+        return self.goes_by_bays or (self.name == "qp" and is_held)
 
     @property
     def draws_vertices(self) -> bool:

@@ -73,6 +73,10 @@ class ClearanceTable(Table, called="[clearance]"):
         default=0.0002,
         description="distance that the QP keeps over the least one, so that the exact checks pass at once, m",
     )
+    distance: Literal["fcl", "exact"] = Field(
+        default="fcl",
+        description="what gives the rows of pairs that can become active: FCL, each answer proven, or closed forms",
+    )
     self_collision: Flag = Field(
         default=True, description="whether members that share no node keep apart too"
     )

@@ -46,7 +46,11 @@ class BaySolver(CondensedSolver):
         spare = bays[-1].spare.stop
         self._free = slice(spare, spare + layout.free_curve)
         self._unknown = np.concatenate([np.full(self._free.stop, -1), self._after])
-        self._actuators, self._bounded, self._equal = self._before, self._before, 0
+        # Bays follow the curve in positions, or in all; the turn of the last station alone is left to the QP.
+        followed = 3 * len(layout.tracked) + layout.turns * len(layout.tracked) * layout.hard_turns
+        left = builder.hard_gaps[builder.hard_gaps >= builder.gaps[0] + followed]
+        self._actuators, self._equal = self._before, len(left)
+        self._bounded = np.concatenate([left, self._actuators])
         self._actuated_rows = np.flatnonzero(layout.arm.actuated)
 
     def _reduction(self, numbers: StepNumbers, qp: StepQP) -> tuple[Array, Array]:

@@ -51,7 +51,9 @@ class CondensedSolver:
         hessian = Z.T @ (qp.P @ Z)
         with np.errstate(invalid="ignore"):  # What is infinite becomes NaN, and is refused with the answer.
             gradient = Z.T @ (qp.P @ start + qp.q)
-        rows = np.concatenate([builder.tip_rows, np.arange(builder.fixed_rows, len(qp.row_lower))])
+        rows = np.concatenate(
+            [builder.tip_rows, builder.leg_rows, np.arange(builder.fixed_rows, len(qp.row_lower))]
+        )
         bounded, size = self._bounded, len(self._unknown)
         constraint = np.concatenate([Z[bounded], (qp.A @ Z)[rows]])
         known = np.concatenate([start[bounded], (qp.A @ start)[rows]])

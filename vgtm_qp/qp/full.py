@@ -128,9 +128,10 @@ class FullBuilder:
         self._rows_i = np.concatenate([entry.rows.reshape(-1) + start for entry, start in entries])
         self._rows_j = np.concatenate([entry.columns.reshape(-1) for entry, _ in entries])
         self.tip_rows = np.arange(starts[1], starts[2])
-        self.gap_rows = np.arange(starts[min(3, len(starts) - 1)], self.fixed_rows)
+        self.leg_rows = np.arange(self.fixed_rows - len(layout.legs), self.fixed_rows)
+        self.gap_rows = np.arange(starts[min(3, len(starts) - 1)], self.fixed_rows - len(layout.legs))
         self.gaps = np.arange(self.column["position"].start, self.column["spacing"].stop)
-        self.hard_gaps = self.gaps[: layout.hard_rows]
+        self.hard_gaps = self.gaps[layout.hard]
         self._pattern: tuple[bytes, ...] | None = None
         self._matrix = sparse.csc_matrix((0, self.size))
         self._order: Index = np.zeros(0, dtype=np.int64)
@@ -187,17 +188,16 @@ class FullBuilder:
         )
         column_lower[self.column["slack"]] = 0.0
         column_lower[-1], column_upper[-1] = numbers.progress_lower, numbers.progress_upper
-        if layout.hard_tracking:
-            column_lower[self.column["position"]] = column_upper[self.column["position"]] = 0.0
-        if layout.hard_turns:
-            column_lower[self.column["tangent"]] = column_upper[self.column["tangent"]] = 0.0
+        column_lower[self.hard_gaps] = column_upper[self.hard_gaps] = 0.0
         equal = np.concatenate([rows.rhs(numbers).reshape(-1) for rows in self._fixed])
+        below = np.concatenate([equal, np.full(len(clearance), np.inf)])
+        below[self.leg_rows] = np.inf
         return StepQP(
             self._hessian,
             q,
             self._matrix,
             np.concatenate([equal, clearance.lower]),
-            np.concatenate([equal, np.full(len(clearance), np.inf)]),
+            below,
             column_lower,
             column_upper,
             self._column_labels,
@@ -250,11 +250,11 @@ class FullBuilder:
             ),
             "position": (
                 labels(f"gap: {word} ", "tracking gap", "m", tracked),
-                0.0 if layout.hard_tracking else weights.tracking,
+                sparse.diags(layout.gap_weights.reshape(-1)),
             ),
             "tangent": (
                 labels(f"tilt: {word} ", "tangent gap", "rad", tracked, self._turns),
-                sparse.diags(layout.turn_weights * (not layout.hard_turns)),
+                sparse.diags(layout.tilt_weights.reshape(-1)),
             ),
             "spacing": (
                 labels("stretch: piece ", "spacing gap", "m", range(layout.spacings), " "),
@@ -369,6 +369,19 @@ class FullBuilder:
                 [Label(f"spacing: piece {piece}", "spacing", "m") for piece in pieces],
                 [_Entries(*_grid(pieces, curve), spacing), gap("spacing")],
                 lambda numbers: -numbers.spacing_rhs,
+            ),
+            _Rows(
+                [
+                    Label(f"curve {name} leg", "curve leg", "m")
+                    for name in ("first", "last")[: len(layout.legs)]
+                ],
+                [
+                    _Entries(
+                        *_grid(np.arange(len(layout.legs)), curve[: 3 * layout.vertices]),
+                        lambda numbers: numbers.legs.over_vertices(layout),
+                    )
+                ],
+                lambda numbers: numbers.legs.lower,
             ),
         ]
 

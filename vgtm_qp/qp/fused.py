@@ -52,7 +52,9 @@ class FusedSolver:
         self._torsion = size - 1 - layout.torsion
         self._shape = arm.home_configuration.shape
         self._tip = len(layout.tip_rows)
-        self._hard = layout.hard_rows
+        self._hard = len(layout.hard)
+        self._equal, self._legs = self._tip + self._hard, len(layout.legs)
+        self._hard_at = nodes + layout.hard
         out = self._rows.outputs
         self._stack = out[0].reshape(size, -1)
         self._response = self._stack[:, :nodes]
@@ -75,11 +77,11 @@ class FusedSolver:
         self._answer, self._multipliers = settled.inputs[17], settled.inputs[18]
         self._gram, self._follows = settled.inputs[19].reshape(actuators, actuators), settled.inputs[20]
         self._room = _Room()
-        self._reserve(size + self._tip + self._hard + NEAR)
+        self._reserve(size + self._equal + self._legs + NEAR)
         self._draw(layout)
         if self._hard:
             self._soft = np.ones(self._stack.shape[1])
-            self._soft[nodes : nodes + self._hard] = 0.0
+            self._soft[self._hard_at] = 0.0
 
     def drawn(self, layout: Layout) -> FusedSolver:
         """Return the solver of a layout that differs in the control vertices with goals alone; buffers are shared."""
@@ -99,6 +101,7 @@ class FusedSolver:
     def load(self, asked: StepInput) -> None:
         """Linearise and condense."""
         asked.load(self._rows)
+        self._vertices = asked.vertices
         self._rows()
         if self.layout.vertex_goals:
             self._goal_pull = self._goal_weight[:, None] * self._offset
@@ -114,7 +117,7 @@ class FusedSolver:
             As ``CondensedSolver.solve``.
         """
         answer = self.ask(clearance)
-        x, rows = answer.x, self._tip + self._hard + len(clearance)
+        x, rows = answer.x, self._equal + self._legs + len(clearance)
         bounds = self._room.lower[: self._size + rows], self._room.upper[: self._size + rows]
         daqp.check(answer, self._hessian, self._gradient, self._room.constraint[:rows], *bounds)
         count = self._actuators
@@ -152,15 +155,23 @@ class FusedSolver:
         """
         size, count, hard, near = self._size, self._actuators, self._hard, len(clearance.lower)
         hessian, gradient = self._assemble()
-        first = self._tip + hard
+        first = self._equal + self._legs
         rows = first + near
         if size + rows > len(self._room.lower):
             self._reserve(2 * (size + rows))
         constraint, lower, upper = self._room.constraint[:rows], self._room.lower, self._room.upper
         if hard:
-            block = self._stack[:, self.layout.node_columns : self.layout.node_columns + hard]
-            constraint[self._tip : first, :-1] = block[:-1].T
-            upper[size + self._tip : size + first] = lower[size + self._tip : size + first] = -block[-1]
+            block = self._stack[:, self._hard_at]
+            constraint[self._tip : self._equal, :-1] = block[:-1].T
+            held = slice(size + self._tip, size + self._equal)
+            upper[held] = lower[held] = -block[-1]
+        if self._legs:
+            axes, least = self.layout.leg_bounds(self._vertices, self._normal)
+            if self._legs > 1:
+                # Control vertices stand behind the leg at the base.
+                last = self._torsion - 6
+                constraint[self._equal + 1, last : last + 6] = np.concatenate([-axes[1], axes[1]])
+            lower[size + self._equal : size + first] = least
         if near:
             moved = np.dot(self._spread_rows(clearance), self._response.T)
             moved *= self._scale
@@ -224,7 +235,7 @@ class FusedSolver:
 
     def _settle(self, follows: float) -> None:
         """Settle where the answer leads, or at 0 the configuration that was loaded."""
-        if not self._hard:
+        if not self.layout.hard_tracking:
             response = self._response[: self._actuators]
             np.dot(response, response.T, out=self._gram)
         self._follows[0] = follows
@@ -245,18 +256,21 @@ class FusedSolver:
 
     def _reserve(self, rows: int) -> None:
         """Make room for bounds of all unknowns and `rows` less so many constraints; kernels write the first of them."""
-        size, equal = self._size, self._size + self._tip + self._hard
+        size, equal = self._size, self._size + self._equal
         self._room.constraint = np.zeros((rows - size, size))
         self._room.lower, self._room.upper = np.full(rows, -UNBOUNDED), np.full(rows, UNBOUNDED)
         self._room.sense = np.zeros(rows, dtype=np.int32)
         self._room.row_start = self._width * np.arange(rows - size)[:, None, None]
         self._room.sense[size:equal] = EQUALITY
+        if self._legs:
+            # The first leg is the first of the curve's free coordinates.
+            self._room.constraint[self._equal, self._actuators] = 1.0
         tip_rows = self._room.constraint[: self._tip].reshape(-1)
         bounds = (values[: size + self._tip] for values in (self._room.lower, self._room.upper))
         for result, array in enumerate((tip_rows, *bounds), start=1):
             array[:] = self._rows.outputs[result]
             self._rows.bind_output(result, array)
-        checked = equal + NEAR
+        checked = equal + self._legs + NEAR
         self._room.used = checked
         for argument, array in (
             (9, self._room.constraint[: checked - size]),

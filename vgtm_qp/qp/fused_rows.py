@@ -68,23 +68,24 @@ def row_function(layout: Layout) -> Bound:
 def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX]) -> list[ca.MX]:
     """Return the rows of all gaps, then turns, then spacings, times the roots of their weights; of hard rows, by 1."""
     layout, arm, weights = graph.layout, graph.layout.arm, graph.layout.weights
-    hard, turned, actuators = layout.hard_tracking, layout.hard_turns, len(arm.actuators)
+    actuators = len(arm.actuators)
     tracking, tangent, roll, spacing = graph.weights(
-        1.0 if hard else weights.tracking,
-        1.0 if turned else weights.tangent,
-        1.0 if turned else weights.roll,
-        weights.spacing,
+        weights.tracking, weights.tangent, weights.roll, weights.spacing
     )
     station, motion, offset = _condensed_station(layout, actuators), graph.motion, graph.offset
     every = offset if layout.general is None else ca.vertcat(ca.vec(offset), ca.MX.zeros(layout.torsion))
-    turn_scale = ca.sqrt(ca.vertcat(tangent, tangent, roll)[: layout.turns])
-    closed = 1.0 if hard else motion, 1.0 if turned else motion
+    scales = ca.repmat(ca.sqrt(tracking), 3), ca.sqrt(ca.vertcat(tangent, tangent, roll)[: layout.turns])
     gaps, tilts = [], []
     for k, face in enumerate(layout.tracked.tolist()):
         moving = displacement(arm.stations.nodes[face].tolist())
-        gap, tilt = station(*graph.station(k), moving, every, graph.normal, *closed)
-        gaps.append(ca.sqrt(tracking) * gap)
-        tilts.append(ca.repmat(turn_scale, 1, gap.shape[1]) * tilt)
+        hard = [ca.DM(mask[k].astype(float)) for mask in (layout.hard_gaps, layout.hard_tilts)]
+        # What is hard is closed by corrections too, and stands there without a weight.
+        closed = [mask + (1.0 - mask) * motion for mask in hard]
+        rows = station(*graph.station(k), moving, every, graph.normal, *closed)
+        weighed = [mask + (1.0 - mask) * scale for mask, scale in zip(hard, scales, strict=True)]
+        gap, tilt = (ca.repmat(w, 1, row.shape[1]) * row for w, row in zip(weighed, rows, strict=True))
+        gaps.append(gap)
+        tilts.append(tilt)
     if layout.spacings:
         pieces, rows = graph.given[4], graph.given[5].T
         stretch = ca.horzcat(curve_rows.free_columns(rows, graph.normal), motion * pieces + rows @ every)
@@ -109,7 +110,11 @@ def _condensed_station(layout: Layout, actuators: int) -> ca.Function:
     moving = ca.SX.sym("moving", 9, actuators + 1)
     size = 3 * layout.vertices + layout.torsion
     offset = ca.SX.sym("offset", 3, layout.vertices) if layout.general is None else ca.SX.sym("offset", size)
-    normal, gap_on, turn_on = ca.SX.sym("normal", 3), ca.SX.sym("gap_on"), ca.SX.sym("turn_on")
+    normal, gap_on, turn_on = (
+        ca.SX.sym("normal", 3),
+        ca.SX.sym("gap_on", 3),
+        ca.SX.sym("turn_on", layout.turns),
+    )
     centre, turned = ca.kron(station.weights.T, ca.SX.eye(3)) @ moving, station.face @ moving
     gap_curve, turn_curve, gap_offset, turn_offset = station.over_curve(offset, normal)
     gap = gap_on * station.gap + centre[:, -1] + gap_offset

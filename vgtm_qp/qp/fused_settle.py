@@ -75,7 +75,7 @@ def settle_function(layout: Layout) -> Bound:
         for _ in range(_HELD_STEPS):
             end = held(end, points)
     first = error = tip_error(layout.tip_rows, *tip(end), *goal_pose)
-    if not layout.hard_rows:
+    if not layout.hard_tracking:
         gain = qp.gain(stiffness)
         settling = symbols.coordinates(scale * (qp.response @ gain), gain)
         step = _settling_step(layout, symbols, constants, tip, settling.shape)
@@ -142,7 +142,7 @@ class _SolvedQP:
         self._layout, count = layout, len(layout.arm.actuators)
         self._size = size = count + layout.free_curve + 1
         self._tip = len(layout.tip_rows)
-        equal = self._tip + layout.hard_rows + NEAR
+        equal = self._tip + len(layout.hard) + len(layout.legs) + NEAR
         self.low, self.high = (ca.MX.sym(name, size + equal) for name in ("low", "high"))
         self.constraint, self.multipliers = (
             ca.MX.sym("C", size, equal),

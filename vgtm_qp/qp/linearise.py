@@ -12,7 +12,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.graph import StationSymbols, StepGraph
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
+from vgtm_qp.qp.numbers import ClearanceRows, Legs, StepNumbers
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 
@@ -106,10 +106,8 @@ class Linearisation:
             base_rhs = -base_axes @ (vertices[1] - vertices[0])
         if moves:
             pull = layout.vertex_gradient(vertices, asked.vertex_goals)
-        if not (moves or layout.hard_tracking):
-            gap = np.zeros_like(gap)
-        if not (moves or layout.hard_turns):
-            turn = np.zeros_like(turn)
+        if not moves:
+            gap, turn = gap * layout.hard_gaps, turn * layout.hard_tilts
         face = face.reshape(count, 9, turns).transpose(0, 2, 1)
         curve = curve.reshape(count, curve.size // max(count * turns, 1), turns).transpose(0, 2, 1)
         spacing = np.zeros(0) if asked.curve is None else asked.curve.spacing
@@ -134,6 +132,7 @@ class Linearisation:
             base_axes=base_axes,
             base_rhs=base_rhs,
             clearance=clearance,
+            legs=Legs(*layout.leg_bounds(vertices, np.cross(base_axes[0], base_axes[1]))),
             spacing_rhs=spacing if moves else 0.0 * spacing,
             curve=asked.curve,
         )

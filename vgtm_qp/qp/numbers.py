@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,12 +22,15 @@ class ClearanceRows:
     ``nodes`` (R, 4) are node indices: the two ends of the member, then those of the other member in a self pair
     (repeated with zero coefficients otherwise); with offset joints (R, 12), the triangles of those four ends.
     ``coefficients`` is (R, 4, 3) or (R, 12, 3). Base nodes may occur; their displacement is already part of ``lower``.
+    So many of the rows were supplied ``by_fcl``, and so many ``by_formula``; the others are of angles.
     """
 
     nodes: Index = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))
     coefficients: Array = field(default_factory=lambda: np.zeros((0, 4, 3)))
     lower: Array = field(default_factory=lambda: np.zeros(0))
     name: Callable[[int], str] = str
+    by_fcl: int = 0
+    by_formula: int = 0
 
     def __len__(self) -> int:
         return len(self.lower)
@@ -55,6 +59,30 @@ class ClearanceRows:
             np.concatenate([rows.coefficients for rows in parts]),
             np.concatenate([self.lower, other.lower]),
             lambda k: first(k) if k < count else second(k - count),
+            self.by_fcl + other.by_fcl,
+            self.by_formula + other.by_formula,
+        )
+
+
+class Legs(NamedTuple):
+    """The legs of the control polygon that may not turn round: axes . (displacement of their ends) >= lower, in m.
+
+    Attributes
+    ----------
+    axes, lower : (G, 3), (G,)
+        Of the legs of ``Layout.legs``.
+    """
+
+    axes: Array
+    lower: Array
+
+    def over_vertices(self, layout: Layout) -> Array:
+        """Return (G, 3 V) the rows over the control vertices."""
+        count = np.zeros((len(layout.legs), layout.vertices))
+        at = np.arange(len(count))
+        count[at, layout.legs[:, 0]], count[at, layout.legs[:, 1]] = -1.0, 1.0
+        return np.asarray(
+            (count[:, :, None] * self.axes[:, None, :]).reshape(len(count), 3 * layout.vertices)
         )
 
 
@@ -70,6 +98,7 @@ class RowNumbers:
     tip_rate, tip_rhs : (n_e,)
     progress_lower, progress_upper, progress_gradient, progress_curvature : float
     clearance : ClearanceRows
+    legs : Legs
     """
 
     lower: Array
@@ -83,6 +112,7 @@ class RowNumbers:
     progress_gradient: float
     progress_curvature: float
     clearance: ClearanceRows
+    legs: Legs
 
 
 @dataclass
@@ -99,7 +129,7 @@ class StepNumbers(RowNumbers):
         tangent = tangent_face d_rho[face] + tangent_curve . (W' d_p) + tangent_rhs   rad
         stretch = spacing rows d_c + spacing_rhs                   m
         d_p[0]  = base_displacement, base_axes (d_p[1] - d_p[0]) = base_rhs            m
-        clearance rows
+        first and last leg of the control polygon; clearance rows
 
     Attributes
     ----------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any, Literal
 
 from vgtm_qp.errors import ResultError
@@ -89,6 +89,15 @@ class Certificate:
         actuated lengths, m/m.
     tip_error_per_millimetre : Measure
         Greatest singular value of the same: mm at the tip for actuator errors whose squares sum to 1 mm^2.
+    tracking_gap, states_off_curve : Measure
+        Greatest distance of a station from its node on the reference curve, m, and the share of the states in which it
+        is more than 1e-6 m; but for the home pose, to which the curve is fitted.
+    curve_end_gap, curve_end_angle : Measure
+        Greatest distance of the curve's end from the end effector, m, and angle between their directions, rad, where
+        the method ties them.
+    fcl_rows, exact_rows : Measure
+        How many clearance rows the solver had of FCL, and how many of closed forms: its own count, which the states
+        cannot show.
     contradictions, notes : tuple of str
         What in the file disagrees with itself or with its problem, and what could not be checked, one line each.
     """
@@ -110,6 +119,12 @@ class Certificate:
     length_singular_value: Measure
     tip_singular_value: Measure
     tip_error_per_millimetre: Measure
+    tracking_gap: Measure = Measure(None, "m")
+    states_off_curve: Measure = Measure(None, "of the states")
+    curve_end_gap: Measure = Measure(None, "m")
+    curve_end_angle: Measure = Measure(None, "rad")
+    fcl_rows: Measure = Measure(None, "")
+    exact_rows: Measure = Measure(None, "")
     contradictions: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -141,6 +156,8 @@ class Certificate:
             values: dict[str, Any] = {
                 f.name: tuple(data[f.name]) if f.name in texts else Measure(**data[f.name])
                 for f in fields(cls)
+                # Files of earlier versions lack what has a default.
+                if f.name in data or f.default is MISSING or f.name in texts
             }
             return cls(**values)
         except (KeyError, TypeError) as error:

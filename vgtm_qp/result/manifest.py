@@ -1,11 +1,13 @@
 """The manifest of a result file: problem, arm, outcome and versions as strict JSON data.
 
-It has `schema_version`; the `problem` in the form of its file; the `arm` as its `record` gives it; `status`, `reached`,
-the share of the path covered, 0 to 1, and `blocked_by`, the names of what stopped the arm; the `stop` as its `to_dict`
-gives it; `way_out`, the change of the problem with which a retry came further; `recovered`, pairs below their clearance
-in the home pose and their distances there, m; `method` and `solver`; `setup_time`, s; `directory`, where relative paths
-of the problem start; `meshes`, what `mesh_record` returns for each; `versions`; the `certificate`, null before
-verification; and `jacobian_rank`, that of the last step where the method reveals it.
+It has `schema_version`; the `problem` in the form of its file; the `arm` as its `record` gives it; the `curve` as
+``Layout.record`` gives it, null without one; `status`, `reached`, the share of the path covered, 0 to 1, and
+`blocked_by`, the names of what stopped the arm; the `stop` as its `to_dict` gives it; `way_out`, the change of the
+problem with which a retry came further; `recovered`, pairs below their clearance in the home pose and their distances
+there, m; `method` and `solver`; `setup_time`, s; `directory`, where relative paths of the problem start; `meshes`, what
+`mesh_record` returns for each; `versions`; the `certificate`, null before verification; `jacobian_rank`, that of the
+last step where the method reveals it; and `clearance_rows`, how many rows of the QPs that moved the arm were supplied
+by `fcl`, and how many were `exact`.
 """
 
 from __future__ import annotations
@@ -69,6 +71,9 @@ def check_manifest(manifest: Any) -> dict[str, Any]:
     names = copy["blocked_by"]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ResultError("manifest.blocked_by is not a list of names")
+    rows = copy.get("clearance_rows", {})
+    if not isinstance(rows, dict) or not all(type(count) is int and count >= 0 for count in rows.values()):
+        raise ResultError(f"manifest.clearance_rows is {rows!r}; expected numbers of rows by name")
     if copy.get("certificate") is not None:
         if not isinstance(copy["certificate"], dict):
             raise ResultError("manifest.certificate is not a JSON object")

@@ -215,6 +215,7 @@ class Result:
             "step_time": self._step_time(),
             "setup_time": manifest.get("setup_time"),
             "blocked_by": list(self.blocked_by),
+            "clearance_rows": manifest.get("clearance_rows"),
             "way_out": str(manifest.get("way_out", "")),
             "verified": None if certificate is None else certificate.ok,
             "failures": [] if certificate is None else list(certificate.failures()),

@@ -9,6 +9,8 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 
+_TINY = 1e-300
+
 
 def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
     """Return (3, V) the displacements of the control vertices (3, V) that bring the curve back to its base, m.
@@ -20,6 +22,20 @@ def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
     offset[:, 0] = centre - vertices[:, 0]
     offset[:, 1] = offset[:, 0] - across @ (across.T @ (vertices[:, 1] - vertices[:, 0]))
     return offset
+
+
+def legs(vertices: Array, normal: Array, *, both: bool) -> tuple[Array, Array]:
+    """Return axes (G, 3) and lengths (G,), m, along them, of the first leg of the control polygon, and of the last.
+
+    The first lies along the base's `normal` (3,), the last along itself. A leg of no length is about to turn round, and
+    the curve with it.
+    """
+    axes, lengths = [normal], [float((vertices[1] - vertices[0]) @ normal)]
+    if both:
+        last = vertices[-1] - vertices[-2]
+        lengths.append(float(np.linalg.norm(last)))
+        axes.append(last / max(lengths[1], _TINY))
+    return np.array(axes), np.array(lengths)
 
 
 def free_basis(normal: Array, size: int) -> Array:

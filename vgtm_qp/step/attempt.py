@@ -15,6 +15,7 @@ from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepErro
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance, TrackingError
 from vgtm_qp.step.actuation import Actuation
+from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
@@ -37,6 +38,9 @@ _DEVIATION = 0.1
 
 _SETTLING = 5e-3
 """A tip that is further off than this share of the arm's length after a QP calls for another one."""
+
+_FURTHER = 1e-6
+"""Stations leave the curve for so much progress more, at least."""
 
 _ROUNDING = float(np.finfo(float).eps)
 
@@ -76,22 +80,41 @@ class Attempt:
 
     def use(self, setup: Setup) -> None:
         """Go on with the curve of another `setup` of the arm."""
-        layout, self._engine = setup.layout, setup.engine
+        layout = setup.layout
+        self._setup = setup
         self._tracking = TrackingError(layout, setup.kinematics) if layout.hard_tracking else None
 
     def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Step:
         """Return what a step from `state` along the target's piece of path does, with its progress on that.
 
         `share` is the length of the piece as a part of the step before: it scales the motion guessed from that.
-        `progress` is how much of the piece lies behind the tip at the start.
+        `progress` is how much of the piece lies behind the tip at the start. Where stations that are to be on the curve
+        hold the arm back they give way, if they may, and if it comes further then.
         """
         self.phases.start()
+        step = self._separated(state, target, share, progress, self._setup.engine, self._tracking)
+        if self._setup.elastic is None or (step.moved and step.progress >= WHOLE):
+            return step
+        other = self._separated(state, target, share, progress, self._setup.elastic(), None)
+        return other if not step.moved or other.progress > step.progress + _FURTHER else step
+
+    def _separated(
+        self,
+        state: State,
+        target: Target,
+        share: float,
+        progress: float,
+        engine: Engine,
+        tracking: TrackingError | None,
+    ) -> Step:
+        """Return the step of an engine, which drives pairs apart that are too near; without that where it fails."""
         short = self.separation.shortfall_of(state)
-        if short:
-            step = self._run(state, target, share, progress, short, RECOVERY)
+        for gain in (RECOVERY, 0.0) if short else (0.0,):
+            asked, reach = self._first(state, target, share, progress, short, gain)
+            step = self._run(state, asked, reach, short, gain, engine, tracking)
             if step.moved:
-                return step
-        return self._run(state, target, share, progress, short, 0.0)
+                break
+        return step
 
     def first_input(self, state: State, target: Target) -> QPInput:
         """Return what the first QP of a step from `state` is linearised at."""
@@ -114,11 +137,17 @@ class Attempt:
         return QPInput(q, q + 0.5 * guess, *curve, target, goal, progress, rows, True), reach
 
     def _run(
-        self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
+        self,
+        state: State,
+        asked: QPInput,
+        reach: float,
+        short: Shortfall,
+        gain: float,
+        engine: Engine,
+        tracking: TrackingError | None,
     ) -> Step:
-        """Run it; pairs that are too near at the start, `short`, are driven apart by `gain`, m."""
-        phases, separation = self.phases, self.separation
-        asked, reach = self._first(state, target, share, progress, short, gain)
+        """Run it from its first input; pairs that are too near at the start, `short`, are driven apart by `gain`, m."""
+        phases, separation, target = self.phases, self.separation, asked.target
         q, fractions = state.q, list[float]()
         solution: StepSolution | None = None
         rows: ClearanceRows | None = None
@@ -138,7 +167,7 @@ class Attempt:
                 asked = QPInput(*at, target, target.goal(move.progress), move.progress, near, False)
             phases.add("distance")
             try:
-                move = self._engine.move(asked, self.accuracy, phases.add)
+                move = engine.move(asked, self.accuracy, phases.add)
             except AnswerError as error:
                 return blocked(str(error), error, solver_failed=True)
             except EvaluationError as error:
@@ -162,9 +191,11 @@ class Attempt:
             flaw = self._flaw(state, target, move, move.closed)
             if flaw:
                 return blocked(flaw, solver_failed=True)
-            q, curve = move.closed.q, (move.vertices, move.torsion)
-            if self._tracking is not None:
-                gap = self._tracking.greatest(q, *curve, target.base)
+            q, closed = move.closed.q, move.closed
+            # The linear rows leave a little between the curve's end and the tip.
+            vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
+            if tracking is not None:
+                gap = tracking.greatest(q, vertices, move.torsion, target.base)
                 if not gap <= self.accuracy.tracking:
                     continue
             report, after = separation.proof(state, q, target.time, short)
@@ -176,9 +207,12 @@ class Attempt:
             if self._has_limit and (too_long := self._too_long(self._arm.nodes(q) - state.nodes)):
                 return blocked(too_long)
             if report.certified:
-                then = state.next(self._arm, target.time, move.closed, *curve, after)
+                then = state.next(self._arm, target.time, closed, vertices, move.torsion, after)
                 status = StepStatus.REACHED if move.progress >= WHOLE else StepStatus.SLOWED
-                return Step(status, move.progress, then, "", count, solution=solution, rows=rows)
+                gave_way = tracking is None and self._tracking is not None
+                return Step(
+                    status, move.progress, then, "", count, gave_way=gave_way, solution=solution, rows=rows
+                )
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")

@@ -174,7 +174,7 @@ class Brakes:
     def _let_go(self, state: State, value: float) -> Steps | None:
         """Brake every actuator by itself, whatever becomes of the tip; None where stations must stay on the curve."""
         setup = self.shaping.setup
-        if setup.layout.hard_tracking:
+        if setup.layout.hard_tracking and setup.elastic is None:
             return None
         closing = Closing(setup.layout, setup.kinematics)
 

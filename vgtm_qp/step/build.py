@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +34,9 @@ from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
 from vgtm_qp.step.path import base_motion
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import TipTask
+
+_STRAIGHTENS = 1e-6
+"""Weight that makes a curve as straight as the stations of a bent arm let it be."""
 
 _CONDENSED_ALL_THE_SAME = (
     "elastic end effector: the elimination along the bays does not know its slacks, so the QP is condensed onto the "
@@ -63,8 +68,13 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
         "safe": clearance.safe,
         "influence": clearance.influence,
+        "by_fcl": clearance.distance == "fcl",
     }
     engine = make_engine(solver, home.layout, kinematics, task, tracking, compiled=compiled)
+    # Bays that follow the curve can do nothing else.
+    is_exact = problem.method.tracking_mode == "exact" and not problem.method.goes_by_bays
+    gives_way = home.layout.hard_tracking and is_exact
+    elastic = elastic_engine(solver, home.layout, kinematics, task) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
     return Setup(
@@ -73,6 +83,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         layout=home.layout,
         task=task,
         engine=engine,
+        elastic=elastic,
         monitor=monitor,
         solver=solver,
         tracking=tracking,
@@ -117,19 +128,23 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         tables = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
         layout = Layout(arm, *tables, task.row_names, method.weights, elastic_tip=elastic)
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
-    mistakes = list(_beyond_the_arm(problem, arm, task))
+    is_hard, mistakes = method.holds_curve, list(_beyond_the_arm(problem, arm, task))
+    may_give_way = method.tracking_mode == "exact" and not method.goes_by_bays
+    if may_give_way and mistakes and method.hard_coordinates == ("position",):
+        # Nobody asked for more, and what this arm can hold exactly is the curve's end alone.
+        is_hard, mistakes = False, []
     if mistakes:
         raise problem.error(mistakes)
     options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
     family = make_family(spec.family, spec.control_vertices, **options)
-    stride = stations.stride if method.holds_curve else 1
+    stride = stations.stride if is_hard else 1
     tracked = np.arange(len(stations) - 1, stride - 1, -stride)[::-1]
     centres = stations.centres(arm.home)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
     fractions = travelled[tracked] / travelled[-1]
     s, vertices = _fitted(family, fractions, centres[0], centres[tracked])
     torsion = np.zeros(spec.torsion_vertices)
-    tracks_roll = bool(torsion.size) or (method.holds_curve and "orientation" in method.hard_coordinates)
+    tracks_roll = bool(torsion.size) or (is_hard and "orientation" in method.hard_coordinates)
     roll = None
     if tracks_roll:
         frames = Curve(family, vertices, torsion, stations.frames[0]).frame(s)
@@ -158,12 +173,14 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         tracked,
         task.row_names,
         method.weights,
-        hard_tracking=method.holds_curve,
-        hard_turns=method.holds_curve and len(method.hard_coordinates) > 1,
+        hard_tracking=is_hard,
+        hard_turns=is_hard and len(method.hard_coordinates) > 1,
         elastic_tip=elastic,
         shape=shape,
         vertex_goals=tuple(sorted(goal.index for goal in spec.control_vertex_goals)),
     )
+    end = arm.end_effector
+    vertices = layout.ended(vertices, end.position(arm.home), end.frame)
     return HomeCurve(layout, vertices, torsion, goals)
 
 
@@ -181,8 +198,10 @@ def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) 
         return fractions if even else straight.arc_parameter(fractions), straight.control_vertices
     weights = family.weights(fractions)
     second = np.diff(np.eye(family.control_vertices), n=2, axis=0)
-    system = np.vstack([weights[:, 1:], 1e-3 * second[:, 1:]])
-    known = np.vstack([points - np.outer(weights[:, 0], start), -1e-3 * np.outer(second[:, 0], start)])
+    system = np.vstack([weights[:, 1:], _STRAIGHTENS * second[:, 1:]])
+    known = np.vstack(
+        [points - np.outer(weights[:, 0], start), -_STRAIGHTENS * np.outer(second[:, 0], start)]
+    )
     return fractions, np.vstack([start, np.linalg.lstsq(system, known, rcond=None)[0]])
 
 
@@ -235,6 +254,15 @@ def make_engine(
     if along is not None and ChainEngine.serves(along):
         return ChainEngine(along, kinematics, task)
     return GeneralEngine(layout, kinematics, task, along or make_solver(solver, layout), compiled=compiled)
+
+
+def elastic_engine(
+    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask
+) -> Callable[[], Engine]:
+    """Return what gives the engine of the same layout with elastic tracking, built when it is first asked for."""
+    elastic = replace(layout, hard_tracking=False, hard_turns=False)
+    # It is seldom needed, and no compiler is kept waiting then.
+    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False))
 
 
 def check_solver(problem: Problem) -> None:

@@ -17,7 +17,7 @@ from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import PeriodValues
 from vgtm_qp.qp.long.solver import ChainSolver
-from vgtm_qp.qp.numbers import RowNumbers
+from vgtm_qp.qp.numbers import Legs, RowNumbers
 from vgtm_qp.qp.settle import held
 from vgtm_qp.rows.curve import base_offset
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
@@ -98,6 +98,7 @@ class ChainEngine(Engine):
             progress_gradient=progress_gradient(curvature, progress),
             progress_curvature=curvature,
             clearance=rows,
+            legs=Legs(*layout.leg_bounds(vertices, normal)),
         )
         solution = self._solver.solve_filled(numbers)
         self._answer = solution.actuators, numbers.lower, numbers.upper

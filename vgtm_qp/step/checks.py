@@ -162,7 +162,7 @@ def _inside_obstacles(problem: Problem, setup: Setup, hollow: float) -> Iterator
     at_tip = np.isin(arm.bodies.joints, arm.end_effector.nodes).any(axis=1)
     needed = safe + float(arm.bodies.radius[at_tip].min())
     spot = capsules([[0, 1]], 0.0)
-    point = Clearance(spot, obstacles, safe=safe, influence=needed, self_collision=False)
+    point = Clearance(spot, obstacles, safe=safe, influence=needed, self_collision=False, by_fcl=False)
     for target, key, value in _targets(problem):
         distance, pair = point.least(np.stack([target, target + _POINT / 2]))
         if pair is not None and distance + hollow + _POINT < needed:

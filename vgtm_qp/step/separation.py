@@ -27,9 +27,6 @@ _ROUNDING = 1e-10
 _APPROACH = 0.4
 """Largest share of its remaining clearance that a pair may use in one step."""
 
-_BINDING = 0.002
-"""FCL is asked about pairs that are nearer than this to their floor, m, too."""
-
 _LEAST_APPROACH = 2e-3
 """A pair that slows down may come nearer by so much in one step all the same, m."""
 
@@ -65,7 +62,7 @@ class Separation:
         points, (floor, self_floor) = self._arm.points(q), self._floors
         if self._monitor.keeps(points, time, floor, self_floor):
             return {}
-        contacts = self._monitor.near(points, time, floor, self_reach=self_floor, fcl_reach=0.0)
+        contacts = self._monitor.near(points, time, floor, self_reach=self_floor)
         found: dict[Pair, float] = {}
         for k in range(len(contacts)):
             pair = contacts.pair(k)
@@ -131,7 +128,7 @@ class Separation:
     def rows(
         self, q: Array, time: float, duration: float, reach: float, short: Shortfall, gain: float
     ) -> ClearanceRows:
-        """Return the rows at a configuration.
+        """Return the rows at a configuration: of every pair that can become active, by FCL as far as it is proven.
 
         Parameters
         ----------
@@ -148,9 +145,8 @@ class Separation:
         kept, motion, monitor = self._setup, duration > 0.0, self._monitor
         reach += monitor.pieces.fastest * duration
         limits = min(kept.influence, kept.safe + reach), min(kept.influence, kept.self_safe + 2.0 * reach)
-        fcl_reach = kept.safe + _BINDING if motion else 0.0
         contacts = monitor.near(
-            self._arm.points(q), time, limits[0], self_reach=limits[1], fcl_reach=fcl_reach, tracked=not short
+            self._arm.points(q), time, limits[0], self_reach=limits[1], by_fcl=True, tracked=not short
         )
         rows = self._clearance_rows(q, contacts)
         if len(contacts):
@@ -183,7 +179,7 @@ class Separation:
         """Return `rows`, and those at `fractions`, 0 to 1, of the way from a state to `q`: this moves them too."""
         for s in fractions:
             at, now = state.q + s * (q - state.q), state.time + s * (time - state.time)
-            contacts = self._monitor.near(self._arm.points(at), now, 1.5 * self._setup.safe)
+            contacts = self._monitor.near(self._arm.points(at), now, 1.5 * self._setup.safe, by_fcl=True)
             rows = rows.joined(self._clearance_rows(at, contacts, s))
         return rows
 
@@ -197,7 +193,8 @@ class Separation:
             *pairs, kept.safe, kept.self_safe, margin=kept.margin, fraction=fraction
         )
         nodes, coefficients = self._arm.over_nodes(q, contacts.points, coefficients)
-        return ClearanceRows(nodes, coefficients, lower, contacts.name)
+        by_fcl = int(np.count_nonzero(contacts.by_fcl))
+        return ClearanceRows(nodes, coefficients, lower, contacts.name, by_fcl, len(contacts) - by_fcl)
 
     def _vectors(self, q: Array) -> tuple[Array, Array]:
         """Return the vectors (K, 3), m, of both bodies of each corner away from the joint where they meet."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,9 @@ class Setup:
         Of the arm; overwritten by whoever evaluates it.
     layout, task, engine, monitor
         The QP, the end effector's rows, what solves a step, and what measures clearance.
+    elastic : callable or None
+        Gives what solves a step with elastic tracking where the engine's hard rows have none; None where they have to
+        hold, or there are none.
     solver, tracking : str
         Names of the QP solver, and of how stations track the curve.
     control_vertices, torsion : (V, 3), (T,)
@@ -58,6 +62,7 @@ class Setup:
     layout: Layout
     task: TipTask
     engine: Engine
+    elastic: Callable[[], Engine] | None
     monitor: Clearance
     solver: str
     tracking: str

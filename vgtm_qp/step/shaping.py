@@ -16,7 +16,7 @@ from vgtm_qp.curve.redundancy import Refit, add_control_vertices, remove_control
 from vgtm_qp.errors import GoalError
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.actuation import Box
-from vgtm_qp.step.build import make_engine
+from vgtm_qp.step.build import elastic_engine, make_engine
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
@@ -101,7 +101,10 @@ class Shaping:
             if engine is None:
                 engine = make_engine(setup.solver, layout, setup.kinematics, setup.task, setup.tracking)
                 finish_compiling()
-            self._built[_key(layout)] = replace(setup, layout=layout, engine=engine)
+            elastic = setup.elastic
+            if elastic is not None:
+                elastic = elastic_engine(setup.solver, layout, setup.kinematics, setup.task)
+            self._built[_key(layout)] = replace(setup, layout=layout, engine=engine, elastic=elastic)
         self.setup = self._built[_key(layout)]
 
 

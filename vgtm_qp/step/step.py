@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 
@@ -49,6 +49,8 @@ class Step:
     braked : bool
         Whether no other step was found than to brake on the path that the arm was on before: limited accelerations
         do not let it leave that at once.
+    gave_way : bool
+        Whether stations left the curve, with ``method.tracking_mode`` exact, since the arm came further without it.
     left_path : bool
         Whether the tip left the path while braking: it is elastic, or its base moves on whatever happens.
     solution, rows, limits
@@ -65,6 +67,7 @@ class Step:
     solver_failed: bool = False
     braked: bool = False
     left_path: bool = False
+    gave_way: bool = False
     solution: StepSolution | None = None
     rows: ClearanceRows | None = None
     limits: Limits | None = None
@@ -84,8 +87,7 @@ class Step:
         status, progress = self.status, share * self.progress
         if self.moved:
             status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
-        rest = self.solver_failed, self.braked, self.left_path, self.solution, self.rows, limits, self.failure
-        return Step(status, progress, self.state, self.reason, self.qps, *rest)
+        return replace(self, status=status, progress=progress, limits=limits)
 
     @property
     def moved(self) -> bool:
@@ -108,6 +110,16 @@ class Step:
         for k in np.flatnonzero((np.abs(pull) > 1e-9) & limited):
             found[self.limits.name(int(k), upper=bool(pull[k] > 0.0))] = float(abs(pull[k]))
         return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    @property
+    def fcl_rows(self) -> int:
+        """How many clearance rows of that QP FCL supplied, each proven."""
+        return 0 if self.rows is None else self.rows.by_fcl
+
+    @property
+    def exact_rows(self) -> int:
+        """How many of them are by closed forms: FCL was not to be asked, its answer was refused, or an axis touched."""
+        return 0 if self.rows is None else self.rows.by_formula
 
     @property
     def failed_qp(self) -> StepQP | None:

@@ -77,8 +77,8 @@ def text(rows: Sequence[Row]) -> str:
         groups[module] = select(rows, module=module)
     parts = [
         f"Seed {rows[0]['seed']}, scenes 0 to {max(row['number'] for row in rows)}, {rows[0]['steps']} steps each. "
-        f"{_of(rows)} solved; states that break a tolerance by the independent check: in {broken} scenes.",
-        markdown_table(("", "solved"), [(name, _of(some)) for name, some in groups.items()]),
+        f"{share_of(rows)} solved; states that break a tolerance by the independent check: in {broken} scenes.",
+        markdown_table(("", "solved"), [(name, share_of(some)) for name, some in groups.items()]),
     ]
     solved = select(rows, status="solved")
     for words, key, some in (
@@ -91,7 +91,8 @@ def text(rows: Sequence[Row]) -> str:
     return "\n\n".join(parts)
 
 
-def _of(rows: Sequence[Row]) -> str:
+def share_of(rows: Sequence[Row]) -> str:
+    """Return how many rows were solved, of how many, with the interval of 95 % for the share."""
     if not rows:
         return "none of 0"
     done = len(select(rows, status="solved"))

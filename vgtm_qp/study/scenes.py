@@ -174,5 +174,5 @@ def _cubes(
 def is_clear(truss: Truss, obstacle: shapes.Obstacle, X: Array) -> bool:
     """Whether members between nodes at `X` (N, 3) keep the safe distance from an obstacle, with some room."""
     members = capsules(truss.members, truss.radius)
-    monitor = Clearance(members, [obstacle], safe=SAFE, influence=0.5, self_collision=False)
+    monitor = Clearance(members, [obstacle], safe=SAFE, influence=0.5, self_collision=False, by_fcl=False)
     return monitor.least(X)[0] >= SAFE + _ROOM

@@ -23,6 +23,7 @@ from vgtm_qp.verify.clearance import (
     Least,
     RecordedMotion,
 )
+from vgtm_qp.verify.curve import curve_measures
 from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.verify.path import (
     DIRECTION_TOLERANCE,
@@ -87,6 +88,7 @@ def verify(maneuver: Result) -> Certificate:
     if maneuver.joints is None:
         differences["member_lengths"] = np.abs(maneuver.member_lengths - arm.quantities(motion.states))
     furthest = max(differences, key=lambda name: float(np.max(differences[name], initial=0.0)))
+    reported = maneuver.manifest.get("clearance_rows") or {}
     return Certificate(
         **_limits(maneuver, arm, arm.quantities(motion.states)),
         **clearances,
@@ -98,7 +100,10 @@ def verify(maneuver: Result) -> Certificate:
         array_error=_worst(differences[furthest], "m", ARRAY_TOLERANCE, array=furthest),
         length_singular_value=_least_of(values[:, 0], ""),
         tip_singular_value=_least_of(values[:, 1], "m/m"),
+        **curve_measures(maneuver, rotation),
         tip_error_per_millimetre=_worst(values[:, 2] if len(values) else None, "mm", None),
+        fcl_rows=Measure(reported.get("fcl"), ""),
+        exact_rows=Measure(reported.get("exact"), ""),
         contradictions=(
             *wrong,
             *astray,

@@ -6,7 +6,7 @@ function.
 
 from __future__ import annotations
 
-from typing import cast
+from typing import NamedTuple, cast
 
 import casadi as ca
 import numpy as np
@@ -18,7 +18,7 @@ from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.elimination import member_lengths
 from vgtm_qp.qp.long.sparse_symbols import dense_function, nonzeros, sparsity_of
-from vgtm_qp.qp.numbers import StepNumbers
+from vgtm_qp.qp.numbers import Legs, StepNumbers
 from vgtm_qp.rows import tracking
 from vgtm_qp.rows.curve import free_basis
 
@@ -132,6 +132,32 @@ class ChainData:
         """Return (V, 3) the displacements of the control vertices for free coordinates (3V - 5,)."""
         return self.offset + (self._free @ free).reshape(-1, 3)
 
+    def end_rows(self) -> EndRows:
+        """Return the rows that keep the curve's end in the end effector, but those that hold by elimination."""
+        layout = self._chain.layout
+        gaps, tilts = layout.ends_at_tip and not layout.hard_tracking, layout.ends_along_tip
+        if not (gaps or tilts):
+            return EndRows.none(self._free.shape[1])
+        (k,) = np.flatnonzero(self.stations == len(layout.tracked) - 1)
+        free = self._free.reshape(len(self.offset), 3, -1)
+        nodes = layout.arm.stations.nodes[layout.tracked[-1]][self.station_order.reshape(-1, 3)[k]]
+        turns = self.part["tangent_face"].reshape(-1, 2, 3, 3)[k]
+        over_slope = self.part["tangent_curve"].reshape(-1, 2, 3)[k]
+        weights = self._chain.station_weights[-1]
+        coefficients = np.concatenate(
+            [weights[None, :, None] * np.eye(3)[:, None, :], turns.reshape(2, 3, 3)]
+        )
+        curve = np.vstack(
+            [-np.tensordot(self.weights[k], free, 1), over_slope @ np.tensordot(self.slopes[k], free, 1)]
+        )
+        rhs = -np.concatenate([self.part["gap"].reshape(-1, 3)[k], self.part["tilt"].reshape(-1, 2)[k]])
+        kept = np.flatnonzero([gaps] * 3 + [tilts] * 2)
+        return EndRows(nodes, coefficients[kept], curve[kept], rhs[kept])
+
+    def leg_rows(self, legs: Legs) -> Array:
+        """Return (G, 3V - 5) the rows of the legs of the control polygon over the curve's free coordinates."""
+        return legs.over_vertices(self._chain.layout) @ self._free
+
     def polygon_terms(self) -> tuple[Array, Array]:
         """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the vertices alone."""
         return self._free.T @ self._polygon_hessian @ self._free, self.polygon_gradient(self.offset)
@@ -167,6 +193,29 @@ class ChainData:
         return gap + stations[:, :3], tilt + stations[:, 3:]
 
 
+class EndRows(NamedTuple):
+    """Equalities that tie the curve's end to the end effector: coefficients . d_rho[nodes] + curve . x = rhs.
+
+    Attributes
+    ----------
+    nodes : (K,) int
+    coefficients : (R, K, 3)
+    curve : (R, 3V - 5)
+        Over the free coordinates x of the curve.
+    rhs : (R,)
+    """
+
+    nodes: Index
+    coefficients: Array
+    curve: Array
+    rhs: Array
+
+    @classmethod
+    def none(cls, size: int) -> EndRows:
+        """Return no rows for a curve of so many free coordinates."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 0, 3)), np.zeros((0, size)), np.zeros(0))
+
+
 class PeriodValues:
     """Fills :class:`ChainData` from the positions of the nodes.
 
@@ -184,7 +233,10 @@ class PeriodValues:
             self._kernel.bind_output(k, array)
         inputs = [array.reshape(chain.periods, -1) for array in self._kernel.inputs]
         self._X, self._Y = (array.reshape(-1, 3) for array in inputs[:2])
-        self._curve, self._switches = inputs[6].reshape(-1, 2, 6), inputs[7]
+        self._curve, self._motion = inputs[6].reshape(-1, 2, 6), inputs[7]
+        # One pair of switches for each station, for gap and angles: what is hard is closed by corrections too.
+        self._closes, tracked = inputs[8].reshape(-1, 2), data.stations
+        self._is_hard = np.stack([layout.hard_gaps[tracked, 0], layout.hard_tilts[tracked, 0]], axis=1)
         inputs[2][:], inputs[3][:] = layout.arm.home_quantities[data.members], ~bays.actuated[data.members]
         for array, constants in zip(inputs[4:6], _frame_constants(chain, data), strict=True):
             array[:] = constants.reshape(array.shape)
@@ -204,7 +256,8 @@ class PeriodValues:
         window = data.window.reshape(-1)
         np.take(X, window, axis=0, out=self._X, mode="clip")
         np.take(Y, window, axis=0, out=self._Y, mode="clip")
-        self._switches[:] = motion, motion or chain.layout.hard_tracking
+        self._motion[:] = motion
+        self._closes[:] = self._is_hard | motion
         if len(data.stations):
             both = np.hstack([vertices, data.offset])
             np.matmul(data.weights, both, out=self._curve[:, 0])
@@ -224,7 +277,7 @@ def period_values(chain: Chain) -> ca.Function:
     Arguments: X, Y (3, w + m), where residuals and where Jacobians are evaluated; home (3m), lengths, and fixed (3m),
     1 where a member keeps it; angles (6f), polar angles' cosines and sines of each station; alignment (3, 3f); curve
     (12f), for each station its point, the point's displacement with the base, the slope and that slope's displacement;
-    switches (2), motion and gap.
+    motion, 0 or 1; closes (2f), for each station whether its gap and its angles are closed.
 
     Results: ``head`` and ``tail`` of ``elimination.Inputs``, ``ChainData.turn_squares`` and the lengths (3m) at X.
     """
@@ -232,8 +285,11 @@ def period_values(chain: Chain) -> ca.Function:
     X, Y = (ca.SX.sym(name, 3, chain.window.shape[1]) for name in "XY")
     home, fixed = ca.SX.sym("home", chain.own), ca.SX.sym("fixed", chain.own)
     angles, alignment = ca.SX.sym("angles", 6 * stations), ca.SX.sym("alignment", 3, 3 * stations)
-    curve, switches = ca.SX.sym("curve", 12 * stations), ca.SX.sym("switches", 2)
-    motion, gap_on = switches[0], switches[1]
+    curve, motion, closes = (
+        ca.SX.sym("curve", 12 * stations),
+        ca.SX.sym("motion"),
+        ca.SX.sym("closes", 2 * stations),
+    )
 
     lengths, actuated = member_lengths(chain, X), np.flatnonzero(chain.actuated).tolist()
     jacobian = ca.jacobian(member_lengths(chain, Y), ca.vec(Y))
@@ -249,15 +305,15 @@ def period_values(chain: Chain) -> ca.Function:
         turn_curves.append(ca.vec(over_slope.T))
         products.append(ca.vec(over_slope.T @ over_slope))
         centre = X[:, places] @ ca.DM(chain.station_weights[k])
-        gaps.append(gap_on * tracking.gap(centre, point) - moved)
-        tilts.append(motion * tilt + over_slope @ slope_moved)
+        gaps.append(closes[2 * k] * tracking.gap(centre, point) - moved)
+        tilts.append(closes[2 * k + 1] * tilt + over_slope @ slope_moved)
     outputs = [
         ca.vertcat(*head, *turns),
         ca.vertcat(*tail, *turn_curves, *gaps, *tilts),
         ca.vertcat(*products),
         lengths,
     ]
-    return dense_function("values", [X, Y, home, fixed, angles, alignment, curve, switches], outputs)
+    return dense_function("values", [X, Y, home, fixed, angles, alignment, curve, motion, closes], outputs)
 
 
 def _frame_constants(chain: Chain, data: ChainData) -> tuple[Array, Array]:

@@ -68,18 +68,22 @@ class ChainSolver(ABC):
         self._eliminate()
         if not numbers.progress_curvature > 0.0:
             raise SolverError(SINGULAR)
-        table = RowTable(self.layout, numbers, self.chain.locked, self.data.member_rows)
+        data = self.data
+        of_curve = data.end_rows(), data.leg_rows(numbers.legs)
+        table = RowTable(self.layout, numbers, self.chain.locked, data.member_rows, *of_curve)
         scale = 1.0 / np.sqrt(numbers.progress_curvature)
         progress = 0.0
 
         def columns(rows: Index) -> Array:
-            nodes, coefficients, along = table.coefficients(rows)
-            return np.vstack([self._columns(nodes, coefficients), scale * along])
+            nodes, coefficients, curve, along = table.coefficients(rows)
+            return np.vstack([self._columns(nodes, coefficients, curve), scale * along])
 
         def values(combined: Array) -> Array:
             nonlocal progress
             progress = -scale * (scale * numbers.progress_gradient + float(combined[-1]))
-            return table.values(*self._least(combined[:-1]), progress)
+            # What is least is found before the curve's coordinates there are read.
+            least = self._least(combined[:-1])
+            return table.values(*least, self._free, progress)
 
         answer = solve_rows(table, self._size + 1, columns, values, self._active)
         nodes, vertices = self.displacements(), self.data.vertices(self._free)
@@ -113,6 +117,8 @@ class ChainSolver(ABC):
         )
         forces[self._held_at] = multipliers[table.locked]
         left, dual = self._residuals(nodes, vertices, strokes, nodal, forces.reshape(self.chain.periods, -1))
+        if self._curve:
+            dual[-self._curve :] += table.curve_forces(multipliers)
         primal = norm(np.concatenate([left, beyond(values, table.lower, table.upper)]))
         refuse_large(primal, relative(norm(dual), forces, multipliers), "the elimination")
 
@@ -125,8 +131,8 @@ class ChainSolver(ABC):
         """Factorise the Hessian that `data` make; raise SolverError where it is singular."""
 
     @abstractmethod
-    def _columns(self, nodes: Index, coefficients: Array) -> Array:
-        """Return (size, R) L^-1 A' of rows A: nodes (R, Q), coefficients (R, Q, 3)."""
+    def _columns(self, nodes: Index, coefficients: Array, curve: Array) -> Array:
+        """Return (size, R) L^-1 A' of rows A: nodes (R, Q), coefficients (R, Q, 3), and over the curve (R, 3V - 5)."""
 
     @abstractmethod
     def _least(self, combined: Array) -> tuple[Moved, Array, Array]:
@@ -143,7 +149,7 @@ class ChainSolver(ABC):
     def _residuals(
         self, nodes: Array, vertices: Array, strokes: Array, nodal: Array, forces: Array
     ) -> tuple[Array, Array]:
-        """Return what is left of the equalities, m, and of stationarity.
+        """Return what is left of the equalities, m, and of stationarity, last in the curve's free coordinates.
 
         Given are displacements (N, 3), (V, 3), (n_a,), and gradients by nodes (N, 3) and members (n, 3m).
         """

@@ -68,7 +68,7 @@ class StagedSolver(ChainSolver):
         known = dict(zip(answer.rows, answer.columns[:-1].T, strict=True))
         missing = np.array([row for row in rows if row not in known], dtype=np.int64)
         if len(missing):
-            known |= zip(missing.tolist(), self._columns(*table.coefficients(missing)[:2]).T, strict=True)
+            known |= zip(missing.tolist(), self._columns(*table.coefficients(missing)[:3]).T, strict=True)
         columns = np.stack([known[row] for row in rows], axis=1)
         gram = columns.T @ columns
         try:
@@ -91,7 +91,7 @@ class StagedSolver(ChainSolver):
         """See :class:`ChainSolver`."""
         return ChainClosing(self.chain, self._elimination.close(), self._forward_head, self._forward_gains)
 
-    def _columns(self, nodes: Index, coefficients: Array) -> Array:
+    def _columns(self, nodes: Index, coefficients: Array, curve: Array) -> Array:
         passed = self._through.outputs[1].reshape(self._freedom, BLOCK)
         columns = np.empty((self._size, len(nodes)))
         for start in range(0, len(nodes), BLOCK):
@@ -103,7 +103,7 @@ class StagedSolver(ChainSolver):
             columns[: self._freedom, block] = passed[:, :count]
             self._rows[place] = 0.0
         if self._curve:
-            through = self._outer[:, :-1].T @ columns[: self._freedom]
+            through = self._outer[:, :-1].T @ columns[: self._freedom] - curve.T
             columns[self._freedom :] = -dtrtrs(self._curve_factor, through, lower=1)[0]
         return columns
 

@@ -116,9 +116,9 @@ class TrackedSolver(ChainSolver):
         """See :class:`ChainSolver`: keeps the stations on the curve, too."""
         return ChainClosing(self.chain, self._graphs.hold(), self.data.head, self._following.outputs[1])
 
-    def _columns(self, nodes: Index, coefficients: Array) -> Array:
+    def _columns(self, nodes: Index, coefficients: Array, curve: Array) -> Array:
         moved = self._moving.take(self._place[nodes], axis=0)
-        rows = np.einsum("rqc,rqcn->nr", coefficients, moved[..., :-1])
+        rows = np.einsum("rqc,rqcn->nr", coefficients, moved[..., :-1]) + curve.T
         return np.asarray(dtrtrs(self._factor, rows, lower=1)[0])
 
     def _least(self, combined: Array) -> tuple[Moved, Array, Array]:

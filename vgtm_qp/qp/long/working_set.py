@@ -13,6 +13,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp import daqp
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.long.chain_data import EndRows
 from vgtm_qp.qp.numbers import UNBOUNDED, RowNumbers
 from vgtm_qp.qp.residual import InfeasibleStepError
 
@@ -38,42 +39,66 @@ Moved = Callable[[Index], Array]
 
 
 class RowTable:
-    """All rows with bounds of one QP: tip, locked members, progress, actuators, clearance, in this order.
+    """All rows with bounds: tip, locked members, curve's end, progress, legs, actuators, clearance; in this order.
 
     Attributes
     ----------
     numbers : RowNumbers
-    locked, actuators, clearance : slice
+    locked, end, actuators, clearance : slice
         The first are fixed members that are held by a row of their own.
     equal : int
         Number of equalities, which come first; the progress is the next row.
     lower, upper : (total,)
     """
 
-    def __init__(self, layout: Layout, numbers: RowNumbers, locked: Index, member_rows: MemberRows) -> None:
-        self.numbers, self._arm, self._member_rows = numbers, layout.arm, member_rows
+    def __init__(
+        self,
+        layout: Layout,
+        numbers: RowNumbers,
+        locked: Index,
+        member_rows: MemberRows,
+        end: EndRows,
+        legs: Array,
+    ) -> None:
+        self.numbers, self._arm, self._member_rows, self._end = numbers, layout.arm, member_rows, end
+        self._legs = legs
         self._tip, near, held = len(numbers.tip_rhs), len(numbers.clearance), np.zeros(len(locked))
-        self.equal = self._tip + len(locked)
-        self.locked = slice(self._tip, self.equal)
-        self.actuators = slice(self.equal + 1, self.equal + 1 + len(numbers.lower))
+        self.locked = slice(self._tip, self._tip + len(locked))
+        self.equal = self.locked.stop + len(end.rhs)
+        self.end = slice(self.locked.stop, self.equal)
+        self.legs = slice(self.equal + 1, self.equal + 1 + len(legs))
+        self.actuators = slice(self.legs.stop, self.legs.stop + len(numbers.lower))
         self.clearance = slice(self.actuators.stop, self.actuators.stop + near)
-        known, lower, free = [numbers.tip_rhs, held], numbers.clearance.lower, np.full(near, UNBOUNDED)
-        self.lower = np.concatenate([*known, [numbers.progress_lower], numbers.lower, lower])
-        self.upper = np.concatenate([*known, [numbers.progress_upper], numbers.upper, free])
-        self._members = np.concatenate([locked, [-1], layout.arm.actuators])
+        known, lower, free = (
+            [numbers.tip_rhs, held, end.rhs],
+            numbers.clearance.lower,
+            np.full(near, UNBOUNDED),
+        )
+        least, any_length = numbers.legs.lower, np.full(len(legs), UNBOUNDED)
+        self.lower = np.concatenate([*known, [numbers.progress_lower], least, numbers.lower, lower])
+        self.upper = np.concatenate([*known, [numbers.progress_upper], any_length, numbers.upper, free])
+        none = np.full(len(end.rhs) + 1 + len(legs), -1)
+        self._members = np.concatenate([locked, none, layout.arm.actuators])
 
-    def values(self, moved: Moved, strokes: Array, held: Array, progress: float) -> Array:
+    def values(self, moved: Moved, strokes: Array, held: Array, curve: Array, progress: float) -> Array:
         """Return (total,) row values at displacements of the nodes.
 
-        `strokes` (n_a,) and `held` (l,) are the changes of the actuated and of the locked members' lengths.
+        `strokes` (n_a,) and `held` (l,) are the changes of the actuated and of the locked members' lengths, `curve`
+        (3V - 5,) those of the curve's free coordinates.
         """
         numbers, clearance = self.numbers, self.numbers.clearance
         tip = numbers.tip_jacobian @ moved(self._arm.end_effector.nodes).reshape(-1)
-        near = np.einsum("rsc,rsc->r", clearance.coefficients, moved(clearance.nodes))
-        return np.concatenate([tip - numbers.tip_rate * progress, held, [progress], strokes, near])
+        near, end = np.einsum("rsc,rsc->r", clearance.coefficients, moved(clearance.nodes)), self._end.rhs
+        if len(end):
+            end = np.tensordot(self._end.coefficients, moved(self._end.nodes), 2) + self._end.curve @ curve
+        legs = self._legs @ curve
+        return np.concatenate([tip - numbers.tip_rate * progress, held, end, [progress], legs, strokes, near])
 
-    def coefficients(self, rows: Index) -> tuple[Index, Array, Array]:
-        """Return nodes (R, Q), coefficients (R, Q, 3), zero where spare, and those of the progress (R,)."""
+    def coefficients(self, rows: Index) -> tuple[Index, Array, Array, Array]:
+        """Return nodes (R, Q) of rows and what they have over them, (R, Q, 3), zero where spare.
+
+        Then what they have over the curve's free coordinates (R, 3V - 5) and the progress (R,).
+        """
         numbers, clearance, tip_nodes = self.numbers, self.numbers.clearance, self._arm.end_effector.nodes
         progress = (rows == self.equal).astype(float)
         at_tip = np.flatnonzero(rows < self._tip)
@@ -81,7 +106,18 @@ class RowTable:
         on_tip = numbers.tip_jacobian[rows[at_tip]].reshape(len(at_tip), len(tip_nodes), 3)
         parts = [(at_tip, tip_nodes[None], on_tip)]
         is_near = rows >= self.clearance.start
-        at_members = np.flatnonzero((rows >= self._tip) & (rows != self.equal) & ~is_near)
+        curve = np.zeros((len(rows), self._end.curve.shape[1]))
+        at_end = np.flatnonzero((rows >= self.end.start) & (rows < self.equal))
+        if len(at_end):
+            which = rows[at_end] - self.end.start
+            parts.append((at_end, self._end.nodes[None], self._end.coefficients[which]))
+            curve[at_end] = self._end.curve[which]
+        at_legs = np.flatnonzero((rows >= self.legs.start) & (rows < self.legs.stop))
+        curve[at_legs] = self._legs[rows[at_legs] - self.legs.start]
+        is_member = ((rows >= self._tip) & (rows < self.end.start)) | (
+            (rows >= self.actuators.start) & ~is_near
+        )
+        at_members = np.flatnonzero(is_member)
         if len(at_members):
             parts.append((at_members, *self._member_rows(self._members[rows[at_members] - self._tip])))
         if is_near.any():
@@ -93,14 +129,21 @@ class RowTable:
         for where, named, values in parts:
             nodes[where, : named.shape[1]] = named
             coefficients[where, : named.shape[1]] = values
-        return nodes, coefficients, progress
+        return nodes, coefficients, curve, progress
+
+    def curve_forces(self, multipliers: Array) -> Array:
+        """Return (3V - 5,) the multipliers (total,) of the curve's end and legs times their rows over the curve."""
+        return np.asarray(multipliers[self.end] @ self._end.curve + multipliers[self.legs] @ self._legs)
 
     def nodal_forces(self, multipliers: Array) -> Array:
-        """Return (N, 3) the tip's and clearance rows' multipliers (total,) times their coefficients."""
+        """Return (N, 3) the multipliers (total,) of tip, curve's end and clearance times their coefficients."""
         numbers, clearance = self.numbers, self.numbers.clearance
         forces = np.zeros((len(self._arm.node_names), 3))
         tip = multipliers[: self._tip] @ numbers.tip_jacobian
         np.add.at(forces, self._arm.end_effector.nodes, tip.reshape(-1, 3))
+        if len(self._end.rhs):
+            held = np.tensordot(multipliers[self.end], self._end.coefficients, 1)
+            np.add.at(forces, self._end.nodes, held)
         active = np.flatnonzero(multipliers[self.clearance])
         pressing = multipliers[self.clearance][active, None, None] * clearance.coefficients[active]
         np.add.at(forces, clearance.nodes[active], pressing)

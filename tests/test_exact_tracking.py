@@ -1,0 +1,151 @@
+"""Tracking as an equality: the curve ends in the tip, stations keep to it where they can, and give way where not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arms import arm_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vgtm_qp as vq
+from vgtm_qp.curve.curve import Curve
+from vgtm_qp.curve.families import make_family
+from vgtm_qp.errors import ProblemError, ResultError
+from vgtm_qp.study.scenes import random_scene
+from vgtm_qp.verify.curve import RecordedCurve
+
+MODES = ("exact", "hard", "elastic")
+
+
+@pytest.fixture(autouse=True)
+def _without_a_compiler(monkeypatch):
+    monkeypatch.setenv("VGTM_CC", "none")
+
+
+def gaps(resolver):
+    """(K,) distances of the stations from their curve nodes."""
+    layout, state = resolver.setup.layout, resolver.state
+    stations = layout.arm.stations.centres(state.nodes)[layout.tracked]
+    return np.linalg.norm(stations - layout.curve_weights @ state.control_vertices, axis=1)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("module", "bays", "track"),
+    [
+        ("octahedral", 5, "position"),
+        ("octahedral", 6, "pointing"),
+        ("hexapod", 4, "pointing"),
+        ("longeron", 6, "orientation"),
+        ("tetrahedral", 4, "position"),
+        ("octahedral", 12, "pointing"),
+    ],
+)
+def test_the_curve_begins_at_the_base_and_ends_in_the_end_effector(module, bays, track, mode):
+    turned = {"pointing": {"pointing": [0, 0, 1]}, "orientation": {"rotation_vector": [0, 0, 0]}}.get(track)
+    problem = arm_problem(
+        bays=bays,
+        truss={"module": module, "stroke": None},
+        curve={"control_vertices": 5, "torsion_vertices": int(track == "orientation")},
+        end_effector={"track": ["position", track] if turned else ["position"]},
+        method={"tracking_mode": mode},
+        target=(0.3, -0.2, 0.7 * bays),
+        waypoint=turned,
+    )
+    resolver = vq.Resolver(problem)
+    start = resolver.tip()[0]
+    for share in np.linspace(0.05, 0.2, 4):
+        goal = start + share * (np.array([0.5, -0.3, 0.8 * start[2]]) - start)
+        step = resolver.step(position=goal)
+        assert step.moved
+        p, (position, rotation) = resolver.state.control_vertices, resolver.tip()
+        np.testing.assert_allclose(p[0], 0.0, atol=1e-12)
+        np.testing.assert_allclose((p[1] - p[0])[:2], 0.0, atol=1e-12)
+        assert (p[1] - p[0])[2] > 0.0
+        np.testing.assert_allclose(p[-1], position, atol=1e-12)
+        if turned:
+            last = p[-1] - p[-2]
+            np.testing.assert_allclose(last / np.linalg.norm(last), rotation[:, 2], atol=1e-9)
+        if mode == "hard" or (mode == "exact" and not step.gave_way):
+            assert gaps(resolver).max() < 1e-6
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rows_of_the_curve_end_are_equalities_of_every_qp(mode):
+    problem = vq.load_problem("five_bay_two_cubes_pointing").replace({"method.tracking_mode": mode})
+    qp = vq.Resolver(problem).build(position=[0.05, 0.0, 4.0])
+    names = [label.name for label in qp.columns]
+    held = ["gap: face 5 x", "gap: face 5 y", "gap: face 5 z", "tilt: face 5 x", "tilt: face 5 y"]
+    other = "gap: face 3 x"
+    for name in [*held, *([] if mode == "elastic" else [other])]:
+        k = names.index(name)
+        assert qp.column_lower[k] == qp.column_upper[k] == 0.0, name
+    if mode == "elastic":
+        assert not np.isfinite(qp.column_upper[names.index(other)])
+    assert {label.kind for label in qp.rows} >= {"curve leg", "curve base", "tracking"}
+
+
+def test_stations_give_way_where_they_must_and_come_back():
+    problem = random_scene(1991, 20).problem.replace({"method.retries": False})
+    gave: list[bool] = []
+    exact = vq.solve(problem, progress=lambda _, step: gave.append(step.gave_way))
+    assert exact.status == "solved"
+    assert 0 < sum(gave) < 5
+    assert not gave[-1]
+    certificate = exact.certificate
+    assert certificate.ok
+    assert 0.0 < certificate.states_off_curve.value <= sum(gave) / len(gave)
+    assert certificate.tracking_gap.value > 1e-3
+    assert certificate.curve_end_gap.value < 1e-9
+    hard = vq.solve(problem.replace({"method.tracking_mode": "hard"}))
+    assert hard.status == "blocked"
+    assert hard.certificate.ok
+    assert hard.certificate.states_off_curve.value == 0.0
+
+
+def test_an_arm_that_cannot_hold_its_stations_tracks_elastically_and_says_so_where_it_is_asked_to():
+    problem = vq.load_problem("five_bay_free").replace({"method.hard_coordinates": ["position", "pointing"]})
+    with pytest.raises(ProblemError, match=r"hard_coordinates.*cannot keep pointing"):
+        vq.Resolver(problem)
+    assert not vq.Resolver(problem.replace({"method.tracking_mode": "elastic"})).setup.layout.hard_tracking
+
+
+def test_a_curve_that_is_not_where_the_file_says_is_found():
+    maneuver = vq.solve(arm_problem(bays=3, steps=4, curve={"control_vertices": 5}, target=(0.2, 0.1, 2.4)))
+    assert maneuver.certificate.ok
+    moved = maneuver.control_vertices.copy()
+    moved[2, -1] += [0.0, 1e-3, 0.0]
+    found = vq.verify(replace(maneuver, control_vertices=moved))
+    assert found.curve_end_gap.value == pytest.approx(1e-3, rel=1e-6)
+    assert found.curve_end_gap.where == "row 2"
+    assert not found.ok
+    record = {**maneuver.manifest["curve"], "stations": [[0, 1, 999]] * 3}
+    with pytest.raises(ResultError, match=r"manifest\.curve does not fit"):
+        vq.verify(replace(maneuver, manifest={**maneuver.manifest, "curve": record}))
+    without = {key: value for key, value in maneuver.manifest.items() if key != "curve"}
+    assert vq.verify(replace(maneuver, manifest=without)).tracking_gap.value is None
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    family=st.sampled_from(["bezier", "b-spline", "beta-spline"]),
+    seed=st.integers(0, 2**31),
+    vertices=st.integers(4, 9),
+    by_arc_length=st.booleans(),
+)
+def test_curve_nodes_of_the_certificate_are_those_of_the_curve(family, seed, vertices, by_arc_length):
+    rng = np.random.default_rng(seed)
+    options = {"bias": 1.3, "tension": 2.0} if family == "beta-spline" else {}
+    made = make_family(family, vertices, **options)
+    p = np.linspace(0.0, 1.0, vertices)[:, None] * [0.3, 0.2, 4.0] + 0.1 * rng.normal(size=(vertices, 3))
+    curve, nodes = Curve(made, p), np.sort(rng.uniform(0.0, 1.0, 5))
+    s = curve.arc_parameter(nodes) if by_arc_length else nodes
+    recorded = RecordedCurve(
+        made.breaks, made.extraction, nodes, by_arc_length, np.zeros((5, 1), int), np.ones((5, 1))
+    )
+    np.testing.assert_allclose(recorded.points(p[None])[0], curve.position(s), atol=1e-7)
+    end = recorded.end_direction(p[None])[0]
+    np.testing.assert_allclose(end / np.linalg.norm(end), curve.tangent(1.0), atol=1e-12)

@@ -1,0 +1,91 @@
+"""What ``build`` shows is the QP that a step begins with: other solvers give it the step's own first answer."""
+
+from __future__ import annotations
+
+import os
+import warnings
+
+import numpy as np
+import pytest
+import qpsolvers
+from scipy import sparse
+
+import vgtm_qp as vq
+from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.problem import bundled_problems
+
+EVERY = 1 if os.environ.get("VGTM_EVERY_STATE") else 12
+"""States from one that is compared to the next."""
+
+SOLVERS = {
+    "clarabel": {"tol_gap_abs": 1e-14, "tol_gap_rel": 1e-14, "tol_feas": 1e-14},
+    "piqp": {"eps_abs": 1e-13, "eps_rel": 1e-13, "eps_duality_gap_abs": 1e-13, "eps_duality_gap_rel": 1e-15},
+    "osqp": {"eps_abs": 1e-10, "eps_rel": 1e-10, "max_iter": 400_000, "polishing": True},
+}
+TOLERANCE = 1e-7
+QPS = [name for name in bundled_problems() if vq.load_problem(name).method.name == "qp"]
+
+
+@pytest.fixture(autouse=True)
+def _without_a_compiler(monkeypatch):
+    monkeypatch.setenv("VGTM_CC", "none")
+
+
+def answer(qp, solver):
+    """The answer of one of the solvers to the QP's own arrays."""
+    equal = qp.row_lower == qp.row_upper
+    sides, lower, upper = qp.A[~equal], qp.row_lower[~equal], qp.row_upper[~equal]
+    below, above = np.isfinite(lower), np.isfinite(upper)
+    problem = qpsolvers.Problem(
+        sparse.csc_matrix(qp.P),
+        qp.q,
+        sparse.vstack([sides[above], -sides[below]]).tocsc(),
+        np.concatenate([upper[above], -lower[below]]),
+        sparse.csc_matrix(qp.A[equal]),
+        qp.row_lower[equal],
+        qp.column_lower,
+        qp.column_upper,
+    )
+    with warnings.catch_warnings():
+        # Tolerances as tight as these end with a solver's remark that it came no nearer.
+        warnings.simplefilter("ignore")
+        found = qpsolvers.solve_problem(problem, solver, **SOLVERS[solver]).x
+    assert found is not None, solver
+    return found
+
+
+@pytest.mark.parametrize("name", QPS)
+def test_other_solvers_give_the_first_answer_of_the_step(name):
+    resolver = vq.Resolver(vq.load_problem(name))
+    plan, compared, task = make_plan(vq.load_problem(name), *resolver.tip()), 0, resolver.setup.task
+    value = plan.path.start
+    for number, mark in enumerate(plan.marks[1:]):
+        if number % EVERY == 0:
+            goal = plan.path.at(float(mark))
+            asked = {"position": goal.position}
+            if task.turns == "pointing":
+                asked["pointing"] = goal.rotation[:, 2]
+            state, qp = resolver.state, resolver.build(**asked)
+            answers = {solver: answer(qp, solver) for solver in SOLVERS}
+            step = resolver.step(**asked)
+            if step.status == "reached" and not step.gave_way:
+                columns = [label.kind for label in qp.columns]
+                of = {kind: np.array([k == kind for k in columns]) for kind in set(columns)}
+                wanted = step.solution
+                parts = {"actuator displacement": wanted.actuators, "progress": [wanted.progress]}
+                if len(wanted.nodes):
+                    # The engine of short arms keeps what its nodes do to itself.
+                    parts["node displacement"] = wanted.nodes[resolver.setup.arm.free].reshape(-1)
+                for solver, z in answers.items():
+                    for kind, values in parts.items():
+                        where = f"{solver}, state {number}, {kind}"
+                        np.testing.assert_allclose(
+                            z[of[kind]], values, atol=TOLERANCE, rtol=0.0, err_msg=where
+                        )
+                compared += 1
+            resolver.state = state
+        step = resolver.follow(plan.path, value, float(mark))
+        if not step.moved:
+            break
+        value += step.progress * (float(mark) - value)
+    assert compared > 0

@@ -1,0 +1,145 @@
+"""How far the stations of an arm are from their nodes on the reference curve, and the curve's end from the tip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import comb
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vgtm_qp.arrays import Array, Index
+from vgtm_qp.errors import ResultError
+from vgtm_qp.result.certificate import Measure
+from vgtm_qp.result.result import Result
+from vgtm_qp.verify.path import DIRECTION_TOLERANCE, angles
+
+TRACKING_TOLERANCE = 1e-6
+"""Stations that are to be on the curve exactly, and the curve's end, m."""
+
+_PIECES = 400
+"""Chords of each Bezier segment whose lengths make its arc length."""
+_REFINEMENTS = 3
+
+
+class RecordedCurve(NamedTuple):
+    """A curve as the manifest records it: a chain of Bezier segments whose points are averages of control vertices.
+
+    Attributes
+    ----------
+    breaks : (S + 1,)
+        Parameters at which the segments begin and end.
+    extraction : (S, d + 1, V)
+        Bezier points of each segment as averages of the control vertices.
+    nodes : (K,)
+        Parameters of the curve nodes, or their shares of the arc length where `by_arc_length`.
+    stations, weights : (K, Q) int, (K, Q)
+        The nodes that each station is the weighted mean of.
+    """
+
+    breaks: Array
+    extraction: Array
+    nodes: Array
+    by_arc_length: bool
+    stations: Index
+    weights: Array
+
+    @classmethod
+    def of(cls, record: Mapping[str, Any], nodes: int, vertices: int) -> RecordedCurve:
+        """Read ``Layout.record``; ResultError where it does not fit so many nodes and control vertices."""
+        try:
+            names = "breaks", "extraction", "nodes", "weights"
+            breaks, extraction, at, weights = (np.asarray(record[name], dtype=float) for name in names)
+            stations = np.asarray(record["stations"], dtype=np.int64)
+            curve = cls(breaks, extraction, at, bool(record["by_arc_length"]), stations, weights)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ResultError(f"manifest.curve is malformed: {error}") from None
+        segments = len(curve.breaks) - 1
+        fits = curve.extraction.ndim == 3 and curve.extraction.shape[::2] == (segments, vertices)
+        fits = fits and stations.shape == weights.shape == (len(curve.nodes), stations.shape[-1])
+        if not fits or (stations.size and not (stations.min() >= 0 and stations.max() < nodes)):
+            raise ResultError(f"manifest.curve does not fit {nodes} nodes and {vertices} control vertices")
+        return curve
+
+    def at(self, s: Array, vertices: Array) -> Array:
+        """Return (T, K, 3) the points at parameters `s` (T, K) of curves with control vertices (T, V, 3), m."""
+        segment = np.searchsorted(self.breaks[1:-1], s, side="right")
+        u = (s - self.breaks[segment]) / np.diff(self.breaks)[segment]
+        degree = self.extraction.shape[1] - 1
+        j = np.arange(degree + 1)
+        share = (
+            np.array([comb(degree, k) for k in j]) * u[..., None] ** j * (1.0 - u[..., None]) ** (degree - j)
+        )
+        table = np.einsum("tkj,tkjv->tkv", share, self.extraction[segment])
+        return np.asarray(table @ vertices)
+
+    def points(self, vertices: Array) -> Array:
+        """Return (T, K, 3) the curve nodes of curves with control vertices (T, V, 3), m."""
+        if not self.by_arc_length:
+            return self.at(np.tile(self.nodes, (len(vertices), 1)), vertices)
+        states = np.arange(len(vertices))[:, None]
+        within = np.arange(2 * _PIECES) / (2 * _PIECES)
+        fine = (self.breaks[:-1, None] + np.diff(self.breaks)[:, None] * within).reshape(-1)
+        fine = np.append(fine, self.breaks[-1])
+        points = self.at(np.tile(fine, (len(vertices), 1)), vertices)
+        halves = np.linalg.norm(np.diff(points, axis=1), axis=2)
+        whole = np.linalg.norm(np.diff(points[:, ::2], axis=1), axis=2)
+        # Twice as many chords are four times nearer to the arc.
+        arcs = (4.0 * (halves[:, ::2] + halves[:, 1::2]) - whole) / 3.0
+        travelled = np.pad(np.cumsum(arcs, axis=1), ((0, 0), (1, 0)))
+        wanted = self.nodes * travelled[:, -1:]
+        piece = np.array(
+            [np.searchsorted(a[1:-1], w, side="right") for a, w in zip(travelled, wanted, strict=True)]
+        )
+        left, start, before = wanted - travelled[states, piece], fine[2 * piece], points[states, 2 * piece]
+        s = start + (fine[2 * piece + 2] - start) * left / arcs[states, piece]
+        for _ in range(_REFINEMENTS):
+            chord = np.linalg.norm(self.at(s, vertices) - before, axis=2)
+            share = np.divide(left, chord, out=np.ones_like(left), where=chord > 0.0)
+            s = np.clip(start + (s - start) * share, 0.0, 1.0)
+        return self.at(s, vertices)
+
+    def end_direction(self, vertices: Array) -> Array:
+        """Return (T, 3) the direction in which the curves end."""
+        ends = self.extraction[-1, -2:] @ vertices
+        return np.asarray(ends[:, 1] - ends[:, 0])
+
+
+def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
+    """Return the measures of a maneuver's curve, whose tip has the attitudes `rotation` (T, 3, 3)."""
+    record, vertices = maneuver.manifest.get("curve"), maneuver.control_vertices
+    if not record or not vertices.shape[1]:
+        return {}
+    curve = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices.shape[1])
+    stations = np.einsum("kq,tkqc->tkc", curve.weights, maneuver.nodes[:, curve.stations])
+    off = np.linalg.norm(stations - curve.points(vertices), axis=2)
+    # At home the curve is fitted to the arm, however that is bent.
+    moved = off[min(1, len(off) - 1) :]
+    row, k = divmod(int(np.argmax(moved)), moved.shape[1])
+    row += len(off) - len(moved)
+    method = maneuver.manifest["problem"].get("method") or {}
+    is_hard = method.get("tracking_mode") == "hard" and bool(record["held"])
+    found = {
+        "tracking_gap": Measure(
+            float(off[row, k]),
+            "m",
+            TRACKING_TOLERANCE if is_hard else None,
+            "most",
+            f"row {row}, station {k + 1}",
+        ),
+        "states_off_curve": Measure(float(np.mean(moved.max(axis=1) > TRACKING_TOLERANCE)), "of the states"),
+    }
+    ends = {
+        "curve_end_gap": ("ends_at_tip", off[:, -1], "m", TRACKING_TOLERANCE),
+        "curve_end_angle": (
+            "ends_along_tip",
+            angles(curve.end_direction(vertices), rotation[:, :, 2]),
+            "rad",
+            DIRECTION_TOLERANCE,
+        ),
+    }
+    for name, (key, errors, unit, bound) in ends.items():
+        if record[key]:
+            row = int(np.argmax(errors))
+            found[name] = Measure(float(errors[row]), unit, bound, "most", f"row {row}")
+    return found
