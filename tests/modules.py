@@ -7,7 +7,7 @@ from typing import Any
 
 from vgtm_qp.arm.truss.build import build_truss
 from vgtm_qp.arm.truss.truss import Truss
-from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, PlateTruss, TetrahedralTruss
+from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, TetrahedralTruss
 
 
 def octahedral(bays: int, **keys: Any) -> Truss:
@@ -28,10 +28,6 @@ def longeron(bays: int, **keys: Any) -> Truss:
 
 def tetrahedral(bays: int, **keys: Any) -> Truss:
     return build_truss(TetrahedralTruss(module="tetrahedral", bays=bays, **keys))
-
-
-def plate(rows: int, columns: int, **keys: Any) -> Truss:
-    return build_truss(PlateTruss(module="plate", rows=rows, columns=columns, **keys))
 
 
 def graph_truss(

@@ -16,9 +16,9 @@ import pytest
 
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
-from vgtm_qp.problem.goal import DeploymentManeuver, PathManeuver, WaypointManeuver
+from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.problem.obstacle import Box
-from vgtm_qp.problem.shape import BezierCurve, BSplineCurve, Surface
+from vgtm_qp.problem.shape import BezierCurve, BSplineCurve
 from vgtm_qp.problem.truss import ModuleTruss
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
@@ -104,18 +104,13 @@ def test_a_problem_in_python_from_tables_keywords_and_arrays() -> None:
 
 
 def test_the_tables_of_each_kind() -> None:
-    plate = Problem(truss={"module": "plate", "rows": 4, "columns": 4}, maneuver=MANEUVER)
-    assert plate.curve is None
-    assert plate.surface == Surface(control_vertices=(4, 4))
-    deployment = Problem(truss=TRUSS, maneuver={"kind": "deployment", "steps": 40})
-    assert isinstance(deployment.maneuver, DeploymentManeuver)
     spline = Problem(truss=TRUSS, maneuver=MANEUVER, curve={"family": "b-spline", "degree": 2})
     assert isinstance(spline.curve, BSplineCurve)
     locked = Problem(truss={**TRUSS, "locked": ["B1-1", {"member": "B2-1", "time": 5}]}, maneuver=MANEUVER)
     assert locked.truss is not None
     assert [(lock.member, lock.time) for lock in locked.truss.locked] == [("B1-1", 0.0), ("B2-1", 5.0)]
     data = {"schema_version": 1, "truss": {**TRUSS, "locked": ["B1-1"]}, "maneuver": MANEUVER}
-    for problem in (plate, deployment, spline, locked):
+    for problem in (spline, locked):
         validator().validate(problem.to_dict())
     validator().validate(data)
 

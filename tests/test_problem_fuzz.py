@@ -30,8 +30,8 @@ family = "beta-spline"
 bias = 1.5
 control_vertex_goals = [{ index = 2, position = [0, 0, 1] }]
 [maneuver]
-kind = "deployment"
-guide = [[0, 0, 0], [0, 0, 1]]
+kind = "path"
+waypoint = [{ time = 1.0, position = [0, 0, 1] }]
 [[obstacle]]
 name = "ball"
 shape = "sphere"

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
-# What stands in each table of the problem-file reference; plates and deployments are not available.
+# What stands in each table of the problem-file reference.
 TABLES = {
     "[truss]": ("ModuleTruss", "TetrahedralTruss", "GraphTruss"),
     "[[truss.node]]": ("Node",),

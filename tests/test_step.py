@@ -726,11 +726,9 @@ def test_steps_do_not_depend_on_the_solver(crate_problem, solver):
     assert any("crate" in name for name in active)
 
 
-def test_an_unknown_solver_and_a_plate_are_refused_with_their_place(crate_problem):
+def test_an_unknown_solver_is_refused_with_its_place(crate_problem):
     with pytest.raises(ProblemError, match=r'method\.solver: found "osq"; .*did you mean "osqp"'):
         Resolver(crate_problem.replace({"method.solver": "osq"}))
-    with pytest.raises(ProblemError, match=r"truss\.module"):
-        Resolver(arm_problem(truss={"module": "plate", "rows": 4, "columns": 3, "bays": None}))
     assert issubclass(ProblemError, VgtmError)
 
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from modules import double_octahedral, hexapod, longeron, octahedral, plate, tetrahedral
+from modules import double_octahedral, hexapod, longeron, octahedral, tetrahedral
 
 from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.arm.truss.build import build_truss, lock_members
 from vgtm_qp.arm.truss.determinacy import check_determinacy, length_jacobian
 from vgtm_qp.arm.truss.mobility import describe, tip_response, trackable_coordinates
 from vgtm_qp.errors import TrussError, VgtmError
-from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
+from vgtm_qp.problem.truss import ModuleTruss, TetrahedralTruss
 
 MODULES = {
     "octahedral": octahedral,
@@ -185,14 +185,9 @@ def test_tip_response_moves_the_tip_as_newton_on_the_lengths_does():
     np.testing.assert_allclose(response[3:], [turn[2, 1], turn[0, 2], turn[1, 0]], atol=1e-4)
 
 
-@pytest.mark.parametrize("module", [*MODULES, "plate"])
+@pytest.mark.parametrize("module", MODULES)
 def test_axial_joint_offsets_shorten_members_and_keep_the_home_jacobian(module):
-    build = (
-        (lambda **keys: plate(5, 4, **keys))
-        if module == "plate"
-        else (lambda **keys: MODULES[module](4, **keys))
-    )
-    pins, joints = build(), build(joint_offset=0.1)
+    pins, joints = MODULES[module](4), MODULES[module](4, joint_offset=0.1)
     np.testing.assert_allclose(joints.home_lengths, node_distances(pins) - 0.2, rtol=1e-12)
     np.testing.assert_allclose(length_jacobian(joints).toarray(), length_jacobian(pins).toarray(), atol=1e-12)
     np.testing.assert_allclose(joints.stroke[~joints.actuated, 0], joints.home_lengths[~joints.actuated])
@@ -219,18 +214,6 @@ def test_joint_triangles_are_faces_and_counter_clockwise():
 
 
 @pytest.mark.parametrize(
-    ("columns", "nodes", "condition"), [(3, 33, 100), (4, 46, 200), (5, 59, 200), (6, 72, 200)]
-)
-def test_plates_are_determinate(columns, nodes, condition):
-    truss = plate(7, columns)
-    assert truss.node_count == nodes
-    report = check_determinacy(truss)
-    assert report.members == 15 * (2 * columns - 1)
-    assert report.condition < condition
-    assert_stages_square_and_regular(truss, length_jacobian(truss).toarray())
-
-
-@pytest.mark.parametrize(
     ("build", "message"),
     [
         (lambda: octahedral(0), "bays: found 0; expected an integer from 1"),
@@ -246,12 +229,6 @@ def test_plates_are_determinate(columns, nodes, condition):
         (lambda: tetrahedral(2, actuated=(1, 1)), "one to three different numbers"),
         (lambda: tetrahedral(2, actuated=(1, 4)), "an integer from 1 to 3"),
         (lambda: tetrahedral(2, longeron=1.75), "where the helix folds flat"),
-        (lambda: plate(2, 4), "rows: found 2; expected an integer from 3"),
-        (
-            lambda: plate(4, 4, stroke=[0.8, 1.2]),
-            "home length of member D2-1, 1.41421 m, is outside its stroke",
-        ),
-        (lambda: plate(4, 4, depth=0.1, joint_offset=0.4), "less than half the shortest member, 0.357"),
     ],
 )
 def test_impossible_dimensions_are_refused(build, message):
@@ -272,7 +249,6 @@ def test_build_truss_follows_the_table():
         assert built.module == module
         assert built.joints is not None
     assert build_truss(TetrahedralTruss(module="tetrahedral", bays=2, actuated=(2, 3))).actuated.sum() == 12
-    assert build_truss(PlateTruss(module="plate", rows=4, columns=4)).node_count == 4 * 4 + 3 * 3
 
 
 def test_locked_members_are_fixed_at_their_length():

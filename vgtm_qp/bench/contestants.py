@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods import Resolver
+from vgtm_qp.methods import Resolver, with_method
 from vgtm_qp.methods.conventional import DenseSolution
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
@@ -68,10 +68,11 @@ class BarePseudoinverse:
 
 
 class ResolverStep:
-    """A resolver of the package, with `changes` to the problem's method."""
+    """A resolver of the package by a `method` of that name, or by the problem's own with another `solver`."""
 
-    def __init__(self, problem: Problem, **changes: Any) -> None:
-        changed = problem.replace({f"method.{key}": value for key, value in changes.items()})
+    def __init__(self, problem: Problem, *, method: str | None = None, solver: str | None = None) -> None:
+        changed = problem if method is None else with_method(problem, method)
+        changed = changed if solver is None else changed.replace({"method.solver": solver})
         self.resolver: Resolver = Resolver(changed)
 
     def place(self, state: State) -> None:
@@ -91,12 +92,12 @@ BASELINES: dict[BaselineName, Baseline] = {
     "eq28-sparse": Baseline(
         "eq. (28), banded",
         1000,
-        partial(ResolverStep, name="pseudoinverse", algebra="sparse", tracking="none"),
+        partial(ResolverStep, method="pseudoinverse-sparse"),
     ),
     "curve": Baseline(
         "curve by pseudoinverse, bays after it",
         1000,
-        partial(ResolverStep, name="curve-pseudoinverse", tracking="recursive"),
+        partial(ResolverStep, method="curve-pseudoinverse"),
     ),
     "ipopt": Baseline("one nonlinear program a step, IPOPT", 20, NonlinearStep),
     "osqp": Baseline("the same QPs, sparse, OSQP", 200, partial(ResolverStep, solver="osqp")),

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import Mistake
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.rotation import rotation_from_vector, turn_between
@@ -44,15 +43,12 @@ class Plan:
 def make_plan(problem: Problem, position: Array, rotation: Array) -> Plan:
     """Return the plan of a problem's maneuver from the home pose of the tip, `position` (3,) and `rotation` (3, 3).
 
-    ProblemError where the maneuver is of a kind that has no path, or its file is wrong.
+    ProblemError where the path file is wrong.
     """
     maneuver = problem.maneuver
     if isinstance(maneuver, WaypointManeuver):
         return _through_waypoints(maneuver, position, rotation)
-    if isinstance(maneuver, PathManeuver):
-        return _along_file(maneuver, position, rotation)
-    expected = 'a path: "path" (deployment is not available in this version)'
-    raise problem.error([Mistake("maneuver.kind", '"deployment"', expected)])
+    return _along_file(maneuver, position, rotation)
 
 
 def _through_waypoints(maneuver: WaypointManeuver, position: Array, rotation: Array) -> Plan:

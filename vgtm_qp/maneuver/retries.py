@@ -1,8 +1,7 @@
 """Retries after a dead end: the same maneuver once more from home, with the redundancy resolved differently.
 
 A path that is blocked for one shape of the arm may be open for another, and the null-space terms decide which shape it
-takes. The retries stand in the order of their success over random scenes (``vgtm study robustness``; README, section
-Robustness).
+takes. The retries stand in the order of their success over random scenes (``vgtm study robustness``).
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
     vertices = len(dead_end.control_vertices)
     centring, rate = 10.0 * max(weights.stroke_centring, 0.02), 50.0 * max(weights.actuator_rate, 0.02)
     yield "actuators drawn to their home lengths", {"method.weights.stroke_centring": centring}
-    if curve is not None and not curve.control_vertex_goals and vertices >= 4:
+    if not curve.control_vertex_goals and vertices >= 4:
         firm = {"method.weights.tracking": max(weights.tracking, _FIRM_TRACKING)}
         for name, quarter, size in _BULGES:
             bulged = bulge(dead_end, quarter, size)
@@ -83,8 +82,8 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
     yield "actuator rates as the metric", {"method.weights.actuator_rate": rate}
     # Hard tracking asks for the curve, so there is no retry without it.
     if method.tracking == "coupled" and method.tracking_mode != "hard":
-        yield "no curve", {"method.tracking": "none"}
-    if curve is not None and vertices:
+        yield "no curve", {"method": method.kept_by("qp", "none"), "curve.control_vertex_goals": []}
+    if vertices:
         yield "more control vertices", {"curve.control_vertices": curve.control_vertices + _MORE_VERTICES}
 
 

@@ -215,7 +215,7 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
 
     def __init__(self, problem: Problem) -> None:
         method = problem.method
-        super().__init__(arm_without_curve(problem), method.step_limit)
+        super().__init__(arm_without_curve(problem))
         self._fixed = truss_of(self.setup.arm).fixed
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         self._objective = TrussObjective(names, method.weights, self.setup)

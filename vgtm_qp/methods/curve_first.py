@@ -29,8 +29,9 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
 
     def __init__(self, problem: Problem) -> None:
         method = problem.method
-        changes = {"method.tracking": "coupled", "method.solver": "piqp"}
-        super().__init__(build_arm(problem.replace(changes)), method.step_limit)
+        # The solver is never called; this one compiles no kernels.
+        coupled = {**method.kept_by("qp", "coupled"), "solver": "piqp"}
+        super().__init__(build_arm(problem.replace({"method": coupled})))
         setup = self.setup
         if setup.base_motion is not None:
             raise CurveError("a moving base takes the method qp, with any tracking, or pseudoinverse")

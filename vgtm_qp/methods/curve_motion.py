@@ -35,7 +35,7 @@ class CurveMotion:
 
     def __init__(self, problem: Problem, setup: Setup) -> None:
         method, spec, truss = problem.method, problem.curve, truss_of(setup.arm)
-        if spec is None or not len(truss.faces):
+        if not len(truss.faces):
             raise CurveError("this method needs a reference curve and a truss with faces")
         family = setup.layout.family
         assert family is not None, "an arm with faces and a curve is laid out with its family"

@@ -79,7 +79,7 @@ DEFAULT_METHODS = (
 
 
 def with_method(problem: Problem, name: str) -> Problem:
-    """Return the problem with the method called `name`; its own weights, gains and solver stay.
+    """Return the problem with the method called `name`; what that serves of its own weights, gains and keys stays.
 
     Raises
     ------
@@ -89,7 +89,9 @@ def with_method(problem: Problem, name: str) -> Problem:
         The problem contradicts it.
     """
     check_methods([name])
-    return problem.replace(PRESETS[name])
+    changes = PRESETS[name]
+    kept = problem.method.kept_by(changes["method.name"], changes.get("method.tracking", "coupled"))
+    return problem.replace({"method": kept, **changes})
 
 
 def methods_for(problem: Problem) -> dict[str, Problem]:

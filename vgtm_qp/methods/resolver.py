@@ -43,12 +43,11 @@ class MethodResolver(Resolver):
     It knows the arm's state after a step alone: nothing that brakes, drives pairs apart or follows control vertices.
     """
 
-    def __init__(self, setup: Setup, step_limit: float | None) -> None:
+    def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._state = setup.home_state()
         self._actuation = Actuation(setup)
         self._clock = Phases("kinematics", "solve", "correction", "acceptance")
-        self._limit = step_limit
         self._steps = 0
 
     @property
@@ -128,8 +127,10 @@ class MethodResolver(Resolver):
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
         truss, lengths = truss_of(self.setup.arm), self.setup.arm.home_quantities
+        if too_long := self.setup.too_long(nodes - self.state.nodes):
+            raise SolverError(too_long)
         asked = float(np.linalg.norm(path.at(end).position - path.at(start).position))
-        limit = self._limit or 0.5 * float(lengths.min()) + 3.0 * asked
+        limit = 0.5 * float(lengths.min()) + 3.0 * asked
         moved = float(np.max(np.abs(nodes - self.state.nodes)))
         if not moved <= limit:
             raise SolverError(
@@ -149,8 +150,8 @@ def arm_without_curve(problem: Problem) -> Setup:
         The arm cannot be built.
     """
     # The solver is never called; this one compiles no kernels.
-    changes = {"method.tracking": "none", "method.tracking_mode": "elastic", "method.solver": "piqp"}
-    return build_arm(problem.replace(changes))
+    method = {**problem.method.kept_by("qp", "none"), "solver": "piqp"}
+    return build_arm(problem.replace({"method": method}))
 
 
 def displacement_to(goal: TipGoal, start: TipGoal) -> TipGoal:

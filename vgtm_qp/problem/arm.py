@@ -1,4 +1,4 @@
-"""``[arm]``: a serial arm in the place of a truss, from a URDF file or a list of joints."""
+"""``[arm]``: a serial arm in the place of a truss, from a list of joints."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from vgtm_qp.problem.fields import (
     ORIGIN,
     Direction,
     Distance,
-    File,
     Limit,
     Name,
     Number,
@@ -70,20 +69,12 @@ class JointLock(LockTable, called="a locked joint"):
 class ArmTable(Table, called="an arm"):
     """A serial arm."""
 
-    urdf: File | None = Field(default=None, description="URDF file, relative to the problem file")
-    base_link: Name | None = Field(
-        default=None, description="first link taken from the URDF; its root where absent"
+    later = dict.fromkeys(
+        ("urdf", "package_path", "base_link", "tip_link", "home", "bodies"),
+        "a list of joints [[arm.joint]]; URDF files are not read by this version",
     )
-    tip_link: Name | None = Field(
-        default=None, description="last link taken from the URDF; its one leaf where absent"
-    )
-    home: tuple[Number, ...] | None = Field(
-        default=None,
-        description="joint values of the home pose of a URDF arm, base first, rad or m; zeros where absent",
-    )
-    joint: tuple[Joint, ...] = Field(
-        default=(), description="the joints, base first, in the place of a URDF file"
-    )
+
+    joint: tuple[Joint, ...] = Field(default=(), description="the joints, base first")
     tip: Vector = Field(default=ORIGIN, description="position of the end effector in the last frame, m")
     link_radius: Distance = Field(
         default=0.03, description="radius of the capsules between successive joints, m"
@@ -102,15 +93,9 @@ class ArmTable(Table, called="an arm"):
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from increasing("base_motion", [pose.time for pose in self.base_motion])
         yield from unique("locked", "joint", [lock.joint for lock in self.locked])
-        if self.urdf is not None and self.joint:
-            yield ("joint",), "a urdf file or a list of joints, not both"
-        if self.urdf is None:
-            if not self.joint:
-                yield ("joint",), "a list of joints [[arm.joint]], or a urdf file"
-            for key in ("base_link", "tip_link", "home"):
-                if getattr(self, key) is not None:
-                    yield (key,), f"no {key} without a urdf file"
-            yield from unique("joint", "name", [joint.name for joint in self.joint])
-            names = {joint.name: joint for joint in self.joint}
-            for i, lock in enumerate(self.locked):
-                yield from known_names(("locked", i), (lock.joint,), names, key="joint")
+        if not self.joint:
+            yield ("joint",), "a list of joints [[arm.joint]]"
+        yield from unique("joint", "name", [joint.name for joint in self.joint])
+        names = {joint.name: joint for joint in self.joint}
+        for i, lock in enumerate(self.locked):
+            yield from known_names(("locked", i), (lock.joint,), names, key="joint")

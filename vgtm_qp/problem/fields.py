@@ -71,10 +71,17 @@ class ByKey:
     """Annotation of a union of tables: the value of one key, a ``Literal`` of strings in each of them, picks the table.
 
     A table in which it has a default needs no key. Where given, `pick` returns the table for a value, or None, instead.
+    Values `later` are reserved: messages say that this version does not serve them.
     """
 
-    def __init__(self, key: str, pick: Callable[[Any], type[BaseModel] | None] | None = None) -> None:
-        self.key, self.pick = key, pick or self._by_key
+    def __init__(
+        self,
+        key: str,
+        pick: Callable[[Any], type[BaseModel] | None] | None = None,
+        *,
+        later: Iterable[str] = (),
+    ) -> None:
+        self.key, self.pick, self.later = key, pick or self._by_key, ",".join(later)
         # Both are read from the tables of the union when its schema is built.
         self.tables: dict[str, type[BaseModel]] = {}
         self.default: str | None = None
@@ -90,7 +97,7 @@ class ByKey:
             lambda value: _tag(self.pick(value)),
             custom_error_type="choice",
             custom_error_message="a table",
-            custom_error_context={"key": self.key, "choices": ",".join(self.tables)},
+            custom_error_context={"key": self.key, "choices": ",".join(self.tables), "later": self.later},
         )
 
     def _by_key(self, value: Any) -> type[BaseModel] | None:

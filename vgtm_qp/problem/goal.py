@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from vgtm_qp.problem.fields import ByKey, Direction, File, Length, NonNegative, Seconds, Vector, count, entry
+from vgtm_qp.problem.fields import ByKey, Direction, File, Seconds, Vector, count, entry
 from vgtm_qp.problem.table import Place, Table, increasing
 
 Coordinates = Literal["position", "pointing", "orientation", "x", "y", "z"]
@@ -82,33 +82,14 @@ class PathManeuver(Table, called="a maneuver along a path file"):
     )
 
 
-class DeploymentManeuver(Table, called="a deployment"):
-    """From the stowed to the deployed truss, along a guide curve, tip first."""
-
-    kind: Literal["deployment"]
-    steps: Steps = Field(default=150, description="number of steps")
-    duration: Seconds = Field(default=10.0, description="time from stowed to deployed, s")
-    stowed_batten: Length | None = Field(
-        default=None, description="length of the battens when stowed, m; 1.65 longerons where absent"
-    )
-    overlap: NonNegative = Field(
-        default=2.0, description="how many bays open at the same time besides the foremost"
-    )
-    guide: tuple[Vector, ...] | None = Field(
-        default=None,
-        min_length=2,
-        description="control vertices of the guide curve, m; straight up where absent",
-    )
-
-
 def _pick(value: Any) -> type[Table] | None:
-    kind = entry(value, "kind")
-    if kind == "deployment":
-        return DeploymentManeuver
-    if kind not in (None, "path") or not isinstance(value, Mapping | Table):
+    if entry(value, "kind") not in (None, "path") or not isinstance(value, Mapping | Table):
         return None
     has_path = entry(value, "path") is not None and entry(value, "waypoint") is None
     return PathManeuver if has_path else WaypointManeuver
 
 
-Maneuver = Annotated[WaypointManeuver | PathManeuver | DeploymentManeuver, ByKey("kind", _pick)]
+Maneuver = Annotated[
+    WaypointManeuver | PathManeuver,
+    ByKey("kind", _pick, later=("goal", "deployment", "follow-the-leader", "shape")),
+]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
 
 from pydantic import Field
 
 from vgtm_qp.problem.fields import Factor, Flag, Length, Name, Weight, quoted
-from vgtm_qp.problem.table import Place, Table
+from vgtm_qp.problem.table import Place, Table, shown
 
 NullSpaceTerm = Literal[
     "node_rate",
@@ -21,6 +21,54 @@ NullSpaceTerm = Literal[
 ]
 HardCoordinate = Literal["position", "pointing", "orientation"]
 HARD_COORDINATES = ("position", "pointing", "orientation")
+_WAYS = {
+    "coupled": '"qp" with tracking "coupled"',
+    "none": '"qp" with tracking "none"',
+    "bays": '"qp" with tracking "recursive" or "parallel"',
+    "pseudoinverse": '"pseudoinverse"',
+    "curve-pseudoinverse": '"curve-pseudoinverse"',
+}
+"""The ways in which arms are moved, as messages call them."""
+_QP, _COUPLED, _INVERSE, _CURVE = (
+    ("coupled", "bays", "none"),
+    ("coupled", "bays"),
+    ("pseudoinverse",),
+    ("curve-pseudoinverse",),
+)
+SERVED: dict[str, tuple[str, ...]] = {
+    "name": tuple(_WAYS),
+    "tracking": (*_QP, *_CURVE),
+    "tracking_mode": ("coupled",),
+    "hard_coordinates": _COUPLED,
+    "solver": ("coupled", "none"),
+    "retries": tuple(_WAYS),
+    "slow_approach": _QP,
+    "step_limit": tuple(_WAYS),
+    "variant": _INVERSE,
+    "algebra": _INVERSE,
+    "correct": (*_INVERSE, *_CURVE),
+    "null_space": (*_INVERSE, *_CURVE),
+    "damping": _INVERSE,
+    "truncation": _INVERSE,
+    "weights.node_rate": (*_QP, *_INVERSE),
+    "weights.actuator_rate": (*_QP, *_INVERSE),
+    "weights.stroke_centring": (*_QP, *_INVERSE),
+    "weights.curve_rate": _COUPLED,
+    "weights.tracking": ("coupled",),
+    "weights.tangent": _COUPLED,
+    "weights.roll": _COUPLED,
+    "weights.spacing": _COUPLED,
+    "weights.smoothness": _COUPLED,
+    "weights.vertex_goal": _COUPLED,
+    "weights.obstacle_potential": _INVERSE,
+    "weights.end_effector": _QP,
+    "weights.progress": _QP,
+    "gains.spacing": _CURVE,
+    "gains.smoothness": _CURVE,
+    "gains.curve_rate": _CURVE,
+    "gains.obstacle_potential": _CURVE,
+}
+"""Which of the ways each key has a meaning for; with the others it is refused unless it has its default."""
 TRUSS_TERMS = ("node_rate", "actuator_rate", "stroke_centring", "obstacle_potential")
 CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 
@@ -91,7 +139,8 @@ class Method(Table, called="[method]"):
     )
     tracking: Literal["coupled", "recursive", "parallel", "none"] = Field(
         default="coupled",
-        description="truss and curve together; curve first, then bay after bay or all bays at once; no curve",
+        description="truss and curve together; curve first, then bay after bay or all bays at once; no curve. With "
+        "curve-pseudoinverse coupled means recursive",
     )
     tracking_mode: Literal["exact", "hard", "elastic"] = Field(
         default="exact",
@@ -106,7 +155,8 @@ class Method(Table, called="[method]"):
     )
     solver: Name = Field(default="daqp", description="daqp, osqp, piqp, or another solver of qpsolvers")
     retries: Flag = Field(
-        default=True, description="whether other ways out of a dead end are tried before giving up"
+        default=True,
+        description="whether other ways out of a dead end are tried before giving up; pseudoinverse methods know none",
     )
     slow_approach: Flag = Field(
         default=True,
@@ -115,7 +165,8 @@ class Method(Table, called="[method]"):
     )
     step_limit: Length | None = Field(
         default=None,
-        description="greatest displacement of a node in one step, m; set from the members where absent",
+        description="greatest displacement of a node in one step, m; longer steps are shortened along the path, or "
+        "refused where the tip stays on time",
     )
     variant: Literal["moore-penrose", "weighted", "damped", "truncated"] = Field(
         default="moore-penrose", description="pseudoinverse of eq. (28)"
@@ -143,6 +194,11 @@ class Method(Table, called="[method]"):
     )
 
     @property
+    def modes(self) -> tuple[str, ...]:
+        """Modes of the end effector that the method has; the pseudoinverse methods are always on time."""
+        return ("scaled", "hard", "elastic") if self.name == "qp" else ("scaled", "hard")
+
+    @property
     def goes_by_bays(self) -> bool:
         """Whether the QP is one over the curve alone, which each bay follows exactly."""
         return self.name == "qp" and self.tracking in ("recursive", "parallel")
@@ -153,19 +209,57 @@ class Method(Table, called="[method]"):
         is_held = self.tracking == "coupled" and self.tracking_mode != "elastic"
         return self.goes_by_bays or (self.name == "qp" and is_held)
 
+    @property
+    def draws_vertices(self) -> bool:
+        """Whether control vertices follow goals of their own."""
+        return _way(self.name, self.tracking) in _COUPLED
+
+    @property
+    def moves_curve_first(self) -> bool:
+        """Whether the truss moves after a curve that has moved by itself."""
+        return self.name == "curve-pseudoinverse"
+
+    def kept_by(self, name: str, tracking: str = "coupled") -> dict[str, Any]:
+        """Return the table of another method: those of its keys here that are not as by default."""
+        way = _way(name, tracking)
+        kept: dict[str, Any] = {"name": name, "tracking": tracking}
+        for key, value in self._changed():
+            outer, _, inner = key.partition(".")
+            if way in SERVED[key] and key not in kept:
+                kept.setdefault(outer, {}).update({inner: value}) if inner else kept.update({key: value})
+        return kept
+
+    def _changed(self) -> Iterator[tuple[str, Any]]:
+        """Yield each key that is not as by default, and its value; keys of inner tables as ``weights.tracking``."""
+        for key, value in self.model_dump(mode="json", exclude_defaults=True).items():
+            if isinstance(value, Mapping):
+                yield from ((f"{key}.{inner}", own) for inner, own in value.items())
+            else:
+                yield key, value
+
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
-        if self.tracking_mode == "hard" and self.tracking == "none":
-            yield ("tracking_mode",), '"exact" or "elastic", since tracking is "none"'
-        if self.goes_by_bays and self.tracking_mode == "elastic":
-            yield ("tracking_mode",), f'"exact" or "hard", since tracking is "{self.tracking}"'
-        if self.goes_by_bays and self.solver != "daqp":
-            over = f'"daqp", which solves the QP over the curve where tracking is "{self.tracking}"'
-            yield ("solver",), over
+        way = _way(self.name, self.tracking)
+        for key, _ in self._changed():
+            if way not in SERVED[key]:
+                others = " or ".join(_WAYS[other] for other in SERVED[key])
+                place = tuple(key.split("."))
+                table = type(self) if len(place) == 1 else type(getattr(self, place[0]))
+                default = shown(table.model_fields[place[-1]].default)
+                yield place, f"{default}, since {_WAYS[way]} does without this key; it belongs to {others}"
+        if self.name == "curve-pseudoinverse" and self.tracking == "none":
+            yield ("tracking",), '"recursive" or "parallel": the method moves the curve first'
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
             yield ("hard_coordinates",), f"the first one, two or three of {quoted(HARD_COORDINATES)}"
         if self.variant == "truncated" and self.algebra == "sparse":
             yield ("algebra",), '"dense", since the variant truncated needs the singular values'
-        known = {"pseudoinverse": TRUSS_TERMS, "curve-pseudoinverse": CURVE_TERMS}.get(self.name)
-        for i, term in enumerate(self.null_space or ()):
-            if known is not None and term not in known:
+        known = TRUSS_TERMS if way == "pseudoinverse" else CURVE_TERMS
+        for i, term in enumerate(self.null_space or () if way in SERVED["null_space"] else ()):
+            if term not in known:
                 yield ("null_space", i), f"a term of the method {self.name}: {quoted(known)}"
+
+
+def _way(name: str, tracking: str) -> str:
+    """Return which of the ways in which arms are moved a method is."""
+    if name == "qp":
+        return tracking if tracking in ("coupled", "none") else "bays"
+    return name

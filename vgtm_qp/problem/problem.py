@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field, PrivateAttr, WithJsonSchema, model_validator
+from pydantic import Field, PrivateAttr, WithJsonSchema
 
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem.arm import ArmTable
-from vgtm_qp.problem.fields import Name, entry, expect
+from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
 from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
-from vgtm_qp.problem.shape import Curve, Surface
+from vgtm_qp.problem.shape import BezierCurve, Curve
 from vgtm_qp.problem.table import Place, Table, key_path, shown, unique, value_at
-from vgtm_qp.problem.truss import PlateTruss, Truss
+from vgtm_qp.problem.truss import Truss
 
 SCHEMA_VERSION = 1
 
@@ -33,6 +33,11 @@ class Problem(Table, called="a problem"):
         With one :class:`~vgtm_qp.errors.Mistake` per mistake.
     """
 
+    later: ClassVar = {
+        "surface": "a reference [curve]; surfaces belong to plates, which this version does not have",
+        "loads": "no loads; this version knows no forces",
+    }
+
     schema_version: Annotated[
         int,
         Field(strict=True, ge=SCHEMA_VERSION, le=SCHEMA_VERSION),
@@ -42,11 +47,8 @@ class Problem(Table, called="a problem"):
     name: Name = Field(default="unnamed", description="title in tables and figures")
     truss: Truss | None = Field(default=None, description="the arm: a truss")
     arm: ArmTable | None = Field(default=None, description="a serial arm, in the place of a truss")
-    curve: Curve | None = Field(
-        default=None, description="the reference curve; a Bezier of 6 vertices where absent"
-    )
-    surface: Surface | None = Field(
-        default=None, description="the reference surface of a plate, in the place of a curve"
+    curve: Curve = Field(
+        default_factory=BezierCurve, description="the reference curve; a Bezier of 6 vertices where absent"
     )
     end_effector: EndEffector = Field(
         default_factory=EndEffector, description="which coordinates are steered"
@@ -107,14 +109,6 @@ class Problem(Table, called="a problem"):
         """Return the error of mistakes that a later check found."""
         return ProblemError(str(self.source or self.name), mistakes)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _with_shape(cls, data: Any) -> Any:
-        """Add the default curve, or surface of a plate, where a truss or arm has neither."""
-        if not isinstance(data, Mapping) or data.get("curve") is not None or data.get("surface") is not None:
-            return data
-        return {**data, "surface" if entry(data.get("truss"), "module") == "plate" else "curve": {}}
-
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.truss is None and self.arm is None:
             yield ("truss",), "a table [truss], or a table [arm] in its place"
@@ -124,11 +118,18 @@ class Problem(Table, called="a problem"):
             yield ("method", "name"), '"qp": the pseudoinverse methods move trusses, not serial arms'
         elif self.arm is not None and self.method.tracking in ("recursive", "parallel"):
             yield ("method", "tracking"), '"coupled" or "none": the others go along the bays of a truss'
-        if isinstance(self.truss, PlateTruss):
-            if self.curve is not None:
-                yield ("curve",), "no curve, since a plate tracks a surface: [surface]"
-        elif self.surface is not None:
-            yield ("surface",), 'no surface, since only a truss with module = "plate" tracks one'
+        if self.curve.control_vertex_goals and not self.method.draws_vertices:
+            yield (
+                ("curve", "control_vertex_goals"),
+                'none, since only "qp" with a curve draws control vertices',
+            )
+        if self.curve.nodes == "arc-length" and self.method.moves_curve_first:
+            yield (
+                ("curve", "nodes"),
+                '"parameter", since a curve that moves first keeps the parameters of its nodes',
+            )
+        if self.end_effector.mode not in self.method.modes:
+            yield ("end_effector", "mode"), f"{quoted(self.method.modes)}: the method has no other mode"
         yield from unique("obstacle", "name", [obstacle.name for obstacle in self.obstacle])
         if isinstance(self.maneuver, WaypointManeuver):
             for i, waypoint in enumerate(self.maneuver.waypoint):

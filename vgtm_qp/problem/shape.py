@@ -1,4 +1,4 @@
-"""``[curve]`` and ``[surface]``: the reference shapes that a truss tracks."""
+"""``[curve]``: the reference curve that an arm tracks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from vgtm_qp.problem.fields import ByKey, Factor, NonNegative, Vector, count, exactly
+from vgtm_qp.problem.fields import ByKey, Factor, NonNegative, Vector, count
 from vgtm_qp.problem.table import Place, Table, unique
 
 
@@ -79,12 +79,3 @@ class BetaSplineCurve(_Curve, called="a Beta-spline curve"):
 
 
 Curve = Annotated[BezierCurve | BSplineCurve | BetaSplineCurve, ByKey("family")]
-
-
-class Surface(Table, called="a surface"):
-    """A tensor-product Bezier surface, for plates."""
-
-    control_vertices: Annotated[
-        tuple[Annotated[int, count(2, 30)], Annotated[int, count(2, 30)]],
-        exactly(2, "two integers [along, across]"),
-    ] = Field(default=(4, 4), description="numbers of control vertices along and across")

@@ -44,6 +44,8 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     called: ClassVar[str] = "this table"
+    later: ClassVar[Mapping[str, str]] = {}
+    """Keys whose names are reserved for what this version does not do, and what it takes instead."""
 
     def __init_subclass__(cls, *, called: str | None = None, **options: Any) -> None:
         """Name the table in messages as `called`, where given."""
@@ -121,7 +123,9 @@ class Table(BaseModel):
             phrase = found["msg"]
         elif kind == "extra_forbidden":
             keys, unknown = list(cls.model_fields), str(place[-1])
-            phrase = f"one of the keys of {cls.called}: {', '.join(keys)}{nearest(unknown, keys)}"
+            phrase = cls.later.get(
+                unknown, f"one of the keys of {cls.called}: {', '.join(keys)}{nearest(unknown, keys)}"
+            )
         elif kind == "missing":
             field = cls.model_fields.get(str(place[0])) if len(place) == 1 else None
             about = f" ({field.description})" if field and field.description else ""
@@ -130,6 +134,8 @@ class Table(BaseModel):
             key = context["key"]
             place, value = (*place, key), value.get(key, _MISSING)
             phrase = _one_of(context["choices"].split(","), value)
+            if value in context["later"].split(","):
+                phrase += "; that one is reserved for a later version"
         elif kind == "literal_error":
             phrase = _one_of(re.findall("'([^']+)'", context["expected"]), value)
         elif kind == "tuple_type" and isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""``[truss]``: a module stacked into bays, a plate, or any graph of nodes and members."""
+"""``[truss]``: a module stacked into bays, or any graph of nodes and members."""
 
 from __future__ import annotations
 
@@ -180,25 +180,6 @@ class TetrahedralTruss(_Stack, called="a tetrahedral truss"):
             yield ("longeron",), f"less than sqrt(3) times the batten, {flat:g} m, where the helix folds flat"
 
 
-class PlateTruss(_Truss, called="a plate"):
-    """A plate of two layers whose nodes track a surface; its first two rows are clamped."""
-
-    module: Literal["plate"]
-    rows: Annotated[int, count(3, 200)] = Field(
-        description="rows of nodes along +z, the two clamped ones included"
-    )
-    columns: Annotated[int, count(3, 200)] = Field(description="nodes in a row")
-    spacing: Length = Field(default=1.0, description="distance of neighbouring nodes of a layer at home, m")
-    depth: Length = Field(default=math.sqrt(0.5), description="distance of the two layers at home, m")
-    stroke: Stroke | None = Field(
-        default=None, description="least and greatest length of an actuated member, m"
-    )
-
-    def _contradictions(self) -> Iterator[tuple[Place, str]]:
-        yield from super()._contradictions()
-        yield from self._misfits(self.stroke, self.spacing, {"spacing": self.spacing})
-
-
 class Node(Table, called="a node"):
     """A node of a graph."""
 
@@ -322,7 +303,7 @@ class GraphTruss(_Truss, called="a truss given as a graph"):
                 yield ("member", i, "nodes"), f'two nodes that no other member joins; "{other}" joins these'
 
 
-Truss = Annotated[ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss, ByKey("module")]
+Truss = Annotated[ModuleTruss | TetrahedralTruss | GraphTruss, ByKey("module", later=("plate",))]
 
 
 def holds_home(

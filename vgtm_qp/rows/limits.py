@@ -18,7 +18,8 @@ def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
         gap = np.maximum(distance, 0.0)
         steps = np.maximum(np.ceil((np.sqrt(1.0 + 8.0 * gap / (acceleration * dt * dt)) - 1.0) / 2.0), 1.0)
         speed = gap / (steps * dt) + acceleration * dt * (steps - 1.0) / 2.0
-    return np.asarray(np.where(np.isfinite(acceleration), speed, np.inf))
+    # A joint without limits has all the distance there is.
+    return np.asarray(np.where(np.isfinite(acceleration) & np.isfinite(gap), speed, np.inf))
 
 
 def actuator_box(

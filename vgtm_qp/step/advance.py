@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.step.actuation import Actuation
+from vgtm_qp.step.actuation import Actuation, Box
 from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.braking import ANY_RANK, Brakes, Braking
+from vgtm_qp.step.setup import TOO_LONG
 from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
@@ -19,6 +20,9 @@ from vgtm_qp.step.target import Target
 
 _TRUST = 0.2
 """An actuator moves by no more than this times the share of the step that is tried, m, where the whole one failed."""
+
+_LONGER = 2.0
+"""An actuator between two nodes changes by no more than this times what each of them moves."""
 
 _BEYOND = 60.0
 """An arm that is at the end of its path may brake beyond it, within so many times its last piece."""
@@ -45,7 +49,7 @@ class Advancer:
 
     def __init__(self, attempt: Attempt, actuation: Actuation, shaping: Shaping) -> None:
         self._attempt, self._actuation, self._shaping = attempt, actuation, shaping
-        self._tip_mode = shaping.setup.tip_mode
+        self._tip_mode, self._step_limit = shaping.setup.tip_mode, shaping.setup.step_limit
 
     def brakes(self, dt: float) -> Brakes:
         """Return how the arm brakes in steps of `dt`, s."""
@@ -60,30 +64,51 @@ class Advancer:
         good as the arm could brake now, does not count. The step takes `dt`, s, and no share below `smallest` is tried.
         """
         best: Advance | None = None
+        too_long = ""
         for found in self._attempts(state, target, dt, smallest):
+            if found.step.reason.startswith(TOO_LONG):
+                too_long = found.step.reason
             if found.step.moved and found.rank <= worst:
                 best, worst = found, found.rank - 1
                 if not found.rank:
                     break
-        return best or Advance(_blocked(found.step, state, found.step.reason or _OFF_PATH), None)
+        return best or Advance(_blocked(found.step, state, too_long or found.step.reason or _OFF_PATH), None)
 
     def _attempts(self, state: State, target: Target, dt: float, smallest: float) -> Iterator[Advance]:
-        """Yield the attempts at a target: the whole, halves of it where the tip may be slow, and creeping."""
-        yield self._try(state, target, dt)
-        share, values, box = 1.0, self._actuation.values(state), (target.lower, target.upper)
-        while share > smallest and self._tip_mode == "scaled":
+        """Yield the attempts at a target: the whole, halves of it where the tip may be slow, and creeping.
+
+        Where nodes may move by no more than so much, the tip cannot either: a longer piece is not tried.
+        """
+        values, box, limit = self._actuation.values(state), (target.lower, target.upper), self._step_limit
+        is_slow, first = self._tip_mode == "scaled", 1.0
+        if is_slow and limit < np.inf:
+            first = min(1.0, limit / max(self._asked(target), _INSTANT))
+        whole = first == 1.0
+        yield self._try(state, target, dt) if whole else self._try_piece(state, target, dt, first, box)
+        share, trust = first, min(_TRUST, _LONGER * limit) / first
+        while share > first * smallest and is_slow:
             share /= 2
-            near, far = values - share * _TRUST, values + share * _TRUST
+            near, far = values - share * trust, values + share * trust
             lower, upper = (
                 np.minimum(np.maximum(box[0], near), box[1]),
                 np.maximum(np.minimum(box[1], far), box[0]),
             )
-            end = target.start + share * (target.end - target.start)
-            yield self._try(state, replace(target, end=end, lower=lower, upper=upper), dt, share)
+            yield self._try_piece(state, target, dt, share, (lower, upper))
         if not self._actuation.starts_at_once:
             slow = self._actuation.creeping(state, box, dt)
             if slow is not None:
                 yield self._try(state, replace(target, lower=slow[0], upper=slow[1]), dt)
+
+    def _asked(self, target: Target) -> float:
+        """Return how far a target asks the tip to move, m."""
+        path, axes = target.path, self._shaping.setup.task.axes
+        asked = path.at(target.end).position - path.at(target.start).position
+        return float(np.linalg.norm(asked[axes]))
+
+    def _try_piece(self, state: State, target: Target, dt: float, share: float, box: Box) -> Advance:
+        """Return what comes of a step towards a `share` of a target with other limits."""
+        end = target.start + share * (target.end - target.start)
+        return self._try(state, replace(target, end=end, lower=box[0], upper=box[1]), dt, share)
 
     def _try(self, state: State, target: Target, dt: float, share: float = 1.0) -> Advance:
         """Return what comes of a step towards a target, a `share` of the one whose progress counts."""

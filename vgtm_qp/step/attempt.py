@@ -68,6 +68,7 @@ class Attempt:
 
     def __init__(self, setup: Setup, separation: Separation, actuation: Actuation) -> None:
         self._arm, self._influence = setup.arm, setup.influence
+        self._has_limit, self._too_long = setup.step_limit < np.inf, setup.too_long
         self.separation = separation
         self.phases = Phases("distance", "qp", "correction", "acceptance")
         # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
@@ -203,6 +204,8 @@ class Attempt:
                 continue
             if not separation.deviation(state.q, q) < _DEVIATION:
                 return blocked("the arm turns too far in one step")
+            if self._has_limit and (too_long := self._too_long(self._arm.nodes(q) - state.nodes)):
+                return blocked(too_long)
             if report.certified:
                 then = state.next(self._arm, target.time, closed, vertices, move.torsion, after)
                 status = StepStatus.REACHED if move.progress >= WHOLE else StepStatus.SLOWED

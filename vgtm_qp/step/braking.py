@@ -210,8 +210,10 @@ class Brakes:
 
         Each takes as much off it as its box is wide on either side of its middle.
         """
-        speed = np.abs(0.5 * (limits[0] + limits[1]) - self.actuation.values(state))
-        width = np.maximum(0.5 * (limits[1] - limits[0]), 1e-12)
+        finite = np.isfinite(limits[0]) & np.isfinite(limits[1])
+        lower, upper = limits[0][finite], limits[1][finite]
+        speed = np.abs(0.5 * (lower + upper) - self.actuation.values(state)[finite])
+        width = np.maximum(0.5 * (upper - lower), 1e-12)
         return int(np.ceil(min(float((speed / width).max(initial=0.0)), float(_MOST_STEPS))))
 
     def _released(self, state: State, limits: Box, closing: Closing) -> State | None:
@@ -232,7 +234,8 @@ class Brakes:
         if found is None or not report.certified:
             return None
         still = self.shaping.target(state, self.dt, _NOWHERE, 0.0, 1.0, limits)
-        if attempt.acceptance.flaw(closed, state.q, still, None, vertices, state.torsion):
+        flaw = attempt.acceptance.flaw(closed, state.q, still, None, vertices, state.torsion)
+        if flaw or setup.too_long(arm.nodes(closed.q) - state.nodes):
             return None
         return state.next(arm, then, closed, vertices, state.torsion, found)
 

@@ -55,7 +55,6 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         The truss is not statically determinate.
     """
     check_is_problem(problem)
-    _check_supported(problem)
     check_solver(problem)
     arm = make_arm(problem)
     kinematics = arm.kinematics()
@@ -97,6 +96,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         margin=clearance.margin,
         dt=step_duration(problem.maneuver),
         minimum_angle=clearance.minimum_angle,
+        step_limit=problem.method.step_limit or np.inf,
         tip_mode=problem.end_effector.mode,
         base_motion=base_motion(spec.base_motion) if spec.base_motion else None,
         slow_approach=problem.method.slow_approach,
@@ -124,7 +124,7 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
     """
     method, stations, spec = problem.method, arm.stations, problem.curve
     elastic = problem.end_effector.mode == "elastic"
-    if method.tracking == "none" or not len(stations) or spec is None:
+    if method.tracking == "none" or not len(stations):
         tables = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
         layout = Layout(arm, *tables, task.row_names, method.weights, elastic_tip=elastic)
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
@@ -208,7 +208,7 @@ def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) 
 def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mistake]:
     """Yield what stations are to keep on the curve although the arm has not the motions for it."""
     method, curve = problem.method, problem.curve
-    if not method.holds_curve or curve is None:
+    if not method.holds_curve:
         return
     wanted = list(method.hard_coordinates)
     if len(wanted) == 2 and curve.torsion_vertices:
@@ -263,21 +263,6 @@ def elastic_engine(
     elastic = replace(layout, hard_tracking=False, hard_turns=False)
     # It is seldom needed, and no compiler is kept waiting then.
     return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False))
-
-
-def _check_supported(problem: Problem) -> None:
-    """Refuse, in one message, the parts of the contract that no method here serves."""
-    expected: dict[tuple[str, str], str] = {}
-    if problem.arm is not None and problem.arm.urdf is not None:
-        expected["arm", "urdf"] = "a list of joints [[arm.joint]]; URDF files are not read by this version"
-    elif problem.truss is not None and problem.truss.module == "plate":
-        modules = "octahedral, double-octahedral, hexapod, longeron, tetrahedral or graph"
-        expected["truss", "module"] = f"{modules}; plates are not available in this version"
-    if problem.maneuver.kind != "path":
-        expected["maneuver", "kind"] = '"path"; deployment is not available in this version'
-    if expected:
-        mistakes = [problem.mistake(place, text) for place, text in expected.items()]
-        raise problem.error(mistakes)
 
 
 def check_solver(problem: Problem) -> None:

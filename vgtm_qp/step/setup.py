@@ -16,6 +16,9 @@ from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
 
+TOO_LONG = "a node would move further than method.step_limit"
+"""How the reason of a step begins that is refused for its length."""
+
 
 @dataclass(frozen=True, eq=False)
 class Setup:
@@ -39,8 +42,9 @@ class Setup:
     safe, self_safe, influence, margin : float
         Least clearance to obstacles and between bodies, the distance from which pairs enter the QP, and what this keeps
         over the clearance for all that is not linear in its step, m.
-    dt, minimum_angle : float
-        Duration of a step, s, and least angle between bodies that meet, rad.
+    dt, minimum_angle, step_limit : float
+        Duration of a step, s, least angle between bodies that meet, rad, and greatest displacement of a node in one
+        step, m, infinite where it is free.
     tip_mode : str
         How strictly the end effector follows its path: ``scaled``, ``hard`` or ``elastic``.
     base_motion : Path or None
@@ -71,11 +75,17 @@ class Setup:
     margin: float
     dt: float
     minimum_angle: float
+    step_limit: float
     tip_mode: str
     base_motion: Path | None
     slow_approach: bool
     jams: tuple[tuple[str, float], ...]
     measure: Clearance | None
+
+    def too_long(self, displacements: Array) -> str:
+        """Return why nodes (N, 3) may not be displaced so far in one step, m; empty where they may."""
+        moved = float(np.linalg.norm(displacements, axis=1).max())
+        return "" if moved <= self.step_limit else f"{TOO_LONG}, {self.step_limit:g} m: by {moved:.3g} m"
 
     @property
     def slows_down(self) -> bool:

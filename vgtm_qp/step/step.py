@@ -105,7 +105,9 @@ class Step:
             name = self.rows.name(int(k))
             found[name] = max(found.get(name, 0.0), float(pressing[k]))
         pull = self.solution.actuator_multipliers
-        for k in np.flatnonzero(np.abs(pull) > 1e-9):
+        # A share of a step has narrower bounds than the limits, so that an actuator without any may be held by one.
+        limited = np.isfinite(np.where(pull > 0.0, self.limits.upper, self.limits.lower))
+        for k in np.flatnonzero((np.abs(pull) > 1e-9) & limited):
             found[self.limits.name(int(k), upper=bool(pull[k] > 0.0))] = float(abs(pull[k]))
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 

@@ -26,7 +26,7 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.separation import Separation
-from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.setup import TOO_LONG, Setup
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step
 from vgtm_qp.step.task import over_all_nodes, tip_response
@@ -59,6 +59,7 @@ class StopKind(StrEnum):
     LOCKED = "locked"
     SINGULAR = "singular pose"
     OUT_OF_REACH = "out of reach"
+    STEP_LIMIT = "step limit"
     NONLINEAR = "nonlinear"
     SOLVER = "solver"
     INTERRUPTED = "interrupted"
@@ -74,7 +75,8 @@ class Stop:
         ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
         where the tip cannot start in that direction whatever the limits, or the fixed quantities do not determine the
         nodes; ``out of reach`` where the arm is stretched towards a goal further away; ``nonlinear`` where no row
-        forbids the step to first order, and ``acceleration`` if it is one after which the arm could not brake;
+        forbids the step to first order, ``acceleration`` if it is one after which the arm could not brake, and
+        ``step limit`` if it is longer than the problem allows;
         ``solver`` where none does and the QP solver gave no good answer.
     multipliers : dict
         Rows of the set, the most decisive first, and the share of the way that each costs per metre (radian).
@@ -98,7 +100,7 @@ class Stop:
         return tuple(self.multipliers) or (str(self if self.kind is StopKind.SOLVER else self.kind),)
 
     def __str__(self) -> str:
-        is_unclear = self.kind in (StopKind.NONLINEAR, StopKind.SOLVER)
+        is_unclear = self.kind in (StopKind.STEP_LIMIT, StopKind.NONLINEAR, StopKind.SOLVER)
         reason = self.reason if is_unclear or _is_braking(self.reason) else ""
         return ": ".join(part for part in (str(self.kind), ", ".join(self.multipliers), reason) if part)
 
@@ -142,6 +144,8 @@ def explain(
     if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= bar:
         if share <= _SINGULAR:
             return Stop(StopKind.OUT_OF_REACH if is_outward else StopKind.SINGULAR, reason=reason)
+        if reason.startswith(TOO_LONG):
+            return Stop(StopKind.STEP_LIMIT, reason=reason)
         other = StopKind.ACCELERATION if _is_braking(reason) else StopKind.NONLINEAR
         kinds = {_kind(setup, name) for name in pressing}
         return Stop(_first(kinds, other), pressing, _obstacles(setup, pressing), reason)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from vgtm_qp.errors import GoalError, nearest
-from vgtm_qp.machine import machine, sentence
+from vgtm_qp.machine import commit, machine, sentence
 from vgtm_qp.study.workers import Row, Task, run_dask, run_here, run_processes
 
 
@@ -159,7 +159,13 @@ def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None
     from vgtm_qp.view.figure import save_figure
 
     name, module, found = place.name, import_module(study.module), machine()
-    data = {"study": name, "title": study.title, "machine": found, "rows": rows}
+    data: dict[str, Any] = {
+        "study": name,
+        "title": study.title,
+        "commit": commit(),
+        "machine": found,
+        "rows": rows,
+    }
     (place / f"{name}.json").write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
     flat = [{key: value for key, value in row.items() if not isinstance(value, list | dict)} for row in rows]
     with (place / f"{name}.csv").open("w", newline="") as file:
@@ -170,5 +176,6 @@ def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None
     save_figure(module.draw(counted), place / f"{name}.pdf")
     lines = [f"## {study.title}", "", module.text(counted).strip(), ""]
     lines += [f"Not counted: a run that failed, {row['failed']}" for row in rows if "failed" in row]
-    lines += [f"Measured on: {sentence(found)}. Made again by `{command}`.", ""]
+    at = f", commit {data['commit'][:12]}" if data["commit"] else ""
+    lines += [f"Measured on: {sentence(found)}{at}. Made again by `{command}`.", ""]
     (place / f"{name}.md").write_text("\n".join(lines))

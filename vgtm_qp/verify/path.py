@@ -54,10 +54,9 @@ def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], l
         for kind, targets in _direction_targets(maneuver).items()
         if targets is None
     ]
-    notes, corners = [], None
-    if wanted.get("kind") == "deployment":
-        notes.append("a deployment has no path to check the targets against")
-    elif axes:
+    notes: list[str] = []
+    corners = None
+    if axes:
         try:
             corners = _corners(maneuver.manifest, tip[0])
         except (ProblemError, ValueError) as error:

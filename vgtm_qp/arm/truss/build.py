@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from vgtm_qp.arm.truss.graph import truss_from_graph
-from vgtm_qp.arm.truss.modules import plate, stacked, tetrahedral
+from vgtm_qp.arm.truss.modules import stacked, tetrahedral
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.errors import TrussError, nearest
-from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, PlateTruss, TetrahedralTruss
+from vgtm_qp.problem.truss import GraphTruss, ModuleTruss, TetrahedralTruss
 
 
 class LockError(TrussError):
@@ -27,7 +27,7 @@ class LockError(TrussError):
         )
 
 
-def build_truss(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
+def build_truss(spec: ModuleTruss | TetrahedralTruss | GraphTruss) -> Truss:
     """Build the truss of a problem; members locked from the start are fixed at their home length.
 
     Locks with a later time are left to the maneuver.
@@ -55,11 +55,9 @@ def lock_members(truss: Truss, names: Iterable[str]) -> Truss:
     return dataclasses.replace(truss, actuated=actuated, stroke=stroke, rate=rate, acceleration=acceleration)
 
 
-def _unlocked(spec: ModuleTruss | TetrahedralTruss | GraphTruss | PlateTruss) -> Truss:
+def _unlocked(spec: ModuleTruss | TetrahedralTruss | GraphTruss) -> Truss:
     if isinstance(spec, GraphTruss):
         return truss_from_graph(spec)
-    if isinstance(spec, PlateTruss):
-        return plate(spec)
     return tetrahedral(spec) if isinstance(spec, TetrahedralTruss) else stacked(spec)
 
 

@@ -1,4 +1,4 @@
-"""The trusses of the paper from their tables: modules that are stacked along +z of the base frame, and plates.
+"""The trusses of the paper from their tables: modules that are stacked along +z of the base frame.
 
 In a stack a name is a kind, a layer of nodes (0 is the base) and a place in it (from 1): node ``n0-1``, batten
 ``B4-1``, longeron or leg ``L3-2``, diagonal ``D2-1``. Lengths of a table are distances between nodes.
@@ -16,7 +16,7 @@ from vgtm_qp.arm.truss.joints import axial_joints, joint_triangles
 from vgtm_qp.arm.truss.truss import Truss, check_stroke
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import TrussError
-from vgtm_qp.problem.truss import ModuleTruss, PlateTruss, TetrahedralTruss
+from vgtm_qp.problem.truss import ModuleTruss, TetrahedralTruss
 
 _POSE = ("position", "pointing", "orientation")
 
@@ -122,49 +122,6 @@ def tetrahedral(spec: TetrahedralTruss) -> Truss:
     )
 
 
-def plate(spec: PlateTruss) -> Truss:
-    """Return a plate in the xz plane that grows along +z; its first two rows and the apexes between are the base.
-
-    Nodes ``n<row>-<column>`` of the surface and ``a<row>-<column>`` over the cells' centres, towards -y. A
-    free row is a stage: its surface nodes and the apexes below it. Three fixed legs ``G`` carry each apex;
-    longitudinals ``L``, transverses ``T``, one diagonal ``D`` a row, and the apexes' longitudinals ``M`` and
-    one transverse ``U`` are actuated. A diagonal in every cell has the right count but leaves a mechanism.
-
-    Raises
-    ------
-    TrussError
-        A home length is outside its stroke, or the joint offsets leave no member.
-    """
-    rows, columns, spacing = spec.rows, spec.columns, spec.spacing
-    left = -0.5 * spacing * (columns - 1)
-    nodes: list[tuple[str, tuple[float, float, float], int]] = []
-    for i in range(rows):
-        for j in range(columns - 1 if i else 0):
-            apex = left + spacing * (j + 0.5), -spec.depth, spacing * (i - 0.5)
-            nodes.append((f"a{i - 1}-{j + 1}", apex, max(i - 2, -1)))
-        for j in range(columns):
-            nodes.append((f"n{i}-{j + 1}", (left + spacing * j, 0.0, spacing * i), max(i - 2, -1)))
-    names, positions, stages = zip(*nodes, strict=True)
-    index = {name: i for i, name in enumerate(names)}
-    members = [
-        MemberRow(name, (index[first], index[second]), name[0] != "G")
-        for i in range(2, rows)
-        for name, first, second in _row(i, columns)
-    ]
-    return _assemble(
-        spec,
-        names,
-        np.array(positions),
-        np.array(stages, dtype=np.int64),
-        members,
-        (0.7, 1.4),
-        faces=np.empty((0, 3), dtype=np.int64),
-        weights=(0.5, 0.5),
-        trackable=("position",),
-        tip=np.array([index[f"n{rows - 1}-1"], index[f"n{rows - 1}-{columns}"]]),
-    )
-
-
 def _layer_names(count: int) -> tuple[str, ...]:
     return tuple(f"n{i // 3}-{i % 3 + 1}" for i in range(count))
 
@@ -218,29 +175,8 @@ def _battens(layer: int, *, actuated: bool) -> Iterator[MemberRow]:
         yield MemberRow(f"B{layer}-{i + 1}", (3 * layer + i, 3 * layer + (i + 1) % 3), actuated)
 
 
-def _row(i: int, columns: int) -> list[tuple[str, str, str]]:
-    """Return name and node names of the members that place row `i` and the apexes below it."""
-    members: list[tuple[str, str, str]] = []
-    for j in range(1, columns):
-        apex = f"a{i - 1}-{j}"
-        # With three columns the second apex stands on the mirror image of the first one's legs.
-        mirrored = columns == 3 and j == 2
-        feet = (
-            (f"n{i - 1}-{j + 1}", f"n{i}-{j + 1}", f"n{i}-{j}")
-            if mirrored
-            else (f"n{i - 1}-{j}", f"n{i}-{j}", f"n{i}-{j + 1}")
-        )
-        members += [(f"G{i}-{3 * (j - 1) + k}", apex, foot) for k, foot in enumerate(feet, start=1)]
-    members += [(f"L{i}-{j}", f"n{i - 1}-{j}", f"n{i}-{j}") for j in range(1, columns + 1)]
-    members += [(f"T{i}-{j}", f"n{i}-{j}", f"n{i}-{j + 1}") for j in range(1, columns)]
-    members += [(f"D{i}-1", f"n{i - 1}-1", f"n{i}-2")]
-    members += [(f"M{i}-{j}", f"a{i - 2}-{j}", f"a{i - 1}-{j}") for j in range(1, columns)]
-    members += [(f"U{i}-1", f"a{i - 1}-{columns - 2}", f"a{i - 1}-{columns - 1}")]
-    return members
-
-
 def _assemble(
-    spec: ModuleTruss | TetrahedralTruss | PlateTruss,
+    spec: ModuleTruss | TetrahedralTruss,
     node_names: tuple[str, ...],
     home: Array,
     stage: Index,
@@ -250,13 +186,12 @@ def _assemble(
     faces: Index,
     trackable: tuple[str, ...],
     weights: Sequence[float] = (1 / 3, 1 / 3, 1 / 3),
-    tip: Index | None = None,
     face_stride: int = 1,
 ) -> Truss:
     """Return the truss of a table, whose face and tip frames at home are those of the base.
 
     Without a stroke in the table, actuated members are `stroke_factors` times their home lengths, least and greatest.
-    The tip, the last face if not given, and every face have the same `weights`.
+    The tip is the last face; every face has the same `weights`.
     """
     names = tuple(member.name for member in members)
     pairs = np.array([member.nodes for member in members], dtype=np.int64)
@@ -292,7 +227,7 @@ def _assemble(
         faces=faces,
         face_weights=np.resize(np.asarray(weights, dtype=np.float64), faces.shape),
         face_frames=np.tile(np.eye(3), (len(faces), 1, 1)),
-        tip=faces[-1] if tip is None else tip,
+        tip=faces[-1],
         tip_weights=np.asarray(weights, dtype=np.float64),
         tip_frame=np.eye(3),
         stage=stage,
