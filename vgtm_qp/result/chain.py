@@ -182,10 +182,10 @@ class RecordedChain:
 
     def _greatest_reaches(self) -> Array:
         """Return (J + 1,) how far the tip may be from the base and from each joint, m."""
-        ways = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
+        links = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
         slides = np.where(self.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
-        after = np.cumsum((ways[1:] + slides)[::-1])[::-1]
-        return np.concatenate([[after[0] + ways[0]], after])
+        after = np.cumsum((links[1:] + slides)[::-1])[::-1]
+        return np.concatenate([[after[0] + links[0]], after])
 
 
 def same(recorded: ArrayLike, given: ArrayLike) -> bool:
