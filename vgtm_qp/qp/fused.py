@@ -80,8 +80,8 @@ class FusedSolver:
         self._reserve(size + self._equal + self._legs + NEAR)
         self._draw(layout)
         if self._hard:
-            self._soft = np.ones(self._stack.shape[1])
-            self._soft[self._hard_at] = 0.0
+            self._elastic = np.ones(self._stack.shape[1])
+            self._elastic[self._hard_at] = 0.0
 
     def drawn(self, layout: Layout) -> FusedSolver:
         """Return the solver of a layout in which only other control vertices have goals; buffers are shared."""
@@ -283,7 +283,7 @@ class FusedSolver:
         """Return Hessian and gradient of the objective."""
         count, stack = self._actuators, self._stack
         hessian, gradient, linear = self._hessian, self._gradient, self._linear
-        np.dot(stack * self._soft if self._hard else stack, stack.T, out=hessian)
+        np.dot(stack * self._elastic if self._hard else stack, stack.T, out=hessian)
         np.add(hessian[-1], linear, out=gradient)
         gradient[-1] = linear[-1]
         if self.layout.vertex_goals:

@@ -26,7 +26,7 @@ _INSTANT = 1e-9
 class Limits(NamedTuple):
     """The box of the actuators after a step, and the limits that set its sides.
 
-    These are the value (n_a,) before the step, the greatest change by the rate, the stroke (n_a, 2), the greatest
+    These are the value (n_a,) before the step, the greatest `travel` by the rate, the stroke (n_a, 2), the greatest
     acceleration, and whether the actuator is locked.
     """
 
@@ -34,15 +34,15 @@ class Limits(NamedTuple):
     upper: Array
     names: tuple[str, ...]
     value: Array
-    way: Array
+    travel: Array
     stroke: Array
     acceleration: Array
     held: NDArray[np.bool_]
 
     def name(self, k: int, *, upper: bool) -> str:
         """Return the limit that sets one side of the box of actuator `k`, see ``rows.limits.binding``, and its name."""
-        one, way = slice(k, k + 1), self.way if upper else -self.way
-        bound, fastest = (self.upper if upper else self.lower)[one], (self.value + way)[one]
+        one, travel = slice(k, k + 1), self.travel if upper else -self.travel
+        bound, fastest = (self.upper if upper else self.lower)[one], (self.value + travel)[one]
         end, rest = self.stroke[one, int(upper)], (self.acceleration[one], self.held[one])
         return f"{binding(bound, end, fastest, *rest)[0]}: {self.names[k]}"
 

@@ -1,4 +1,4 @@
-"""Braking: how an arm with limited accelerations comes to rest, proven before each step is taken.
+"""Braking: how an arm with limited accelerations comes to rest, proven before each step is accepted.
 
 A moving arm with limited accelerations cannot stop at once. A step into a state is accepted only if further steps are
 known that bring the arm from there to rest, each within the limits and clear of obstacles. If no other step is found

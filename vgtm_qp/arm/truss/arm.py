@@ -1,4 +1,4 @@
-"""The first arm behind the door: a truss, whose configuration is the positions of its nodes, eqs. (7)-(10)."""
+"""A truss as an arm: its configuration is the positions of its nodes, eqs. (7)-(10)."""
 
 from __future__ import annotations
 
