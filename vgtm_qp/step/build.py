@@ -234,7 +234,7 @@ def make_engine(
     *,
     compiled: bool = True,
 ) -> Engine:
-    """Return the engine that solves the steps of an arm with the solver `name`, or by its bays.
+    """Return the engine that solves the steps of an arm with the QP solver of that name, or by its bays.
 
     Raises
     ------
