@@ -107,37 +107,35 @@ class TrackingError:
 
     def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
         self._layout, self._kinematics = layout, kinematics
-        count = len(layout.tracked)
-        self._nodes = layout.arm.stations.nodes[layout.tracked].reshape(-1)
-        station = StationSymbols(layout)
-        nodes, rotation, _, weights, *curve = station.inputs
-        if layout.general is not None:
-            curve = [curve[0], curve[2]]
-        function = ca.Function(
-            "station", [nodes, rotation, weights, *curve], [station.gap, ca.densify(station.turn)]
-        )
-        self._kernel = kernel = Kernel(function.map(count), compiled=False)
-        kernel.inputs[2][:] = layout.arm.stations.weights[layout.tracked].reshape(-1)
-        kernel.inputs[1].reshape(count, 9)[:] = np.eye(3).reshape(-1)
+        if not layout.hard_turns:
+            return
+        station, count = StationSymbols(layout), len(layout.tracked)
+        _, rotation, _, _, *curve = station.inputs
+        # The slope of a plain curve says its direction, the frame of any other one all.
+        curve = curve[:3] if layout.general is None else [curve[2]]
+        function = ca.Function("turns", [rotation, *curve], [ca.densify(station.turn)])
+        self._turns = Kernel(function.map(count), compiled=False)
         if layout.general is None:
-            kernel.inputs[4][:] = layout.curve_weights.reshape(-1)
-            kernel.inputs[5][:] = layout.curve_slopes.reshape(-1)
+            self._turns.inputs[2][:] = layout.curve_weights.reshape(-1)
+            self._turns.inputs[3][:] = layout.curve_slopes.reshape(-1)
 
     def greatest(self, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
         """Return the greatest gap, m, or turn, rad, at a configuration and its curve (V, 3), m, and (T,), rad."""
-        layout, inputs = self._layout, self._kernel.inputs
-        tracked, arm, shape = layout.tracked, layout.arm, layout.general
-        inputs[0][:] = arm.nodes(q).take(self._nodes, axis=0).reshape(-1)
-        if layout.hard_turns:
-            self._kinematics.evaluate(q)
-            inputs[1][:] = self._kinematics.station_rotation[tracked].transpose(0, 2, 1).reshape(-1)
-        if shape is None:
-            inputs[3].reshape(len(tracked), -1)[:] = vertices.reshape(-1)
-        else:
+        layout, arm, shape = self._layout, self._layout.arm, self._layout.general
+        points, frames = layout.curve_weights @ vertices, None
+        if shape is not None and (layout.hard_turns or shape.by_arc_length):
             rows = shape.rows(vertices, torsion, base_frame(arm, base))
-            inputs[3][:] = rows.position.reshape(-1)
-            inputs[4][:] = rows.frame.reshape(-1)
-        self._kernel()
-        gap, turn = self._kernel.outputs
-        worst = float(np.abs(gap).max())
-        return max(worst, float(np.abs(turn).max())) if layout.hard_turns else worst
+            points, frames = rows.position, rows.frame
+        worst = float(np.abs(arm.stations.centres(arm.nodes(q))[layout.tracked] - points).max())
+        return max(worst, self._greatest_turn(q, vertices, frames)) if layout.hard_turns else worst
+
+    def _greatest_turn(self, q: Array, vertices: Array, frames: Array | None) -> float:
+        tracked, inputs = self._layout.tracked, self._turns.inputs
+        self._kinematics.evaluate(q)
+        inputs[0][:] = self._kinematics.station_rotation[tracked].transpose(0, 2, 1).reshape(-1)
+        if frames is None:
+            inputs[1].reshape(len(tracked), -1)[:] = vertices.reshape(-1)
+        else:
+            inputs[1][:] = frames.reshape(-1)
+        self._turns()
+        return float(np.abs(self._turns.outputs[0]).max())
