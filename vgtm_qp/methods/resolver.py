@@ -60,11 +60,6 @@ class MethodResolver(Resolver):
         """Seconds spent so far in each phase."""
         return self._clock.seconds
 
-    @property
-    def locked(self) -> frozenset[str]:
-        """Names of the actuators locked so far; members locked from the start are fixed members."""
-        return frozenset(self._actuation.locked)
-
     def lock(self, name: str) -> None:
         """See :class:`Resolver`: a locked actuator is a fixed member from then on."""
         self._actuation.lock(name, self.state)

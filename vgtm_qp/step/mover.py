@@ -12,6 +12,7 @@ from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.full import StepQP
+from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
@@ -46,6 +47,7 @@ class Resolver:
 
     rank: int | None = None
     draws_vertices = False
+    _actuation: Actuation
     _method = ""
     _served: ClassVar[dict[str, type[Resolver]]] = {}
 
@@ -102,7 +104,7 @@ class Resolver:
     @property
     def locked(self) -> frozenset[str]:
         """Names of the actuators locked so far; members locked from the start are fixed members."""
-        raise NotImplementedError
+        return frozenset(self._actuation.locked)
 
     def lock(self, name: str) -> None:
         """Hold an actuator at its present length or value from now on.

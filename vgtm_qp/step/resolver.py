@@ -66,11 +66,6 @@ class QPResolver(Resolver, serves="qp"):
         """Seconds spent so far in each phase."""
         return self._attempt.phases.seconds
 
-    @property
-    def locked(self) -> frozenset[str]:
-        """Names of the actuators locked so far; members locked from the start are fixed members."""
-        return frozenset(self._actuation.locked)
-
     def lock(self, name: str) -> None:
         """See :class:`Resolver`.
 
