@@ -1,13 +1,13 @@
 """The manifest of a result file: problem, arm, outcome and versions as strict JSON data.
 
-It has `schema_version`; the `problem` in the form of its file; the `arm` as its `record` gives it; the `curve` as
-``Layout.record`` gives it, null without one; `status`, `reached`, the share of the path covered, 0 to 1, and
-`blocked_by`, the names of what stopped the arm; the `stop` as its `to_dict` gives it; `way_out`, the change of the
-problem with which a retry came further; `recovered`, pairs below their clearance in the home pose and their distances
-there, m; `method` and `solver`; `setup_time`, s; `directory`, where relative paths of the problem start; `meshes`, what
-`mesh_record` returns for each; `versions`; the `certificate`, null before verification; `jacobian_rank`, that of the
-last step where the method reveals it; and `clearance_rows`, how many rows of the QPs that moved the arm were supplied
-by `fcl`, and how many were `exact`.
+It has `schema_version`; the `problem` in the form of its file, and `problem_digests`, what the function of that name
+returns; the `arm` as its `record` gives it; the `curve` as ``Layout.record`` gives it, null without one; `status`,
+`reached`, the share of the path covered, 0 to 1, and `blocked_by`, the names of what stopped the arm; the `stop` as its
+`to_dict` gives it; `way_out`, the change of the problem with which a retry came further; `recovered`, pairs below their
+clearance in the home pose and their distances there, m; `method` and `solver`; `setup_time`, s; `directory`, where
+relative paths of the problem start; `meshes`, what `mesh_record` returns for each; `versions`; the `certificate`, null
+before verification; `jacobian_rank`, that of the last step where the method reveals it; and `clearance_rows`, how many
+rows of the QPs that moved the arm were supplied by `fcl`, and how many were `exact`.
 """
 
 from __future__ import annotations
@@ -37,6 +37,29 @@ _MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "bloc
 def mesh_record(path: str | Path, triangles: int) -> dict[str, Any]:
     """Return what ties a result to a mesh file: its SHA-256 and the number of its triangles."""
     return {"sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(), "triangles": int(triangles)}
+
+
+def problem_digests(
+    problem: Mapping[str, Any], source: str | Path | None, path: str | Path | None
+) -> dict[str, str | None]:
+    """Return the SHA-256 that tie a result to its problem; None where there is no such file, or none any more.
+
+    They are of the canonical text of `problem` as the manifest holds it, of the problem's file `source` and of the file
+    `path` of its path. Those of meshes are in their records.
+    """
+    return {
+        "problem": hashlib.sha256(dump_manifest(problem).encode()).hexdigest(),
+        "file": file_digest(source),
+        "path": file_digest(path),
+    }
+
+
+def file_digest(path: str | Path | None) -> str | None:
+    """Return the SHA-256 of a file, or None where there is none that can be read."""
+    try:
+        return None if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except (OSError, ValueError):
+        return None
 
 
 def recorded_versions() -> dict[str, str]:

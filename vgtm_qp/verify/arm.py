@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.chain import RecordedChain, extreme_values, numbers, same
+from vgtm_qp.result.chain import RecordedChain, extreme_values, numbers
+from vgtm_qp.verify.truss_table import table_contradictions
 
 _TOLERANCE = 1e-9
 """Of recorded lengths against those of the home nodes, m."""
@@ -93,27 +94,7 @@ class RecordedArm:
             found.append(
                 f"the arm record's length of {self.member_names[k]} is {off[k]:.3g} m off its home nodes"
             )
-        truss = problem.get("truss") or {}
-        entries = {str(entry["name"]): entry for entry in truss.get("member") or ()}
-        if entries and set(entries) != set(self.member_names):
-            found.append("the members of the arm record are not those of the problem")
-        for name, recorded in (
-            ("member_radius", self.radius),
-            ("stroke", self.stroke),
-            ("rate", self.rate),
-            ("acceleration", self.acceleration),
-        ):
-            differing = []
-            for k, member in enumerate(self.member_names):
-                if name != "member_radius" and not self.actuated[k]:
-                    continue
-                given = entries.get(member, {}).get(name.removeprefix("member_"))
-                wanted = truss.get(name) if given is None else given
-                if wanted is not None and not same(recorded[k], wanted):
-                    differing.append(f"{member} (problem: {wanted})")
-            if differing:
-                more = f" and {len(differing) - 1} more members" if len(differing) > 1 else ""
-                found.append(f"the arm record's {name} differs from the problem's at {differing[0]}{more}")
+        found += table_contradictions(self, problem.get("truss") or {})
         return found
 
     @property
@@ -228,9 +209,10 @@ class RecordedArm:
             return self._sparse_values(J, tip)
         dense = J.toarray()
         least = float(np.linalg.svd(dense, compute_uv=False)[-1])
-        if least == 0.0:
+        try:
+            return least, *extreme_values(np.linalg.solve(dense.T, tip)[self.actuated])
+        except np.linalg.LinAlgError:
             return 0.0, 0.0, np.inf
-        return least, *extreme_values(np.linalg.solve(dense.T, tip)[self.actuated])
 
     def _sparse_values(self, J: Any, tip: Array) -> tuple[float, float, float]:
         """Inverse power iteration on J^T J: it comes down to the least singular value from above."""
