@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ExportError, ResultError
-from vgtm_qp.result.manifest import check_manifest, dump_manifest, parse_manifest
+from vgtm_qp.result.manifest import check_manifest, dump_manifest, parse_manifest, stored_problem
 
 _STALE_SECONDS = 60.0
 _UNREADABLE = (
@@ -129,6 +129,7 @@ def read_result(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         digest = content_digest(arrays, {key: value for key, value in manifest.items() if key != "digest"})
         if manifest.get("digest") != digest:
             raise ResultError("the content does not match its digest: an array or the manifest was altered")
+        stored_problem(manifest["problem"])
     except ResultError as error:
         raise ResultError(f"{path}: {error}") from None
     return arrays, manifest

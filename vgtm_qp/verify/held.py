@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vgtm_qp.errors import ProblemError, ResultError
-from vgtm_qp.result.manifest import dump_manifest, file_digest, problem_digests
+from vgtm_qp.result.manifest import dump_manifest, file_digest, problem_digests, stored_problem
 from vgtm_qp.result.result import Result
 
 if TYPE_CHECKING:
@@ -54,17 +53,6 @@ def held_against(maneuver: Result, problem: Problem | None) -> tuple[Result, lis
         (notes if is_how else wrong).append(line)
     directory = str((problem.source.parent if problem.source else Path.cwd()).resolve())
     return replace(maneuver, manifest={**manifest, "problem": real, "directory": directory}), wrong, notes
-
-
-def stored_problem(data: Any) -> Problem:
-    """Return the problem of a manifest, held against the schema of problem files; ResultError with the keys."""
-    from vgtm_qp.problem import Problem
-
-    try:
-        return Problem.from_dict(data)
-    except ProblemError as error:
-        mistakes = "; ".join(f"manifest.problem.{mistake}" for mistake in error.mistakes[:8])
-        raise ResultError(mistakes) from None
 
 
 def describe_problem(maneuver: Result, problem: Problem | None) -> dict[str, Any]:
