@@ -70,7 +70,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
             code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
         return ExitCode.SOLVED if code is None else int(code)
     except (Exception, KeyboardInterrupt) as error:
-        code, message = _told(error)
+        code, message = _outcome(error)
         mistakes = []
         if isinstance(error, ProblemError):
             mistakes = [{"file": error.source, **asdict(mistake)} for mistake in error.mistakes]
@@ -81,8 +81,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
         return code
 
 
-def _told(error: BaseException) -> tuple[ExitCode, str]:
-    """Return the exit code and what is said of an error; the traceback of an internal one is printed."""
+def _outcome(error: BaseException) -> tuple[ExitCode, str]:
+    """Return the exit code and the message of an error; the traceback of an internal one is printed."""
     match error:
         case CycloptsError():
             return ExitCode.USAGE, _explained(error)
