@@ -70,6 +70,9 @@ def main(tokens: Sequence[str] | None = None) -> int:
             code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
         return ExitCode.SOLVED if code is None else int(code)
     except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt) and (compiled := sys.modules.get("vgtm_qp.compiled")):
+            # The process would wait for them.
+            compiled.stop_compilers()
         code, message = _told(error)
         mistakes = []
         if isinstance(error, ProblemError):
