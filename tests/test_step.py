@@ -142,7 +142,13 @@ def test_rows_of_the_full_qp_linearise_what_they_say(name, track, joint_offset):
     z[builder.column["tangent"]] = tilt.reshape(-1)
     z[-1] = progress_step
     wanted = np.where(truss.actuated, 0.0, lengths)
-    parts = [wanted, error, start, slope, np.zeros(3 * tracked), np.zeros(2 * tracked)]
+    # A leg grows by what its ends move along it.
+    legs = np.diff(vertex_step, axis=0)[scene.layout.legs[:, 0]]
+    normal = scene.kinematics.station_rotation[0][:, 2] if scene.target.base is None else numbers.legs.axes[0]
+    last = np.diff(scene.vertices, axis=0)[-1]
+    axes = np.array([normal, last / np.linalg.norm(last)])[: len(legs)]
+    grown = np.einsum("gc,gc->g", axes, legs)
+    parts = [wanted, error, start, slope, np.zeros(3 * tracked), np.zeros(2 * tracked), grown]
     np.testing.assert_allclose(qp.A @ z, np.concatenate(parts), atol=2e-8)
 
 
@@ -187,7 +193,10 @@ def test_a_correction_asks_for_the_constraints_alone():
     motion, correction = scene.numbers(), scene.numbers(motion=False)
     for name in ("actuator_gradient", "vertex_gradient", "position_rhs", "tangent_rhs"):
         assert np.any(getattr(motion, name))
-        assert not np.any(getattr(correction, name)), name
+        # The curve's end is a constraint.
+        asked = getattr(correction, name)[:-1] if name == "position_rhs" else getattr(correction, name)
+        assert not np.any(asked), name
+    np.testing.assert_allclose(correction.position_rhs[-1], motion.position_rhs[-1], atol=1e-13)
     np.testing.assert_allclose(correction.motion.rhs, motion.motion.rhs, atol=1e-13)
     np.testing.assert_allclose(correction.motion.values, motion.motion.values, atol=1e-13)
     for name in ("tip_rhs", "base_rhs", "base_displacement", "tip_jacobian", "tangent_face"):

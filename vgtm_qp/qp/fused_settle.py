@@ -17,6 +17,7 @@ NEAR = 24
 """Clearance rows of a QP whose answer is checked by the compiled function; those of more are checked without it."""
 
 _HELD_STEPS = 4
+_BOXED_STEPS = 2
 
 
 def settle_function(layout: Layout) -> Bound:
@@ -74,6 +75,9 @@ def settle_function(layout: Layout) -> Bound:
         end = start
         for _ in range(_HELD_STEPS):
             end = held(end, points)
+        # The stations take actuators along: what these are beyond their boxes goes back, by less than gaps count.
+        for _ in range(_BOXED_STEPS):
+            end = symbols.closed(end, lower, upper)
     first = error = tip_error(layout.tip_rows, *tip(end), *goal_pose)
     if not layout.hard_tracking:
         gain = qp.gain(stiffness)

@@ -141,7 +141,7 @@ class ChainEngine(Engine):
         closed = self._closed(X, own, worst)
         strokes = closed.quantities[self.layout.arm.actuators]
         if not (solver.knows_gain or (worst <= accuracy.member and within(strokes, *bounds, enough))):
-            closed = self._any_closing.close(X, *bounds, accuracy.member)
+            closed = self._any_closing.close(closed.q, *bounds, accuracy.member)
         off = float(np.abs(self._task.error(closed.tip_position, closed.tip_rotation, goal)).max())
         return closed if off <= accuracy.tip and closed.error <= accuracy.member else None
 

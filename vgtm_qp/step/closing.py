@@ -101,7 +101,7 @@ class Closing:
     ) -> Closed | None:
         """Return the configuration near `q` whose tracked stations are at `points` (K, 3), m; actuators follow.
 
-        None where an actuator would leave its bounds (n_a,), or the pose is singular.
+        What an actuator is beyond its bounds (n_a,) then goes back, and the stations with it. None in a singular pose.
         """
         arm, kinematics, tracked = self._arm, self._kinematics, self._layout.tracked
         home = arm.home_quantities[self._fixed]
@@ -113,10 +113,8 @@ class Closing:
         def solve(error: Array) -> Array:
             return self._stations.solve(kinematics.gradient, error)
 
-        closed = self._newton(q, missing, solve, tolerance, _TOO_FAR)
-        values = closed.quantities[self._actuators]
-        held = closed.error < np.inf and within(values, lower, upper, enough_length(q, tolerance))
-        return closed if held else None
+        closed = self._newton(q, missing, solve, tolerance, np.inf)
+        return self.close(closed.q, lower, upper, tolerance) if closed.error < np.inf else None
 
     def _newton(
         self,
