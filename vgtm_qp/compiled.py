@@ -26,8 +26,10 @@ import shutil
 import signal
 import stat
 import subprocess
+import sys
 import tempfile
 import threading
+import time
 import warnings
 import weakref
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
@@ -63,6 +65,9 @@ _MOST_COMPILERS, _MOST_LINKERS = 4, 64
 
 _PATIENCE = 60.0
 """Seconds after which a compiler counts as hung."""
+
+_TICK = 0.2
+"""Seconds after which a compiler is looked after."""
 
 _WORTH_IT = 100
 """Functions of fewer lines are not compiled by themselves."""
@@ -247,16 +252,25 @@ class _Workers:
                 command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
+                # Its end is seen at once, where a process without a pipe is asked twenty times a second.
+                stderr=subprocess.PIPE,
                 start_new_session=True,
             )
             self._running.add(process)
+        end = time.monotonic() + _PATIENCE
+        given: bytes | None = text
         with process:
-            try:
-                process.communicate(text, timeout=_PATIENCE)
-            except subprocess.TimeoutExpired:
-                self.hung = True
-                _end(process)
+            while True:
+                try:
+                    process.communicate(given, timeout=_TICK)
+                    break
+                except subprocess.TimeoutExpired:
+                    # What it has not read yet goes on being written.
+                    given = None
+                    self.hung = time.monotonic() > end
+                    if self.hung or _is_interrupted():
+                        _end(process)
+                        break
         with self._lock:
             self._running.discard(process)
         return process.returncode == 0
@@ -270,6 +284,12 @@ class _Workers:
             pool.shutdown(wait=False, cancel_futures=True)
         for process in running:
             _end(process)
+
+
+def _is_interrupted() -> bool:
+    """Return whether an interrupt that nobody caught ended the program, which waits for its threads now."""
+    last = getattr(sys, "last_type", None)
+    return last is KeyboardInterrupt and not threading.main_thread().is_alive()
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
