@@ -71,7 +71,7 @@ BY_ELASTIC_TRACKING = (
     "octahedral 6, moving obstacle",
     "loop octahedral 5",
 )
-"""Cases that elastic tracking records: on the curve exactly rounding grows in them, or limits tie for the first place."""
+"""Cases of elastic tracking: on the curve exactly rounding grows in them, or limits tie for the first place."""
 
 HEIGHT = {
     "octahedral": 0.8165,
@@ -324,7 +324,7 @@ def _coupled_scenes() -> Iterator[Case]:
     yield Case("longeron 6", _scene(5, "longeron", 6))
     yield Case("tetrahedral 4", _scene(6, "tetrahedral", 4))
     two = {"truss__actuated": [2, 3], "curve__control_vertices": 4}
-    yield Case("tetrahedral 5, two actuated", _scene(7, "tetrahedral", 5, **two))
+    yield Case("tetrahedral 5, two actuated", _scene(7, "tetrahedral", 5, **two), tolerance=ITERATIVE)
     yield Case("octahedral 5, hard tip", _scene(8, "octahedral", 5, end_effector__mode="hard"))
     yield Case("octahedral 5, elastic tip", _scene(9, "octahedral", 5, end_effector__mode="elastic"))
     yield Case("hexapod 4, elastic tip", _scene(10, "hexapod", 4, end_effector__mode="elastic"))
@@ -438,7 +438,7 @@ def _methods() -> Iterator[Case]:
 
 def _loops() -> Iterator[Case]:
     """Yield the control loops: goals that wander at random from a seed."""
-    yield Case("loop octahedral 5", _scene(61, "octahedral", 5), loop={"steps": 50, "seed": 1, "size": 0.1})
+    yield Case("loop octahedral 5", _scene(62, "octahedral", 5), loop={"steps": 50, "seed": 7, "size": 0.1})
     yield Case(
         "loop hexapod 4, vertex goals",
         _scene(62, "hexapod", 4),

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
+import signal
+import sys
+import types
 from pathlib import Path
+from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 import vgtm_qp as vq
 from vgtm_qp.cli import main
 from vgtm_qp.errors import GoalError
 from vgtm_qp.methods import PRESETS, with_method
+from vgtm_qp.study.study import STUDIES, Study
 
 METHODS = ["qp", "pseudoinverse", "pseudoinverse-corrected", "curve-pseudoinverse-plain"]
 
@@ -129,3 +137,89 @@ def test_the_study_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert (tmp_path / "figure4" / "figure4.pdf").exists()
     assert main(["study", "figure5", "--output", str(tmp_path)]) == 2
     assert main(["study", "figure4", "--workers", "0", "--output", str(tmp_path)]) == 2
+
+
+def _interrupting(monkeypatch: pytest.MonkeyPatch, module: str, *, at: int, after: int) -> None:
+    """Let Ctrl-C come in solution `at` of a module, counted from 1, after so many of its steps."""
+    given, count = vq.solve, itertools.count(1)
+
+    def solve(problem: vq.Problem, **options: Any) -> vq.Maneuver:
+        if next(count) != at:
+            return given(problem, **options)
+        steps, progress = itertools.count(1), options.get("progress")
+        if not after:
+            os.kill(os.getpid(), signal.SIGINT)
+
+        def interrupt(part: float, step: vq.Step) -> None:
+            if progress is not None:
+                progress(part, step)
+            if next(steps) == after:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        return given(problem, **{**options, "progress": interrupt})
+
+    monkeypatch.setattr(f"{module}.solve", solve)
+
+
+@pytest.mark.parametrize("after", [0, 3])
+def test_an_interrupted_comparison_says_which_rows_are_missing(
+    after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _interrupting(monkeypatch, "vgtm_qp.comparison.compare", at=2, after=after)
+    arguments = ["compare", "five_bay_free", "ten_bay_round_a_cube", "--methods", "qp,qp-none,pseudoinverse"]
+    assert main([*arguments, "--output", str(tmp_path), "--json"]) == 130
+    data = json.loads(capsys.readouterr().out)
+    assert [row["status"] for row in data["rows"]] == ["solved", *5 * ["interrupted"]]
+    assert not any(row["solved"] or row["kept"] for row in data["rows"][1:])
+    assert data["rows"][1]["steps"] <= after + 1
+    assert json.loads((tmp_path / "compare.json").read_text()) == data
+    assert (tmp_path / "compare.md").read_text().count("interrupted") == 5
+
+
+def test_an_interrupted_study_keeps_its_finished_runs_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tasks = [{"seed": k} for k in range(6)]
+    study = types.ModuleType("interrupted_study")
+    problem = vq.load_problem("five_bay_free").replace({"maneuver.steps": 6})
+    asked: list[int] = []
+
+    def run(seed: int) -> dict[str, Any]:
+        asked.append(seed)
+        return {"status": study.solve(problem).status}
+
+    study.solve, study.run, study.tasks = vq.solve, run, lambda short: tasks
+    study.text, study.draw = lambda rows: f"{len(rows)} rows", lambda rows: Figure()
+    monkeypatch.setitem(sys.modules, "interrupted_study", study)
+    monkeypatch.setitem(STUDIES, "figure4", Study("interrupted_study", "A study"))
+    _interrupting(monkeypatch, "interrupted_study", at=2, after=3)
+    command = ["study", "figure4", "--output", str(tmp_path)]
+    assert main(command) == 130
+    said = capsys.readouterr().err
+    assert "the same command goes on from there" in said
+    assert len((tmp_path / "figure4" / "rows.jsonl").read_text().splitlines()) == 1
+    assert main(command) == 0
+    assert asked == [0, 1, 1, 2, 3, 4, 5]
+    assert "6 rows" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="no limit of a file's size")
+@pytest.mark.parametrize("to", ["csv", "mcap", "html", "pdf", "png", "ros", "mjcf", "gif"])
+def test_a_full_disk_is_told_with_exit_code_1_and_leaves_no_half_file(
+    to: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import resource
+
+    result = tmp_path / "arm.npz"
+    vq.solve(vq.load_problem("five_bay_free").replace({"maneuver.steps": 8})).save(result)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        code = main(["export", str(result), "--to", to])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert code == 1
+    said = capsys.readouterr().err
+    assert "the system refuses" in said
+    assert "Traceback" not in said
+    assert [path.name for path in tmp_path.iterdir()] == ["arm.npz"]

@@ -5,12 +5,18 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from vgtm_qp.compiled import Kernel, compiler, finish_compiling
+from vgtm_qp.compiled import Kernel, compiler, finish_compiling, stop_compilers
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -168,3 +174,163 @@ def test_a_forked_process_does_not_wait_for_the_compilers_of_its_parent(tmp_path
         os._exit(0 if kernel.is_compiled else 1)
     assert os.waitpid(child, 0)[1] == 0
     assert kernel.is_compiled
+
+
+def _run(code: str, cache: Path, **settings: str) -> subprocess.CompletedProcess[str]:
+    """Run Python in a process of its own, with a kernel cache at `cache`."""
+    environment = {**os.environ, "VGTM_CACHE": str(cache), **settings}
+    return subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300
+    )
+
+
+LOADED = """
+import casadi as ca
+from vgtm_qp.compiled import Kernel
+x = ca.SX.sym("x")
+kernel = Kernel(ca.Function("square", [x], [x * x]))
+kernel.inputs[0][:] = 3.0
+kernel()
+print(kernel.is_compiled, kernel.outputs[0][0])
+"""
+
+
+@needs_compiler
+def test_a_damaged_library_is_made_again_and_never_loaded(tmp_path):
+    assert _run(LOADED, tmp_path).stdout == "True 9.0\n"
+    (library,) = tmp_path.glob("*.so")
+    whole = library.read_bytes()
+    for damage in (whole[:64] + bytes(len(whole) - 64), whole[: len(whole) // 2], whole[:-1] + b"x", b""):
+        library.write_bytes(damage)
+        found = _run(LOADED, tmp_path)
+        assert (found.returncode, found.stdout) == (0, "True 9.0\n"), found.stderr
+        assert library.read_bytes() == whole
+
+
+@needs_compiler
+def test_a_library_without_its_checksum_is_made_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    assert Kernel(_square()).is_compiled
+    (library,), (digest,) = tmp_path.glob("*.so"), tmp_path.glob("*.so.sha256")
+    before = library.stat().st_ino
+    assert Kernel(_square()).is_compiled
+    assert library.stat().st_ino == before
+    digest.unlink()
+    assert Kernel(_square()).is_compiled
+    assert library.stat().st_ino != before
+    assert digest.exists()
+
+
+@needs_compiler
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owners")
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o777])
+def test_a_cache_that_others_may_write_is_not_used(tmp_path, mode):
+    cache = tmp_path / f"cache{mode:o}"
+    cache.mkdir()
+    cache.chmod(mode)
+    found = _run(LOADED, cache)
+    assert found.stdout == "False 9.0\n"
+    assert f"chmod go-w {cache}" in found.stderr
+    assert not list(cache.iterdir())
+
+
+@needs_compiler
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root gives files away")
+def test_what_others_own_is_not_loaded(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    assert Kernel(_square()).is_compiled
+    (library,) = tmp_path.glob("*.so")
+    before = library.stat().st_ino
+    os.chown(library, 12345, 12345)
+    assert Kernel(_square()).is_compiled
+    assert library.stat().st_ino != before
+    assert library.stat().st_uid == 0
+    os.chown(tmp_path, 12345, 12345)
+    found = _run(LOADED, tmp_path)
+    assert found.stdout == "False 9.0\n"
+    assert "belongs to another user" in found.stderr
+
+
+@needs_compiler
+def test_files_of_the_cache_that_others_may_write_are_made_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    mask = os.umask(0o000)
+    try:
+        assert Kernel(_long("open", 1.0)).is_compiled
+    finally:
+        os.umask(mask)
+    for path in (tmp_path / "cache", *(tmp_path / "cache").iterdir()):
+        assert not path.stat().st_mode & 0o022, path
+    (library,) = (tmp_path / "cache").glob("*.so")
+    before = library.stat().st_ino
+    library.chmod(0o666)
+    assert Kernel(_long("open", 1.0)).is_compiled
+    assert library.stat().st_ino != before
+
+
+LATER = """
+import casadi as ca, time
+from vgtm_qp.compiled import Kernel
+x = ca.SX.sym("x")
+kernel = Kernel(ca.Function("square", [x], [x * x]))
+time.sleep(300.0)
+"""
+SOLVE = "from vgtm_qp.cli import main; raise SystemExit(main(['solve', 'five_bay_free']))"
+
+
+def _hanging(folder: Path) -> Path:
+    """Return a compiler that hangs, with a child that writes its number into ``child``."""
+    wrapper = folder / "hangs"
+    wrapper.write_text(
+        f'#!/bin/sh\nsleep 600 &\necho $! > "{folder / "new"}"\nmv "{folder / "new"}" "{folder / "child"}"\nwait\n'
+    )
+    wrapper.chmod(0o755)
+    return wrapper
+
+
+def _wait(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 300.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def _is_running(number: int) -> bool:
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
+def test_a_compiler_that_hangs_is_ended_with_its_children_and_not_asked_again(tmp_path, monkeypatch):
+    monkeypatch.setattr("vgtm_qp.compiled._PATIENCE", 1.0)
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("VGTM_CC", str(_hanging(tmp_path)))
+    try:
+        with pytest.warns(UserWarning, match="did not end within 1 s"):
+            assert _value(Kernel(_square())) == 9.0
+        _wait(lambda: not _is_running(int((tmp_path / "child").read_text())))
+        (tmp_path / "child").unlink()
+        assert not Kernel(_long("after", 2.0)).is_compiled
+        assert not (tmp_path / "child").exists()
+    finally:
+        stop_compilers()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
+@pytest.mark.parametrize(
+    "command", [LOADED, "from vgtm_qp.cli import main; raise SystemExit(main(['solve', 'five_bay_free']))"]
+)
+def test_an_interrupt_ends_a_compiler_that_hangs_with_its_children(tmp_path, command):
+    environment = {**os.environ, "VGTM_CACHE": str(tmp_path / "cache"), "VGTM_CC": str(_hanging(tmp_path))}
+    with subprocess.Popen(
+        [sys.executable, "-c", command], env=environment, cwd=Path.cwd(), stderr=subprocess.PIPE
+    ) as process:
+        _wait((tmp_path / "child").exists)
+        child = int((tmp_path / "child").read_text())
+        process.send_signal(signal.SIGINT)
+        # The compiler would hang for ten minutes.
+        process.communicate(timeout=300.0)
+    assert process.returncode in (130, -signal.SIGINT)
+    _wait(lambda: not _is_running(child))

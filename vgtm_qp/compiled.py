@@ -8,6 +8,9 @@ The first set-up of an arm is mostly compile time. The straight-line functions t
 separately, once for all kernels that use them, by several processes at a time; a kernel waits for them at its first
 call.
 
+What is loaded from the cache runs as this process does. Folder and files must therefore be the user's, with nobody else
+allowed to write them, and the SHA-256 beside a library must be that of its content.
+
 The return code of a function shows whether it could be evaluated; if not, its outputs keep their old values. Every call
 checks the code, in half a microsecond, so that old outputs never pass as new ones.
 """
@@ -20,11 +23,16 @@ import os
 import re
 import shlex
 import shutil
+import signal
+import stat
 import subprocess
+import sys
 import tempfile
 import threading
+import time
+import warnings
 import weakref
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -54,6 +62,12 @@ _LONG = 100_000
 
 _MOST_COMPILERS, _MOST_LINKERS = 4, 64
 """Processes at a time; most linkers only wait for their objects."""
+
+_PATIENCE = 60.0
+"""Seconds after which a compiler counts as hung."""
+
+_TICK = 0.2
+"""Seconds after which a compiler is looked after."""
 
 _WORTH_IT = 100
 """Number of lines below which functions are not compiled separately."""
@@ -95,6 +109,32 @@ def cache_directory() -> Path:
         return Path(os.environ["VGTM_CACHE"])
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "vgtm-qp"
+
+
+def distrust(path: Path) -> str:
+    """Return why code from `path`, a folder or a file, may be somebody else's; empty where it is the user's own."""
+    if not hasattr(os, "getuid"):
+        return ""
+    found = path.stat()
+    if found.st_uid not in (os.getuid(), 0):
+        return f"{path} belongs to another user (number {found.st_uid})"
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return f"others may write {path}; chmod go-w {shlex.quote(str(path))}"
+    return ""
+
+
+def _digest_file(path: Path) -> Path:
+    return path.with_name(f"{path.name}.sha256")
+
+
+def _is_sound(path: Path) -> bool:
+    """Return whether a file of the cache is there, the user's own, and as it was made."""
+    with contextlib.suppress(OSError, ValueError):
+        digest = _digest_file(path)
+        if not distrust(path) and not distrust(digest):
+            with path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest() == digest.read_text().strip()
+    return False
 
 
 @cache
@@ -154,22 +194,112 @@ def _with_fast_helpers(source: str) -> str:
 
 
 class _Workers:
-    """The threads in which the compilers of this process run, and the objects they make."""
+    """The threads in which the compilers of this process run, the objects they make, and the compilers."""
 
     def __init__(self) -> None:
         self.resolving = threading.RLock()
         self.linkers = ThreadPoolExecutor(_MOST_LINKERS, "vgtm-linker")
+        self.hung = False
         self._compilers = ThreadPoolExecutor(min(_MOST_COMPILERS, os.cpu_count() or 1), "vgtm-compiler")
         self._lock = threading.Lock()
         self._objects: dict[Path, Future[bool]] = {}
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._stopped = False
 
     def compile(self, cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Future[bool]:
         """Begin to compile `text` into the object `target`, unless that is done or being done."""
         with self._lock:
-            if target not in self._objects or (self._objects[target].done() and not target.exists()):
+            begun = self._objects.get(target)
+            if begun is None or (begun.done() and not (begun.result() and target.exists())):
                 command = [*shlex.split(cc), *_FLAGS, *flags, "-x", "c", "-c", "-"]
-                self._objects[target] = self._compilers.submit(_make, target, command, text)
+                self._objects[target] = self._compilers.submit(self.make, target, command, text)
             return self._objects[target]
+
+    def link(self, cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | None:
+        """Return the shared library, made of `objects`; None where it cannot be made."""
+        made = False
+        if all(begun.result() for begun in objects.values()):
+            made = self.make(library, [*shlex.split(cc), "-shared", *map(str, objects), "-lm"])
+            for left in (library.with_suffix(".o"), _digest_file(library.with_suffix(".o"))):
+                with contextlib.suppress(OSError):
+                    left.unlink()
+        # Another process may have made the library meanwhile, and cleared up.
+        return library if made or _is_sound(library) else None
+
+    def make(self, target: Path, command: list[str], text: str = "") -> bool:
+        """Have a compiler read `text` and write all of `target`, or nothing; return whether it is there."""
+        with contextlib.suppress(OSError):
+            if not _is_sound(target):
+                target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
+                    made = Path(scratch) / target.name
+                    if self._run([*command, "-o", str(made)], text.encode()):
+                        made.chmod(0o644)
+                        digest = _digest_file(made)
+                        digest.write_text(hashlib.sha256(made.read_bytes()).hexdigest())
+                        digest.chmod(0o644)
+                        # A library whose digest is not there yet would be made again by others.
+                        digest.replace(_digest_file(target))
+                        made.replace(target)
+        return _is_sound(target)
+
+    def _run(self, command: list[str], text: bytes) -> bool:
+        """Run a compiler; return whether it succeeded. One that hangs is ended, and no other is begun."""
+        with self._lock:
+            if self._stopped or self.hung:
+                return False
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                # Its end is seen at once, where a process without a pipe is asked twenty times a second.
+                stderr=subprocess.PIPE,
+                start_new_session=True,
+            )
+            self._running.add(process)
+        end = time.monotonic() + _PATIENCE
+        given: bytes | None = text
+        with process:
+            while True:
+                try:
+                    process.communicate(given, timeout=_TICK)
+                    break
+                except subprocess.TimeoutExpired:
+                    # What it has not read yet goes on being written.
+                    given = None
+                    self.hung = time.monotonic() > end
+                    if self.hung or _is_interrupted():
+                        _end(process)
+                        break
+        with self._lock:
+            self._running.discard(process)
+        return process.returncode == 0
+
+    def stop(self) -> None:
+        """End the compilers that run, with all their children, and begin no other."""
+        with self._lock:
+            self._stopped = True
+            running = list(self._running)
+        for pool in (self._compilers, self.linkers):
+            pool.shutdown(wait=False, cancel_futures=True)
+        for process in running:
+            _end(process)
+
+
+def _is_interrupted() -> bool:
+    """Return whether an interrupt that nobody caught ended the program, which waits for its threads now."""
+    last = getattr(sys, "last_type", None)
+    return last is KeyboardInterrupt and not threading.main_thread().is_alive()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill what is left of a compiler and its children, which are a session of their own."""
+    if process.poll() is None:
+        with contextlib.suppress(OSError):
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
 
 
 _workers = _Workers()
@@ -181,31 +311,15 @@ def _start_anew() -> None:
     _workers = _Workers()
 
 
+def stop_compilers() -> None:
+    """End all compilers of this process at once, as an interrupt does; kernels that are wanted later begin anew."""
+    global _workers
+    stopped, _workers = _workers, _Workers()
+    stopped.stop()
+
+
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_start_anew)
-
-
-def _link(cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | None:
-    """Return the shared library, made of `objects` if it is not there; None where it cannot be made."""
-    if not library.exists() and all(made.result() for made in objects.values()):
-        _make(library, [*shlex.split(cc), "-shared", *map(str, objects), "-lm"])
-        with contextlib.suppress(OSError):
-            library.with_suffix(".o").unlink()
-    # Another process may have made the library meanwhile, and cleared up.
-    return library if library.exists() else None
-
-
-def _make(target: Path, command: list[str], text: str = "") -> bool:
-    """Have a compiler read `text` and write all of `target`, or nothing; return whether it is there."""
-    with contextlib.suppress(OSError, subprocess.SubprocessError):
-        if not target.exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-                made = Path(scratch) / target.name
-                whole = [*command, "-o", str(made)]
-                subprocess.run(whole, input=text.encode(), check=True, capture_output=True, timeout=300)
-                made.replace(target)
-    return target.exists()
 
 
 def _begin(function: ca.Function, cc: str) -> Future[Path | None]:
@@ -215,16 +329,19 @@ def _begin(function: ca.Function, cc: str) -> Future[Path | None]:
     source = generator.dump()
     folder = cache_directory()
     library = folder / f"{function.name()}-{_hash(source, cc)}.so"
+    if _is_sound(library):
+        found: Future[Path | None] = Future()
+        found.set_result(library)
+        return found
     objects: dict[Path, Future[bool]] = {}
-    if not library.exists():
-        rest, units = _split(source)
-        texts = {folder / f"{name}-{_hash(cc)[:8]}.o": text for name, text in units.items()}
-        main, quick = library.with_suffix(".o"), _QUICK if len(rest) > _LONG else ()
-        texts[main] = _with_fast_helpers(rest) if quick else rest
-        # The longest first: nothing waits for it at the end.
-        for path in sorted(texts, key=lambda path: -len(texts[path])):
-            objects[path] = _workers.compile(cc, texts[path], path, quick if path == main else ())
-    return _workers.linkers.submit(_link, cc, objects, library)
+    rest, units = _split(source)
+    texts = {folder / f"{name}-{_hash(cc)[:8]}.o": text for name, text in units.items()}
+    main, quick = library.with_suffix(".o"), _QUICK if len(rest) > _LONG else ()
+    texts[main] = _with_fast_helpers(rest) if quick else rest
+    # The longest first: nothing waits for it at the end.
+    for path in sorted(texts, key=lambda path: -len(texts[path])):
+        objects[path] = _workers.compile(cc, texts[path], path, quick if path == main else ())
+    return _workers.linkers.submit(_workers.link, cc, objects, library)
 
 
 class Compiling:
@@ -237,20 +354,28 @@ class Compiling:
 
     def _begin(self) -> None:
         self._begun_by = _workers
-        self._library = None if self._cc is None else _begin(self._function, self._cc)
+        self._library: Future[Path | None] | None = None
+        if self._cc is not None and not _warned_of(cache_directory()):
+            self._library = _begin(self._function, self._cc)
 
     def result(self) -> ca.Function:
         """Return the compiled function when it is there, or the one it comes from where no compiler works."""
         if self._found is None:
-            self._found = self._load() or self._function
+            try:
+                self._found = self._load() or self._function
+            except KeyboardInterrupt:
+                stop_compilers()
+                raise
         return self._found
 
     def _load(self) -> ca.Function | None:
         if self._begun_by is not _workers:
-            # The compilers were at work for the process that this one was forked from.
+            # The compilers were at work for the process that this one was forked from, or were interrupted.
             self._begin()
         for _ in range(2):
-            library = None if self._library is None else self._library.result()
+            library = None
+            with contextlib.suppress(CancelledError):
+                library = None if self._library is None else self._library.result()
             if library is None:
                 break
             try:
@@ -260,7 +385,28 @@ class Compiling:
                 with contextlib.suppress(OSError):
                     library.unlink(missing_ok=True)
                 self._begin()
+        if self._begun_by.hung:
+            _warn(
+                f"the C compiler {self._cc} did not end within {_PATIENCE:g} s: kernels run uncompiled, 4 to 10 times "
+                "slower; VGTM_CC names another compiler"
+            )
         return None
+
+
+@cache
+def _warn(text: str) -> None:
+    """Warn once of what makes kernels slow."""
+    warnings.warn(text, stacklevel=2)
+
+
+def _warned_of(folder: Path) -> bool:
+    """Return whether nothing is loaded from the cache at `folder`, and warn of the reason."""
+    hindrance = ""
+    with contextlib.suppress(OSError):
+        hindrance = distrust(folder)
+    if hindrance:
+        _warn(f"{hindrance}: the kernel cache is not used, kernels run uncompiled, 4 to 10 times slower")
+    return bool(hindrance)
 
 
 _waiting: weakref.WeakSet[Kernel] = weakref.WeakSet()

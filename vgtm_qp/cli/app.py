@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 import traceback
 import warnings
@@ -19,6 +20,9 @@ from vgtm_qp.cli.problems import check, list_problems, schema
 from vgtm_qp.cli.results import export, replay, verify, view
 from vgtm_qp.cli.solve import solve
 from vgtm_qp.errors import ProblemError, VgtmError, nearest
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+"""What the system says of a disk that takes no more."""
 
 _EPILOGUE = (
     "Exit codes: 0 solved and verified; 1 internal error; 2 wrong usage or problem file; "
@@ -70,6 +74,9 @@ def main(tokens: Sequence[str] | None = None) -> int:
             code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
         return ExitCode.SOLVED if code is None else int(code)
     except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt) and (compiled := sys.modules.get("vgtm_qp.compiled")):
+            # The process would wait for them.
+            compiled.stop_compilers()
         code, message = _outcome(error)
         mistakes = []
         if isinstance(error, ProblemError):
@@ -86,6 +93,8 @@ def _outcome(error: BaseException) -> tuple[ExitCode, str]:
     match error:
         case CycloptsError():
             return ExitCode.USAGE, _explained(error)
+        case VgtmError() if _lacks_room(error):
+            return ExitCode.INTERNAL, f"the system refuses: {error}"
         case VgtmError():
             return ExitCode.USAGE, str(error)
         case KeyboardInterrupt():
@@ -95,6 +104,13 @@ def _outcome(error: BaseException) -> tuple[ExitCode, str]:
     note("".join(traceback.format_exception(error)).rstrip())
     said = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
     return ExitCode.INTERNAL, said
+
+
+def _lacks_room(error: BaseException | None) -> bool:
+    """Return whether a disk that takes no more is behind an error."""
+    while error is not None and getattr(error, "errno", None) not in _NO_ROOM:
+        error = error.__context__
+    return error is not None
 
 
 @contextmanager

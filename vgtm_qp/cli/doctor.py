@@ -36,11 +36,14 @@ def doctor(*, json: Json = False) -> int:
     """
     import platform
 
-    from vgtm_qp.compiled import cache_directory, compiler
+    from vgtm_qp.compiled import cache_directory, compiler, distrust
     from vgtm_qp.machine import versions
 
     cache = cache_directory()
     hindrance = why_not_writable(cache)
+    hindrance = f"CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else ""
+    if not hindrance and cache.exists() and (reason := distrust(cache)):
+        hindrance = f"IS NOT USED, kernels run uncompiled: {reason}"
     found: dict[str, Any] = {
         "versions": {"python": platform.python_version(), "system": platform.platform()}
         | versions(("vgtm-qp", *_CORE)),
@@ -49,7 +52,7 @@ def doctor(*, json: Json = False) -> int:
         "cache": {
             "folder": str(cache),
             "kernels": len(list(cache.glob("*.so"))),
-            "hindrance": f"; CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else "",
+            "hindrance": f"; {hindrance}" if hindrance else "",
         },
         "kernels": _tried(_kernels),
         "fcl": _tried(_fcl),

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from vgtm_qp.bench import BaselineName, SceneKind, TrackingName
-from vgtm_qp.cli.output import Json, Output, Switch, answer, bar, document, following, note, say
+from vgtm_qp.cli.output import ExitCode, Json, Output, Switch, answer, bar, document, following, note, say
 
 if TYPE_CHECKING:
     from vgtm_qp.step.step import Step
@@ -30,15 +30,18 @@ def compare(
     ] = None,
     output: Annotated[Path | None, Output(help="folder for compare.md, .json and .pdf")] = None,
     json: Json = False,
-) -> None:
+) -> int:
     """Solve problems by several methods and show what each of them keeps; a method that fails is shown as failed.
 
-    Exit code 0 says that the comparison was made, whatever the methods did.
+    Exit code 0 says that the comparison was made, whatever the methods did; 130 that it was interrupted, and rows
+    that are missing say so.
     """
+    from vgtm_qp.comparison.compare import Report, missing_row
     from vgtm_qp.comparison.compare import compare as run
     from vgtm_qp.methods import DEFAULT_METHODS, PRESETS
     from vgtm_qp.methods.presets import check_methods
     from vgtm_qp.problem import load_problem
+    from vgtm_qp.result.file import replacing
     from vgtm_qp.view.figure import save_figure
 
     names = [name for entry in methods or DEFAULT_METHODS for name in entry.split(",")]
@@ -47,7 +50,7 @@ def compare(
     loaded = [load_problem(problem) for problem in problems]
     folder = output or Path("compare")
     folder.mkdir(parents=True, exist_ok=True)
-    reports = []
+    reports: list[Report] = []
     total = len(loaded) * len(names)
     with following("compare", shown=not json) as advance:
         for k, problem in enumerate(loaded):
@@ -55,13 +58,22 @@ def compare(
             def show(name: str, part: float, step: Step, done: int = k * len(names)) -> None:
                 advance((done + names.index(name) + part) / total, step)
 
-            reports.append(run(problem, methods=names, progress=show))
+            if reports and reports[-1].interrupted:
+                rows = tuple(missing_row(problem, name) for name in names)
+                reports.append(Report(rows, {}, reports[-1].machine))
+            else:
+                reports.append(run(problem, methods=names, progress=show))
     report = sum(reports[1:], reports[0])
-    (folder / "compare.md").write_text(report.markdown())
-    (folder / "compare.json").write_text(report.json() + "\n")
+    for name, text in (("compare.md", report.markdown()), ("compare.json", report.json() + "\n")):
+        with replacing(folder / name) as scratch:
+            scratch.write_text(text)
     save_figure(report.figure(), folder / "compare.pdf")
     answer(report.to_dict(), report.markdown(), as_json=json)
     note(f"written: {folder / 'compare.md'}, compare.json, compare.pdf")
+    if report.interrupted:
+        note("vgtm: interrupted; the rows that are missing say so")
+        return ExitCode.INTERRUPTED
+    return ExitCode.SOLVED
 
 
 def study(
@@ -85,7 +97,7 @@ def study(
     ] = None,
     output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
     json: Json = False,
-) -> None:
+) -> int:
     """Run studies and write rows (CSV, JSON), a figure (PDF) and a text (Markdown) for each.
 
     An interrupted study goes on where it stopped: the rows of finished runs are on disk. A run that crashes or
@@ -106,12 +118,19 @@ def study(
     options = {key: value for key, value in (("scenes", scenes), ("seed", seed)) if value is not None}
     for name in titles:
         study_tasks(name, short=short, **options)
-    written = []
+    written: list[dict[str, str]] = []
     for name, title in titles.items():
         with bar(title, shown=not json, counted=True) as progress:
-            place = run_study(
-                name, output, short=short, workers=workers, dask=dask, progress=progress, options=options
-            )
+            try:
+                place = run_study(
+                    name, output, short=short, workers=workers, dask=dask, progress=progress, options=options
+                )
+            except KeyboardInterrupt:
+                said = f"interrupted; the finished runs are in {output / name}, the same command goes on from there"
+                note(f"vgtm: {said}")
+                if json:
+                    document({"studies": written, "error": said})
+                return ExitCode.INTERRUPTED
         written.append({"study": name, "title": title, "folder": str(place)})
         if not json:
             say((place / f"{name}.md").read_text())
@@ -119,6 +138,7 @@ def study(
         document({"studies": written})
     else:
         note("written: " + ", ".join(entry["folder"] for entry in written))
+    return ExitCode.SOLVED
 
 
 def bench(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from vgtm_qp.comparison.row import Row, make_row
+from vgtm_qp.comparison.row import INTERRUPTED, Row, make_row
 from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.machine import machine, sentence
@@ -59,6 +59,11 @@ class Report:
         solved = ", ".join(f"{row.method} {'solved' if row.solved else 'not'}" for row in self.rows)
         return f"<Report: {solved}>"
 
+    @property
+    def interrupted(self) -> bool:
+        """True if an interrupt ended the comparison; the methods without their turn have rows that say so."""
+        return any(row.status == INTERRUPTED for row in self.rows)
+
     def row(self, method: str) -> Row:
         """Return the first row of a method."""
         return next(row for row in self.rows if row.method == method)
@@ -105,7 +110,8 @@ def compare(
     methods
         Names of ``vgtm_qp.methods.presets.PRESETS``, at least one.
     progress
-        Called after each step with the method's name, its share of the path, 0 to 1, and the step.
+        Called after each step with the method's name, its share of the path, 0 to 1, and the step. An interrupt
+        ends the comparison: rows without a whole maneuver have the status ``interrupted``.
 
     Raises
     ------
@@ -116,9 +122,23 @@ def compare(
     """
     check_is_problem(problem)
     check_methods(methods)
-    found = {name: run_method(problem, name, progress=progress) for name in methods}
+    found: dict[str, tuple[Row, Maneuver | None]] = {}
+    try:
+        for name in methods:
+            found[name] = run_method(problem, name, progress=progress)
+            if found[name][0].status == INTERRUPTED:
+                break
+    except KeyboardInterrupt:
+        pass
+    for name in methods:
+        found.setdefault(name, (missing_row(problem, name), None))
     maneuvers = {(problem.name, name): maneuver for name, (_, maneuver) in found.items() if maneuver}
     return Report(tuple(found[name][0] for name in methods), maneuvers, machine())
+
+
+def missing_row(problem: Problem, name: str) -> Row:
+    """Return the row of a method that an interrupt left without its turn."""
+    return Row(problem.name, name, False, False, INTERRUPTED, 0.0, 0, "interrupted before its first step")
 
 
 def run_method(
@@ -133,7 +153,10 @@ def run_method(
     except VgtmError as error:
         reason = str(error).splitlines()[0]
         return Row(problem.name, name, False, False, "refused", 0.0, 0, reason), None
-    return make_row(problem.name, name, maneuver), maneuver
+    row = make_row(problem.name, name, maneuver)
+    if INTERRUPTED in maneuver.blocked_by:
+        row = replace(row, status=INTERRUPTED)
+    return row, maneuver
 
 
 def _cells(row: Row) -> list[str]:

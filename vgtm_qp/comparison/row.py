@@ -8,6 +8,7 @@ import numpy as np
 
 from vgtm_qp.maneuver.maneuver import Maneuver
 
+INTERRUPTED = "interrupted"
 _DRIFT = 1e-3
 
 
@@ -23,7 +24,7 @@ class Row:
         It reached the end and kept every limit and clearance, with a tolerance of 1 mm for members and tip: the
         standard for methods without drift correction.
     status : str
-        ``solved``, ``blocked`` or ``refused`` (the method cannot be set up for this arm).
+        ``solved``, ``blocked``, ``refused`` (the method cannot be set up for this arm) or ``interrupted``.
     reached : float
         Share of the path covered, 0 to 1.
     reason : str

@@ -8,7 +8,8 @@ import numpy as np
 
 from vgtm_qp.result.result import Result
 from vgtm_qp.view.drawing import camera_for, drawing_of_maneuver, resampled
-from vgtm_qp.view.scene import ArmScene, viser_server
+from vgtm_qp.view.scene import ArmScene
+from vgtm_qp.view.server import viser_server
 
 _LONGEST = 20.0
 _FRAMES = 200

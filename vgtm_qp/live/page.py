@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import traceback
+import warnings
 from collections.abc import Callable
 from functools import partial
 from html import escape
@@ -21,7 +23,8 @@ from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.methods import method_name, methods_for
 from vgtm_qp.problem import Problem
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled, stroke_colours
-from vgtm_qp.view.scene import ArmScene, viser_server
+from vgtm_qp.view.scene import ArmScene
+from vgtm_qp.view.server import LOOPBACK, is_loopback, is_unspecified, viser_server
 
 _PERIOD = 1.0 / 30.0
 _READ_OUT_PERIOD = 0.1
@@ -45,21 +48,29 @@ def view(
     shown: Problem | Maneuver,
     *,
     port: int = 8080,
+    host: str = LOOPBACK,
     ready: Callable[[str], None] | None = None,
     stop: Event | None = None,
 ) -> None:
-    """Serve the live page of a problem or a result, to this machine alone, until interrupted.
+    """Serve the live page of a problem or a result until interrupted, by default to this machine alone.
 
-    The `port` is the next free one from there on, 0 for any; `ready` is called with the page's address once it can be
-    opened; `stop` ends the page when it is set. MissingExtraError where viser is not installed.
+    The `port` is the next free one from there on, 0 for any. Who reaches another `host` than the default can move the
+    arm; a page of another origin cannot. `ready` is called with the page's address once it can be opened; `stop` ends
+    the page when it is set. MissingExtraError where viser is not installed, GoalError where host or port do not serve.
     """
+    if not is_loopback(host):
+        warnings.warn(
+            f"the page is served at {host}: whoever reaches this machine can move the arm, without a password",
+            stacklevel=2,
+        )
     maneuver = shown if isinstance(shown, Maneuver) else None
     problem = Problem.from_dict(maneuver.manifest["problem"]) if maneuver else shown
     assert isinstance(problem, Problem)
-    with viser_server(port) as server:
+    with viser_server(port, host) as server:
         page = _Page(server, Session(problem), maneuver)
         if ready is not None:
-            ready(f"http://127.0.0.1:{server.get_port()}")
+            name = LOOPBACK if is_unspecified(host) else f"[{host}]" if ":" in host else host
+            ready(f"http://{name}:{server.get_port()}")
         page.run(stop or Event())
 
 
@@ -101,18 +112,23 @@ class _Page:
             started = perf_counter()
             changed = self._read_inbox()
             if self._playing:
-                self._play(_PERIOD)
-            elif self._session.advance(_PERIOD) or changed:
-                self._draw()
+                self._survive(lambda: self._play(_PERIOD))
+            else:
+                self._survive(partial(self._advance, changed))
             if started - read_at > _READ_OUT_PERIOD:
                 self._read_out.content = read_out(self._session, self._message)
                 read_at = started
             stop.wait(max(0.0, _PERIOD - (perf_counter() - started)))
 
+    def _advance(self, changed: bool) -> None:
+        """Step towards what is wanted, and draw the arm if it moved or something else `changed`."""
+        if self._session.advance(_PERIOD) or changed:
+            self._draw()
+
     def _read_inbox(self) -> bool:
         found = not self._inbox.empty()
         while not self._inbox.empty():
-            self._inbox.get()()
+            self._survive(self._inbox.get())
         if self._settings:
             settings, self._settings = self._settings, {}
             self._try(lambda: self._session.change(settings))
@@ -120,10 +136,21 @@ class _Page:
 
     def _try(self, action: Callable[[], None]) -> None:
         self._message = ""
+        self._survive(action)
+
+    def _survive(self, action: Callable[[], None]) -> None:
+        """Run what a widget asks for; whatever that raises is shown, and the page goes on."""
         try:
             action()
         except VgtmError as error:
             self._message = str(error)
+        except Exception as error:
+            said = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
+            if said != self._message:
+                # Once, not thirty times a second.
+                traceback.print_exc()
+            self._pause()
+            self._message = said
 
     def _draw(self) -> None:
         session = self._session

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import threading
 import time
 import traceback
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -36,9 +38,33 @@ def run_task(function: str, task: Task) -> Row:
 
 
 def run_here(function: str, tasks: Sequence[Task]) -> Iterator[tuple[int, Row]]:
-    """Yield number and row of each task, one after another in this process."""
-    for k, task in enumerate(tasks):
-        yield k, run_task(function, task)
+    """Yield number and row of each task, one after another in this process; an interrupted task has no row."""
+    with _noting_interrupts() as interrupted:
+        for k, task in enumerate(tasks):
+            row = run_task(function, task)
+            if interrupted.is_set():
+                # A maneuver ends with the steps that it made, as if it were blocked.
+                raise KeyboardInterrupt
+            yield k, row
+
+
+@contextmanager
+def _noting_interrupts() -> Iterator[threading.Event]:
+    """Give an event that is set by the first interrupt, which has its usual effect too."""
+    interrupted = threading.Event()
+    before: Any = None
+
+    def interrupt(_signum: int, _frame: Any) -> None:
+        interrupted.set()
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield interrupted
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
 
 
 def run_processes(

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
-from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -34,19 +31,6 @@ def import_viser() -> Any:
     except ImportError:
         raise MissingExtraError("view", "viser") from None
     return viser
-
-
-@contextmanager
-def viser_server(port: int = 0) -> Iterator[Any]:
-    """Run a viser server that this machine alone can reach; its own messages do not reach stdout."""
-    viser = import_viser()
-    with redirect_stdout(StringIO()):
-        server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
-    try:
-        yield server
-    finally:
-        with redirect_stdout(StringIO()):
-            server.stop()
 
 
 class ArmScene:
