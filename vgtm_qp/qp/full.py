@@ -370,20 +370,16 @@ class FullBuilder:
                 [_Entries(*_grid(pieces, curve), spacing), gap("spacing")],
                 lambda numbers: -numbers.spacing_rhs,
             ),
-            _Rows(
-                [
-                    Label(f"curve {name} leg", "curve leg", "m")
-                    for name in ("first", "last")[: len(layout.legs)]
-                ],
-                [
-                    _Entries(
-                        *_grid(np.arange(len(layout.legs)), curve[: 3 * layout.vertices]),
-                        lambda numbers: numbers.legs.over_vertices(layout),
-                    )
-                ],
-                lambda numbers: numbers.legs.lower,
-            ),
+            self._leg_rows(curve[: 3 * layout.vertices]),
         ]
+
+    def _leg_rows(self, vertices: Index) -> _Rows:
+        """Return the rows of the legs whose directions are given; `vertices` (3 V,) are the columns of the curve's."""
+        layout, count = self.layout, len(self.layout.legs)
+        labels = [Label(f"curve {name} leg", "curve leg", "m") for name in ("first", "last")[:count]]
+        grid = _grid(np.arange(count), vertices)
+        entries = [_Entries(*grid, lambda numbers: numbers.legs.over_vertices(layout))]
+        return _Rows(labels, entries, lambda numbers: numbers.legs.lower)
 
 
 class _Entries(NamedTuple):

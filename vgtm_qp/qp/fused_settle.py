@@ -17,7 +17,6 @@ NEAR = 24
 """Greatest number of clearance rows with which the compiled function checks an answer."""
 
 _HELD_STEPS = 4
-_BOXED_STEPS = 2
 
 
 def settle_function(layout: Layout) -> Bound:
@@ -68,16 +67,13 @@ def settle_function(layout: Layout) -> Bound:
 
     is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
     held = symbols.held(layout.tracked.tolist()) if is_plain else None
-    if held is None:
-        end = symbols.closed(symbols.closed(start, lower, upper), lower, upper)
-    else:
+    end = start
+    if held is not None:
         points = vertices_after @ constants.add("curve_weights", layout.curve_weights)
-        end = start
         for _ in range(_HELD_STEPS):
             end = held(end, points)
-        # The stations take actuators along: what these are beyond their boxes goes back, by less than gaps count.
-        for _ in range(_BOXED_STEPS):
-            end = symbols.closed(end, lower, upper)
+    # Where stations took actuators beyond their boxes these go back, by less than gaps count.
+    end = symbols.closed(symbols.closed(end, lower, upper), lower, upper)
     first = error = tip_error(layout.tip_rows, *tip(end), *goal_pose)
     if not layout.hard_tracking:
         gain = qp.gain(stiffness)

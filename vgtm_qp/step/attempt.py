@@ -194,10 +194,9 @@ class Attempt:
             q, closed = move.closed.q, move.closed
             # Linearised rows leave a small gap between the curve's end and the tip.
             vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
-            if tracking is not None:
-                gap = tracking.greatest(q, vertices, move.torsion, target.base)
-                if not gap <= self.accuracy.tracking:
-                    continue
+            off = 0.0 if tracking is None else tracking.greatest(q, vertices, move.torsion, target.base)
+            if not off <= self.accuracy.tracking:
+                continue
             report, after = separation.proof(state, q, target.time, short)
             phases.add("acceptance")
             if after is None:
