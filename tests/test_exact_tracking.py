@@ -123,7 +123,7 @@ def test_a_curve_that_is_not_where_the_file_says_is_found():
     assert found.curve_end_gap.where == "row 2"
     assert not found.ok
     record = {**maneuver.manifest["curve"], "stations": [[0, 1, 999]] * 3}
-    with pytest.raises(ResultError, match=r"manifest\.curve does not fit"):
+    with pytest.raises(ResultError, match=r"manifest\.curve\.stations"):
         vq.verify(replace(maneuver, manifest={**maneuver.manifest, "curve": record}))
     without = {key: value for key, value in maneuver.manifest.items() if key != "curve"}
     assert vq.verify(replace(maneuver, manifest=without)).tracking_gap.value is None
