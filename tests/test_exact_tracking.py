@@ -11,9 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vgtm_qp as vq
+from vgtm_qp import Resolver
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.errors import ProblemError, ResultError
+from vgtm_qp.maneuver.retries import DeadEnd, retries
+from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.study.scenes import random_scene
 from vgtm_qp.verify.curve import RecordedCurve
 
@@ -149,3 +152,36 @@ def test_curve_nodes_of_the_certificate_are_those_of_the_curve(family, seed, ver
     np.testing.assert_allclose(recorded.points(p[None])[0], curve.position(s), atol=1e-7)
     end = recorded.end_direction(p[None])[0]
     np.testing.assert_allclose(end / np.linalg.norm(end), curve.tangent(1.0), atol=1e-12)
+
+
+def test_no_retry_lets_hard_tracking_give_way():
+    """Elastic tracking reaches the end of this path; hard tracking does not, whatever else is tried."""
+    problem = vq.load_problem("five_bay_two_cubes_pointing").replace(
+        {"method.tracking_mode": "hard", "maneuver.steps": 10}
+    )
+    first = vq.solve(problem.replace({"method.retries": False}))
+    assert first.status == "blocked"
+    vertices = first.control_vertices[-1]
+    stop = Stop(StopKind.OBSTACLE)
+    modes = [p.method.tracking_mode for _, p in retries(problem, DeadEnd(stop, vertices, 4.0, np.eye(3)[0]))]
+    assert len(modes) > 5
+    assert set(modes) == {"hard"}
+    exact = problem.replace({"method.tracking_mode": "exact"})
+    names = [name for name, _ in retries(exact, DeadEnd(stop, vertices, 4.0, np.eye(3)[0]))]
+    assert names[0] == "elastic tracking"
+
+
+def test_braking_steps_say_whether_stations_are_off_the_curve():
+    resolver = Resolver(
+        vq.load_problem("five_bay_two_cubes").replace({"truss.rate": 0.4, "truss.acceleration": 0.3})
+    )
+    start = resolver.tip()[0]
+    for k in range(1, 6):
+        assert resolver.step(position=start + k * np.array([0.08, 0.0, -0.1]), dt=0.3).moved
+    off = []
+    while (step := resolver.brake()) is not None:
+        assert step.braked
+        off.append(bool(gaps(resolver).max() > 1e-6))
+        assert step.gave_way == off[-1]
+    assert True in off
+    assert False in off

@@ -54,10 +54,9 @@ def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
     # If elastic tracking on demand was not enough, tracking is elastic from the start, in all later retries too.
-    # A solver by bays has no elastic tracking.
-    held = problem.method.holds_curve and not problem.method.goes_by_bays
-    elastic = {"method.tracking_mode": "elastic"} if held else {}
-    if elastic and problem.method.tracking_mode == "exact":
+    # Hard tracking and a solver by bays have no elastic tracking.
+    elastic = {"method.tracking_mode": "elastic"} if problem.method.gives_way else {}
+    if elastic:
         yield "elastic tracking", problem.replace(elastic)
     for name, changes in _changes(problem, dead_end):
         with suppress(ProblemError):
@@ -80,7 +79,7 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
     if isinstance(problem.maneuver, WaypointManeuver):
         yield "shorter steps", {"maneuver.steps": 3 * problem.maneuver.steps}
     yield "actuator rates as the metric", {"method.weights.actuator_rate": rate}
-    # Hard tracking asks for the curve, so there is no retry without it.
+    # Hard tracking asks for the curve, so there is no retry without it either.
     if method.tracking == "coupled" and method.tracking_mode != "hard":
         yield "no curve", {"method": method.kept_by("qp", "none"), "curve.control_vertex_goals": []}
     if vertices:

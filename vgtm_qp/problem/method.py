@@ -210,6 +210,11 @@ class Method(Table, called="[method]"):
         return self.goes_by_bays or (self.name == "qp" and is_held)
 
     @property
+    def gives_way(self) -> bool:
+        """Whether stations may leave the curve where it holds the arm back; a solver by bays cannot let them."""
+        return self.holds_curve and self.tracking_mode == "exact" and not self.goes_by_bays
+
+    @property
     def draws_vertices(self) -> bool:
         """Whether control vertices follow goals of their own."""
         return _kind(self.name, self.tracking) in _COUPLED

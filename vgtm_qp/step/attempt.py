@@ -116,6 +116,15 @@ class Attempt:
                 break
         return step
 
+    def gave_way(self, state: State) -> bool:
+        """Return whether stations of a state are off the curve that exact tracking keeps them on."""
+        setup, base = self._setup, self._setup.base_motion
+        if setup.elastic is None or self._tracking is None:
+            return False
+        pose = None if base is None else base.pose(state.time)
+        gap = self._tracking.greatest(state.q, state.control_vertices, state.torsion, pose)
+        return not gap <= self.accuracy.tracking
+
     def first_input(self, state: State, target: Target) -> QPInput:
         """Return the input of the first QP of a step from `state`."""
         short = self.separation.shortfall_of(state)

@@ -71,9 +71,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "by_fcl": clearance.distance == "fcl",
     }
     engine = make_engine(solver, home.layout, kinematics, task, tracking, compiled=compiled)
-    # A solver by bays has no solution with elastic tracking.
-    is_exact = problem.method.tracking_mode == "exact" and not problem.method.goes_by_bays
-    gives_way = home.layout.hard_tracking and is_exact
+    gives_way = home.layout.hard_tracking and problem.method.gives_way
     elastic = elastic_engine(solver, home.layout, kinematics, task) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
@@ -129,8 +127,7 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         layout = Layout(arm, *tables, task.row_names, method.weights, elastic_tip=elastic)
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
     is_hard, mistakes = method.holds_curve, list(_beyond_the_arm(problem, arm, task))
-    may_give_way = method.tracking_mode == "exact" and not method.goes_by_bays
-    if may_give_way and mistakes and method.hard_coordinates == ("position",):
+    if method.gives_way and mistakes and method.hard_coordinates == ("position",):
         # By default: this arm can hold only the curve's end exactly.
         is_hard, mistakes = False, []
     if mistakes:

@@ -50,7 +50,8 @@ class Step:
         True if the only step found was to brake on the arm's previous path, which limited accelerations do not let it
         leave at once.
     gave_way : bool
-        True if stations left the curve, with ``method.tracking_mode`` exact, because the arm got further that way.
+        True if stations left the curve, with ``method.tracking_mode`` exact, because the arm got further that way, or
+        are off it while the arm brakes.
     left_path : bool
         True if the tip left the path while braking, because it is elastic or its base moves on.
     solution, rows, limits
