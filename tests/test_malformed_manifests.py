@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 import vgtm_qp as vq
 from vgtm_qp.cli.app import main
 from vgtm_qp.result.file import content_digest
+from vgtm_qp.result.manifest import stored_problem
 
 WRONG: tuple[Any, ...] = (
     None,
@@ -135,3 +137,29 @@ def test_the_key_is_named(
     write(tmp_path / "wrong.npz", content, manifest)
     assert main(["verify", str(tmp_path / "wrong.npz")]) == 4
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("former", "present"),
+    [
+        ({"hard_tracking": True}, {"tracking_mode": "hard"}),
+        ({"hard_tracking": False, "variant": "damped"}, {"tracking_mode": "elastic", "variant": "damped"}),
+        ({"hard_tracking": False, "tracking": "recursive", "solver": "osqp"}, {"tracking_mode": "exact"}),
+        ({"hard_tracking": False, "name": "pseudoinverse", "tracking": "none"}, {"tracking_mode": "exact"}),
+    ],
+)
+def test_results_of_earlier_versions_are_read_and_verified(files, tmp_path, former, present):
+    """Their problems have a former key, and keys that the method had no use for."""
+    result = vq.load_result(files["five_bay_free"])
+    problem = copy.deepcopy(result.manifest["problem"])
+    del problem["method"]["tracking_mode"]
+    problem["method"].update(former)
+    manifest = {
+        key: result.manifest[key] for key in result.manifest if key not in ("curve", "problem_digests")
+    }
+    path = tmp_path / "earlier.npz"
+    replace(result, manifest={**manifest, "problem": problem}).save(path)
+    assert vq.load_result(path).manifest["problem"] == problem
+    assert vq.verify(vq.load_result(path)).ok
+    read = stored_problem(problem).to_dict()["method"]
+    assert read.items() >= present.items()

@@ -22,6 +22,7 @@ from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.methods import method_name, methods_for
 from vgtm_qp.problem import Problem
+from vgtm_qp.result.manifest import stored_problem
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled, stroke_colours
 from vgtm_qp.view.scene import ArmScene
 from vgtm_qp.view.server import LOOPBACK, is_loopback, is_unspecified, viser_server
@@ -64,7 +65,7 @@ def view(
             stacklevel=2,
         )
     maneuver = shown if isinstance(shown, Maneuver) else None
-    problem = Problem.from_dict(maneuver.manifest["problem"]) if maneuver else shown
+    problem = stored_problem(maneuver.manifest["problem"]) if maneuver else shown
     assert isinstance(problem, Problem)
     with viser_server(port, host) as server:
         page = _Page(server, Session(problem), maneuver)

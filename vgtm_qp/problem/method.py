@@ -242,7 +242,7 @@ class Method(Table, called="[method]"):
             else:
                 yield key, value
 
-    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+    def _unused(self) -> Iterator[tuple[Place, str]]:
         kind = _kind(self.name, self.tracking)
         for key, _ in self._changed():
             if kind not in SERVED[key]:
@@ -251,6 +251,9 @@ class Method(Table, called="[method]"):
                 table = type(self) if len(place) == 1 else type(getattr(self, place[0]))
                 default = shown(table.model_fields[place[-1]].default)
                 yield place, f"{default}, since {_KINDS[kind]} does without this key; it belongs to {others}"
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        kind = _kind(self.name, self.tracking)
         if self.name == "curve-pseudoinverse" and self.tracking == "none":
             yield ("tracking",), '"recursive" or "parallel": the method moves the curve first'
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:

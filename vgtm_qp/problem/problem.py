@@ -71,14 +71,20 @@ class Problem(Table, called="a problem"):
 
     @classmethod
     def from_dict(
-        cls, data: Mapping[str, Any], *, source: str | Path | None = None, check_files: bool = False
+        cls,
+        data: Mapping[str, Any],
+        *,
+        source: str | Path | None = None,
+        check_files: bool = False,
+        of_result: bool = False,
     ) -> Self:
         """Make a problem from what :meth:`to_dict` returned; ProblemError with one mistake per mistake.
 
         Mistakes name `source`, the file of the data, and relative paths start at its folder. With `check_files` the
-        files that the problem names must exist; a result that was moved elsewhere is read without that.
+        files that the problem names must exist; a result that was moved elsewhere is read without that. With
+        `of_result` values that the method has no use for are allowed, since earlier versions solved such problems.
         """
-        context = {"source": source, "check_files": check_files}
+        context = {"source": source, "check_files": check_files, "of_result": of_result}
         if source is not None:
             context["folder"] = Path(source).absolute().parent
         problem = cls.model_validate(data, context=context)
@@ -109,15 +115,7 @@ class Problem(Table, called="a problem"):
         """Return the error of mistakes that a later check found."""
         return ProblemError(str(self.source or self.name), mistakes)
 
-    def _contradictions(self) -> Iterator[tuple[Place, str]]:
-        if self.truss is None and self.arm is None:
-            yield ("truss",), "a table [truss], or a table [arm] in its place"
-        if self.truss is not None and self.arm is not None:
-            yield ("arm",), "a truss or an arm, not both"
-        if self.arm is not None and self.method.name != "qp":
-            yield ("method", "name"), '"qp": the pseudoinverse methods move trusses, not serial arms'
-        elif self.arm is not None and self.method.tracking in ("recursive", "parallel"):
-            yield ("method", "tracking"), '"coupled" or "none": the others go along the bays of a truss'
+    def _unused(self) -> Iterator[tuple[Place, str]]:
         if self.curve.control_vertex_goals and not self.method.draws_vertices:
             yield (
                 ("curve", "control_vertex_goals"),
@@ -130,6 +128,16 @@ class Problem(Table, called="a problem"):
             )
         if self.end_effector.mode not in self.method.modes:
             yield ("end_effector", "mode"), f"{quoted(self.method.modes)}: the method has no other mode"
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        if self.truss is None and self.arm is None:
+            yield ("truss",), "a table [truss], or a table [arm] in its place"
+        if self.truss is not None and self.arm is not None:
+            yield ("arm",), "a truss or an arm, not both"
+        if self.arm is not None and self.method.name != "qp":
+            yield ("method", "name"), '"qp": the pseudoinverse methods move trusses, not serial arms'
+        elif self.arm is not None and self.method.tracking in ("recursive", "parallel"):
+            yield ("method", "tracking"), '"coupled" or "none": the others go along the bays of a truss'
         yield from unique("obstacle", "name", [obstacle.name for obstacle in self.obstacle])
         if isinstance(self.maneuver, WaypointManeuver):
             for i, waypoint in enumerate(self.maneuver.waypoint):

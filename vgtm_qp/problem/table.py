@@ -70,6 +70,10 @@ class Table(BaseModel):
         """Yield place and expectation of each value that contradicts another one of this table."""
         yield from ()
 
+    def _unused(self) -> Iterator[tuple[Place, str]]:
+        """Yield place and expectation of each value that the method has no use for; a result may have such values."""
+        yield from ()
+
     @model_validator(mode="wrap")
     @classmethod
     def _explain(cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
@@ -89,9 +93,10 @@ class Table(BaseModel):
                     if not (_echo(found) or (found["type"] == "missing" and found["loc"] in misspelt))
                 ]
             else:
+                unused = () if (info.context or {}).get("of_result") else table._unused()
                 details = [
                     InitErrorDetails(type=unexpected(phrase), loc=place, input=value_at(table, place))
-                    for place, phrase in table._contradictions()
+                    for place, phrase in (*unused, *table._contradictions())
                 ]
                 if not details:
                     return table

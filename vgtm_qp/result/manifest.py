@@ -162,10 +162,21 @@ def stored_problem(data: Any) -> Problem:
     from vgtm_qp.problem import Problem
 
     try:
-        return Problem.from_dict(data)
+        return Problem.from_dict(_with_present_keys(data), of_result=True)
     except ProblemError as error:
         mistakes = "; ".join(f"manifest.problem.{mistake}" for mistake in error.mistakes[:8])
         raise ResultError(mistakes) from None
+
+
+def _with_present_keys(data: Any) -> Any:
+    """Return the problem of a manifest with ``tracking_mode`` in the place of ``hard_tracking``, its former key."""
+    method = data.get("method") if isinstance(data, Mapping) else None
+    if not isinstance(method, Mapping) or not isinstance(method.get("hard_tracking"), bool):
+        return data
+    present = {key: value for key, value in method.items() if key != "hard_tracking"}
+    if (present.get("name", "qp"), present.get("tracking", "coupled")) == ("qp", "coupled"):
+        present.setdefault("tracking_mode", "hard" if method["hard_tracking"] else "elastic")
+    return {**data, "method": present}
 
 
 def dump_manifest(manifest: Mapping[str, Any]) -> str:
