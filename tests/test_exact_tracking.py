@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -185,3 +186,61 @@ def test_braking_steps_say_whether_stations_are_off_the_curve():
         assert step.gave_way == off[-1]
     assert True in off
     assert False in off
+
+
+@pytest.fixture(scope="module")
+def hard_result():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VGTM_CC", "none")
+        problem = vq.load_problem("five_bay_two_cubes_pointing")
+        return vq.solve(
+            problem.replace({"method.tracking_mode": "hard", "method.retries": False, "maneuver.steps": 10})
+        )
+
+
+def last_station_alone(curve):
+    curve.update({key: curve[key][-1:] for key in ("nodes", "stations", "weights")})
+
+
+def shrunk(name):
+    return lambda curve: curve.update({name: (0.5 * np.array(curve[name])).tolist()})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict.clear, None),
+        (last_station_alone, "has 1 stations; this truss has 5"),
+        (shrunk("extraction"), "extraction are not those of means"),
+        (shrunk("weights"), "weights are not those of means"),
+        (shrunk("nodes"), "nodes do not increase to 1"),
+        (shrunk("breaks"), "breaks do not increase to 1"),
+        (lambda curve: curve["stations"].reverse(), "do not end with the end effector"),
+        (lambda curve: curve.update(ends_at_tip=False), "ends_at_tip is false"),
+        (lambda curve: curve.update(ends_along_tip=False), "ends_along_tip is false"),
+    ],
+)
+def test_a_certificate_refuses_a_curve_that_is_not_that_of_the_problem(hard_result, change, message):
+    assert hard_result.certificate.ok
+    curve = copy.deepcopy(hard_result.manifest["curve"])
+    change(curve)
+    changed = replace(hard_result, manifest={**hard_result.manifest, "curve": curve or None})
+    certificate = vq.verify(changed)
+    assert not certificate.ok
+    assert any((message or "manifest.curve is missing") in line for line in certificate.contradictions)
+
+
+@pytest.mark.parametrize("tracking", ["coupled", "recursive", "parallel"])
+def test_a_certificate_bounds_the_gaps_of_every_method_that_keeps_stations_on_the_curve(
+    hard_result, tracking
+):
+    problem = copy.deepcopy(hard_result.manifest["problem"])
+    problem["method"].update(tracking=tracking, tracking_mode="hard" if tracking == "coupled" else "exact")
+    curve = {**hard_result.manifest["curve"], "held": False}
+    vertices = hard_result.control_vertices.copy()
+    vertices[3:, 2] += 1e-3
+    manifest = {**hard_result.manifest, "problem": problem, "curve": curve}
+    gap = vq.verify(replace(hard_result, manifest=manifest, control_vertices=vertices)).tracking_gap
+    assert gap.bound == 1e-6
+    assert gap.value > 1e-4
+    assert not gap.ok

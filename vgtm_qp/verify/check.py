@@ -24,7 +24,7 @@ from vgtm_qp.verify.clearance import (
     Least,
     RecordedMotion,
 )
-from vgtm_qp.verify.curve import curve_measures
+from vgtm_qp.verify.curve import curve_contradictions, curve_measures
 from vgtm_qp.verify.held import held_against
 from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.verify.path import (
@@ -117,6 +117,7 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
             *foreign,
             *wrong,
             *astray,
+            *curve_contradictions(maneuver),
             *arm.contradictions(maneuver.manifest["problem"], maneuver.arrays),
             *_jams_between_rows(maneuver),
             *_outcome_contradictions(maneuver),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from math import comb
 from typing import Any, NamedTuple
 
@@ -21,6 +21,10 @@ TRACKING_TOLERANCE = 1e-6
 _PIECES = 400
 """Chords of each Bezier segment whose lengths make its arc length."""
 _REFINEMENTS = 3
+
+_ROUNDING = 1e-9
+_ENDS_AT_TIP = 3
+"""Number of control vertices from which on a curve can end in the tip; along its direction with one more."""
 
 
 class RecordedCurve(NamedTuple):
@@ -113,15 +117,13 @@ def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
         return {}
     table = Record(record, "manifest.curve")
     curve = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices.shape[1])
-    is_held, *_ = (table.flag(key) for key in ("held", "ends_at_tip", "ends_along_tip"))
     stations = np.einsum("kq,tkqc->tkc", curve.weights, maneuver.nodes[:, curve.stations])
     off = np.linalg.norm(stations - curve.points(vertices), axis=2)
     # At home the curve is fitted to the arm, however that is bent.
     moved = off[min(1, len(off) - 1) :]
     row, k = divmod(int(np.argmax(moved)), moved.shape[1])
     row += len(off) - len(moved)
-    method = maneuver.manifest["problem"].get("method") or {}
-    is_hard = method.get("tracking_mode") == "hard" and is_held
+    is_hard = keeps_stations(maneuver.manifest["problem"]) and len(off) > 1
     found = {
         "tracking_gap": Measure(
             float(off[row, k]),
@@ -146,3 +148,51 @@ def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
             row = int(np.argmax(errors))
             found[name] = Measure(float(errors[row]), unit, bound, "most", f"row {row}")
     return found
+
+
+def keeps_stations(problem: Mapping[str, Any]) -> bool:
+    """Return whether the method of a problem keeps stations on the curve in every step, or stops the arm."""
+    method = problem.get("method") or {}
+    # Results of earlier versions, which do not have this key, do not record their curve.
+    if "tracking_mode" not in method or method.get("name") != "qp":
+        return False
+    tracking = method.get("tracking")
+    return tracking in ("recursive", "parallel") or (
+        tracking == "coupled" and method["tracking_mode"] == "hard"
+    )
+
+
+def curve_contradictions(maneuver: Result) -> Iterator[str]:
+    """Yield where the recorded curve cannot be that of the problem, so that its measures say nothing."""
+    problem, record = maneuver.manifest["problem"], maneuver.manifest.get("curve")
+    truss, vertices = problem.get("truss") or {}, maneuver.control_vertices.shape[1]
+    if record is None or not vertices:
+        if keeps_stations(problem) and (truss.get("module") != "graph" or truss.get("faces")):
+            yield "manifest.curve is missing, but the problem keeps stations on the curve"
+        return
+    table = Record(record, "manifest.curve")
+    curve = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices)
+    for name, shares in (("extraction", curve.extraction), ("weights", curve.weights)):
+        if np.abs(shares.sum(axis=-1) - 1.0).max() > _ROUNDING:
+            yield f"manifest.curve.{name} are not those of means: they do not add up to 1"
+    for name, values in (("breaks", curve.breaks), ("nodes", np.append(0.0, curve.nodes))):
+        if np.abs(values[[0, -1]] - [0.0, 1.0]).max() > _ROUNDING or (np.diff(values) <= 0.0).any():
+            yield f"manifest.curve.{name} do not increase to 1"
+    if "bays" in truss:
+        count = truss["bays"] // (2 if truss["module"] == "longeron" and table.flag("held") else 1)
+        if len(curve.nodes) != count:
+            yield f"manifest.curve has {len(curve.nodes)} stations; this truss has {count}"
+    tip = maneuver.manifest["arm"]["tip"]
+    last = tip["nodes"] if isinstance(tip, Mapping) else [maneuver.nodes.shape[1] - 1]
+    track = (problem.get("end_effector") or {}).get("track") or ()
+    if not np.array_equal(np.sort(curve.stations[-1]), np.sort(last)):
+        if truss.get("module") != "graph":
+            yield "manifest.curve.stations do not end with the end effector"
+    elif vertices >= _ENDS_AT_TIP and not table.flag("ends_at_tip"):
+        yield "manifest.curve.ends_at_tip is false, but the last station is the end effector"
+    elif (
+        vertices > _ENDS_AT_TIP
+        and {"pointing", "orientation"} & {*track}
+        and not table.flag("ends_along_tip")
+    ):
+        yield "manifest.curve.ends_along_tip is false, but the direction of the tip is tracked"
