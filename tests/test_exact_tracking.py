@@ -244,3 +244,21 @@ def test_a_certificate_bounds_the_gaps_of_every_method_that_keeps_stations_on_th
     assert gap.bound == 1e-6
     assert gap.value > 1e-4
     assert not gap.ok
+
+
+def test_an_arm_too_short_to_keep_a_station_on_the_curve_is_moved_elastically_or_refused():
+    short = vq.load_problem("longeron_past_a_cube").replace({"truss.bays": 1, "obstacle": []})
+    resolver = Resolver(short)
+    assert not resolver.setup.layout.hard_tracking
+    assert resolver.step(position=resolver.tip()[0] + [0.01, 0.0, -0.01]).status == "reached"
+    for key, value in (("tracking_mode", "hard"), ("tracking", "recursive"), ("tracking", "parallel")):
+        with pytest.raises(ProblemError, match=f'method.{key}: found "{value}".*so short an arm'):
+            Resolver(short.replace({f"method.{key}": value}))
+
+
+@pytest.mark.parametrize("tracking", ["recursive", "parallel"])
+def test_an_arm_without_faces_is_not_moved_along_them(tracking):
+    problem = vq.load_problem("tetrahedral_truss_circle")
+    assert not problem.truss.faces
+    with pytest.raises(ProblemError, match=f'method.tracking: found "{tracking}".*this arm has none'):
+        Resolver(problem.replace({"method": {"name": "qp", "tracking": tracking}}))

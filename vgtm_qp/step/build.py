@@ -122,6 +122,9 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
     """
     method, stations, spec = problem.method, arm.stations, problem.curve
     elastic = problem.end_effector.mode == "elastic"
+    if method.goes_by_bays and not len(stations):
+        text = '"coupled" or "none": the others go along the faces, and this arm has none'
+        raise problem.error([problem.mistake(("method", "tracking"), text)])
     if method.tracking == "none" or not len(stations):
         tables = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
         layout = Layout(arm, *tables, task.row_names, method.weights, elastic_tip=elastic)
@@ -211,6 +214,12 @@ def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mista
     if len(wanted) == 2 and curve.torsion_vertices:
         wanted.append("orientation")
     stations = arm.stations
+    if len(stations) <= stations.stride:
+        key, other = ("tracking", '"coupled"') if method.goes_by_bays else ("tracking_mode", '"elastic"')
+        yield problem.mistake(
+            ("method", key), f"{other}: no {stations.word} of so short an arm can be kept on the curve"
+        )
+        return
     missing = ", ".join(name for name in wanted if name not in stations.trackable)
     if missing:
         which = f"every {stations.word}" if stations.stride == 1 else f"every second {stations.word}"
