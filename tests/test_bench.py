@@ -379,7 +379,10 @@ def test_a_comparison_corrects_for_the_machine_by_a_baseline_that_both_have() ->
     # A machine of half the speed, and a step of a quarter of the work.
     new = {"scenes": [scene_document(5, 2.0, 8.0), scene_document(10, 2.0, 8.0), scene_document(20, 1.0)]}
     found = report.compare(new, old)
-    assert (found["commit"], [row["name"] for row in found["scenes"]]) == ("abc", ["cubes-5", "cubes-10"])
+    assert (found["commit"], [row["name"] for row in found["scenes"]]) == (
+        "abc",
+        ["cubes-5-elastic", "cubes-10-elastic"],
+    )
     first, second = found["scenes"]
     assert (first["cpu"], first["corrected"], first["by"]) == (0.5, 0.25, "eq28-sparse")
     assert (second["cpu"], second["corrected"], second["by"]) == (0.5, None, None)
@@ -404,7 +407,7 @@ def test_json_is_one_document_of_the_schema(printed: Path) -> None:
     document = json.loads(printed.read_text())
     jsonschema.validate(document, DOCUMENT)
     (scene,) = document["scenes"]
-    assert (scene["name"], scene["step"]["steps"], scene["cold"]) == ("free-5", 12, None)
+    assert (scene["name"], scene["step"]["steps"], scene["cold"]) == ("free-5-elastic", 12, None)
     assert sum(scene["breakdown"]["phases"].values()) == pytest.approx(scene["breakdown"]["total"])
     assert list(scene["baselines"]) == ["eq28", "ipopt"]
     for found in scene["baselines"].values():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arm.truss.bounds import longest_ways
+from vgtm_qp.arm.truss.bounds import longest_paths
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
 
@@ -92,7 +92,7 @@ def test_a_target_in_an_obstacle_is_refused_where_no_tip_can_surround_it(free: v
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=25, deadline=None)
-def test_no_pose_reaches_farther_than_the_longest_ways(seed: int):
+def test_no_pose_reaches_farther_than_the_longest_paths(seed: int):
     problem = vq.load_problem("five_bay_free")
     truss = truss_of(build_arm(problem).arm)
     nodes = truss.home * np.random.default_rng(seed).uniform(0.3, 1.1, 3)
@@ -101,4 +101,4 @@ def test_no_pose_reaches_farther_than_the_longest_ways(seed: int):
     scale = float((lengths / truss.stroke[:, 1]).max())
     sources = np.flatnonzero(truss.base)
     apart = np.linalg.norm(nodes[sources, None] - nodes[None], axis=2)
-    assert np.all(apart <= scale * longest_ways(truss, sources) + 1e-12)
+    assert np.all(apart <= scale * longest_paths(truss, sources) + 1e-12)

@@ -19,16 +19,6 @@ EQUATIONS = range(1, 40)
 # Those that README.md has no row for.
 UNUSED = {2, 31}
 
-# Those that head several functions, a part each or another form each. Nobody adds to it.
-SEVERAL = {
-    36: {"curve/curve.py: Curve.position_jacobian", "curve/curve.py: Curve.orientation_jacobian"},
-    39: {
-        "methods/tracking.py: Tracker.rates",
-        "methods/tracking.py: Tracker.track",
-        "rows/tracking.py: gap",
-        "rows/tracking.py: turns",
-    },
-}
 
 # The independent check has everything a second time.
 SECOND = "verify/"
@@ -86,12 +76,7 @@ def table() -> dict[int, set[str]]:
 @pytest.mark.parametrize("number", EQUATIONS)
 def test_an_equation_heads_one_function(number: int) -> None:
     functions = headed().get(number, set())
-    if number in UNUSED:
-        assert not functions
-    elif number in SEVERAL:
-        assert functions == SEVERAL[number]
-    else:
-        assert len(functions) == 1, functions
+    assert len(functions) == (number not in UNUSED), functions
 
 
 def test_no_docstring_names_an_equation_that_the_paper_does_not_have() -> None:

@@ -7,6 +7,7 @@ import pytest
 from steps import numbers_at, solved
 
 import vgtm_qp as vq
+from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.solvers import make_solver
@@ -33,7 +34,8 @@ def one_qp(penalty):
     """Return arm, elastic solver and the numbers of a step whose strokes cannot give all that the tip asks for."""
     problem = three_bays(**{"end_effector.mode": "elastic", "method.weights.end_effector": penalty})
     arm = build_arm(problem)
-    X = arm.truss.home
+    truss = truss_of(arm.arm)
+    X = truss.home
     arm.kinematics.evaluate(X)
     start = arm.arm.end_effector.position(X)
     rotation = arm.kinematics.tip_rotation.copy()
@@ -42,7 +44,7 @@ def one_qp(penalty):
         np.stack([start, start + np.array([0.1, 0.02, -0.03])]),
         np.stack([rotation] * 2),
     )
-    lengths = arm.truss.home_lengths[arm.truss.actuators]
+    lengths = truss.home_lengths[truss.actuators]
     target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
     separation = Separation(arm)
     rows = separation.rows(X, 0.0, 1.0, 0.1, {}, 0.0)

@@ -215,16 +215,19 @@ def test_members_that_touch_at_full_speed_jolt_all_actuators():
     assert slow.sum() <= 0.9 * abrupt.sum()
 
 
-def test_contacts_with_two_cubes_do_not_jolt_the_arm_and_what_they_add_is_within_free_motion():
+@pytest.mark.parametrize(("mode", "within", "jolt"), [("elastic", 2.6, 0.4), ("exact", 3.0, 0.9)])
+def test_contacts_with_two_cubes_do_not_jolt_the_arm_and_what_they_add_is_within_free_motion(
+    mode, within, jolt
+):
     """Free of the ends of its strokes: those add as much again as the cubes."""
-    cubes = vq.load_problem("five_bay_two_cubes")
+    cubes = vq.load_problem("five_bay_two_cubes").replace({"method.tracking_mode": mode})
     free = changes_of_rates(cubes.replace({"obstacle": []}))[1].sum()
     _, changes = changes_of_rates(cubes.replace({"truss.stroke": [0.4, 1.7]}))
     assert changes.sum() <= 2.0 * free
     _, changes = changes_of_rates(cubes)
-    assert changes.sum() <= 2.6 * free
+    assert changes.sum() <= within * free
     _, abrupt = changes_of_rates(cubes.replace({"method.slow_approach": False}))
-    assert changes.max() <= 0.4 * abrupt.max()
+    assert changes.max() <= jolt * abrupt.max()
     assert changes.sum() <= 0.9 * abrupt.sum()
 
 

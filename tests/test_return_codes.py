@@ -122,7 +122,7 @@ LIES = {
 
 @pytest.mark.parametrize("what", LIES)
 def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(monkeypatch, what):
-    resolver = Resolver(vq.load_problem("five_bay_free"))
+    resolver = Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
     before = resolver.state
     goal = resolver.tip()[0] + np.array([0.05, 0.0, -0.02])
     with monkeypatch.context() as patch:
@@ -134,7 +134,7 @@ def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(monkeypatch, what)
 
 
 def test_a_state_of_an_earlier_call_is_refused(monkeypatch):
-    resolver = Resolver(vq.load_problem("five_bay_free"))
+    resolver = Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
     kept = []
 
     def earlier(closed):
@@ -149,7 +149,7 @@ def test_a_state_of_an_earlier_call_is_refused(monkeypatch):
 
 
 def test_an_attempt_whose_function_has_no_value_falls_back_or_is_refused(monkeypatch):
-    resolver = Resolver(vq.load_problem("five_bay_free"))
+    resolver = Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
     goal = resolver.tip()[0] + np.array([0.05, 0.0, -0.02])
 
     def fail(*_):
@@ -174,7 +174,7 @@ def test_why_an_arm_stops_is_told_of_a_pose_whose_lengths_do_not_determine_it(mo
     flat = LengthRows(truss, np.zeros((truss.member_count, slots, 3)), np.zeros(truss.member_count))
     with pytest.raises(SolverError, match="singular"):
         flat.response()
-    resolver = Resolver(vq.load_problem("five_bay_free"))
+    resolver = Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
     tip, rotation = resolver.tip()
     path = Path(np.array([0.0, 1.0]), np.stack([tip, tip + 0.1]), np.stack([rotation, rotation]))
     last = replace(resolver.step(position=tip), reason="because")

@@ -4,15 +4,15 @@
 is there and the library is kept by a hash of its source, so the second process pays only for a `dlopen`. Without a
 compiler the CasADi virtual machine evaluates the same graph, 4 to 10 times slower.
 
-The first time, the compiler's time is what an arm waits for. The straight-line functions that a kernel maps or calls
-are compiled by themselves, once for all kernels that use them, by several processes at a time, and a kernel waits for
-its own when it is called first.
+The first set-up of an arm is mostly compile time. The straight-line functions that a kernel maps or calls are compiled
+separately, once for all kernels that use them, by several processes at a time; a kernel waits for them at its first
+call.
 
 What is loaded from the cache runs as this process does. Folder and files must therefore be the user's, with nobody else
 allowed to write them, and the SHA-256 beside a library must be that of its content.
 
-A function tells by its return code that it could not be evaluated, and then leaves its outputs as they were. Every call
-reads that code, in half a microsecond: outputs of an earlier call never pass as those of this one.
+The return code of a function shows whether it could be evaluated; if not, its outputs keep their old values. Every call
+checks the code, in half a microsecond, so that old outputs never pass as new ones.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ _FLAGS = (
     '-DCASADI_SYMBOL_EXPORT=__attribute__((visibility("default")))',
 )
 _QUICK = ("-O1",)
-"""For what calls the straight-line functions, where it is long: half the compiler's time, and little to gain."""
+"""Flags for long code that calls the straight-line functions: half the compile time, at little cost in speed."""
 
 _LONG = 100_000
-"""Source texts of more characters take the compiler seconds."""
+"""Length of a source text, in characters, from which compiling lasts seconds."""
 
 _MOST_COMPILERS, _MOST_LINKERS = 4, 64
 """Processes at a time; most linkers only wait for their objects."""
@@ -70,7 +70,7 @@ _TICK = 0.2
 """Seconds after which a compiler is looked after."""
 
 _WORTH_IT = 100
-"""Functions of fewer lines are not compiled by themselves."""
+"""Number of lines below which functions are not compiled separately."""
 
 _FUNCTION = re.compile(r"^static int (casadi_f\d+)\(.*?^}\n", re.MULTILINE | re.DOTALL)
 _HELPER = re.compile(
@@ -471,7 +471,7 @@ class Kernel:
             self._resolve()
         self._evaluate()
         if self._code():
-            # Nothing that is left in the outputs could be read as an answer.
+            # Old outputs must not be read as an answer.
             for array in self.outputs:
                 array.fill(np.nan)
             raise EvaluationError(f'the function "{self._given.name()}" has no value at its arguments')

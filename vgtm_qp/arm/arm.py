@@ -1,13 +1,13 @@
-"""The door: all that a step may know of an arm.
+"""`Arm`, the interface of all arms: everything that a step may use of one.
 
 An arm is a configuration q that places points in space, its *nodes* X = p(q) of shape (N, 3): the joints of a truss,
 which are its configuration themselves, or the joints of a serial arm. *Bodies* are spanned by points of the arm,
 *stations* are poses made of nodes: they track the reference curve, and the last of all is the end effector.
 
-What moves an arm are its *quantities* [c; a]: those that are fixed, c(q) = const, and the actuated ones a(q), which
-have boxes. They are as many as the coordinates of q, so that to first order the nodes move by K d_a + r.
+An arm is moved by its *quantities* [c; a]: fixed ones, c(q) = const, and actuated ones a(q), which have boxes. They are
+as many as the coordinates of q, so that to first order the nodes move by K d_a + r.
 
-Nothing outside the folder ``arm`` asks which arm it has.
+Nothing outside the folder ``arm`` depends on the kind of arm.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RANK_TOLERANCE = 1e-8
 """Singular values of a Jacobian below this fraction of the greatest one count as zero."""
 
 _FEW_STATIONS = 20
-"""Another compiled function without the stations does not pay for so few."""
+"""Number of stations up to which a second compiled function without stations is not worth its compilation."""
 
 
 class Label(NamedTuple):
@@ -45,13 +45,13 @@ class Label(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Where the base is: its origin (3,), m, and rotation (3, 3) against its home pose."""
+    """Pose of the base: its origin (3,), m, and rotation (3, 3) relative to its home pose."""
 
     position: Array
     rotation: Array
 
     def carry(self, points: Array, after: Pose) -> Array:
-        """Return where `points` (K, 3), m, are if they move with the base from this pose to the one `after`."""
+        """Return `points` (K, 3), m, moved with the base from this pose to the pose `after`."""
         turn = after.rotation @ self.rotation.T
         return np.asarray((points - self.position) @ turn.T + after.position)
 
@@ -69,10 +69,10 @@ class Stations:
     frames : (F, 3, 3)
         Rotations at home, columns x, y, z in the base frame; z along the arm.
     trackable : tuple of str
-        What every `stride`-th station can keep on the curve exactly: ``"position"``, ``"pointing"``, ``"orientation"``.
+        Coordinates every `stride`-th station can keep on the curve exactly: "position", "pointing", "orientation".
     stride : int
     word : str
-        What a station is called in names: ``"face"`` or ``"joint"``.
+        Word for a station in names: ``"face"`` or ``"joint"``.
     """
 
     nodes: Index
@@ -86,7 +86,7 @@ class Stations:
         return len(self.nodes)
 
     def centres(self, X: Array) -> Array:
-        """Return (F, 3) the positions of the stations where the nodes are at `X` (N, 3), m."""
+        """Return (F, 3) the positions of the stations for nodes at `X` (N, 3), m."""
         return np.asarray(np.einsum("fk,fkc->fc", self.weights, X.take(self.nodes, axis=0)))
 
 
@@ -94,7 +94,7 @@ class Stations:
 class Tip:
     """The end effector: its nodes (K,), their weights (K,), and its rotation at home (3, 3).
 
-    It has an orientation where it has three nodes or more.
+    It has an orientation if it has three nodes or more.
     """
 
     nodes: Index
@@ -107,7 +107,7 @@ class Tip:
         return len(self.nodes) >= 3
 
     def position(self, X: Array) -> Array:
-        """Return (3,) the position of the end effector, eq. (1), where the nodes are at `X` (N, 3), m."""
+        """Return (3,) the position of the end effector, eq. (1), for nodes at `X` (N, 3), m."""
         return np.asarray(self.weights @ X.take(self.nodes, axis=0))
 
 
@@ -120,7 +120,7 @@ class Description(Protocol):
 
 
 class MotionPattern(NamedTuple):
-    """Where the nonzeros of the rows that tie nodes to actuators stand: rows and columns (E,), and the rows' labels.
+    """Sparsity of the rows that tie nodes to actuators: rows and columns (E,) of the nonzeros, and the rows' labels.
 
     Columns are those of the free nodes' displacements, 3 (N - N_c), followed by the n_a actuators'.
     """
@@ -162,7 +162,7 @@ class LengthRowsLike(Protocol):
 
 
 class Bays(Protocol):
-    """The bays of an arm, for speed alone: how its members hang on one another, as in ``truss.Truss``."""
+    """The bays of an arm, for speed alone: the order of its members, as in ``truss.Truss``."""
 
     @property
     def joints(self) -> object: ...
@@ -192,11 +192,11 @@ class Arm(ABC):
     Attributes
     ----------
     kind : str
-        What the arm is called: the module of a truss, or ``"serial"``.
+        Name of the arm's kind: the module of a truss, or ``"serial"``.
     bays : Bays or None
-        What the arm's own structure offers for speed.
+        Structure of the arm that eliminations use; None without one.
     leaves_chords : bool
-        Whether points do not move on straight lines where the configuration does, see :meth:`deviation`.
+        True if points leave their straight chords when the configuration moves straight, see :meth:`deviation`.
     segments : int
         Number of bays or joints.
     node_names : tuple of str
@@ -205,7 +205,7 @@ class Arm(ABC):
     home : (N, 3)
         Nodes at home, m.
     base : (N,) bool
-        Nodes that only the base moves, eq. (7).
+        Nodes that move with the base, eq. (7).
     free : (N - N_c,) int
         The others, eq. (9), in the order in which they can be eliminated.
     quantity_names : tuple of str
@@ -215,7 +215,7 @@ class Arm(ABC):
     actuator_units : (n_a,) str
         ``"m"`` or ``"rad"``.
     stroke, rate, acceleration : (M, 2), (M,), (M,)
-        Least and greatest value, and greatest rates; inf where there is no limit.
+        Least and greatest value, and greatest rates; inf without a limit.
     stations : Stations
         Empty where nothing tracks a curve.
     end_effector : Tip
@@ -257,7 +257,7 @@ class Arm(ABC):
 
     @abstractmethod
     def symbols(self, constants: Constants) -> ArmSymbols:
-        """Return the arm in symbols, and add what it keeps constant to `constants`."""
+        """Return the arm in symbols, and add its constants to `constants`."""
 
     @abstractmethod
     def motion_rows(self, *values: Array) -> MotionRows:
@@ -269,11 +269,11 @@ class Arm(ABC):
 
     @abstractmethod
     def measured(self, q: Array) -> Array:
-        """Return (M,) the quantities by plain arithmetic, which shares nothing with :meth:`symbols` and kinematics."""
+        """Return (M,) the quantities by plain arithmetic, which shares no code with :meth:`symbols` and kinematics."""
 
     @abstractmethod
     def based(self, q: Array, pose: Pose) -> Array:
-        """Return the configuration with its base at `pose` and all else as it is; eqs. (7)-(8)."""
+        """Return the configuration with its base at `pose` and all else unchanged; eqs. (7)-(8)."""
 
     def carried(self, q: Array, before: Pose, after: Pose) -> Array:  # noqa: ARG002
         """Return the configuration that moves as a rigid body with its base from one pose to another."""
@@ -281,13 +281,13 @@ class Arm(ABC):
 
     @abstractmethod
     def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:
-        """Return the configuration after displacements of nodes (N, 3) and actuators (n_a,) that belong together."""
+        """Return the configuration after consistent displacements of nodes (N, 3) and actuators (n_a,)."""
 
     @abstractmethod
     def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:
         """Return the configuration after one Newton step that changes the quantities by `missing` (M,).
 
-        `solve` returns the displacements (N - N_c, 3) of the free nodes where they have to be solved for.
+        `solve` returns the displacements (N - N_c, 3) of the free nodes, for arms that need them.
         """
 
     def nodes(self, q: Array) -> Array:
@@ -305,7 +305,7 @@ class Arm(ABC):
         return constants.bound("nodes", [q], [symbols.nodes(q)]).kernel(compiled=False)
 
     def points(self, q: Array) -> Array:
-        """Return (P, 3) the points that span the bodies, m; the nodes as a rule."""
+        """Return (P, 3) the points that span the bodies, m; by default the nodes."""
         return self.nodes(q)
 
     def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:  # noqa: ARG002
@@ -317,7 +317,7 @@ class Arm(ABC):
 
     @abstractmethod
     def deviation(self, start: Array, end: Array) -> float:
-        """Return a bound of how much nearer two points come than their chords do, m, where q moves straight."""
+        """Return a bound of how much nearer two points come than their chords, m, when q moves straight."""
 
     @abstractmethod
     def travel(self, motion: Array) -> float:
@@ -340,7 +340,7 @@ class Arm(ABC):
         """Return the arm's counts, and what they allow."""
 
     def record(self) -> dict[str, Any]:
-        """Return what verification needs to know of the arm, as JSON data.
+        """Return the arm as JSON data for verification.
 
         Keys of every arm: ``actuated``, ``stroke`` (M, 2), ``rate`` and ``acceleration`` of its quantities, and the
         ``radius`` of its bodies. None means no limit.
@@ -355,7 +355,7 @@ class Arm(ABC):
 
     @abstractmethod
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
-        """Return the arrays of a result file that tell of configurations (T, ...) and quantities (T, M)."""
+        """Return the arrays of a result file for configurations (T, ...) and quantities (T, M)."""
 
 
 class Kinematics:
@@ -424,15 +424,15 @@ class Kinematics:
 
 
 def rank(values: NDArray[Any]) -> int:
-    """Return the rank that goes with singular values of a Jacobian."""
+    """Return the rank of a Jacobian with these singular values."""
     return int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
 
 
 def has_full_rank(rows: Array) -> bool:
-    """Whether the functions whose Jacobian this is can be changed one by one."""
+    """Whether the rows of a Jacobian are independent."""
     return 0 < len(rows) <= rows.shape[1] and rank(np.linalg.svd(rows, compute_uv=False)) == len(rows)
 
 
 def _or_none(limits: Array) -> list[float | None]:
-    """Return limits as JSON data, which has no infinity: None where there is none."""
+    """Return limits as JSON data: None for infinity, which JSON lacks."""
     return [limit if math.isfinite(limit) else None for limit in limits.tolist()]

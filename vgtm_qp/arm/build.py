@@ -20,7 +20,7 @@ def make_arm(problem: Problem) -> Arm:
     Raises
     ------
     ProblemError
-        A locked member is no actuated one, or joints are not those of an arm that can be moved.
+        A locked member is not actuated, or the joints make no arm that can be moved.
     TrussError
         The truss is not statically determinate.
     """
@@ -38,7 +38,7 @@ def make_arm(problem: Problem) -> Arm:
 
 
 def _beyond_serial(problem: Problem, spec: ArmTable) -> Iterator[Mistake]:
-    """Yield what a serial arm of these joints would not know of itself."""
+    """Yield the mistakes of joints that leave a serial arm without an extent or without a bound of its reach."""
     if not any(any(joint.position) for joint in spec.joint[1:]) and not any(spec.tip):
         expected = "a position away from the last joint, since all joints are in one place"
         yield problem.mistake(("arm", "tip"), expected)

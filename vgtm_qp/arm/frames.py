@@ -40,7 +40,7 @@ def turning(fitted: ca.SX, nodes: ca.SX, axes: ca.SX) -> ca.SX:
 
 
 def frames_along(points: Array) -> Array:
-    """Return (F, 3, 3) frames at `points` (F, 3) on a way, the first upright; each turns no more than its z-axis does.
+    """Return (F, 3, 3) frames at `points` (F, 3) of a polyline, the first upright; each turns only with its z-axis.
 
     The z-axes point from the point before. Of two points in one place the second has the attitude of the first.
     """

@@ -1,4 +1,4 @@
-"""Arms in joint space: joint values and the pose of the base are the configuration, and nothing is to be eliminated.
+"""Arms in joint space: the configuration is joint values and the base's pose, without constraints to eliminate.
 
 A configuration q (J + 6,) holds the joints' values, rad or m, then position, m, and rotation vector, rad, of the base.
 """
@@ -21,14 +21,14 @@ from vgtm_qp.rotation import vector_near
 
 @dataclass(frozen=True)
 class JointSpaceDescription:
-    """What `vgtm check` tells of an arm.
+    """What `vgtm check` prints about an arm.
 
     Attributes
     ----------
     kind : str
     joints, actuated, links, stations : int
     length : float
-        Of the way from the base over the joints to the tip at home, m.
+        Length of the polyline from the base over the joints to the tip at home, m.
     hard : bool
         Whether all stations can keep their positions on the curve at home.
     """
@@ -76,7 +76,7 @@ class JointSpaceArm(Arm):
     functions : (casadi.Function, casadi.Function)
         (q, *constants) -> nodes (3, N), m; the same and their Jacobian (3 N, J).
     constants : mapping
-        What these take beside the configuration, the columns of each as rows.
+        Arguments of these besides the configuration, the columns of each as rows.
     revolute : (J,) bool
         True for joints that turn, False for those that slide.
     reaches : (J + 1,)
@@ -128,8 +128,8 @@ class JointSpaceArm(Arm):
     def deviation(self, start: Array, end: Array) -> float:
         """See ``arm.Arm``: an eighth of a bound of the nodes' second derivative on the way, for both of a pair.
 
-        A point's velocity is sum w_j a_j x (X - o_j) + sum d_j a_j, the axes a_j turn with all joints before them, and
-        what is beyond a joint moves against it by no more than its own joints make it.
+        A point's velocity is sum w_j a_j x (X - o_j) + sum d_j a_j. The axes a_j turn with all joints before them, and
+        X - o_j changes only by the joints from there on.
         """
         turn, slide = self._motions(end - start)
         before = np.concatenate([[0.0], np.cumsum(turn)[:-1]])

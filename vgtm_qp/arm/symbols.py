@@ -1,4 +1,4 @@
-"""What symbolic arms are made of: constants that are bound once, rotations, and the frames of their stations."""
+"""Parts of arms in symbols: constants that are bound once, rotations, and the frames of stations."""
 
 from __future__ import annotations
 
@@ -71,8 +71,7 @@ class Frames:
 class ArmSymbols(ABC):
     """An arm in CasADi's symbols: functions of a configuration of :attr:`shape`.
 
-    What is constant over a maneuver is an argument that is bound once, so that what is compiled depends on the
-    topology of the arm alone.
+    Constants of a maneuver are arguments that are bound once: compiled code depends on the arm's topology alone.
 
     Attributes
     ----------
@@ -82,7 +81,7 @@ class ArmSymbols(ABC):
     given : list of int
         Nodes whose displacement with the base is given; the others follow by the fixed quantities.
     can_eliminate : bool
-        Whether :meth:`response`, :meth:`closed` and :meth:`held` are there: coordinates follow one after another.
+        Whether coordinates can be eliminated in order, by :meth:`response`, :meth:`closed` and :meth:`held`.
     """
 
     shape: tuple[int, int]
@@ -115,7 +114,7 @@ class ArmSymbols(ABC):
 
     @abstractmethod
     def coordinates(self, nodes: Any, strokes: Any) -> Any:
-        """Return which of both moves the configuration: those of the nodes (3 (N - N_c), c), or strokes (n_a, c)."""
+        """Return the displacements that move the configuration: of the nodes (3 (N - N_c), c), or strokes (n_a, c)."""
 
     @abstractmethod
     def along(self, q: Any, coordinates: Any) -> Any:
@@ -126,19 +125,19 @@ class ArmSymbols(ABC):
         """Return the configuration after one Newton step to the fixed quantities, actuators in their boxes (n_a,)."""
 
     def aims(self, quantities: Any, lower: Any, upper: Any) -> Any:
-        """Return what quantities (M, 1) should be: as at home, or in their boxes (n_a,)."""
+        """Return the target values of `quantities` (M, 1): fixed ones as at home, actuators in their boxes (n_a,)."""
         aims = self.home * 1.0
         aims[self._actuators] = ca.fmax(lower, ca.fmin(upper, quantities[self._actuators]))
         return aims
 
     def error(self, quantities: Any, lower: Any, upper: Any) -> Any:
-        """Return the norm of what quantities (M, 1) are off, boxes (n_a,) included."""
+        """Return the norm of the errors of `quantities` (M, 1), boxes (n_a,) included."""
         return ca.norm_2(self.aims(quantities, lower, upper) - quantities)
 
     def held(self, tracked: Sequence[int]) -> Callable[[Any, Any], Any] | None:  # noqa: ARG002
         """Return the Newton step of a configuration whose `tracked` stations go to points (3, K) of the curve.
 
-        None where these and the fixed quantities do not determine the configuration, or not stage by stage.
+        None if these and the fixed quantities do not determine the configuration stage by stage.
         """
         return None
 

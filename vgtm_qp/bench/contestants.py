@@ -1,4 +1,4 @@
-"""Baselines: other ways to take the same steps, each behind ``place`` and ``step``."""
+"""Baselines: other methods for the same steps, each with ``place`` and ``step``."""
 
 from __future__ import annotations
 

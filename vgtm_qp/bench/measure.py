@@ -1,10 +1,9 @@
 """Timing: one resolver by itself over whole maneuvers, then in turn with a baseline, step by step.
 
 In turn, both take each step from the state that the resolver had reached, and which of them is first alternates:
-a machine that slows down slows both, and the ratio of their medians holds. What is left in the processor's caches
-differs, by up to a half after a large baseline, to the disadvantage of the smaller one. Ratios are those of
-CPU time: where processes wait for their turn, what takes longer is interrupted more often. Garbage is collected
-as it is for every user.
+a machine that slows down slows both, and the ratio of their medians holds. The content of the processor's caches
+differs: after a large baseline the smaller contestant may take half as long again. Ratios are those of CPU time,
+because longer steps are interrupted more often. Garbage is collected as usual.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ _LEAST_STEPS = 10
 _WARM_UP = 5
 _STALLED_PROGRESS, _STALLED_STEPS = 1e-3, 10
 _OVERRUN = 5.0
-"""However few steps there were, a run ends after so many times its duration."""
+"""A run ends after this many times its duration, however few steps it had."""
 
 
 class Spent(NamedTuple):
-    """What a step took, s: by the clock, and of the processor."""
+    """Wall-clock and CPU time of a step, s."""
 
     wall: float
     cpu: float

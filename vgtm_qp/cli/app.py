@@ -77,7 +77,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         if isinstance(error, KeyboardInterrupt) and (compiled := sys.modules.get("vgtm_qp.compiled")):
             # The process would wait for them.
             compiled.stop_compilers()
-        code, message = _told(error)
+        code, message = _outcome(error)
         mistakes = []
         if isinstance(error, ProblemError):
             mistakes = [{"file": error.source, **asdict(mistake)} for mistake in error.mistakes]
@@ -88,8 +88,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
         return code
 
 
-def _told(error: BaseException) -> tuple[ExitCode, str]:
-    """Return the exit code and what is said of an error; the traceback of an internal one is printed."""
+def _outcome(error: BaseException) -> tuple[ExitCode, str]:
+    """Return the exit code and the message of an error; the traceback of an internal one is printed."""
     match error:
         case CycloptsError():
             return ExitCode.USAGE, _explained(error)

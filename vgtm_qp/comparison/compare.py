@@ -37,7 +37,7 @@ _NUMBERS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """What a comparison found.
+    """The result of a comparison.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Report:
     maneuvers : dict
         The maneuvers by (problem, method); a method that was refused is missing.
     machine : dict
-        What the times belong to.
+        Machine and versions of the times.
     """
 
     rows: tuple[Row, ...]

@@ -1,4 +1,4 @@
-"""One method on one problem: what the maneuver kept, in numbers."""
+"""One method on one problem: the limits its maneuver kept, in numbers."""
 
 from __future__ import annotations
 

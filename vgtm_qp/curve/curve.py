@@ -150,7 +150,7 @@ class Curve:
         return np.asarray(s.reshape(fraction.shape))
 
     def position_jacobian(self, s: ArrayLike) -> Array:
-        """dr/d(p, tau), the upper rows of eq. (36): (..., 3, D)."""
+        """dr/d(p, tau), eq. (36) for positions: (..., 3, D)."""
         return self._pad(_spread(self.family.weights(s)))
 
     def tangent_jacobian(self, s: ArrayLike) -> Array:
@@ -158,11 +158,11 @@ class Curve:
         return self._pad(self._tangent_rows(self.family.weights(s, 1)))
 
     def orientation_jacobian(self, s: ArrayLike) -> Array:
-        """Angular velocity of F(s) per rate of (p, tau), the lower rows of eq. (36): (..., 3, D).
+        """Angular velocity of F(s) per rate of (p, tau), the lower rows of J_s: (..., 3, D).
 
-        Two of its three components turn the tangent. The third, about the tangent, is the torsion's rate less
-        the integral of w_i' kappa b over 0 to s, kappa b = r' x r'' / |r'|^3, plus what the least rotation at
-        the base contributes where the curve leaves it off the normal.
+        They are eq. (36) for orientations. Two components turn the tangent. The third, about it, is the torsion's
+        rate less the integral of w_i' kappa b over 0 to s, kappa b = r' x r'' / |r'|^3, plus the contribution of the
+        least rotation at the base if the curve leaves it off the normal.
         """
         self._require_smooth()
         s = np.asarray(s, dtype=float)

@@ -16,8 +16,8 @@ _BEGIN = 8
 _SWITCH = 64
 """A capacity that was not prepared is compiled from the 8th call that asks for it on, and used from the 64th on.
 
-Until then smaller ones serve, with the same answers but for rounding: a list that is made once is not worth a compiler,
-and no step waits for one.
+Until then smaller ones are used, with the same results up to rounding: a list that is made once is not worth compiling
+for, and no step waits for the compiler.
 """
 
 
@@ -29,7 +29,7 @@ class Batch:
     Attributes
     ----------
     kernels : dict
-        By capacity, those that are in use: a kernel, its inputs as rows, and its output as rows.
+        The kernels in use by capacity, each with its inputs and its output as rows.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -39,9 +39,9 @@ class Batch:
         self._asked: dict[int, int] = {}
 
     def prepare(self, count: int, *, for_later: bool = False) -> None:
-        """Begin to compile what `count` rows need, so that no step has to wait for it.
+        """Begin to compile the kernel for `count` rows, so that no step has to wait for it.
 
-        What is `for_later` is not waited for by :func:`vgtm_qp.compiled.finish_compiling`.
+        :func:`vgtm_qp.compiled.finish_compiling` does not wait for kernels `for_later`.
         """
         self._use(_capacity(count, _CAPACITIES), for_later=for_later)
 
@@ -53,7 +53,7 @@ class Batch:
             self.kernels[capacity] = kernel, inputs, kernel.outputs[0].reshape(capacity, -1)
 
     def _ask(self, capacity: int) -> None:
-        """Note that a capacity that is not there would be of use."""
+        """Count a call that would have used a kernel of a missing capacity."""
         asked = self._asked[capacity] = self._asked.get(capacity, 0) + 1
         if capacity == _CAPACITIES[0] or asked >= _SWITCH:
             self._use(capacity)

@@ -25,7 +25,7 @@ class Bodies:
         The joints at the two ends. Two bodies with a joint in common are neighbours, and may touch.
     names : tuple of str
     kind : str
-        What such a body is called, as in ``"member L3-2"``.
+        Word for such a body in names, as in ``"member L3-2"``.
     """
 
     points: Index

@@ -1,4 +1,4 @@
-"""Which pairs may come near: good until bodies have moved too far, or the arm has bent too much between two."""
+"""Lists of pairs that may come near, valid until bodies have moved too far or the arm has bent too much."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Motion = tuple[Displacement, Displacement, Displacement]
 _TO_PIECES, _RIGID, _BENDING = range(3)
 
 _FEW_PAIRS = 20_000
-"""Scenes with no more pairs list them all."""
+"""Greatest number of pairs for which a scene lists all of them."""
 
 _MOST_BENDING = 0.5
-"""Where a larger share of the near parts than that bends, all bodies are compared again."""
+"""Share of bending parts above which all bodies are compared again."""
 
 
 class _PairList:
-    """Pairs that share a reference (P, 3): where the points were when they were compared, m, at a time, s.
+    """Pairs that share a reference: the positions (P, 3), m, and the time, s, at which they were compared.
 
-    Pairs of this kind that are not listed were as far apart there as the horizon, m; `unneeded` counts the pairs that
-    have been evaluated since and turned out to be far.
+    Pairs of this kind that are not listed were at least the horizon, m, apart there; `unneeded` counts the pairs that
+    were evaluated since and turned out to be far.
     """
 
     def __init__(self, reference: Array, time: float) -> None:
@@ -49,11 +49,10 @@ class _PairList:
 class Candidates:
     """All pairs nearer than a horizon at a reference configuration, with their exact distances there.
 
-    There are three lists, each with a reference. One is of bodies and pieces. Two bodies are compared with each other
-    again only where the arm has bent: however far two of them have moved, they are as far apart as they were if they
-    moved together. Pairs in parts of the arm that were found to bend are in a list of their own, so that the pairs of
-    all other parts, which are called rigid here, keep their reference. As a rule pairs have to be nearer than
-    `influence` to obstacles and than `self_influence` to other bodies, m.
+    There are three lists, each with a reference. The first is of bodies and pieces. The other two are of pairs of
+    bodies in rigid and in bending parts of the arm: bodies that moved together keep their distance, however far they
+    moved, and are compared again only if the arm has bent. By default pairs are listed that are nearer than
+    `influence` to obstacles or than `self_influence` to other bodies, m.
     """
 
     def __init__(self, scene: Scene, influence: float, self_influence: float) -> None:
@@ -99,7 +98,7 @@ class Candidates:
         horizon = max(reach, self._influence) + self._influence + travel + drift
         self_horizon = max(self_reach, self._self_influence) + self._influence + 2.0 * travel
         if len(bodies) * (len(bodies) + len(pieces)) <= _FEW_PAIRS:
-            # A list of all pairs never needs another broad phase, which would cost more than the far pairs in it.
+            # A list of all pairs never needs another broad phase: that would cost more than its far pairs do.
             horizon = self_horizon = FAR
         if not self._lists:
             self._lists = _PairList(X, time), _PairList(X, time), _PairList(X, time)
@@ -125,7 +124,7 @@ class Candidates:
         """List the pairs of two bodies that are nearer than `horizon`, m, at `X`, the new reference."""
         bodies = self._scene.bodies
         self._seen, self._bent = X, 0.0
-        # Twice as far, so that parts may come somewhat nearer before their bodies have to be listed.
+        # Twice the horizon, so that parts may come nearer before their bodies must be listed.
         self._parts = Parts(bodies, X, 2.0 * horizon)
         self._is_bending = np.zeros(len(self._parts.near), dtype=bool)
         self._bending_points = np.zeros(0, dtype=np.int64)
@@ -136,8 +135,8 @@ class Candidates:
     def _follow_bodies(self, X: Array, time: float, reach: float, travel: float, horizon: float) -> None:
         """List all pairs of bodies that may come nearer than `reach`, m, while no point moves further than `travel`.
 
-        As a rule the arm has moved far but has hardly bent, and then only in a few of its parts, so that this costs
-        much less than :meth:`renew_bodies`. Pairs are listed up to `horizon`, m, where they are listed anew.
+        Usually the arm has moved far but bent only in a few parts, so that this costs much less than
+        :meth:`renew_bodies`. Pairs that are listed anew are listed up to `horizon`, m.
         """
         parts, (_, rigid, bending) = self._parts, self._lists
         change = parts.distance_changes(X - rigid.reference)
@@ -169,7 +168,7 @@ class Candidates:
         bending.renew([pairs], X, time, horizon)
 
     def _bending_displacement(self, *states: Array) -> float:
-        """Return how far a point of a bending part is from its reference, at most, m."""
+        """Return the greatest distance of a point of a bending part from its reference, m."""
         if not self._is_bending.any():
             return 0.0
         points = self._bending_points
@@ -177,16 +176,16 @@ class Candidates:
         return float(_moved(tuple(X.take(points, axis=0) for X in states), reference).max())
 
     def count_unneeded(self, group: Group, count: int) -> None:
-        """Count `count` pairs of `group` that were evaluated although they are far."""
+        """Add `count` pairs of `group` that were evaluated although they are far."""
         self._lists[group.place].unneeded += count
 
     def refresh_where_due(self, X: Array, time: float) -> None:
-        """Move the references of those lists to `X` whose unneeded evaluations have cost as much as that does.
+        """Move the references of lists to `X` once their unneeded evaluations have cost as much as moving does.
 
         There is no broad phase: the horizons shrink by the displacement of the bodies.
         """
         for place, pairs in enumerate(self._lists):
-            # For rigid parts, how the arm has bent has to be computed as well.
+            # For rigid parts the bending of the arm has to be computed too.
             if pairs.unneeded > len(pairs) + (len(self._scene.bodies) if place == _RIGID else 0):
                 self._refresh(place, X.copy(), time)
 
@@ -229,7 +228,7 @@ class Candidates:
         far = to_pieces.horizon - motion[_TO_PIECES].greatest
         if not self._scene.has_self:
             return far, np.inf
-        # Pairs in near parts came nearer by no more than the arm bent there; pairs in other parts are bounded by those.
+        # Pairs in near parts came nearer by no more than the arm bent there; other pairs are bounded by their parts.
         since = motion[_RIGID].greatest - self._bent
         far_self = min(rigid.horizon - self._bent, self._parts.beyond) - since
         return far, min(far_self, bending.horizon - motion[_BENDING].greatest)
@@ -258,7 +257,7 @@ def _near_pieces(X: Array, scene: Scene, time: float, horizon: float) -> tuple[I
     centers = pieces.center + time * pieces.velocity
     middle, half, longest = _axes(X, scene.bodies.points, radius)
     tree = cKDTree(middle, leafsize=BODIES)
-    # In the order of the tree, which pairs at equal distances keep.
+    # In the tree's order, so that pairs at equal distances keep it.
     found = tree.query_ball_point(centers, pieces.radius + longest + horizon, return_sorted=False)
     piece = np.repeat(np.arange(len(pieces)), [len(bodies) for bodies in found])
     body = np.concatenate([np.zeros(0), *found]).astype(np.int64)

@@ -26,9 +26,9 @@ _AMONG = {"all": (False, True), "obstacles": (False,), "members": (True,)}
 class Clearance:
     """Distances of an arm's bodies from obstacles and from each other; one thread at a time.
 
-    Positions ``X`` (P, 3) are those of the points that ``Bodies.points`` counts, m. Lists of the pairs that may be
-    near are kept from one call to the next. Small scenes at rest are watched besides, which is faster for the states
-    of a motion.
+    Positions ``X`` (P, 3), m, are those of the points that ``Bodies.points`` indexes. Lists of pairs that may be near
+    are kept from one call to the next. Small scenes at rest are also watched, which is faster for the states of a
+    motion.
 
     Parameters
     ----------
@@ -37,13 +37,13 @@ class Clearance:
     obstacles
         See :mod:`vgtm_qp.geometry.shapes`.
     safe, influence : float
-        Surface distance to keep, and that from which a pair is near, m.
+        Surface distance to keep, and that below which a pair is near, m.
     self_collision : bool
         Whether pairs of bodies that are not neighbours count.
     watch : bool
         Whether small scenes at rest are watched; the answers are the same.
     by_fcl : bool
-        Whether :meth:`near` has python-fcl supply the contacts where it is asked to.
+        Whether :meth:`near` may use python-fcl for the contacts.
     """
 
     def __init__(
@@ -94,8 +94,8 @@ class Clearance:
         by_fcl : bool
             Whether python-fcl supplies the contacts, each proven; see ``Contacts.by_fcl`` for those that it did not.
         tracked : bool
-            Whether `X` is a state of a motion, which :meth:`between` is asked to go on from. A watched scene is then
-            evaluated from state to state. Positions that are only tried would make the watch go there and back.
+            Whether `X` is an accepted state, from which :meth:`between` goes on. A watched scene is then evaluated from
+            state to state. Trial positions would make the watch go there and back.
         """
         reach = self.influence if reach is None else reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
@@ -192,8 +192,8 @@ class Clearance:
     ) -> BetweenReport:
         """Prove that no surface distance falls below its floor while the points move on straight lines.
 
-        The watch is asked first. Then motion bounds, then separating planes, then halves of the time for the pairs
-        that are left. A motion not proven after twelve halvings is refused: a false alarm, never a false proof.
+        The watch is tried first, then bounds of the motion, then separating planes, then halves of the time for the
+        remaining pairs. A motion not proven after twelve halvings is refused: a false alarm, never a false proof.
 
         Parameters
         ----------

@@ -29,7 +29,7 @@ PROOF = 1e-6
 """An answer of FCL holds if its flaw is no greater, m."""
 
 NORMAL_FROM = 1e-3
-"""Of an axis that is nearer than this to the other, or touches it, the normal would be mostly rounding, m."""
+"""Distance of two axes, m, below which the normal would be mostly rounding."""
 
 SECOND_CONTACT = 0.2
 """Two contacts of a body with one piece are apart by at least this fraction of the body's length."""
@@ -81,7 +81,7 @@ def _weights(shape: str, t: Any, s: Any) -> Any:
 
 @cache
 def proof_function(shape: str) -> ca.Function:
-    """Return the contact that an answer of FCL about a pair means, and by how much that is not proven.
+    """Return the contact of an answer of FCL, and the flaw by which it is not proven.
 
     Inputs ``pair``, whose body may be a point, and ``answer (7,)``: a distance d, a point of the body and one of the
     other. Output ``contact (9,)``, whose last number is the flaw, m; NaN where a number is not finite or the two

@@ -1,9 +1,9 @@
 """Distances and nearest points by python-fcl, for many pairs at once; nothing here checks its answers.
 
 FCL's distance from a capsule to a box is always too large, and for bodies parallel to edges on round coordinates too
-large by up to a metre (FCL issue 508). So a body is asked about as a capsule of radius zero, and each answer has to be
-proven by whoever asks. Of an axis that touches the other, FCL knows no more than that: its penetration depth is not the
-least one, and its signed distance, which is never asked for, can end the process.
+large by up to a metre (FCL issue 508). So a body is a capsule of radius zero here, and the caller has to prove each
+answer. For axes that touch, FCL's penetration depth is not the least one; its signed distance, which is never used, can
+crash the process.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class FclQueries:
             others = map(self._piece, pieces, repeat(time))
         found, request, result, ask = list[float](), self._request, self._result, fcl.distance
         for middle, span, other in zip(middles, spans, others, strict=True):
-            # What FCL does not overwrite is no answer.
+            # Values that FCL does not overwrite are no answer.
             result.min_distance = inf
             found.append(ask(body.placed(middle, span), other, request, result))
             here, there = result.nearest_points

@@ -29,28 +29,28 @@ Found = tuple[Index, Array]
 """Contacts (R, ``CONTACT``) and before them the ``Group.numbers`` (R, 8) of their pairs."""
 
 _FIRST = 16
-"""The least distance is searched for among so many pairs first: those that were nearest at the reference."""
+"""Number of pairs, the nearest at the reference, among which the least distance is searched for first."""
 
 _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
 """From the shifts of both ends of two bodies to that of one middle from the other, and half the turns of both."""
 
 _WATCHED = ((follow_function, (1, 128)), (distance_function, (1,)), (sweep_function, (1,)))
-"""What is evaluated in a watched scene, and for how many pairs at once,"""
+"""Functions evaluated in a watched scene, and for how many pairs at once,"""
 _LISTED = ((distance_function, (1, 64, 1024)), (sweep_function, (1, 64)))
 """and in any other,"""
 _PROVEN = ((proof_function, (1,)),)
-"""and what FCL answers."""
+"""and those for FCL's answers."""
 
 
 class Scene:
-    """Bodies of an arm and obstacles, with what evaluates pairs of them.
+    """Bodies of an arm and obstacles, with the functions that evaluate pairs of them.
 
     Attributes
     ----------
     has_self : bool
         Whether pairs of bodies that are not neighbours count.
     fcl : FclQueries or None
-        What supplies contacts; None where closed forms do alone.
+        Supplies contacts; None if only closed forms are used.
     nothing : Contacts
         No rows.
     """
@@ -65,7 +65,7 @@ class Scene:
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
 
     def prepare(self, *, watched: bool) -> None:
-        """Begin to compile what steps need: for a scene that is watched, and else for few and for many pairs."""
+        """Begin to compile the functions of steps: of a watched scene, or for few and for many pairs."""
         shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
         for make, counts in (*(_WATCHED if watched else _LISTED), *(_PROVEN if self.fcl else ())):
             for shape in shapes:
@@ -75,7 +75,7 @@ class Scene:
                     self.batch(make, shape).prepare(count, for_later=for_later)
 
     def contacts(self, parts: Sequence[Found]) -> Contacts:
-        """Return contacts that were found as rows, one part after the other."""
+        """Return the contacts of all `parts`, one part after the other."""
         if not parts:
             return self.nothing
         if len(parts) == 1:
@@ -109,18 +109,18 @@ class Scene:
 
 
 class Displacement(NamedTuple):
-    """How far the points that span bodies are from a reference: in one state, or on the straight path between two.
+    """Displacements of the points that span bodies from a reference, in one state or on the path between two.
 
     Attributes
     ----------
     states, reference : tuple of (P, 3), (P, 3)
         Positions of one state, or at both ends of the path, m; and those of the reference.
     moved : (P,)
-        How far each point is from its reference, at most, m.
+        Greatest distance of each point from its reference, m.
     greatest : float
-        By how much the distance of a pair has changed since the reference at most, m.
+        Greatest change of the distance of a pair since the reference, m.
     elapsed : float
-        Since the reference, s, in which obstacles move.
+        Time since the reference, s, in which obstacles move.
     """
 
     states: tuple[Array, ...]
@@ -146,9 +146,9 @@ class Group:
     distance : (C,)
         Surface distance at the reference configuration, m, ascending once :meth:`keep_near` was called.
     is_self, moving : bool
-        Whether these are pairs of bodies; whether they are not and some obstacle moves.
+        True for pairs of bodies; True for pairs with obstacles if an obstacle moves.
     place : int
-        Which list of :class:`vgtm_qp.geometry.candidates.Candidates` they are in.
+        Index of their list in :class:`vgtm_qp.geometry.candidates.Candidates`.
     """
 
     def __init__(self, scene: Scene, shape: str, body: Index, other: Index, *, place: int = 0) -> None:
@@ -173,7 +173,7 @@ class Group:
         return len(self.body)
 
     def keep_near(self, X: Array, time: float, horizon: float) -> None:
-        """Make `X` the reference: drop the pairs from `horizon` on and sort the others by distance."""
+        """Make `X` the reference: drop the pairs at `horizon` or further and sort the others by distance."""
         distance = self.distances(X, time, np.arange(len(self)))
         order = np.argsort(distance, kind="stable")
         order = order[: np.searchsorted(distance[order], horizon)]
@@ -189,7 +189,7 @@ class Group:
         The others cannot have come nearer than `limit`, m. `motion` is that of each list of candidates.
         """
         displacement = motion[self.place]
-        # Only near the head of the sorted list can the motion have mattered.
+        # The motion can matter only near the head of the sorted list.
         count = int(np.searchsorted(self.distance, limit + displacement.greatest))
         bound = self.distance[:count]
         if count and self.is_self:
@@ -201,10 +201,10 @@ class Group:
         return bound, float(self.distance[count] - displacement.greatest) if count < len(self) else np.inf
 
     def _nearer(self, displacement: Displacement, count: int) -> Array:
-        """Return by how much the first pairs of bodies have come nearer at most, (count,), m.
+        """Return bounds of how much nearer the first pairs of bodies came, (count,), m.
 
-        That is no more than a point of one has moved relative to a point of the other: no more than their middles
-        have, and both have turned about those. On a straight path it is greatest at an end.
+        A bound is the relative displacement of the two middles plus the turns of both bodies about these. On a straight
+        path it is greatest at an end.
         """
         points = self.points[:count]
         reference = displacement.reference.take(points, axis=0)
@@ -237,7 +237,7 @@ class Group:
 
         The row is -1 where no distance is below.
         """
-        # The nearest pairs at the reference are likely to be so still; they make `best` small for the others.
+        # The nearest pairs at the reference are probably the nearest still; they make `best` small for the others.
         rows, row = np.arange(min(len(self), _FIRST)), -1
         for first in (True, False):
             if len(rows):
@@ -251,10 +251,10 @@ class Group:
         return best, row, len(rows)
 
     def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> Found:
-        """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`, where `by_fcl` as FCL has them.
+        """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`, with `by_fcl` FCL's contacts instead.
 
-        Of a pair with two contacts FCL is asked about the points of the body that these are at. A contact stays as
-        it was found where an axis touches the other, and where FCL's answer is not proven: see ``proof_function``.
+        For a pair with two contacts FCL is given the two points of the body. A contact stays as it was found if the
+        axes touch or FCL's answer is not proven, see ``proof_function``.
         """
         numbers, fcl = self.numbers.take(rows, axis=0), self.scene.fcl
         if fcl is None or not by_fcl or not len(rows):

@@ -1,4 +1,4 @@
-"""What is reported about pairs: contacts with their witness points, and proofs between two states."""
+"""Reports about pairs: contacts with their witness points, and proofs between two states."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Contacts:
     by_fcl : (R,) bool
         Whether FCL supplied the row; a closed form did otherwise.
     names : PairNames
-        What :meth:`name` reads.
+        Names of bodies and obstacles, for :meth:`name`.
     """
 
     distance: Array
@@ -81,13 +81,13 @@ class Contacts:
         return self.names.clearance(self.pair(k))
 
     def pair(self, k: int) -> Pair:
-        """Return which pair row `k` is about."""
+        """Return the pair of row `k`."""
         return Pair(int(self.body[k]), int(self.other[k]), bool(self.is_self[k]))
 
 
 @dataclass(frozen=True, eq=False)
 class BetweenReport:
-    """What was proven about a motion from one state to the next.
+    """The proof about a motion from one state to the next.
 
     Attributes
     ----------

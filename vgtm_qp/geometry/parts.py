@@ -1,7 +1,7 @@
-"""Bodies that lie together, as parts of an arm: how parts have moved relative to each other, and which come near.
+"""Parts of an arm, groups of neighbouring bodies: relative motion of parts, and pairs of parts that come near.
 
-However far an arm has moved, bodies in one place have moved together. Bounds of their distances hold for as long as
-the arm has not bent there.
+However far an arm has moved, neighbouring bodies have moved together. Bounds of their distances hold as long as the arm
+has not bent there.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.bodies import Bodies
 
 BODIES = 32
-"""A part has no more bodies than that: some three bays of a truss."""
+"""Greatest number of bodies of a part: about three bays of a truss."""
 
 
 class Parts:
-    """Bodies, divided by where they are at `X` (P, 3); parts whose balls are nearer than a horizon, m, are near.
+    """Bodies, divided by position at `X` (P, 3); parts whose balls are nearer than a horizon, m, are near.
 
     Attributes
     ----------
@@ -77,9 +77,9 @@ class Parts:
         return pairs, apart - radius[first] - radius[second]
 
     def update_beyond(self, X: Array) -> None:
-        """Compute how near parts that are not near may be at `X` (P, 3): see :attr:`beyond`."""
+        """Compute :attr:`beyond` at `X` (P, 3)."""
         pairs, gaps = self._pairs(X)
-        # Few are so near that their numbers have to be compared.
+        # Only few parts are so near that their codes must be compared.
         close = gaps < self._horizon
         unlisted = ~np.isin(self._codes_of(*pairs[close].T), self._codes)
         self.beyond = min(self._horizon, float(gaps[close][unlisted].min(initial=np.inf)))

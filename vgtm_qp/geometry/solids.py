@@ -1,4 +1,4 @@
-"""Bodies inside closed meshes, told by winding numbers."""
+"""Bodies inside closed meshes, found by winding numbers."""
 
 from __future__ import annotations
 

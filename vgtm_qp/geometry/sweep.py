@@ -1,4 +1,4 @@
-"""Proof of clearance over a straight motion: swept bounds, then halves of the time for the pairs that are left."""
+"""Proof of clearance over a straight motion: swept bounds, then halves of the time for the remaining pairs."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def sweep_group(
     """Return which of the pairs `rows` stay above `floor` over the motion, provably."""
     sweep = _Sweep(group, rows, start, end, start_time, end_time)
     count = len(rows)
-    # The motion of few pairs is cut at once, as finely as a call costs no more: one call instead of several.
+    # The motion of few pairs is cut at once, as finely as one call allows at no extra cost.
     pieces = max(_PIECES // count, 1)
     k = np.repeat(np.arange(count), pieces)
     cuts = np.arange(pieces + 1) / pieces

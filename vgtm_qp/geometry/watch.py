@@ -1,9 +1,8 @@
 """All pairs of a scene at rest, evaluated only when they may have come near.
 
-Each pair keeps a lower bound of its distance: the distance when it was evaluated last, less the most that its bodies
-can have come nearer to each other since. Where the bound falls below the distance that matters, one compiled call
-evaluates the pair and bounds its distance on the way from the state before. Far pairs are evaluated seldom, near ones
-in every state, and all of them are covered in a dozen array operations.
+Each pair keeps a lower bound of its distance: its distance at the last evaluation, less a bound of the approach of its
+bodies since. If the bound falls below the limit, one compiled call evaluates the pair and bounds its distance on the
+way from the state before. Far pairs are evaluated seldom, near ones in every state; a dozen array operations cover all.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from vgtm_qp.geometry.pairs import Contacts
 from vgtm_qp.geometry.shapes import GeometryError
 
 _MOST_PAIRS = 8000
-"""Scenes at rest with no more pairs can be watched."""
+"""Greatest number of pairs of a scene that can be watched."""
 
 _AHEAD = 1.2
-"""Pairs are evaluated from so many times the distance on that mattered last: it may be larger in the next state."""
+"""Ratio of the distance below which pairs are evaluated to the last limit: the next limit may be larger."""
 
 _NEXT = 2.0
-"""Where no pair is near, those below so many times the distance that matters are evaluated too: all in one call."""
+"""If no pair is near, ratio to the limit below which pairs are evaluated all the same, in one call."""
 
 
 def can_be_watched(scene: Scene) -> bool:
-    """Return whether nothing moves but the arm, there are no meshes, and there are not too many pairs."""
+    """Return whether only the arm moves, there are no meshes, and there are not too many pairs."""
     bodies, pieces = len(scene.bodies), scene.pieces
     simple = not pieces.moving and "triangle" not in pieces.shape
     count = bodies * len(pieces) + (bodies * (bodies - 1) // 2 if scene.has_self else 0)

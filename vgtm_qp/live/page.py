@@ -160,7 +160,7 @@ class _Page:
             handle.position = session.vertex_goals.get(i, session.control_vertices[i])
 
     def _add_handle(self, name: str, position: Array, radius: float, colour: Any, moved: Any) -> Any:
-        """Draw a ball; where it is dragged to, and whether it was let go there, is told to `moved`."""
+        """Draw a ball; `moved` is called with the place to which it is dragged, and whether it was released there."""
         handle = self._server.scene.add_icosphere(name, radius=radius, color=colour, position=position)
 
         def dragged(event: Any) -> None:

@@ -1,4 +1,4 @@
-"""What `solve` returns: a result that can be plotted."""
+"""`Maneuver`, the result of `solve`, which can be plotted."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from vgtm_qp.rotation import rotation_from_vector, turn_between
 from vgtm_qp.step.path import Path
 
 _SMALL_REST = 0.05
-"""Share of an interval between marks below which no step of its own is made."""
+"""Share of an interval between marks below which it is joined to the next."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +26,10 @@ class Plan:
     """(S,) times at which the steps end if nothing slows them, s."""
 
     def next_mark(self, value: float, *, keeps_moving: bool = False) -> tuple[float, float]:
-        """Return where the step from `value` of the path aims, and how long it takes, s.
+        """Return the target of the step from `value` of the path, and the step's duration, s.
 
-        It aims at the next mark, or at the one after if the next is very near: marks are preferred times, not
-        constraints. An arm with limited accelerations (`keeps_moving`) aims a whole interval ahead.
+        The target is the next mark, or the one after if the next is very near: marks are preferred times, not
+        constraints. An arm with limited accelerations (`keeps_moving`) has a target a whole interval ahead.
         """
         marks = self.marks
         k = int(np.searchsorted(marks, value, side="right"))

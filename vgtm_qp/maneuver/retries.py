@@ -1,7 +1,7 @@
 """Retries after a dead end: the same maneuver once more from home, with the redundancy resolved differently.
 
-A path that is blocked for one shape of the arm may be open for another, and the null-space terms decide which shape it
-takes. The retries stand in the order of their success over random scenes (``vgtm study robustness``).
+A path that is blocked for one shape of the arm may be open for another, and the null-space terms decide the shape. The
+order of the retries is that of their success over random scenes (``vgtm study robustness``).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _BULGES = (
     ("curve bulged towards it", 2, _BULGE),
     ("curve bulged a little away from what blocks it", 0, 0.1),
 )
-"""Name, side and size: sides in quarters of a turn about the arm, from the direction away from what blocks it."""
+"""Name, side and size: sides in quarters of a turn about the arm, from the direction away from the obstacle."""
 _FIRM_TRACKING = 1.0
 """Least weight of tracking in a retry with a bulged curve."""
 _MORE_VERTICES = 3
@@ -53,8 +53,8 @@ def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]
     """Yield name and changed problem of each retry that applies; nothing if retries are off."""
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
-    # Where stations gave way and it did not suffice, they are not held from the start; all that follows builds on it.
-    # Bays that follow the curve can do nothing else.
+    # If elastic tracking on demand was not enough, tracking is elastic from the start, in all later retries too.
+    # A solver by bays has no elastic tracking.
     held = problem.method.holds_curve and not problem.method.goes_by_bays
     elastic = {"method.tracking_mode": "elastic"} if held else {}
     if elastic and problem.method.tracking_mode == "exact":
@@ -91,7 +91,7 @@ def bulge(dead_end: DeadEnd, quarter: int, size: float = _BULGE) -> Array:
     """Return (V, 3) the control vertices where the arm stopped, displaced sideways by half a sine wave, m.
 
     The middle moves by about `size` times the arm's height. `quarter` counts right angles about the chord from the
-    direction away from what blocks the arm; if no obstacle does, from the direction of the path.
+    direction away from the blocking obstacle; without one, from the direction of the path.
     """
     vertices = dead_end.control_vertices
     chord = vertices[-1] - vertices[0]
@@ -103,7 +103,7 @@ def bulge(dead_end: DeadEnd, quarter: int, size: float = _BULGE) -> Array:
 
 
 def _across(axis: Array, *wanted: Array) -> Array:
-    """Return (3,) the unit vector across `axis` next to the first direction that is not along it."""
+    """Return (3,) the unit vector across `axis` nearest to the first direction of `wanted` not along `axis`."""
     for direction in (*wanted, *np.eye(3)):
         across = direction - axis * (axis @ direction)
         length = float(np.linalg.norm(across))

@@ -1,4 +1,4 @@
-"""The maneuver loop: step after step along the plan until it is done or no safe step is left; of many at once too."""
+"""The maneuver loop: steps along the plan until it is done or no safe step is left; also for many problems at once."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
 def solve_many(
     problems: Iterable[Problem], *, workers: int | None = None, verify: bool = True
 ) -> Iterator[Maneuver]:
-    """Solve problems in processes of their own and yield their maneuvers in order.
+    """Solve problems in separate processes and yield their maneuvers in order.
 
     Each process solves one problem after another with a resolver of its own and one BLAS thread. Kernels are compiled
     once for all of them, into the cache that they share.
@@ -137,7 +137,7 @@ class _Attempt:
                 return self._explain(aim, dt, step)
             stop = self._explain(aim, dt, step, before) if self._gives_up(step) else None
             if stop is not None and step.left_path:
-                # From here on the arm would brake off the path; those states do not belong to the maneuver.
+                # Further braking leaves the path: those states do not belong to the maneuver.
                 return stop
             self._advance(aim, step)
             if stop is not None:
@@ -154,7 +154,7 @@ class _Attempt:
         return self.resolver.explain(self.plan.path, self.value, aim, dt=dt, last=step, state=state)
 
     def _gives_up(self, step: Step) -> bool:
-        """Return whether the maneuver ends with a step, since the arm braked in it.
+        """Return whether the maneuver ends with a step because the arm braked in it.
 
         A hard tip may not be late, so braking ends it; any tip but an elastic one ends when it leaves the path.
         """
@@ -162,7 +162,7 @@ class _Attempt:
         return step.braked and (mode == "hard" or (mode != "elastic" and step.left_path))
 
     def _come_to_rest(self) -> None:
-        """Take the steps in which the arm comes to rest on its path."""
+        """Do the steps in which the arm comes to rest on its path."""
         path = self.plan.path
         while self.value < path.end:
             with self._clock():
@@ -173,14 +173,14 @@ class _Attempt:
 
     @contextmanager
     def _clock(self) -> Iterator[None]:
-        """Note the time of the step that is taken meanwhile, as a whole and by phase."""
+        """Record the time of the step in this context, as a whole and by phase."""
         known, started = dict(self.resolver.phases), perf_counter()
         yield
         self._seconds = perf_counter() - started
         self._phases = [total - known[name] for name, total in self.resolver.phases.items()]
 
     def _advance(self, aim: float, step: Step) -> None:
-        """Count the step that was taken towards `aim`."""
+        """Record a step towards `aim`."""
         reached = step.status is StepStatus.REACHED
         self.value = aim if reached else self.value + step.progress * (aim - self.value)
         self.clearance_rows["fcl"] += step.fcl_rows
@@ -213,7 +213,7 @@ class _Attempt:
 def _retry(
     problem: Problem, first: _Attempt, stop: Stop, progress: Progress | None
 ) -> tuple[str, _Attempt, Stop | None]:
-    """Return name, attempt and stop of the one that comes furthest; the name is empty for the first attempt."""
+    """Return name, attempt and stop of the retry that gets furthest; the name is empty for the first attempt."""
     arm, state = first.resolver.setup.arm, first.resolver.state
     heading = first.plan.path.at(first.value).velocity
     best: tuple[str, _Attempt, Stop | None] = ("", first, stop)

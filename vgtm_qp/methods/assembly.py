@@ -1,4 +1,4 @@
-"""The equations of segments at one configuration: their fixed members and what their end faces track, eq. (39)."""
+"""The equations of segments at one configuration: fixed members, and tracked coordinates of end faces, eq. (39)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class CurveNodes(NamedTuple):
 
 
 class SegmentKinematics:
-    """What ``arm.Kinematics`` has of a truss, evaluated for one segment at a time; the rest stays as it is."""
+    """Kinematics of a truss as in ``arm.Kinematics``, evaluated for one segment at a time."""
 
     def __init__(self, truss: Truss) -> None:
         faces = len(truss.faces)
@@ -44,7 +44,7 @@ class SegmentKinematics:
         return Kernel(frame_function(3))
 
     def evaluate(self, X: Array, segment: Segment) -> None:
-        """Overwrite what concerns a segment's fixed members and its end face with the values at `X` (N, 3), m."""
+        """Overwrite the values of a segment's fixed members and end face with those at `X` (N, 3), m."""
         truss, fixed, face = self._truss, segment.fixed, segment.face
         if len(fixed):
             if len(fixed) not in self._members:
@@ -75,7 +75,7 @@ class SegmentKinematics:
 class SegmentGroup:
     """The equations of K segments of one shape, stacked: r rows over c own columns and b columns before them.
 
-    ``numbers`` (K,) says which segments they are, ``columns`` (K, c) which columns of the layout their nodes have.
+    ``numbers`` (K,) are the numbers of the segments, ``columns`` (K, c) the columns of their nodes in the layout.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class SegmentGroup:
         self._own, self._width = one.columns, one.columns + one.start - one.first
         count, lengths = self._fixed.shape
         turns = one.rows - lengths - 3
-        # What belongs to nodes of the base goes to three columns beyond the last, and is cut off.
+        # Entries of base nodes go to three columns beyond the last, and are cut off.
         self._shape = count, one.rows, self._width + 3
         self._size = int(np.prod(self._shape))
 
@@ -138,7 +138,7 @@ class SegmentGroup:
         return self._stacked(self._still, moved, turned)
 
     def residuals(self, X: Array, nodes: CurveNodes) -> Array:
-        """Return (K, r) what is missing in lengths and to the curve nodes at `X`, where kinematics is evaluated."""
+        """Return (K, r) errors of lengths and of end faces against `nodes`, at the evaluated configuration `X`."""
         lengths = self._home - self._kinematics.quantities.take(self._fixed)
         gap = (
             nodes.position.take(self.numbers, axis=0) - (self._weights @ X.take(self._corners, axis=0))[:, 0]

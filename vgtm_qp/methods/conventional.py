@@ -102,10 +102,10 @@ class DenseSolution:
 
 
 class SparseSolution:
-    """The same by its KKT system, banded in the order of the bays: the cost grows with the bays, not their cube.
+    """The same solution by its KKT system, banded in the order of the bays: the cost is linear in the bays.
 
     With H the Hessian of the null-space terms, J^+ x + (1 - J^+ J) rho_s is the minimiser of those terms under
-    J d = x whichever pseudoinverse is meant, so that Moore-Penrose and weighted are one here. Unknowns are the
+    J d = x for either pseudoinverse, so that Moore-Penrose and weighted give the same here. Unknowns are the
     displacements of nodes and actuators, and the multipliers of the lengths and of the tip.
     """
 
@@ -138,7 +138,7 @@ class SparseSolution:
         self.rank: int | None = members - len(actuators) + len(tips)
 
     def hold(self, members: Index, held: Mask) -> None:
-        """See :meth:`DenseSolution.hold`: the displacement of a held actuator has no part in its length's row."""
+        """See :meth:`DenseSolution.hold`: the row of a held actuator's length loses the actuator's displacement."""
         assert self.rank is not None
         self.rank += int(held.sum()) - int((self._free == 0.0).sum())
         self._fixed = np.concatenate(
@@ -255,8 +255,8 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
     def _linear(self, X: Array, goal: TipGoal) -> Linear:
         """Return the system at nodes `X` (N, 3) whose base rests, J d = x, eqs. (25) and (27).
 
-        The right-hand side is the rates of the `goal`, its motion in the step, and none of the fixed lengths; with
-        corrections, what lengths and tip lack of the goal.
+        The right-hand side is the `goal`'s rates over the step, and zero for fixed lengths; with corrections, the
+        errors of lengths and tip against the goal.
         """
         setup = self.setup
         setup.kinematics.evaluate(X)

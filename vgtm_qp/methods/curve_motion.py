@@ -21,7 +21,7 @@ from vgtm_qp.step.setup import Setup
 DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 
 _SAMPLES = 400
-"""Pieces of the curve to whose ends nodes are assigned: the nearest point to a few thousandths."""
+"""Number of pieces of the curve whose ends are assigned to nodes, as their nearest points."""
 
 
 class CurveMotion:
@@ -53,7 +53,7 @@ class CurveMotion:
         self.home = Curve(
             family, setup.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0]
         )
-        # However the curve bends, its end is the same combination of its vertices.
+        # The curve's end is a constant combination of its vertices.
         self._end = family.weights(1.0)
         self._end_rows = self.home.position_jacobian(1.0)[self._task.axes]
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
@@ -138,7 +138,7 @@ class CurveMotion:
         return Objective(hessian, gradient)
 
     def _missing(self, curve: Curve, goal: TipGoal) -> tuple[Array, Array, Array]:
-        """Return what x(1) lacks of x_e, eq. (34), and the goal's rates, (n_e,) each; and the turned axes (r, 3)."""
+        """Return the error x_e - x(1), eq. (34), and the goal's rates, (n_e,) each; and the turned axes (r, 3)."""
         rotation = curve.frame(1.0) if self._task.turns else np.eye(3)
         error, rate, across, _ = self._task.residual(self._end @ curve.control_vertices, rotation, goal)
         return error, rate, across
@@ -153,7 +153,7 @@ class CurveMotion:
     def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array]:
         """Return rows (R, 3 V) of d distance / d p, and distances (R,), m, of the members near obstacles.
 
-        A member moves with the curve where it stands: that is all a curve can know of the truss.
+        A member is assumed to move with its nearest point of the curve.
         """
         setup = self._setup
         pairs = setup.monitor.near(setup.arm.points(X), time, setup.influence)

@@ -12,11 +12,11 @@ from vgtm_qp.problem.method import Weights
 from vgtm_qp.step.setup import Setup
 
 DEFAULT_TERMS = ("actuator_rate",)
-"""With node displacements alone as the objective, long arms collapse their battens."""
+"""Weight of node displacements beside other terms: with these alone, long arms collapse their battens."""
 
 _TRACE = 1e-6
 _NEAREST = 0.05
-"""Below this part of the influence distance the potential keeps its slope, so that a step stays finite."""
+"""Share of the influence distance below which the potential's slope is constant, so that a step stays finite."""
 
 
 class Terms(NamedTuple):
@@ -41,8 +41,8 @@ class TrussObjective:
         self._potential = weights.obstacle_potential if "obstacle_potential" in names else 0.0
         actuator = self._centring + (weights.actuator_rate if "actuator_rate" in names else 0.0)
         node = weights.node_rate if "node_rate" in names else 0.0
-        # Without any term of the displacements themselves, theirs is the norm that J^+ minimises; beside others a
-        # trace of it makes the Hessian regular off the null space too, as the weighted inverse needs.
+        # Without terms of displacements the objective is their norm, which J^+ minimises. Beside other terms a small
+        # weight of that norm makes the Hessian regular off the null space too, as the weighted inverse needs.
         self._node = node or (_TRACE * actuator if actuator else 1.0)
         self._actuator = actuator
 
@@ -86,9 +86,9 @@ def potential_curvature(distance: Array, influence: float) -> Array:
 def potential_field(setup: Setup, X: Array, time: float) -> tuple[Array, Array]:
     """Return the potential's gradient (N, 3), 1/m, by the nodes, and blocks (N, 3, 3), 1/m^2, above its Hessian.
 
-    The plain gradient asks for steps that grow without end as a distance shrinks. With the curvature along the
-    normals each pair asks for a part of its own distance. A block for each node is enough for a bound: the square of
-    a mean of two displacements is at most the mean of their squares, and that of a difference twice their sum.
+    By the gradient alone, steps grow without bound as a distance shrinks. With the curvature along the normals, the
+    step of each pair is a share of its own distance. One block per node bounds the Hessian: the square of a mean of two
+    displacements is at most the mean of their squares, and that of a difference at most twice their sum.
     """
     influence, joints = setup.influence, setup.monitor.bodies.joints
     pairs = setup.monitor.near(setup.arm.points(X), time, influence)

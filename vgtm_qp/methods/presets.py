@@ -79,7 +79,7 @@ DEFAULT_METHODS = (
 
 
 def with_method(problem: Problem, name: str) -> Problem:
-    """Return the problem with the method called `name`; what that serves of its own weights, gains and keys stays.
+    """Return the problem with the method `name`; its weights, gains and keys stay as far as that method has them.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def methods_for(problem: Problem) -> dict[str, Problem]:
 
 
 def method_name(problem: Problem) -> str:
-    """Return the name of the method that a problem asks for; that of ``method.name`` where its keys are of no other."""
+    """Return the name of a problem's method; that of ``method.name`` if its keys are those of no other name."""
     own = problem.method
     same = [name for name, other in methods_for(problem).items() if other.method == own]
     return next(iter(same), own.name)

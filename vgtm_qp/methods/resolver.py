@@ -40,7 +40,7 @@ class Moved(NamedTuple):
 class MethodResolver(Resolver):
     """Moves an arm step by step by one of the other methods.
 
-    It knows the arm's state after a step alone: nothing that brakes, drives pairs apart or follows control vertices.
+    Its steps do not brake, drive pairs apart or follow goals of control vertices.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -52,7 +52,7 @@ class MethodResolver(Resolver):
 
     @property
     def setup(self) -> Setup:
-        """What was built for the problem; its engine is never called."""
+        """The arm ready to move; its engine is never called."""
         return self._setup
 
     @property
@@ -60,13 +60,8 @@ class MethodResolver(Resolver):
         """Seconds spent so far in each phase."""
         return self._clock.seconds
 
-    @property
-    def locked(self) -> frozenset[str]:
-        """Names of the actuators that are stuck by now; members stuck from the start are fixed ones."""
-        return frozenset(self._actuation.locked)
-
     def lock(self, name: str) -> None:
-        """See :class:`Resolver`: what is held counts as a fixed member from then on."""
+        """See :class:`Resolver`: a locked actuator is a fixed member from then on."""
         self._actuation.lock(name, self.state)
         held = np.isin(self._actuation.names, list(self._actuation.locked))
         self._hold(self.setup.arm.actuators[held], held)
@@ -112,7 +107,7 @@ class MethodResolver(Resolver):
         last: Step | None = None,
         state: State | None = None,  # noqa: ARG002
     ) -> Stop:
-        """Return what the `last` step said: the method knows no rows that hold the arm."""
+        """Return the reason of the `last` step: the method has no rows that hold the arm."""
         if last is None:
             return Stop(StopKind.NONLINEAR)
         return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)

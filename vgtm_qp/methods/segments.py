@@ -1,4 +1,4 @@
-"""Partition of a truss into segments of the right size (figure 6): what each has to place, and what it tracks."""
+"""Partition of a truss into segments (figure 6): the nodes that each places, and the coordinates it tracks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vgtm_qp.qp.layout import Layout
 _ROWS = {"position": 3, "pointing": 5, "orientation": 6}
 
 _JOINED = 3
-"""One or two straight octahedral bays cannot turn their end face without moving it; three can, but for roll."""
+"""Bays of a segment that turns its end face: one or two straight octahedral bays also move it, three do not."""
 
 
 @dataclass(frozen=True, eq=False)

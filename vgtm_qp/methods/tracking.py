@@ -51,9 +51,9 @@ class Tracker:
         ]
 
     def rates(self, X: Array, moved: Array, turned: Array) -> Array:
-        """Return node positions (N, 3), m, after a step that meets eq. (39) to first order from `X`.
+        """Return node positions (N, 3), m, after a step from `X` that follows the curve nodes to first order.
 
-        The curve nodes are `moved`, m, and `turned`, rad, by displacements and rotation vectors (S, 3).
+        It solves eq. (39) for displacements `moved` (S, 3), m, and rotation vectors `turned` (S, 3), rad, of those.
 
         Raises
         ------
@@ -69,10 +69,10 @@ class Tracker:
         return X
 
     def track(self, X: Array, nodes: CurveNodes) -> Array:
-        """Return node positions (N, 3), m, that meet eq. (39) and all fixed lengths, by Newton's method from `X`.
+        """Return node positions (N, 3), m, with end faces at the curve nodes and exact lengths, by Newton from `X`.
 
-        A step of a segment with spare motions is A^+ (residual + A t) - t, with t what it has travelled from `X`:
-        its fixed point is the least displacement, whatever the iterates were.
+        The Jacobian is that of eq. (39). A step of a segment with spare motions is A^+ (residual + A t) - t, with t its
+        displacement from `X` so far: its fixed point is the least displacement, whatever the iterates were.
 
         Raises
         ------
@@ -88,8 +88,8 @@ class Tracker:
     def _converge(
         self, chain: _Chain, start: Array, X: Array, travelled: Array, step: Array, nodes: CurveNodes
     ) -> None:
-        """Bring the nodes that a chain places to where they belong, in `X` and in what they have `travelled`."""
-        # The first step is taken from the old configuration of the bays below too, and passes their motion on.
+        """Move the nodes of a chain to their places, in `X` and in their displacements so far, `travelled`."""
+        # The first step starts from the old configuration of the bays below, whose displacement is its input.
         at, step[chain.before] = start, travelled[chain.before]
         for _ in range(MAX_CORRECTIONS + 1):
             chain.evaluate(at)
@@ -114,11 +114,11 @@ class Tracker:
 class _Chain:
     """Segments that are solved at once, as one block-bidiagonal system.
 
-    Each segment's matrix is factorised with no knowledge of the others; what remains in sequence is, for each
-    segment, the product of a small matrix with the displacement of the nodes that it stands on.
+    Each segment's matrix is factorised independently; sequentially there remains, for each segment, the product of a
+    small matrix with the displacement of the nodes that it stands on.
 
-    `evaluate` evaluates the kinematics of all ``groups`` at node positions (N, 3); `failure` says of Newton's method
-    what is put into it. The segments place ``nodes``, with the columns ``own``, on what has the columns ``before``.
+    `evaluate` evaluates the kinematics of all ``groups`` at node positions (N, 3); `failure` is the format of the error
+    message. The segments place ``nodes``, columns ``own``, and stand on nodes with the columns ``before``.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class _Chain:
         self.before = slice(segments[0].first, segments[0].start)
 
     def solve(self, right: list[Array], travelled: Array, step: Array) -> None:
-        """Overwrite the own columns of `step` with what solves all segments, the columns before them being given."""
+        """Overwrite the own columns of `step` with the solution of all segments, given the columns before them."""
         passed: dict[int, Array] = {}
         for group, rhs in zip(self.groups, right, strict=True):
             own, before = group.matrices()

@@ -21,14 +21,14 @@ NullSpaceTerm = Literal[
 ]
 HardCoordinate = Literal["position", "pointing", "orientation"]
 HARD_COORDINATES = ("position", "pointing", "orientation")
-_WAYS = {
+_KINDS = {
     "coupled": '"qp" with tracking "coupled"',
     "none": '"qp" with tracking "none"',
     "bays": '"qp" with tracking "recursive" or "parallel"',
     "pseudoinverse": '"pseudoinverse"',
     "curve-pseudoinverse": '"curve-pseudoinverse"',
 }
-"""The ways in which arms are moved, as messages call them."""
+"""Kinds of solution, as messages call them."""
 _QP, _COUPLED, _INVERSE, _CURVE = (
     ("coupled", "bays", "none"),
     ("coupled", "bays"),
@@ -36,14 +36,14 @@ _QP, _COUPLED, _INVERSE, _CURVE = (
     ("curve-pseudoinverse",),
 )
 SERVED: dict[str, tuple[str, ...]] = {
-    "name": tuple(_WAYS),
+    "name": tuple(_KINDS),
     "tracking": (*_QP, *_CURVE),
     "tracking_mode": ("coupled",),
     "hard_coordinates": _COUPLED,
     "solver": ("coupled", "none"),
-    "retries": tuple(_WAYS),
+    "retries": tuple(_KINDS),
     "slow_approach": _QP,
-    "step_limit": tuple(_WAYS),
+    "step_limit": tuple(_KINDS),
     "variant": _INVERSE,
     "algebra": _INVERSE,
     "correct": (*_INVERSE, *_CURVE),
@@ -68,7 +68,7 @@ SERVED: dict[str, tuple[str, ...]] = {
     "gains.curve_rate": _CURVE,
     "gains.obstacle_potential": _CURVE,
 }
-"""Which of the ways each key has a meaning for; with the others it is refused unless it has its default."""
+"""The kinds of solution that use each key; with other kinds the key is refused unless it has its default."""
 TRUSS_TERMS = ("node_rate", "actuator_rate", "stroke_centring", "obstacle_potential")
 CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 
@@ -212,7 +212,7 @@ class Method(Table, called="[method]"):
     @property
     def draws_vertices(self) -> bool:
         """Whether control vertices follow goals of their own."""
-        return _way(self.name, self.tracking) in _COUPLED
+        return _kind(self.name, self.tracking) in _COUPLED
 
     @property
     def moves_curve_first(self) -> bool:
@@ -221,11 +221,11 @@ class Method(Table, called="[method]"):
 
     def kept_by(self, name: str, tracking: str = "coupled") -> dict[str, Any]:
         """Return the table of another method: those of its keys here that are not as by default."""
-        way = _way(name, tracking)
+        kind = _kind(name, tracking)
         kept: dict[str, Any] = {"name": name, "tracking": tracking}
         for key, value in self._changed():
             outer, _, inner = key.partition(".")
-            if way in SERVED[key] and key not in kept:
+            if kind in SERVED[key] and key not in kept:
                 kept.setdefault(outer, {}).update({inner: value}) if inner else kept.update({key: value})
         return kept
 
@@ -238,28 +238,28 @@ class Method(Table, called="[method]"):
                 yield key, value
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
-        way = _way(self.name, self.tracking)
+        kind = _kind(self.name, self.tracking)
         for key, _ in self._changed():
-            if way not in SERVED[key]:
-                others = " or ".join(_WAYS[other] for other in SERVED[key])
+            if kind not in SERVED[key]:
+                others = " or ".join(_KINDS[other] for other in SERVED[key])
                 place = tuple(key.split("."))
                 table = type(self) if len(place) == 1 else type(getattr(self, place[0]))
                 default = shown(table.model_fields[place[-1]].default)
-                yield place, f"{default}, since {_WAYS[way]} does without this key; it belongs to {others}"
+                yield place, f"{default}, since {_KINDS[kind]} does without this key; it belongs to {others}"
         if self.name == "curve-pseudoinverse" and self.tracking == "none":
             yield ("tracking",), '"recursive" or "parallel": the method moves the curve first'
         if self.hard_coordinates != HARD_COORDINATES[: len(self.hard_coordinates)]:
             yield ("hard_coordinates",), f"the first one, two or three of {quoted(HARD_COORDINATES)}"
         if self.variant == "truncated" and self.algebra == "sparse":
             yield ("algebra",), '"dense", since the variant truncated needs the singular values'
-        known = TRUSS_TERMS if way == "pseudoinverse" else CURVE_TERMS
-        for i, term in enumerate(self.null_space or () if way in SERVED["null_space"] else ()):
+        known = TRUSS_TERMS if kind == "pseudoinverse" else CURVE_TERMS
+        for i, term in enumerate(self.null_space or () if kind in SERVED["null_space"] else ()):
             if term not in known:
                 yield ("null_space", i), f"a term of the method {self.name}: {quoted(known)}"
 
 
-def _way(name: str, tracking: str) -> str:
-    """Return which of the ways in which arms are moved a method is."""
+def _kind(name: str, tracking: str) -> str:
+    """Return the kind of solution of a method."""
     if name == "qp":
         return tracking if tracking in ("coupled", "none") else "bays"
     return name

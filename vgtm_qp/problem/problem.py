@@ -24,8 +24,8 @@ SCHEMA_VERSION = 1
 class Problem(Table, called="a problem"):
     """A problem as its file gives it; in Python, keywords and dictionaries of the same names make it too.
 
-    Files that it names are held as absolute paths; relative ones are taken from the problem file's folder, or
-    from the working directory where there is no problem file.
+    Paths of files are kept absolute; relative ones start at the problem file's folder, or at the working directory
+    without a problem file.
 
     Raises
     ------
@@ -75,8 +75,8 @@ class Problem(Table, called="a problem"):
     ) -> Self:
         """Make a problem from what :meth:`to_dict` returned; ProblemError with one mistake per mistake.
 
-        Mistakes name `source`, the file that the data came from, and relative files are taken from its folder. With
-        `check_files` the files that the problem names must exist; not so for a result that was moved elsewhere.
+        Mistakes name `source`, the file of the data, and relative paths start at its folder. With `check_files` the
+        files that the problem names must exist; a result that was moved elsewhere is read without that.
         """
         context = {"source": source, "check_files": check_files}
         if source is not None:

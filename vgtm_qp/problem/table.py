@@ -1,4 +1,4 @@
-"""The base of every table of a problem file: unknown keys refused, mistakes told in plain words."""
+"""The base of every table of a problem file: unknown keys are refused, mistakes reported in plain words."""
 
 from __future__ import annotations
 

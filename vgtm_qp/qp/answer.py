@@ -1,4 +1,4 @@
-"""What comes of a step's QP: its answer, and where that leads."""
+"""The answer of a step's QP, and the configuration to which it leads."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StepSolution:
     iterations : int
         Iterations of the solver.
     tip_slack : float
-        How far the tip's rows are left at most, m or rad; zero where they are hard.
+        Greatest violation of the tip's rows, m or rad; zero where they are hard.
     """
 
     nodes: Array
@@ -49,14 +49,14 @@ class StepSolution:
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """A configuration whose quantities are what they should be.
+    """A configuration whose fixed quantities are exact and whose actuators are in their boxes.
 
     Attributes
     ----------
     q : configuration
     quantities : (M,)
     error : float
-        Greatest deviation of a quantity from what it should be.
+        Greatest deviation of a quantity from its target value.
     tip_position, tip_rotation : (3,), (3, 3)
     """
 
@@ -68,10 +68,10 @@ class Closed:
 
 
 class Accuracy(NamedTuple):
-    """How exactly quantities, the tip, and stations that track hard are settled, m or rad.
+    """Tolerances to which quantities, the tip, and stations with hard tracking are settled, m or rad.
 
-    These are tighter than the published tolerances of ``verify`` by a decade, so that rounding cannot decide. A tip
-    that is further off than `start` after a QP calls for another one.
+    These are ten times tighter than the published tolerances of ``verify``, so that rounding cannot decide. A tip
+    error above `start` after a QP calls for another QP.
     """
 
     member: float
@@ -83,8 +83,8 @@ class Accuracy(NamedTuple):
 class Move(NamedTuple):
     """Where the answer of one QP leads: the configuration `q` by the answer alone, the curve and the progress.
 
-    `furthest` is the greatest displacement of a node's coordinate, m. `closed` is the configuration with its quantities
-    closed and its tip at its goal, None where only another QP leads there.
+    `furthest` is the greatest displacement of a node's coordinate, m. `closed` is the configuration with quantities
+    closed and the tip at its goal; None if it takes another QP.
     """
 
     solution: StepSolution

@@ -1,8 +1,8 @@
 """The QP of a step over the curve alone, section 4.5: the bays of a truss follow it, one by one or all at once.
 
-Where stations stay on the curve, a bay's fixed members and the place of its end station determine its nodes, eq. (39).
-Their displacements are a linear function of the curve's: by the chain rule every row over nodes, strokes and clearances
-among them, is one over control vertices.
+With hard tracking, a bay's fixed members and the position of its end station determine its nodes, eq. (39). Nodal
+displacements are then a linear function of the curve's. By the chain rule every row over nodes becomes a row over
+control vertices, those of strokes and clearances included.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _SINGULAR = "a bay is in a singular pose and cannot follow the curve"
 
 
 class BaySolver(CondensedSolver):
-    """Solves the QP of a step in the coordinates of the curve, and in the motions that bays have to spare.
+    """Solves the QP of a step in the coordinates of the curve and the spare motions of the bays.
 
-    `parallel`, the matrices of all bays of one shape are factorised at once, and small products pass on what each bay
-    does to the next. Otherwise they are solved one after another; both give the same answer.
+    With `parallel`, the matrices of all bays of one shape are factorised at once, and small products carry the
+    displacement of each bay to the next. Otherwise bays are solved one after another; both give the same answer.
 
     Raises
     ------
     TrussError
-        A bay has more rows than motions, since one of its actuators is locked, say.
+        A bay has more rows than motions, for example because one of its actuators is locked.
     """
 
     def __init__(self, layout: Layout, *, parallel: bool) -> None:
@@ -46,7 +46,7 @@ class BaySolver(CondensedSolver):
         spare = bays[-1].spare.stop
         self._free = slice(spare, spare + layout.free_curve)
         self._unknown = np.concatenate([np.full(self._free.stop, -1), self._after])
-        # Bays follow the curve in positions, or in all; the turn of the last station alone is left to the QP.
+        # Bays follow the curve in positions, or in positions and turns; the QP has the rows of the last station's turn.
         followed = 3 * len(layout.tracked) + layout.turns * len(layout.tracked) * layout.hard_turns
         left = builder.hard_gaps[builder.hard_gaps >= builder.gaps[0] + followed]
         self._actuators, self._equal = self._before, len(left)
@@ -56,7 +56,7 @@ class BaySolver(CondensedSolver):
     def _reduction(self, numbers: StepNumbers, qp: StepQP) -> tuple[Array, Array]:
         """Return Z (n, size) and z_0 (n,) of the unknowns of the full QP."""
         builder, size = self.builder, len(self._unknown)
-        # The last column is what does not depend on the unknowns.
+        # The last column is the constant part.
         whole = np.zeros((builder.size, size + 1))
         whole[self._after, np.arange(self._free.stop, size)] = 1.0
         curve, whole[curve, self._free], whole[curve, -1] = self._on_base(numbers)
@@ -81,11 +81,11 @@ class BaySolver(CondensedSolver):
 
 
 class Bay(NamedTuple):
-    """What lies between two tracked stations.
+    """The nodes between two tracked stations.
 
-    ``rows`` and ``own`` are its equations in the full QP and the columns of its nodes; ``before`` those of nodes placed
-    earlier that the equations depend on. With more columns than equations it has motions to ``spare``, which are
-    unknowns of the QP.
+    ``rows`` are its equations in the full QP, ``own`` the columns of its nodes, and ``before`` the columns of nodes
+    placed earlier that the equations depend on. With more columns than equations the bay has spare motions, which
+    are the unknowns ``spare`` of the QP.
     """
 
     number: int
@@ -98,7 +98,7 @@ class Bay(NamedTuple):
 class _Followed(NamedTuple):
     """The displacements of a bay's own columns: ``known`` (c, size + 1) - ``gain`` (c, b) times those before.
 
-    And ``free`` (c, c - r), by the motions that it has to spare.
+    ``free`` (c, c - r) are the displacements by its spare motions.
     """
 
     bay: Bay
@@ -108,9 +108,9 @@ class _Followed(NamedTuple):
 
 
 class _Equations:
-    """The rows that bays follow the curve by: lengths of fixed members, and stations that are kept on the curve.
+    """The rows by which bays follow the curve: lengths of fixed members, and stations kept on the curve.
 
-    Their entries (E,) over nodes stand in ``rows`` and ``columns`` of the full QP.
+    ``rows`` and ``columns`` are the places of their entries (E,) over nodes in the full QP.
     """
 
     def __init__(self, layout: Layout, builder: FullBuilder) -> None:
@@ -164,7 +164,7 @@ class _Group:
         self._kept, self._places = np.array(kept), np.array(places)
 
     def solved(self, values: Array, missing: Array) -> list[_Followed]:
-        """Return how each bay follows the curve and the bays before, for the equations' right-hand sides `missing`."""
+        """Return each bay's displacements by the curve and the bays before, for right-hand sides `missing`."""
         size = int(np.prod(self._shape))
         flat = np.bincount(self._places, weights=values[self._kept], minlength=size)
         own, before = np.split(flat.reshape(self._shape), [self._own], axis=2)

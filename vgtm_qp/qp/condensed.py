@@ -1,7 +1,7 @@
 """The step's QP condensed onto the actuators.
 
-Its equalities give every unknown of the full QP as z = Z x + z_0: nodes move by K d_a + r, so that fixed quantities
-hold by construction, the curve begins at the base, and gaps are what rows leave. The unknowns x are the actuator
+The equalities give every unknown of the full QP as z = Z x + z_0. Nodes move by K d_a + r, so that fixed quantities
+hold by construction; the curve begins at the base; gaps follow from nodes and curve. The unknowns x are the actuator
 displacements, the free coordinates of the curve, the progress along the path, and the slacks of an elastic tip.
 """
 
@@ -28,12 +28,12 @@ class CondensedSolver:
         self.layout = layout
         self.builder = builder = FullBuilder(layout)
         actuators, slack = builder.column["actuators"], builder.column["slack"]
-        # The columns that are unknowns of the condensed QP themselves, around the free coordinates of the curve.
+        # The columns that the condensed QP keeps, before and after the free coordinates of the curve.
         self._before = np.arange(actuators.start, actuators.stop)
         self._after = np.array([builder.size - 1, *range(slack.start, slack.stop)])
-        # Which column of the full QP each unknown is, -1 for those that are none.
+        # The column of the full QP that each unknown is; -1 for free coordinates of the curve.
         self._unknown = np.concatenate([self._before, np.full(layout.free_curve, -1), self._after])
-        # Columns that are no unknowns and have bounds: so many of the first are equalities.
+        # Eliminated columns that have bounds; the first `_equal` of them are equalities.
         self._bounded, self._equal = builder.hard_gaps, len(builder.hard_gaps)
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
@@ -49,7 +49,7 @@ class CondensedSolver:
         qp, builder = self.builder.build(numbers), self.builder
         Z, start = self._reduction(numbers, qp)
         hessian = Z.T @ (qp.P @ Z)
-        with np.errstate(invalid="ignore"):  # What is infinite becomes NaN, and is refused with the answer.
+        with np.errstate(invalid="ignore"):  # Infinity becomes NaN, and the check of the answer refuses it.
             gradient = Z.T @ (qp.P @ start + qp.q)
         rows = np.concatenate(
             [builder.tip_rows, builder.leg_rows, np.arange(builder.fixed_rows, len(qp.row_lower))]
@@ -80,7 +80,7 @@ class CondensedSolver:
         return None
 
     def _own(self, bounds: Array) -> Array:
-        """Return the bounds of the unknowns x, from those of all columns; what is no column has none, like nodes."""
+        """Return the bounds of the unknowns x from those of all columns; free coordinates of the curve have none."""
         return np.asarray(np.where(self._unknown >= 0, bounds[self._unknown], bounds[0]))
 
     def _reduction(self, numbers: StepNumbers, qp: StepQP) -> tuple[Array, Array]:
@@ -100,7 +100,7 @@ class CondensedSolver:
         return Z, start
 
     def _on_base(self, numbers: StepNumbers) -> tuple[slice, Array, Array]:
-        """Return columns of the curve (D), and their displacements by the free coordinates (D, q) and the base (D,)."""
+        """Return the curve's columns (D), and their displacements by free coordinates (D, q) and by the base (D,)."""
         column, axes, shift = self.builder.column, numbers.base_axes, numbers.base_displacement
         curve = slice(column["vertices"].start, column["torsion"].stop)
         start = np.zeros(curve.stop - curve.start)

@@ -19,7 +19,7 @@ _FEASIBILITY = 1e-10
 
 
 class DenseAnswer(NamedTuple):
-    """What DAQP gave for a QP, not checked yet.
+    """DAQP's answer to a QP, not checked yet.
 
     Attributes
     ----------

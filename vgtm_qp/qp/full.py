@@ -2,9 +2,9 @@
 
     minimise  1/2 z' P z + q' z   subject to   row_lower <= A z <= row_upper,  column_lower <= z <= column_upper
 
-z holds the displacements over the step of nodes, actuators, control vertices and path progress, and after it the gaps
-between faces and curve and what an elastic tip leaves; because actuators and gaps are columns of their own, P is
-constant and only A's values change.
+z holds the displacements of nodes, actuators, control vertices and path progress over the step, then the gaps between
+stations and curve after it, then the slacks of an elastic tip. Actuators and gaps are separate columns, so that P is
+constant and only the values of A change.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vgtm_qp.rows.tip import unit
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StepQP:
-    """A step's QP as data. Arrays are its builder's, and valid until that builds again.
+    """A step's QP as data. Its builder owns the arrays: they are valid until the next ``build``.
 
     Attributes
     ----------
@@ -60,9 +60,9 @@ class StepQP:
         return norm(self.P @ z + self.q + self.A.T @ row_multipliers + column_multipliers)
 
     def complementarity_residual(self, z: Array, row_multipliers: Array, column_multipliers: Array) -> float:
-        """Return the norm of |multiplier| times slack of its bound, at most 1: what multipliers press on nothing.
+        """Return the norm of |multiplier| times the slack of its bound, at most 1: complementary slackness.
 
-        A multiplier of the wrong sign has the slack of the other bound, one of a free row an infinite slack.
+        A multiplier of the wrong sign has the slack of the other bound; one of a free row has an infinite slack.
         """
         pairs = (
             (row_multipliers, self.A @ z, self.row_lower, self.row_upper),
@@ -75,7 +75,7 @@ class StepQP:
         return norm(np.concatenate(parts))
 
     def violated(self, z: Array, tolerance: float = 1e-9) -> list[tuple[str, float]]:
-        """Return the names of rows and columns out of their bounds at `z` by more than `tolerance`, worst first."""
+        """Return rows and columns that violate their bounds at `z` by more than `tolerance`, worst first."""
         value = self.A @ z
         row = np.maximum(self.row_lower - value, value - self.row_upper)
         column = np.maximum(self.column_lower - z, z - self.column_upper)
@@ -101,7 +101,7 @@ class StepQP:
 
 
 class FullBuilder:
-    """Fills the full QP from :class:`StepNumbers`; the sparsity is kept while the near pairs stay the same."""
+    """Fills the full QP from :class:`StepNumbers`; its sparsity stays while the near pairs stay."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -139,7 +139,7 @@ class FullBuilder:
 
     @property
     def _turns(self) -> str:
-        """Axes of the turns between a face and the curve: x and y tilt it, z rolls it."""
+        """Axes of the turns between a station and the curve: tilts about x and y, roll about z."""
         return "xyz"[: self.layout.turns]
 
     @property
@@ -271,7 +271,7 @@ class FullBuilder:
         }
 
     def _fixed_rows(self) -> list[_Rows]:
-        """Return the rows above the clearances: the arm's own, the tip's, the curve's base, its gaps."""
+        """Return the rows before the clearances: the arm's motion, the tip, the curve's base, the gaps."""
         layout, arm, column = self.layout, self.layout.arm, self.column
         pattern, tip, axis = arm.motion_pattern, np.arange(len(layout.tip_rows)), np.arange(3)
         tip_columns = layout.node_column[arm.end_effector.nodes]
@@ -286,7 +286,7 @@ class FullBuilder:
             signs = np.repeat([1.0, -1.0], len(tip))
             tip_entries.append(_Entries(np.tile(tip, 2), slack, lambda _: signs))
         rows = [
-            # Columns of the arm's own rows are those of the nodes and actuators, which come first.
+            # The arm's motion rows are over nodes and actuators, whose columns come first.
             _Rows(
                 pattern.labels,
                 [_Entries(pattern.rows, pattern.columns, lambda numbers: numbers.motion.values)],
@@ -387,7 +387,7 @@ class FullBuilder:
 
 
 class _Entries(NamedTuple):
-    """Some entries of a kind of row: their rows, from its first one on, their columns and their values."""
+    """Entries of one kind of row: rows, counted from the first of that kind, columns and values."""
 
     rows: Index
     columns: Index

@@ -1,4 +1,4 @@
-"""The fast path of a step: one compiled call linearises and condenses, one BLAS call squares, DAQP solves.
+"""The fast path of a step: one compiled call linearises and condenses, BLAS makes the Hessian, DAQP solves.
 
 It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in 10 to 20 times less time for short arms.
 """
@@ -29,7 +29,7 @@ _NOWHERE: Array = np.zeros((0, 3))
 
 
 class _Room:
-    """Rows and bounds of the QP, which the compiled functions write to and read; shared by solvers that share those."""
+    """Rows and bounds of the QP that compiled functions write and read; solvers with the same functions share them."""
 
     constraint: Array
     lower: Array
@@ -80,11 +80,11 @@ class FusedSolver:
         self._reserve(size + self._equal + self._legs + NEAR)
         self._draw(layout)
         if self._hard:
-            self._soft = np.ones(self._stack.shape[1])
-            self._soft[self._hard_at] = 0.0
+            self._elastic = np.ones(self._stack.shape[1])
+            self._elastic[self._hard_at] = 0.0
 
     def drawn(self, layout: Layout) -> FusedSolver:
-        """Return the solver of a layout that differs in the control vertices with goals alone; buffers are shared."""
+        """Return the solver of a layout in which only other control vertices have goals; buffers are shared."""
         other = copy.copy(self)
         other._draw(layout)
         return other
@@ -168,7 +168,7 @@ class FusedSolver:
         if self._legs:
             axes, least = self.layout.leg_bounds(self._vertices, self._normal)
             if self._legs > 1:
-                # Control vertices stand behind the leg at the base.
+                # Control vertices come after the leg at the base.
                 last = self._torsion - 6
                 constraint[self._equal + 1, last : last + 6] = np.concatenate([-axes[1], axes[1]])
             lower[size + self._equal : size + first] = least
@@ -192,7 +192,7 @@ class FusedSolver:
         return answer
 
     def move(self, answer: DenseAnswer, near: int, torsion: Array, accuracy: Accuracy) -> Move:
-        """Return where an answer of :meth:`ask` leads that had so many clearance rows, at most ``NEAR``.
+        """Return where an answer of :meth:`ask` leads; its QP had `near` clearance rows, at most ``NEAR``.
 
         The solution's ``nodes`` and ``vertices`` are left empty. `torsion` (T,) is the curve's before the step, rad.
 
@@ -217,10 +217,10 @@ class FusedSolver:
     def settle(
         self, q: Array, vertices: Array, lower: Array, upper: Array, goal: TipGoal, accuracy: Accuracy
     ) -> Closed | None:
-        """Return configuration `q` with its quantities closed, actuators in their boxes (n_a,), and its tip at `goal`.
+        """Return configuration `q` with quantities closed, actuators in their boxes (n_a,) and the tip at `goal`.
 
-        `vertices` (V, 3), m, are the curve that stations are held on with hard tracking. None where that was not
-        reached.
+        With hard tracking, stations are held on the curve of control vertices `vertices` (V, 3), m. None if the
+        iteration does not converge.
         """
         inputs = self._settled.inputs
         inputs[0][:] = q.reshape(-1)
@@ -234,7 +234,7 @@ class FusedSolver:
         return self._closed(error, before, after, accuracy)
 
     def _settle(self, follows: float) -> None:
-        """Settle where the answer leads, or at 0 the configuration that was loaded."""
+        """Settle the configuration after the answer, or with `follows` = 0 the one that was loaded."""
         if not self.layout.hard_tracking:
             response = self._response[: self._actuators]
             np.dot(response, response.T, out=self._gram)
@@ -242,7 +242,7 @@ class FusedSolver:
         self._settled()
 
     def _closed(self, error: float, before: float, after: float, accuracy: Accuracy) -> Closed | None:
-        """Return where settling ended; None if it is not exact enough, the tip's errors included, m and rad."""
+        """Return the settled configuration; None if a quantity or the tip is not exact enough, m and rad."""
         if not (error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip):
             return None
         q, quantities, position, rotation = self._settled.outputs[:4]
@@ -255,7 +255,7 @@ class FusedSolver:
         )
 
     def _reserve(self, rows: int) -> None:
-        """Make room for bounds of all unknowns and `rows` less so many constraints; kernels write the first of them."""
+        """Make room for `rows` bounds, those of the unknowns first, and for the constraints behind these."""
         size, equal = self._size, self._size + self._equal
         self._room.constraint = np.zeros((rows - size, size))
         self._room.lower, self._room.upper = np.full(rows, -UNBOUNDED), np.full(rows, UNBOUNDED)
@@ -283,7 +283,7 @@ class FusedSolver:
         """Return Hessian and gradient of the objective."""
         count, stack = self._actuators, self._stack
         hessian, gradient, linear = self._hessian, self._gradient, self._linear
-        np.dot(stack * self._soft if self._hard else stack, stack.T, out=hessian)
+        np.dot(stack * self._elastic if self._hard else stack, stack.T, out=hessian)
         np.add(hessian[-1], linear, out=gradient)
         gradient[-1] = linear[-1]
         if self.layout.vertex_goals:
@@ -299,7 +299,7 @@ class FusedSolver:
         return hessian, gradient
 
     def _constant_hessian(self) -> Array:
-        """Return the part of the Hessian that only a turning base changes."""
+        """Return the part of the Hessian that changes only when the base turns."""
         layout, weights = self.layout, self.layout.weights
         basis = free_basis(self._normal, 3 * layout.vertices + layout.torsion)
         of_curve = basis.T @ layout.curve_hessian @ basis
@@ -311,6 +311,6 @@ class FusedSolver:
         near, width = len(clearance), self._width
         flat = self._place[clearance.nodes][:, :, None] + _AXES
         flat += self._room.row_start[:near]
-        # Sums what stands at one place: a row may name a node twice.
+        # Entries at one place are added up: a row may name a node twice.
         spread = np.bincount(flat.reshape(-1), clearance.coefficients.reshape(-1), near * width)
         return np.asarray(spread.reshape(near, width)[:, :-3], dtype=float)

@@ -17,9 +17,9 @@ from vgtm_qp.rows.tip import progress_gradient
 def row_function(layout: Layout) -> Bound:
     """Return the function that linearises and condenses the QP of a step.
 
-    Arguments are ``StepGraph.inputs``. Results: R (3 (N - N_c) + (3 + R) K + S, n_a + q + 1), whose Gram matrix is the
-    objective's, the last row and column but for the progress its gradient; tip rows (n_a + q + 1, n_e); lower and upper
-    bounds (n_a + q + 1 + n_e) of the unknowns and tip rows; what else there is of the gradient (n_a + q + 1); curvature
+    Arguments are ``StepGraph.inputs``. Results: R (3 (N - N_c) + (3 + R) K + S, n_a + q + 1), whose Gram matrix holds
+    the Hessian and, in its last column, the gradient of the least-squares terms; tip rows (n_a + q + 1, n_e); lower and
+    upper bounds (n_a + q + 1 + n_e) of the unknowns and tip rows; gradient of the other terms (n_a + q + 1); curvature
     of the progress; offsets (3, V) of the control vertices; base normal (3).
     """
     constants, arm, weights = Constants(), layout.arm, layout.weights
@@ -66,7 +66,7 @@ def row_function(layout: Layout) -> Bound:
 
 
 def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX]) -> list[ca.MX]:
-    """Return the rows of all gaps, then turns, then spacings, times the roots of their weights; of hard rows, by 1."""
+    """Return the rows of all gaps, turns and spacings, times the roots of their weights; hard rows times 1."""
     layout, arm, weights = graph.layout, graph.layout.arm, graph.layout.weights
     actuators = len(arm.actuators)
     tracking, tangent, roll, spacing = graph.weights(
@@ -79,7 +79,7 @@ def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX])
     for k, face in enumerate(layout.tracked.tolist()):
         moving = displacement(arm.stations.nodes[face].tolist())
         hard = [ca.DM(mask[k].astype(float)) for mask in (layout.hard_gaps, layout.hard_tilts)]
-        # What is hard is closed by corrections too, and stands there without a weight.
+        # Corrections close hard rows too, and these have no weight.
         closed = [mask + (1.0 - mask) * motion for mask in hard]
         rows = station(*graph.station(k), moving, every, graph.normal, *closed)
         weighed = [mask + (1.0 - mask) * scale for mask, scale in zip(hard, scales, strict=True)]

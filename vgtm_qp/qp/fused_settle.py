@@ -14,7 +14,7 @@ from vgtm_qp.qp.settle import AT_BOUND, LEFT, SETTLED, SETTLING_STEPS, WORST_CON
 from vgtm_qp.rows.tip import error as tip_error
 
 NEAR = 24
-"""Clearance rows of a QP whose answer is checked by the compiled function; those of more are checked without it."""
+"""Greatest number of clearance rows with which the compiled function checks an answer."""
 
 _HELD_STEPS = 4
 _BOXED_STEPS = 2
@@ -26,14 +26,14 @@ def settle_function(layout: Layout) -> Bound:
     Arguments: q; lower, upper (n_a); goal position (3), rotation (3, 3), velocity and spin (3) per unit of progress;
     progress so far; results 0 to 3, 6 and 7 of `row_function`, with the tip rows and bounds followed by those of hard
     tracking and of ``NEAR`` clearances; p (3, V); Hessian and gradient; the QP's answer and multipliers; Gram matrix
-    (n_a, n_a) of the weighted node displacements in R; and 1 where the answer is to be followed, 0 where q is to be
-    settled at the goal given. With hard tracking the stations are held on the curve instead, where they and the fixed
-    quantities determine the configuration: the tip then is where the curve ends.
+    (n_a, n_a) of the weighted node displacements in R; and 1 to follow the answer, 0 to settle q at the given goal.
+    With hard tracking the stations are held on the curve instead, if they and the fixed quantities determine the
+    configuration: the tip is then at the curve's end.
 
-    Results: q, whose fixed quantities are those at home and whose actuators are in their boxes; quantities there; tip
-    position; tip rotation; p; and (7) error of the quantities and of the tip before the gain of ``qp.settle``
-    was first used and at the end (norms, so that NaN shows), progress, greatest displacement of a node by the answer,
-    and the answer's primal and dual residuals, see :mod:`vgtm_qp.qp.residual`; q before it was settled.
+    Results: q with fixed quantities as at home and actuators in their boxes; quantities there; tip position; tip
+    rotation; p; seven numbers; q before it was settled. The seven are the errors of the quantities and of the tip
+    before the gain of ``qp.settle`` was first used and at the end (norms, so that NaN shows), progress, greatest
+    displacement of a node by the answer, and the answer's primal and dual residuals, see :mod:`vgtm_qp.qp.residual`.
     """
     constants, arm = Constants(), layout.arm
     symbols, qp = arm.symbols(constants), _SolvedQP(layout)
@@ -113,8 +113,7 @@ def _settling_step(
 ) -> ca.Function:
     """Return the function of (is_off, q, error, lower, upper, gain, goal pose, constants) that corrects q and error.
 
-    The gain of that `shape` says how coordinates bring the tip to its goal; where the tip `is_off` no more, nothing is
-    changed.
+    The gain, of that `shape`, maps the tip's error to coordinates. Nothing changes unless the tip `is_off`.
     """
     count = len(layout.arm.actuators)
     q, error = ca.MX.sym("q", *symbols.shape), ca.MX.sym("error", len(layout.tip_rows))
@@ -186,9 +185,9 @@ class _SolvedQP:
 
 
 def _gain(gram: ca.MX, stiffness: ca.MX, tip: ca.MX, free: ca.MX) -> ca.MX:
-    """Return (n_a, n_e) actuator displacements per unit of tip error as `settling_gain` does; zeros where it has none.
+    """Return (n_a, n_e) the result of `settling_gain` in symbols; zeros where that is None.
 
-    An actuator that is not `free` (n_a) stands in the system as an equation of its own.
+    An actuator that is not `free` (n_a) has the equation that it rests.
     """
     count, rows = tip.shape
     mask = ca.if_else(free, 1.0, 0.0)
@@ -196,8 +195,8 @@ def _gain(gram: ca.MX, stiffness: ca.MX, tip: ca.MX, free: ca.MX) -> ca.MX:
     reached = tip * ca.repmat(mask, 1, rows)
     answer = ca.solve(hessian, reached, "ldl")
     normal = reached.T @ answer
-    # Left to itself, the virtual machine gives up the whole function at a matrix that is nearly singular, where the
-    # compiled one goes on with infinite shares. Both go on here: `usable` is false for those.
+    # At a nearly singular matrix CasADi's virtual machine fails the whole function, whereas compiled code goes on with
+    # infinities. Here both go on, and `usable` is false.
     shares = ca.inv(normal, "qr", {"eps": 0.0})
     usable = ca.logic_and(
         ca.norm_inf(ca.vec(shares)) * ca.norm_inf(ca.vec(normal)) < WORST_CONDITION, ca.sum1(mask) >= rows

@@ -1,4 +1,4 @@
-"""A step's QP in CasADi's symbols: what the linearised and the condensed form of it have in common."""
+"""A step's QP in CasADi's symbols: the common part of its linearised and its condensed form."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class StepGraph:
     q, at
         Configurations where residuals and where Jacobians are evaluated.
     base : (3, N)
-        Where the nodes are when only the base has moved.
+        Node positions when only the base has moved.
     vertices : (3, V)
     lower, upper : (n_a,)
         Boxes of the actuators.
@@ -31,19 +31,19 @@ class StepGraph:
     goal, turned, velocity, spin : (3,), (3, 3), (3,), (3,)
         Pose of the goal there, and its rates per unit of progress.
     given : list
-        ``CurveRows`` as arguments, transposed as CasADi reads them, where the curve is more than its tables.
+        ``CurveRows`` as arguments, transposed as CasADi reads them, for curves that constant tables do not describe.
     X, moved : (3, N)
-        Nodes at `q`, and what the base moves them by.
+        Nodes at `q`, and their displacement with the base.
     strokes : (n_a,)
     tip_position, tip_rotation : (3,), (3, 3)
     tip_error, tip_rate, tip_jacobian : (n_e,), (n_e,), (n_e, 3K)
         Goal less value, the path's rate, and J_u at `at`.
     curvature : scalar
-        What the progress along the path is weighted by.
+        Weight of the progress along the path.
     rotations, spins : (3, 3F), (3, 9F)
         Of the stations at `q`, and at `at`.
     base_axes, normal, offset : (3, 2), (3,), (3, V)
-        What the base makes of the curve.
+        Axes and normal of the curve's base, and the displacements that bring the curve back to it.
     """
 
     def __init__(self, layout: Layout, symbols: ArmSymbols, constants: Constants) -> None:
@@ -153,12 +153,12 @@ class StepGraph:
 
 
 class StationSymbols:
-    """One station and its curve node as symbols: eqs. (32)-(39) where the station is.
+    """One station and its curve node as symbols: eqs. (32)-(39) at the station.
 
     Attributes
     ----------
     inputs : list
-        What ``StepGraph.station`` gives.
+        The result of ``StepGraph.station``.
     gap, turn : (3,), (R,)
     face : (R, 9)
         Rows of the turns over the station's nodes.
@@ -188,10 +188,9 @@ class StationSymbols:
         self.gap, self.face = tracking.gap(nodes @ self.weights, point), c @ spin
 
     def over_curve(self, offset: ca.SX, normal: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Return what the curve's coordinates do to gap and turn, over those the base leaves free.
+        """Return the rows (3, q) and (R, q) of gap and turn over the curve's free coordinates.
 
-        Rows (3, q) and (R, q), and the constants (3,) and (R,) of an `offset` of all coordinates ((3, V), or flat where
-        the curve has torsion).
+        Then their constants (3,) and (R,) for an `offset` of all coordinates: (3, V), or flat if the curve has torsion.
         """
         if not self._is_tabled:
             rows = -self._position, self._turned
@@ -217,7 +216,7 @@ def tip_frames(layout: Layout, constants: Constants) -> Frames:
 
 
 def _given_curve(layout: Layout) -> list[ca.MX]:
-    """Return the arguments that ``CurveRows`` are given as: each array's last axis is the row index."""
+    """Return symbols for the arrays of ``CurveRows``: each array's last axis is the row index."""
     count, size, pieces = len(layout.tracked), 3 * layout.vertices + layout.torsion, layout.spacings
     shapes = {
         "position": (3, count),

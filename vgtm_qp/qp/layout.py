@@ -1,4 +1,4 @@
-"""The layout of a step's QP: which columns and rows there are, built once from the arm, the curve and the task."""
+"""The layout of a step's QP: its columns and rows, built once from the arm, the curve and the task."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from vgtm_qp.rows.curve import legs
 from vgtm_qp.rows.tip import axes as tip_axes
 
 _ENDS_AT_TIP = 3
-"""A curve of so many control vertices can begin at the base, along its normal, and end anywhere."""
+"""Fewest control vertices with which a curve can begin at the base, along its normal, and end anywhere."""
 
 _LEAST_LEG = 0.1
-"""Shortest that a leg whose direction is given becomes, as a share of one of a straight polygon at home."""
+"""Least length of a leg with a given direction, as a share of a leg of the straight polygon at home."""
 
 _GOAL_REACH = 0.01
-"""Greatest part of the arm's length that a control vertex is drawn towards its goal in one step."""
+"""Greatest share of the arm's length by which a control vertex is drawn towards its goal in one step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,12 @@ class Layout:
     hard_tracking : bool
         Position tracking as an equality at every station instead of a penalty.
     elastic_tip : bool
-        The end effector's rows may give way at an exact penalty.
+        The end effector's rows have slacks with an exact penalty.
     weights : Weights
     hard_turns : bool
         The stations' turns as equalities too, beside their positions.
     shape : CurveShape or None
-        How the curve's nodes are placed; None for a curve that is no more than its tables.
+        How the curve's nodes are placed; None for a curve that constant tables describe.
     vertex_goals : tuple of int
         Control vertices that are drawn to goals.
     """
@@ -84,7 +84,7 @@ class Layout:
 
     @property
     def general(self) -> CurveShape | None:
-        """The curve's shape where its rows have to be computed anew for each QP; None where tables do."""
+        """The curve's shape if its rows are computed for each QP; None if constant tables describe them."""
         return None if self.shape is None or self.shape.is_plain else self.shape
 
     @property
@@ -94,7 +94,7 @@ class Layout:
 
     @property
     def is_tabled(self) -> bool:
-        """Whether the QP has no more rows and objectives than a curve of constant tables needs."""
+        """Whether constant tables give all rows and objectives of the curve."""
         return self.general is None and not self.hard_turns and not self.vertex_goals
 
     @property
@@ -104,24 +104,24 @@ class Layout:
 
     @property
     def turns(self) -> int:
-        """Turns R of each station that are tracked."""
+        """Number R of turns that each station tracks."""
         return 2 if self.general is None else self.general.turns
 
     @cached_property
     def ends_at_tip(self) -> bool:
-        """Whether the curve ends in the end effector, where it has control vertices enough to go there."""
+        """Whether the curve ends in the end effector: if it has enough control vertices for that."""
         tip, last = self.arm.end_effector.nodes, self.arm.stations.nodes[-1:]
         return self.vertices >= _ENDS_AT_TIP and np.array_equal(last, [tip])
 
     @property
     def ends_along_tip(self) -> bool:
-        """Whether it does so in the tip's direction: where that is tracked, and another control vertex is there."""
+        """Whether the curve ends along the tip's z-axis: if that is tracked and there is another control vertex."""
         turned = len(tip_axes(self.tip_rows)) < len(self.tip_rows)
         return turned and self.ends_at_tip and self.vertices > _ENDS_AT_TIP
 
     @cached_property
     def hard_gaps(self) -> Mask:
-        """(K, 3) which gaps are equalities: with hard tracking all, and always that of the curve's end.
+        """(K, 3) mask of gaps that are equalities: all with hard tracking, and always the gap of the curve's end.
 
         The curve ends in the end effector, eq. (34), as it begins at the base.
         """
@@ -131,14 +131,14 @@ class Layout:
 
     @cached_property
     def hard_tilts(self) -> Mask:
-        """(K, R) which turns are, those of the curve's end among them."""
+        """(K, R) mask of turns that are equalities, those of the curve's end among them."""
         hard = np.full((len(self.tracked), self.turns), self.hard_turns)
         hard[-1:, :2] |= self.ends_along_tip
         return hard
 
     @cached_property
     def hard(self) -> Index:
-        """Which of all gaps, then turns, are equalities, rising."""
+        """Sorted indices of the equalities among all gaps, then turns."""
         return np.flatnonzero(np.concatenate([self.hard_gaps.reshape(-1), self.hard_tilts.reshape(-1)]))
 
     @property
@@ -148,12 +148,12 @@ class Layout:
 
     @property
     def least_squares(self) -> int:
-        """Number of the objective's rows over displacements: nodes, gaps and turns of the stations, spacings."""
+        """Number of least-squares rows of the objective: nodes, gaps and turns of the stations, spacings."""
         return self.node_columns + (3 + self.turns) * len(self.tracked) + self.spacings
 
     @property
     def free_curve(self) -> int:
-        """Number of coordinates of the curve that its base leaves free: 3 V - 5 + T."""
+        """Number of free coordinates of a curve fixed at its base: 3 V - 5 + T."""
         return 3 * self.vertices - 5 + self.torsion if self.vertices else 0
 
     @cached_property
@@ -169,16 +169,16 @@ class Layout:
 
     @cached_property
     def _end_gain(self) -> Array:
-        """(V, 1 or 2) least changes of the control vertices behind the base that move the curve's end, or turn it."""
+        """(V, 1 or 2) least changes of the control vertices beyond the base that move the curve's end, or turn it."""
         rows = [self.curve_weights[-1], self.curve_slopes[-1]][: 1 + self.ends_along_tip]
         gain = np.zeros((self.vertices, len(rows)))
         gain[2:] = np.linalg.pinv(np.array(rows)[:, 2:])
         return gain
 
     def ended(self, vertices: Array, position: Array, rotation: Array) -> Array:
-        """Return (V, 3) control vertices whose curve ends at the tip's `position` (3,), m, by the least change.
+        """Return (V, 3) control vertices, changed least, whose curve ends at the tip's `position` (3,), m.
 
-        It ends along the z-axis of its `rotation` (3, 3) where the direction is tracked.
+        The curve ends along the z-axis of the tip's `rotation` (3, 3) if the direction is tracked.
         """
         if not self.ends_at_tip:
             return vertices
@@ -190,13 +190,13 @@ class Layout:
 
     @cached_property
     def legs(self) -> Index:
-        """(G, 2) control vertices of the legs whose directions are given: the first, and the last along the tip's."""
+        """(G, 2) control vertices of the legs with given directions: the first, and the last if along the tip."""
         last = self.vertices - 1
         legs = [(0, 1), (last - 1, last)][: int(last > 0) + self.ends_along_tip]
         return np.array(legs, dtype=np.int64).reshape(-1, 2)
 
     def leg_bounds(self, vertices: Array, normal: Array) -> tuple[Array, Array]:
-        """Return axes (G, 3) of the :attr:`legs`, and what their lengths may change by at least (G,), m."""
+        """Return axes (G, 3) of the :attr:`legs`, and lower bounds (G,) of the changes of their lengths, m."""
         if not len(self.legs):
             return np.zeros((0, 3)), np.zeros(0)
         axes, lengths = legs(vertices, normal, both=len(self.legs) > 1)
@@ -204,7 +204,7 @@ class Layout:
         return axes, np.minimum(least - lengths, 0.0)
 
     def record(self) -> dict[str, Any] | None:
-        """Return what verification needs to know of the curve and of the stations on it, as JSON data; or None.
+        """Return the curve and its stations as JSON data for verification; None without a curve.
 
         Keys: ``breaks``, ``extraction``, ``nodes`` and ``by_arc_length`` of the curve, see ``CurveFamily`` and
         ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``, whether they are
@@ -228,7 +228,7 @@ class Layout:
 
     @cached_property
     def vertex_hessian(self) -> Array:
-        """(V, V) of the objectives that are the curve's own, for each axis."""
+        """(V, V) Hessian, per axis, of the objectives in the control vertices alone."""
         drawn = np.isin(np.arange(self.vertices), self.vertex_goals) * self.weights.vertex_goal
         rate = self.weights.curve_rate * np.eye(self.vertices)
         return np.asarray(rate + self.weights.smoothness * self.polygon_bending + np.diag(drawn))
@@ -242,7 +242,7 @@ class Layout:
     def goal_pull(self, vertices: Array, goals: Array | None) -> Array:
         """Return (V, 3) the gradient of the control vertices' goals (V, 3), m; NaN where a vertex has none.
 
-        A step draws a vertex no further than by a share of the arm's length: a goal far away must not outweigh the
+        A step draws a vertex by no more than a share of the arm's length: a distant goal must not outweigh the
         progress of the tip.
         """
         pull = np.zeros_like(vertices)
@@ -255,7 +255,7 @@ class Layout:
         return pull
 
     def vertex_gradient(self, vertices: Array, goals: Array | None) -> Array:
-        """Return (V, 3) the gradient of the curve's own objectives at control vertices (V, 3), m, and their goals."""
+        """Return (V, 3) the gradient of these objectives at control vertices and goals (V, 3), m."""
         return self.weights.smoothness * (self.polygon_bending @ vertices) + self.goal_pull(vertices, goals)
 
     @cached_property

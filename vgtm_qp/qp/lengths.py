@@ -12,7 +12,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 
 _WIDEST = 200
-"""Number of diagonals up to which a band is factorised sooner than a sparse matrix."""
+"""Greatest number of diagonals for which banded LU is faster than sparse LU."""
 
 _SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
@@ -20,15 +20,15 @@ _SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 class LengthSolver:
     """Solves J d_rho = error with the length Jacobian J.
 
-    Along an arm the nonzeros come near the diagonal where rows follow the last of their columns.
+    Rows are sorted by their last column, which brings the nonzeros of an arm near the diagonal.
 
     Parameters
     ----------
     bays : Bays
     members : (m,) int, optional
-        Whose lengths change as wanted; all by default.
+        Members whose lengths are given; all by default.
     stations : (K, 3) int, (K, 3), optional
-        Nodes and weights of stations that move as wanted, too.
+        Nodes and weights of stations whose displacements are given too.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class LengthSolver:
         self._order = np.argsort(last, kind="stable")
         rows = np.argsort(self._order)[rows]
         self._below, self._above = int((rows - columns).max()), int((columns - rows).max())
-        # LAPACK's storage of a band, by columns: rows of its own for what pivoting fills in come first.
+        # LAPACK's banded storage, by columns: its first rows are for the fill-in of pivoting.
         self._width, self._size = 2 * self._below + self._above + 1, size
         self._entry = columns * self._width + self._below + self._above + rows - columns
         self._places = rows, columns
@@ -72,7 +72,7 @@ class LengthSolver:
         Raises
         ------
         SolverError
-            The truss is in a pose where these do not determine the nodes.
+            The pose is singular: these do not determine the nodes.
         """
         values = np.concatenate([gradient.reshape(-1)[self._flat], self._weights])
         size, known = self._size, error[self._order]

@@ -18,26 +18,26 @@ from vgtm_qp.rows.tip import TipGoal, progress_gradient
 
 
 class StepInput(NamedTuple):
-    """What a step's QP is linearised at.
+    """The point at which a step's QP is linearised.
 
     Attributes
     ----------
     q, at : configurations
-        Where residuals and where Jacobians are evaluated.
+        Configurations of the residuals and of the Jacobians.
     base : (N, 3)
-        Nodes at `q` when only the base has moved to where it will be, m.
+        Nodes at `q` after only the base has moved, m.
     vertices : (V, 3)
         Control vertices, m.
     lower, upper : (n_a,)
         Boxes of the actuators at the end of the step.
     motion : bool
-        Whether the QP moves the arm; a correction returns to the constraints on the shortest way, without the
-        gradients of the null-space objectives.
+        Whether the QP moves the arm. A correction instead returns to the constraints by the least displacement,
+        without the gradients of the null-space objectives.
     progress : float
-        Progress alpha reached so far; the step may go back to 0 and on to 1.
+        Progress alpha so far; the step may change it to anything from 0 to 1.
     goal : TipGoal
     curve : CurveRows or None
-        Rows of a curve that is more than its tables.
+        Rows of a curve that constant tables do not describe.
     vertex_goals : (V, 3) or None
     """
 
@@ -78,7 +78,7 @@ class Linearisation:
     Attributes
     ----------
     quantities : (M,)
-        Of the arm at the configuration linearised last.
+        The arm's, at the configuration linearised last.
     """
 
     def __init__(self, layout: Layout, *, compiled: bool = True) -> None:
@@ -87,7 +87,7 @@ class Linearisation:
         self.quantities = self._kernel.outputs[0]
 
     def numbers(self, asked: StepInput, clearance: ClearanceRows) -> StepNumbers:
-        """Return the QP's numbers, in arrays of their own."""
+        """Return the QP's numbers, in new arrays."""
         layout, kernel = self.layout, self._kernel
         asked.load(kernel)
         kernel()
@@ -144,7 +144,7 @@ def linear_function(layout: Layout) -> Bound:
     Arguments are ``StepGraph.inputs``. Results: quantities (M,), strokes (n_a,); tip error, rate (n_e,) and J_u
     (n_e, 3K); curvature of the progress; offsets (3, V) and base axes (3, 2) of the curve; and, one block a tracked
     station, gaps (3, K), turns (R, K), their rows over the stations' nodes (R, 9 K) and over the curve
-    (``StationSymbols.curve``); last, what the arm's motion rows are made of.
+    (``StationSymbols.curve``); last, the values of ``Arm.motion_rows``.
     """
     constants = Constants()
     graph = StepGraph(layout, layout.arm.symbols(constants), constants)

@@ -1,4 +1,4 @@
-"""The numbers of one step's QP, in the terms of the arm: what both the full and the condensed form are filled from."""
+"""The numbers of one step's QP in the arm's terms, from which its full and condensed forms are filled."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ClearanceRows:
     ``nodes`` (R, 4) are node indices: the two ends of the member, then those of the other member in a self pair
     (repeated with zero coefficients otherwise); with offset joints (R, 12), the triangles of those four ends.
     ``coefficients`` is (R, 4, 3) or (R, 12, 3). Base nodes may occur; their displacement is already part of ``lower``.
-    So many of the rows were supplied ``by_fcl``, and so many ``by_formula``; the others are of angles.
+    ``by_fcl`` and ``by_formula`` count the rows that FCL and closed forms supplied; the other rows are of angles.
     """
 
     nodes: Index = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))
@@ -36,7 +36,7 @@ class ClearanceRows:
         return len(self.lower)
 
     def after(self, displacement: Array) -> ClearanceRows:
-        """Return the rows with a known displacement (N, 3), m, of some nodes taken out of them."""
+        """Return the rows over the displacements that remain after a known `displacement` (N, 3), m, of the nodes."""
         known = np.einsum("rsc,rsc->r", self.coefficients, displacement[self.nodes])
         return replace(self, lower=self.lower - known)
 
@@ -65,7 +65,7 @@ class ClearanceRows:
 
 
 class Legs(NamedTuple):
-    """The legs of the control polygon that may not turn round: axes . (displacement of their ends) >= lower, in m.
+    """The legs of the control polygon that must not reverse: axes . (displacement of their ends) >= lower, in m.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class StepNumbers(RowNumbers):
     position_rhs : (K, 3)
     tangent_face : (K, R, 9)
     tangent_curve : (K, 2, 3)
-        Or (K, R, D) over d_c, where the curve is more than its tables.
+        Or (K, R, D) over d_c, for curves that constant tables do not describe.
     tangent_rhs : (K, R)
     vertex_gradient : (V, 3)
     base_displacement : (3,)
@@ -146,7 +146,7 @@ class StepNumbers(RowNumbers):
     base_rhs : (2,)
     spacing_rhs : (S,)
     curve : CurveRows or None
-        In the place of the curve's tables, where ``Layout.general`` is given.
+        Replaces the curve's tables if ``Layout.general`` is given.
     """
 
     motion: MotionRows
@@ -162,7 +162,7 @@ class StepNumbers(RowNumbers):
     curve: CurveRows | None = None
 
     def curve_rows(self, layout: Layout) -> tuple[Array, Array]:
-        """Return what d_c does to points and turns at the curve's nodes: (3 K, D) and (R K, D)."""
+        """Return the rows of points (3 K, D) and turns (R K, D) at the curve's nodes over d_c."""
         if self.curve is not None:
             position, turn = self.curve.position_rows, self.tangent_curve
         else:
@@ -178,8 +178,8 @@ _SLACK_CURVATURE, _LEAST_PENALTY = 1e-5, 0.1
 def slack_curvature(penalty: float) -> float:
     """Return the curvature of the slacks of an elastic tip, for solvers of strictly convex QPs.
 
-    Their penalty itself is linear. The curvature goes with it: a dual method starts at the slack of no constraints,
-    their ratio, whose rounding is what is left of the rows' accuracy.
+    The penalty itself is linear. A dual method starts at the unconstrained minimum, where a slack is the ratio of
+    penalty and curvature: its rounding limits the accuracy of the rows, so that the curvature is scaled by the penalty.
     """
     return _SLACK_CURVATURE * max(penalty, _LEAST_PENALTY)
 
@@ -194,5 +194,5 @@ def norm(vector: Array) -> float:
 
 
 def beyond(values: Array, lower: Array, upper: Array) -> Array:
-    """Return by how much values are out of their bounds, with sign."""
+    """Return the signed violations of the bounds by `values`."""
     return np.asarray(values - np.minimum(np.maximum(values, lower), upper))

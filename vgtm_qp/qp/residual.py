@@ -14,27 +14,27 @@ if TYPE_CHECKING:
 
 
 TOLERANCE = 1e-6
-"""Greatest residual of an answer: m or rad, and for the dual one relative to the objective's forces.
+"""Greatest residual of an answer, in m or rad; the dual residual is relative to the objective's forces.
 
-DAQP and the eliminations stay below 1e-12. This is what OSQP can keep, too: what it leaves is closed afterwards, and
-the state that comes of it is checked by itself, to 1e-10 m.
+DAQP and the eliminations stay below 1e-12. OSQP reaches this value: settling removes the rest, and the new state is
+checked separately, to 1e-10 m.
 """
 
 
 class FailedStepError(SolverError):
-    """The QP of a step has no answer, or none was found that is good enough.
+    """The QP of a step has no answer, or no accurate one was found.
 
     Attributes
     ----------
     qp : StepQP or None
-        The QP that failed, built when it is asked for.
+        The QP that failed, built on first access.
     """
 
     build: Callable[[], StepQP] | None = None
 
     @property
     def qp(self) -> StepQP | None:
-        """The QP that failed; None where nobody kept it."""
+        """The QP that failed; None if it is unknown."""
         return None if self.build is None else self.build()
 
 
@@ -43,7 +43,7 @@ class InfeasibleStepError(FailedStepError):
 
 
 class AnswerError(FailedStepError):
-    """A solver gave no answer that is good enough, which says nothing about the step."""
+    """A solver gave no accurate answer, which does not mean that the step is infeasible."""
 
 
 class NoAnswerError(AnswerError, InfeasibleStepError):
@@ -51,7 +51,7 @@ class NoAnswerError(AnswerError, InfeasibleStepError):
 
 
 def relative(stationarity: float, *forces: Array) -> float:
-    """Return the norm of what is left of stationarity, relative to those of the objective's forces and multipliers."""
+    """Return the norm of the stationarity residual, relative to the norms of objective forces and multipliers."""
     return stationarity / (1.0 + sum(norm(force) for force in forces))
 
 
@@ -63,7 +63,7 @@ def refuse_large(primal: float, dual: float, solver: str) -> None:
     primal, dual
         See :func:`vgtm_qp.qp.numbers.beyond` and :func:`relative`.
     solver
-        What gave the answer, and how it ended.
+        Name of the solver and its exit status.
     """
     if not (primal <= TOLERANCE and dual <= TOLERANCE):
         raise AnswerError(

@@ -1,8 +1,8 @@
-"""The small correction after a step's QP: the tip back onto its path without solving another one.
+"""The small correction after a step's QP: the tip returns to its path without another QP.
 
-The QP was linearised at the guessed middle of the step, so what is left after it is of third order. It is removed by
-Newton iterations whose Jacobian is kept: the least motion of the nodes, in the QP's metric, that moves the tip by the
-error while actuators at a bound stay there. Clearance rows need no part in it: their margin is larger than the motion.
+The QP was linearised at the predicted middle of the step, so that the remaining tip error is of third order. Newton
+iterations with a constant Jacobian remove it: the least motion of the nodes, in the QP's metric, that moves the tip by
+the error while actuators at a bound stay there. Clearance rows can be left out: their margin exceeds the motion.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from vgtm_qp.arrays import Array
 WORST_CONDITION = 1e8
 SETTLING_STEPS = 6
 SETTLED = 1e-11
-"""A tip this near to its goal gains nothing by being settled once more, m or rad."""
+"""Tip error below which settling stops, m or rad."""
 
 LEFT = 1e-8
-"""A rest of the tip's way, m or rad, that is none."""
+"""Remaining path of the tip, m or rad, that counts as zero."""
 
 AT_BOUND = 1e-6
-"""An actuator nearer than this to a bound counts as held there, m."""
+"""Distance from a bound below which an actuator counts as held there, m."""
 
 
 def held(displacement: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """Return which actuators (n_a,) a QP left at a bound; by where they are, since multipliers may vanish there."""
+    """Return which actuators (n_a,) a QP left at a bound, by their position: multipliers may vanish there."""
     return np.asarray((displacement < lower + AT_BOUND) | (displacement > upper - AT_BOUND))
 
 

@@ -1,4 +1,4 @@
-"""Rows of a curve that are more than constant tables: nodes by arc length, torsion, spacing (sections 4.3-4.4)."""
+"""Rows of curves that constant tables do not describe: nodes by arc length, torsion, spacing (sections 4.3-4.4)."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class CurveRows(NamedTuple):
     position, position_rows : (K, 3), (K, 3, D)
         r(s_k), m.
     frame, spin_rows : (K, 3, 3), (K, 3, D)
-        F(s_k), its third column the tangent, and its angular velocity; without roll, the tangent and its turning.
+        F(s_k), its third column the tangent, and its angular velocity; without roll, those of the tangent.
     spacing, spacing_rows : (S,), (S, D)
-        Distances of successive nodes less those at home, m, from the base on; S = 0 where nobody asks.
+        Distances of successive nodes less those at home, m, from the base on; S = 0 without that objective.
     """
 
     position: Array
@@ -36,7 +36,7 @@ class CurveRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CurveShape:
-    """How a curve's nodes are placed on it and what of its frame the faces track.
+    """How a curve's nodes are placed on it, and how much of its frame the stations track.
 
     Attributes
     ----------
@@ -48,9 +48,9 @@ class CurveShape:
     torsion : int
         Number T of torsion coordinates.
     roll : (K,)
-        Angle about the tangent from the curve's frame to the face at home, rad; kept where faces track roll.
+        Angle about the tangent from the curve's frame to the station at home, rad; kept if stations track roll.
     tracks_roll : bool
-        Whether the third turn of a face is a row of the QP.
+        Whether the third turn of a station is a row of the QP.
     spacing : (S,)
         Distances of successive nodes at home, the base first, m; S = K, or 0 without that objective.
     """
@@ -65,12 +65,12 @@ class CurveShape:
 
     @property
     def is_plain(self) -> bool:
-        """Whether constant tables of weights at the nodes say all there is."""
+        """Whether constant tables of weights at the nodes describe the curve."""
         return not (self.by_arc_length or self.tracks_roll or self.torsion or self.spacing is not None)
 
     @property
     def turns(self) -> int:
-        """Turns of a face that are tracked: two tilts, and the roll if it is."""
+        """Number of turns that a station tracks: two tilts, and the roll with `tracks_roll`."""
         return 3 if self.tracks_roll else 2
 
     @property
@@ -80,7 +80,7 @@ class CurveShape:
 
     @property
     def parameters(self) -> Array:
-        """(K,) parameters for tables of weights; those of arc-length nodes are found anew at each curve."""
+        """(K,) parameters of the tables of weights; nodes by arc length are located again on each curve."""
         return self.nodes
 
     @cached_property
@@ -110,7 +110,7 @@ class CurveShape:
         if self.tracks_roll:
             frame, spin_rows = curve.frame(s) @ self._home_roll, curve.orientation_jacobian(s)
         else:
-            # Without roll only the tangent turns, and the integrals along the curve can be spared.
+            # Without roll only the tangent turns, and no integrals along the curve are needed.
             frame, tangent = np.zeros((len(s), 3, 3)), curve.tangent(s)
             frame[:, :, 2] = tangent
             turned = np.cross(tangent[:, None, :], np.swapaxes(curve.tangent_jacobian(s), 1, 2))

@@ -1,7 +1,7 @@
 """QP solvers by name.
 
-DAQP answers the condensed QP, or goes along the chain of bays where the arm is long; PIQP, OSQP or anything else of
-qpsolvers answers the full QP.
+DAQP solves the condensed QP, for long arms by eliminations along the chain of bays; PIQP, OSQP and the solvers of
+qpsolvers solve the full QP.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class StepSolver(Protocol):
     Attributes
     ----------
     knows_gain : bool
-        Whether :meth:`gain` says how actuators bring the tip to its goal.
+        Whether :meth:`gain` may return an array.
     """
 
     knows_gain: bool
@@ -42,7 +42,7 @@ class StepSolver(Protocol):
         ...
 
     def gain(self, held: NDArray[np.bool_]) -> Array | None:
-        """Return the least changes (n_a, n_e) of the actuators per unit of tip error, `held` ones (n_a,) resting."""
+        """Return the least changes (n_a, n_e) of the actuators per unit of tip error; `held` ones (n_a,) rest."""
         ...
 
 
@@ -53,7 +53,7 @@ class _Answer(Protocol):
 
 
 def available_solvers() -> list[str]:
-    """Return the names that `make_solver` takes here, the default first."""
+    """Return the names that `make_solver` accepts, the default first."""
     import qpsolvers
 
     return [DEFAULT_SOLVER, *sorted({"osqp", "piqp", *qpsolvers.sparse_solvers} - {DEFAULT_SOLVER})]
@@ -83,7 +83,7 @@ def make_solver(name: str, layout: Layout) -> StepSolver:
 
 
 class FullSolver:
-    """Builds the full QP, lets a solver answer, and checks the residuals whatever status came with the answer."""
+    """Builds the full QP, has it solved, and checks the residuals whatever the solver's status."""
 
     knows_gain = False
 
@@ -112,7 +112,7 @@ class FullSolver:
         scale = relative(1.0, qp.q, y)
         dual = max(scale * qp.dual_residual(z, y, w), qp.complementarity_residual(z, scale * y, scale * w))
         refuse_large(qp.primal_residual(z), dual, self._name)
-        # Only a good answer is a warm start: NaN would stay in the solver for ever.
+        # Only an accurate answer is a warm start: NaN would stay in the solver for ever.
         self._structure = self.builder.structure
         return self.builder.solution(z, y, w, iterations)
 
@@ -202,7 +202,7 @@ class _Piqp:
             solver = piqp.SparseSolver()
             solver.settings.eps_abs = 1e-10
             solver.settings.eps_rel = 1e-12
-            # Complementarity, too, must be good enough to tell an active row from one that nearly is.
+            # The complementarity gap must be small enough to tell an active row from a nearly active one.
             solver.settings.eps_duality_gap_abs = 1e-13
             solver.settings.eps_duality_gap_rel = 1e-13
             solver.settings.verbose = False
@@ -227,7 +227,7 @@ _TIGHT: Mapping[str, Mapping[str, float]] = {
     "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9},
     "scs": {"eps_abs": 1e-9, "eps_rel": 1e-9},
 }
-"""What solvers are told so that their answers pass the residual check, which their own defaults would not."""
+"""Options with which solvers' answers pass the residual check; by their defaults they would not."""
 
 
 class _QpSolvers:

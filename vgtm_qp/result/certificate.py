@@ -1,4 +1,4 @@
-"""What a verification found: each measured quantity beside the tolerance that it was held against."""
+"""The result of a verification: each measured quantity with its tolerance."""
 
 from __future__ import annotations
 
@@ -96,8 +96,7 @@ class Certificate:
         Greatest distance of the curve's end from the end effector, m, and angle between their directions, rad, where
         the method ties them.
     fcl_rows, exact_rows : Measure
-        How many clearance rows the solver had of FCL, and how many of closed forms: its own count, which the states
-        cannot show.
+        Numbers of the solver's clearance rows by FCL and by closed forms: its own count, which states cannot confirm.
     contradictions, notes : tuple of str
         What in the file disagrees with itself or with its problem, and what could not be checked, one line each.
     """

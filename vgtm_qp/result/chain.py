@@ -170,7 +170,7 @@ class RecordedChain:
         """Return (P,) a bound, m, of |d2 r / d share2| of any point of the links as the configuration moves straight.
 
         A point's velocity is a sum over the joints before it of w a x (r - o) and v a. The axes a turn with the joints
-        before them, and r - o changes by no more than what the joints from there on do to it.
+        before them, and r - o changes only by the joints from there on.
         """
         joints = np.abs(after - before)[: len(self.quantity_names)]
         turn, slide = np.where(self.revolute, joints, 0.0), np.where(self.revolute, 0.0, joints)
@@ -181,11 +181,11 @@ class RecordedChain:
         return np.full(len(link), turn @ (2.0 * earlier * self._reaches + beyond) + slide @ earlier)
 
     def _greatest_reaches(self) -> Array:
-        """Return (J + 1,) how far the tip may be from the base and from each joint, m."""
-        ways = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
+        """Return (J + 1,) bounds of the distance from the base, and from each joint, to the tip, m."""
+        links = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
         slides = np.where(self.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
-        after = np.cumsum((ways[1:] + slides)[::-1])[::-1]
-        return np.concatenate([[after[0] + ways[0]], after])
+        after = np.cumsum((links[1:] + slides)[::-1])[::-1]
+        return np.concatenate([[after[0] + links[0]], after])
 
 
 def same(recorded: ArrayLike, given: ArrayLike) -> bool:

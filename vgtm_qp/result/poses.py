@@ -1,4 +1,4 @@
-"""Rotations, and where the problem holds the base: for what is checked without the code that moved the arm."""
+"""Rotations, and the base's poses by the problem, for checks without the code that moved the arm."""
 
 from __future__ import annotations
 

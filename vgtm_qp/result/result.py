@@ -1,4 +1,4 @@
-"""The result of a maneuver as data: every accepted state, and the manifest that says what they belong to."""
+"""The result of a maneuver as data: every accepted state, and the manifest of problem, arm and outcome."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Result:
     control_vertices : (T, V, 3)
         Control vertices of the reference curve, m; V = 0 without a curve.
     tip_position, tip_rotation, tip_target_position : (T, 3), (T, 3, 3), (T, 3)
-        Pose of the end effector and the target that each state was accepted for, m.
+        Pose of the end effector, and the target for which each state was accepted, m.
     clearance, self_clearance : (T,)
         Least distance to obstacles, and between members that share no node, m; infinite if nothing is near.
     progress : (T,)

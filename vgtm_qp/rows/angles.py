@@ -7,7 +7,7 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 
 _LEAST_SINE = 1e-6
-"""The gradient of an angle is infinite where the bodies are parallel: its denominator is no smaller."""
+"""Least denominator of an angle's gradient, which is infinite for parallel bodies."""
 
 
 def angles(first: Array, second: Array) -> Array:

@@ -21,7 +21,7 @@ def clearance_rows(
     """Return coefficients (R, 4, 3) and lower bounds (R,), m, of the rows of R contacts.
 
     Row r is ``sum_k coefficients[r, k] . d x_k >= lower[r]`` over the displacements d x_k of the contact's four
-    points, m: the gradient of the distance on the left, what the distance lacks on the right.
+    points, m: the gradient of the distance on the left, the missing clearance on the right.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def clearance_rows(
     is_self : (R,) bool
         Whether `self_safe` is to be kept instead of `safe`.
     safe, self_safe, margin : float
-        Distance to keep from obstacles and between bodies, and what is kept more than that, m.
+        Distance to keep from obstacles and between bodies, and a margin added to both, m.
     fraction : float
         Where on the straight path to the end of the step the contacts were found: a displacement of the end state
         moves that point by this share of it.

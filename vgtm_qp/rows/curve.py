@@ -1,4 +1,4 @@
-"""Where the reference curve begins, eq. (37)'s counterpart at the base, and what its free coordinates are."""
+"""The base of the reference curve, the counterpart of eq. (37) there, and its free coordinates."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
 def legs(vertices: Array, normal: Array, *, both: bool) -> tuple[Array, Array]:
     """Return axes (G, 3) and lengths (G,), m, along them, of the first leg of the control polygon, and of the last.
 
-    The first lies along the base's `normal` (3,), the last along itself. A leg of no length is about to turn round, and
-    the curve with it.
+    The axis of the first is the base's `normal` (3,), that of the last its own direction. A leg must not shrink to zero
+    length: it would reverse, and the curve with it.
     """
     axes, lengths = [normal], [float((vertices[1] - vertices[0]) @ normal)]
     if both:
@@ -39,7 +39,7 @@ def legs(vertices: Array, normal: Array, *, both: bool) -> tuple[Array, Array]:
 
 
 def free_basis(normal: Array, size: int) -> Array:
-    """Return (D, q) what the coordinates that the base leaves free do to all D of them; q = 0 without a curve."""
+    """Return (D, q) the derivative of all D coordinates by the q that the base leaves free; q = 0 without a curve."""
     basis = np.eye(size)[:, 5:]
     basis[:6] = 0.0
     if size:
@@ -50,7 +50,7 @@ def free_basis(normal: Array, size: int) -> Array:
 def free_columns(rows: Any, normal: Any) -> Any:
     """Return (R, q) rows over the coordinates that the base leaves free, from rows (R, 3 V + T) over all.
 
-    p_1 moves along the base normal (3,), all later control vertices and the torsion as they like.
+    p_1 moves along the base normal (3,); all later control vertices and the torsion are free.
     """
     return ca.horzcat(rows[:, 3:6] @ normal, rows[:, 6:])
 

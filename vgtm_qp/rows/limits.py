@@ -1,4 +1,4 @@
-"""Stroke, rate and acceleration of each actuator as one box that never contradicts itself, and what binds it."""
+"""Stroke, rate and acceleration of each actuator as one box that is never empty, and the limits that set it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
         gap = np.maximum(distance, 0.0)
         steps = np.maximum(np.ceil((np.sqrt(1.0 + 8.0 * gap / (acceleration * dt * dt)) - 1.0) / 2.0), 1.0)
         speed = gap / (steps * dt) + acceleration * dt * (steps - 1.0) / 2.0
-    # A joint without limits has all the distance there is.
+    # A joint without limits has an infinite distance.
     return np.asarray(np.where(np.isfinite(acceleration) & np.isfinite(gap), speed, np.inf))
 
 
@@ -55,12 +55,12 @@ def actuator_box(
         least, greatest = speed - acceleration * interval, speed + acceleration * interval
     lower = np.maximum(low, value + np.clip(least, slowest, fastest) * dt)
     upper = np.minimum(high, value + np.clip(greatest, slowest, fastest) * dt)
-    # Where both mean the same value, rounding must not set them in the wrong order.
+    # Where both bounds are the same value, rounding must not swap them.
     return lower, np.maximum(lower, upper)
 
 
 _SAME = 1e-9
-"""Bounds that differ by less are one."""
+"""Bounds that differ by less are equal."""
 
 LOCKED, STROKE, RATE, ACCELERATION = "locked", "stroke", "rate", "acceleration"
 
@@ -68,18 +68,18 @@ LOCKED, STROKE, RATE, ACCELERATION = "locked", "stroke", "rate", "acceleration"
 def binding(
     bound: Array, end: Array, fastest: Array, acceleration: Array, locked: NDArray[np.bool_]
 ) -> list[str]:
-    """Return what sets one side of each actuator's box: ``"locked"``, ``"stroke"``, ``"rate"`` or ``"acceleration"``.
+    """Return the limit that sets a side of each actuator's box: "locked", "stroke", "rate" or "acceleration".
 
     Parameters
     ----------
     bound, end, fastest : (n_a,)
-        The side of the box, the end of the stroke there, and where the greatest rate leads.
+        The side of the box, the end of the stroke there, and the value that the greatest rate reaches.
     acceleration : (n_a,)
         Limits; inf where there is none.
     locked : (n_a,) bool
-        Actuators that are stuck.
+        Actuators that are locked.
     """
-    # Actuators without a limited acceleration that stop short slow down before the end of their stroke.
+    # Without a limited acceleration, only slowing before the end of the stroke gives a smaller bound.
     other = np.where(np.isinf(acceleration), STROKE, ACCELERATION)
     kind = np.where(np.abs(bound - fastest) < _SAME, RATE, other)
     kind = np.where(np.abs(bound - end) < _SAME, STROKE, kind)

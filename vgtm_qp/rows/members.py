@@ -1,7 +1,7 @@
 """Rows of members: ends, lengths and their gradients, and the length Jacobian, eqs. (12)-(15) and (19)-(24).
 
-What is mapped over members is in symbols; the ends of all members are there in arrays, too, so that what was accepted
-can be measured by other arithmetic than it was found by.
+Functions that are mapped over members are in symbols. The ends of all members exist in arrays too, so that an accepted
+state can be measured by other code than the code that made it.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def end_function() -> ca.Function:
 
 
 def joint_frames(X: Array, triangle: Index) -> Array:
-    """Return (N, 3, 3) what :func:`joint_frame` does, in arrays: of triangles (N, 3) of nodes at `X` (N, 3), m."""
+    """Return (N, 3, 3) joint frames as :func:`joint_frame` in arrays: of triangles (N, 3) of nodes `X` (N, 3), m."""
     corner = X[triangle]
     first, second = _units(corner[:, 1] - corner[:, 0]), _units(corner[:, 2] - corner[:, 0])
     z, x = _units(np.cross(first, second)), _units(-(first + second))
@@ -75,7 +75,7 @@ def _units(vectors: Array) -> Array:
 
 
 def member_ends(X: Array, members: Index, triangle: Index, offset: Array) -> Array:
-    """Return (M, 2, 3) what :func:`member_end` does, in arrays: the ends of members (M, 2) in offset joints, m.
+    """Return (M, 2, 3) the ends of members (M, 2) in offset joints, m, as :func:`member_end` in arrays.
 
     `triangle` (N, 3) are the nodes that orient each node's joint, `offset` (M, 2, 3) the ends in those frames.
     """
@@ -91,15 +91,15 @@ def length_nodes(members: Index, triangle: Index | None) -> Index:
 
 
 def fixed_error(lengths: Any, home: Any, actuated: Mask) -> Any:
-    """Return (M, 1) what fixed members lack of their constant lengths, eq. (14), m; zero for actuated ones."""
+    """Return (M, 1) the length errors of fixed members, eq. (14), m; zero for actuated ones."""
     return ca.DM((~actuated).astype(float)) * (home - lengths)
 
 
 def length_rhs(error: Any, gradients: Any, moved: Any, nodes: Index) -> Any:
     """Return (M, 1) the right-hand sides of J d_rho - E d_a = rhs, eq. (22) beside the actuated members' rows, m.
 
-    What lengths lack, `error` (M, 1), less what the base's displacement `moved` (3, N) gives them. `gradients`
-    (3 Q M, 1) are those of the lengths by their nodes (M, Q).
+    The length errors `error` (M, 1) less the changes by the base's displacement `moved` (3, N). `gradients` (3 Q M, 1)
+    are those of the lengths by their nodes (M, Q).
     """
     terms = gradients * ca.vec(moved[:, nodes.reshape(-1).tolist()])
     return error - ca.sum1(ca.reshape(terms, 3 * nodes.shape[1], len(nodes))).T
@@ -152,6 +152,6 @@ class LengthScatter:
         )
 
     def base_rate(self, gradient: Array, displacement: Array) -> Array:
-        """Return (M,) what a displacement (N, 3) of the base nodes alone does to the lengths, eq. (23) negated."""
+        """Return (M,) the changes of the lengths by a displacement (N, 3) of the base nodes alone, eq. (23) negated."""
         moved = displacement[self._nodes] * self._is_base[..., None]
         return np.asarray(np.einsum("mqc,mqc->m", gradient, moved))

@@ -21,28 +21,28 @@ _ROWS = {
 _AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
 
 _TINY = 1e-30
-"""A square that keeps the root of another one smooth at zero."""
+"""Added under a square root to keep it smooth at zero."""
 
 SHORT_WAY = 0.01
-"""A way of the tip in a step, m, below which progress along it counts more.
+"""Displacement of the tip in a step, m, below which its progress has a larger weight.
 
-Progress is weighted by the square of the way. The other objectives pull with forces that do not shrink with the way, so
-that by its square alone the last micrometres would never be covered: below this it is way * SHORT_WAY. Where the path
-stands still progress costs nothing, and any positive number serves.
+The weight is the square of the displacement. The other objectives have forces that do not shrink with it, so that with
+the square alone the last micrometres would never be covered: below this value the weight is displacement * SHORT_WAY.
+On a path of zero length progress costs nothing, and any positive weight will do.
 """
 
 CLOSED = 2e-8
-"""A tip error of a state that a motion need not close, m or rad: within what an accepted state may have."""
+"""Tip error that a motion need not close, m or rad: within the tolerance of an accepted state."""
 
 _OPPOSITE = 1e-9
-"""A direction that is no further than this from the opposite one, rad, is reached by half a turn about any axis."""
+"""Angle from the opposite direction, rad, below which half a turn about any axis will do."""
 
 _HALF_TURN = 1e-4
-"""Sine of a turn near half a one below which its axis is taken from the symmetric part of the rotation."""
+"""Sine of a turn near half a turn below which its axis is that of the rotation's symmetric part."""
 
 
 class TipGoal(NamedTuple):
-    """A pose that the end effector is to have, and its rates.
+    """A goal pose of the end effector, and its rates.
 
     Attributes
     ----------
@@ -102,8 +102,8 @@ def turned_axes(rows: Sequence[str], rotation: Any) -> Any:
 def combined(rows: Sequence[str], position: Any, spin: Any, rotation: Any) -> Any:
     """Return the rows (n_e, n) of the end effector's rate, eqs. (3), (4) and (16)-(18): J, that is [J_u J_c].
 
-    They are made of the tip's velocity and angular velocity (3, n) each by n coordinates. Goals that move are combined
-    in the same way: x_e-dot.
+    Given are the derivatives (3, n) of the tip's velocity and angular velocity by the rates of n coordinates. The rates
+    of a moving goal, x_e-dot, are combined in the same way.
     """
     return ca.vertcat(position[axes(rows), :], turned_axes(rows, rotation) @ spin)
 
@@ -111,11 +111,11 @@ def combined(rows: Sequence[str], position: Any, spin: Any, rotation: Any) -> An
 def error(rows: Sequence[str], position: Any, rotation: Any, goal: Any, turned: Any) -> Any:
     """Return (n_e, 1) goal minus value, eq. (11), m and rad: the pose `goal` (3,), `turned` (3, 3) less the tip's.
 
-    The turn is the rotation vector of the shortest way to the goal's direction, or to its orientation.
+    The turn is the vector of the smallest rotation to the goal's direction, or to its orientation.
     """
     if "tip direction 1" in rows:
         twist, cosine = ca.cross(rotation[:, 2], turned[:, 2]), ca.dot(rotation[:, 2], turned[:, 2])
-        # Towards the opposite direction every way is as long: about the tip's own x-axis.
+        # All turns to the opposite direction are equal: the tip's own x-axis is the axis.
         turn = _turn(twist, cosine, _OPPOSITE, rotation[:, 0])
     elif "tip rotation x" in rows:
         relative = turned @ rotation.T
@@ -129,7 +129,7 @@ def error(rows: Sequence[str], position: Any, rotation: Any, goal: Any, turned: 
 def _turn(twist: Any, cosine: Any, least: float, axis: Any) -> Any:
     """Return the turn (3,) of a `twist` (3,), its axis times its sine; about `axis` (3,) if near half a turn.
 
-    That is where the sine is below `least`, so that the twist does not say what its axis is.
+    There the sine is below `least`, and the twist too small to show its axis.
     """
     sine = ca.sqrt(ca.dot(twist, twist) + _TINY)
     angle = ca.atan2(sine, cosine)
@@ -148,28 +148,28 @@ def _axis(rotation: Any, twist: Any, cosine: Any) -> Any:
 
 
 def worth_closing(error: Any, motion: Any) -> Any:
-    """Return an error (n_e, 1), or zeros where a motion (1) finds it within what an accepted state may have.
+    """Return an error (n_e, 1), or zeros in a motion (1) if it is within the tolerance of an accepted state.
 
-    An arm that is held on all sides cannot close even that: its QP would have no solution, where staying as it is has
-    one whose multipliers say what holds it.
+    An arm held on all sides cannot close even such an error, and its QP would be infeasible. With zeros, resting is
+    feasible, and the multipliers show the rows that hold the arm.
     """
     closed = ca.logic_and(motion > 0, ca.norm_inf(error) <= CLOSED)
     return ca.if_else(closed, ca.DM.zeros(*error.shape), error)
 
 
 def progress_weight(rate: Any) -> Any:
-    """Return what the progress along the path is weighted by, m^2, from the tip's way (n_e, 1) in the step.
+    """Return the weight of the progress along the path, m^2, from the tip's displacement (n_e, 1) over it.
 
-    The square of the way; see :data:`SHORT_WAY`. Where the path stands still any positive number serves.
+    It is the square of the displacement, except for short ones, see :data:`SHORT_WAY`.
     """
     way = ca.norm_2(rate)
     return ca.if_else(way > 1e-6, way * ca.fmax(way, SHORT_WAY), 1.0)
 
 
 def progress_gradient(curvature: Any, progress: Any) -> Any:
-    """Return the objective's slope along the progress, m^2, where so much of it is made.
+    """Return the objective's derivative by the progress, m^2, at a `progress`.
 
-    It pulls towards a progress of 2, so that the end of the piece, at 1, is never its minimum but a bound.
+    The minimum is at a progress of 2, so that the end of the piece, at 1, is always an active bound.
     """
     return curvature * (progress - 2.0)
 

@@ -13,11 +13,11 @@ def gap(centre: Any, point: Any) -> Any:
 
 
 def turns(rotation: Any, frame: Any, count: int) -> tuple[Any, Any]:
-    """Return the turns (R,) between a station's and the curve's frame (3, 3), and c (R, 3): eq. (39) for theta(s, p).
+    """Return the turns (R,) between a station's and the curve's frame (3, 3), and c (R, 3).
 
-    The first two are cosines between the station's x- and y-axes and the tangent, the third the sine of the roll. Each
-    is a function of the relative rotation alone: its rate is c . (angular velocity of the station less that of the
-    curve's frame).
+    They are eq. (39) for theta(s, p). The first two are cosines between the station's x- and y-axes and the tangent,
+    the third the sine of the roll. Each depends on the relative rotation alone: its rate is c . (angular velocity of
+    the station less that of the curve's frame).
     """
     x, y, tangent = rotation[:, 0], rotation[:, 1], frame[:, 2]
     residual = [ca.dot(x, tangent), ca.dot(y, tangent)]

@@ -1,7 +1,7 @@
-"""A state is held once more against what it must be, by other means than those that made it.
+"""Acceptance of a new state: its constraints are checked again, by other code than the code that made it.
 
-What settles a configuration also measures it. If that measure is wrong for any reason, the state is: so the
-configuration is the only thing used of it here, and quantities and tip are found from that anew.
+The engine that settles a configuration also measures it, and an error in that measure would go unnoticed. Here only
+the configuration is used: quantities and tip are computed from it again.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.target import Target, base_frame
 
 _LOOSER = 10.0
-"""What was settled to a tolerance is refused from so many times that on.
+"""A state is refused from this many times the tolerance of settling on.
 
-Rounding never decides then, and what is published of a state still holds.
+Rounding then never decides, and the published tolerances still hold.
 """
 
 _ROUNDING = 64.0 * float(np.finfo(float).eps)
-"""Of the configuration's norm: quantities found in two ways differ by no more."""
+"""Greatest rounding difference between two computations of a quantity, relative to the configuration's norm."""
 
 
 class Acceptance:
-    """Holds states of one arm, settled to an accuracy, against its quantities, limits and goals."""
+    """Checks states of one arm, settled to an accuracy, for their quantities, limits and goals."""
 
     def __init__(self, setup: Setup, accuracy: Accuracy) -> None:
         self._arm, self._kinematics, self._task = setup.arm, setup.kinematics, setup.task
         base, self._actuators = np.flatnonzero(setup.arm.base), setup.arm.actuators
-        # A slice costs less than a choice of rows, and base nodes come first as a rule.
+        # Base nodes usually come first, and a slice is cheaper than an index array.
         is_first = np.array_equal(base, np.arange(len(base)))
         self._base: slice | NDArray[np.int64] = slice(len(base)) if is_first else base
         self._least, self._greatest = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
@@ -57,17 +57,17 @@ class Acceptance:
         """Return what is wrong with a configuration and its curve (V, 3), m, and (T,), rad, or an empty string.
 
         `before` is the configuration of the state before; the limits and the base are those of the `target`. `goal` is
-        that of the tip, None for one that need not be anywhere. A tip with a direction overwrites the kinematics.
+        that of the tip, None for a free tip. A tip with a direction overwrites the kinematics.
         """
         arm, q, base = self._arm, closed.q, target.base
-        # NaN passes no comparison with `<=`, and is in every norm.
+        # NaN fails every comparison with `<=`, and makes every norm NaN.
         size = norm(q.reshape(-1))
         curve = norm(vertices.reshape(-1)) + (norm(torsion) if len(torsion) else 0.0)
         if not size + curve < math.inf:
             return "the new state is not finite"
         rounding = _ROUNDING * size
         X, at = arm.nodes(q), arm.nodes(before if base is None else arm.based(q, base))
-        # A base that rests is left alone by everything, so that it cannot drift either.
+        # Nothing moves a base at rest, so that its nodes must be equal, without a tolerance.
         spare = 0.0 if base is None else self._member + rounding
         off = norm((X[self._base] - at[self._base]).reshape(-1))
         if not off <= spare:
@@ -87,7 +87,7 @@ class Acceptance:
         return ""
 
     def _worst(self, errors: Array) -> str:
-        """Return which quantity is furthest off, and how far; of NaN the first."""
+        """Return the name and error of the quantity with the greatest error, or of the first NaN."""
         k = int(np.argmax(np.abs(errors)))
         return f"{self._arm.quantity_names[k]} {abs(errors[k]):.3g} m or rad"
 
@@ -100,9 +100,9 @@ class Acceptance:
 
 
 class TrackingError:
-    """Measures how far stations that are to stay on the curve exactly are from it; for a layout with hard rows.
+    """Measures how far stations with hard tracking rows are from the curve.
 
-    A linear row leaves a gap, a step must not.
+    A linear row leaves a gap after the step; an accepted state must have none.
     """
 
     def __init__(self, layout: Layout, kinematics: Kinematics) -> None:

@@ -17,37 +17,37 @@ Box = tuple[Array, Array]
 """Least and greatest values (n_a,) of the actuators after a step."""
 
 _APPROACH, _LEAST_APPROACH = 0.3, 2e-3
-"""Largest share of the distance to the end of its stroke that an actuator may use in one step, or this much, m."""
+"""Largest share of the distance to the end of its stroke that an actuator may use in one step, and least one, m."""
 
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 
 
 class Limits(NamedTuple):
-    """The box of the actuators after a step, and what its sides are made of.
+    """The box of the actuators after a step, and the limits that set its sides.
 
-    That is the value (n_a,) before the step, how far the greatest rate leads, the stroke (n_a, 2), the greatest
-    acceleration, and whether the actuator is held where it is.
+    These are the value (n_a,) before the step, the greatest `travel` by the rate, the stroke (n_a, 2), the greatest
+    acceleration, and whether the actuator is locked.
     """
 
     lower: Array
     upper: Array
     names: tuple[str, ...]
     value: Array
-    way: Array
+    travel: Array
     stroke: Array
     acceleration: Array
     held: NDArray[np.bool_]
 
     def name(self, k: int, *, upper: bool) -> str:
-        """Return the name of one side of the box of actuator `k`: what sets it, see ``rows.limits.binding``."""
-        one, way = slice(k, k + 1), self.way if upper else -self.way
-        bound, fastest = (self.upper if upper else self.lower)[one], (self.value + way)[one]
+        """Return the limit that sets one side of the box of actuator `k`, see ``rows.limits.binding``, and its name."""
+        one, travel = slice(k, k + 1), self.travel if upper else -self.travel
+        bound, fastest = (self.upper if upper else self.lower)[one], (self.value + travel)[one]
         end, rest = self.stroke[one, int(upper)], (self.acceleration[one], self.held[one])
         return f"{binding(bound, end, fastest, *rest)[0]}: {self.names[k]}"
 
     def of_stop(self) -> Limits:
-        """Return the same for what stops an arm: an actuator whose stroke is a point counts as locked."""
+        """Return these limits for the explanation of a stop: an actuator with a stroke of length zero is locked."""
         return self._replace(held=self.held | (self.stroke[:, 0] == self.stroke[:, 1]))
 
 
@@ -57,7 +57,7 @@ class Actuation:
     Attributes
     ----------
     names, locked
-        Names of all actuators (n_a,), and of those that are stuck by now.
+        Names of all actuators (n_a,), and of those locked so far.
     starts_at_once : bool
         Whether no acceleration is limited.
     """
@@ -106,7 +106,7 @@ class Actuation:
         return found
 
     def until_jam(self, time: float, dt: float) -> float:
-        """Return the share of a step of `dt` from `time`, s, that ends at the next jam, 1 where none is due."""
+        """Return the share of a step of `dt` from `time`, s, that ends at the next jam; 1 without a jam."""
         left = self._jams[-1][1] - time if self._jams else np.inf
         return left / dt if left < dt - _INSTANT else 1.0
 
@@ -118,7 +118,7 @@ class Actuation:
     def limits(self, state: State, dt: float, *, slowing: bool = False) -> Limits:
         """Return what limits a step of `dt`, s, from `state`.
 
-        With `slowing`, actuators slow down before the ends of their strokes if they do that at all.
+        With `slowing`, actuators slow down before the ends of their strokes, if the problem asks for it.
         """
         value, rates, stroke = self.values(state), state.rates.take(self._actuators), self._stroke
         ends = stroke, self._rate, self._acceleration
@@ -130,13 +130,13 @@ class Actuation:
         return Limits(lower, upper, self.names, value, self._rate * dt, *ends[::2], self._held)
 
     def creeping(self, state: State, box: Box, dt: float) -> Box | None:
-        """Return the part of a box after which every actuator may rest; None where there is none."""
+        """Return the part of a box from which every actuator can stop at once; None if there is none."""
         value, reach = self.values(state), (1.0 - 1e-9) * self._acceleration * dt * dt
         lower, upper = np.maximum(box[0], value - reach), np.minimum(box[1], value + reach)
         return (lower, upper) if np.all(lower <= upper) else None
 
 
 def _approach(distance: Array) -> Array:
-    """Return how far actuators that slow down move in one step at a `distance` (n_a,) before the end, m."""
+    """Return how far a slowing actuator may move in one step at a `distance` (n_a,) before the end, m."""
     distance = np.maximum(distance, 0.0)
     return np.asarray(np.maximum(_APPROACH * distance, np.minimum(distance, _LEAST_APPROACH)))

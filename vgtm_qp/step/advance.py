@@ -1,4 +1,4 @@
-"""How far a step gets: pieces of path are halved until one is accepted, and after which a moving arm can brake."""
+"""Pieces of path are halved until a step is accepted from which a moving arm can still brake."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from vgtm_qp.step.stops import CANNOT_BRAKE
 from vgtm_qp.step.target import Target
 
 _TRUST = 0.2
-"""An actuator moves by no more than this times the share of the step that is tried, m, where the whole one failed."""
+"""Greatest change of an actuator per share of the step, m, after the whole step failed."""
 
 _LONGER = 2.0
-"""An actuator between two nodes changes by no more than this times what each of them moves."""
+"""Greatest ratio of an actuator's change to the displacement of its nodes."""
 
 _BEYOND = 60.0
-"""An arm that is at the end of its path may brake beyond it, within so many times its last piece."""
+"""An arm at the end of its path may brake on its continuation, by this many times its last piece."""
 
 _INSTANT = 1e-9
 
@@ -33,19 +33,19 @@ _OFF_PATH = "the arm could brake after it only off its path"
 
 
 class Advance(NamedTuple):
-    """What came of a step over a piece of path, and how the arm brakes afterwards if it must."""
+    """The step over a piece of path, and the braking that follows it if the arm must brake."""
 
     step: Step
     braking: Braking | None
 
     @property
     def rank(self) -> int:
-        """Rank of the braking, 0 for an arm that need not brake."""
+        """Rank of the braking; 0 if the arm need not brake."""
         return 0 if self.braking is None else self.braking.rank
 
 
 class Advancer:
-    """Finds the step that an arm does along a piece of path."""
+    """Finds an acceptable step along a piece of path."""
 
     def __init__(self, attempt: Attempt, actuation: Actuation, shaping: Shaping) -> None:
         self._attempt, self._actuation, self._shaping = attempt, actuation, shaping
@@ -58,10 +58,10 @@ class Advancer:
     def first_accepted(
         self, state: State, target: Target, dt: float, smallest: float, worst: int = ANY_RANK
     ) -> Advance:
-        """Return the first attempt at a target or a share of its piece of path that is accepted, or else the last.
+        """Return the first accepted attempt at a target, or at a share of its piece of path; or else the last attempt.
 
-        An attempt after which the arm brakes in a better way comes before others. One of a rank beyond the `worst`, as
-        good as the arm could brake now, does not count. The step takes `dt`, s, and no share below `smallest` is tried.
+        Attempts with a lower rank of braking are preferred. Those with a rank above `worst`, the rank of braking at
+        once, are refused. The step takes `dt`, s; shares below `smallest` are not tried.
         """
         best: Advance | None = None
         too_long = ""
@@ -75,9 +75,9 @@ class Advancer:
         return best or Advance(_blocked(found.step, state, too_long or found.step.reason or _OFF_PATH), None)
 
     def _attempts(self, state: State, target: Target, dt: float, smallest: float) -> Iterator[Advance]:
-        """Yield the attempts at a target: the whole, halves of it where the tip may be slow, and creeping.
+        """Yield the attempts at a target: the whole piece, halves of it if the tip may slow down, and creeping.
 
-        Where nodes may move by no more than so much, the tip cannot either: a longer piece is not tried.
+        With a limit on the displacement of nodes, pieces longer than that limit are not tried.
         """
         values, box, limit = self._actuation.values(state), (target.lower, target.upper), self._step_limit
         is_slow, first = self._tip_mode == "scaled", 1.0
@@ -100,23 +100,23 @@ class Advancer:
                 yield self._try(state, replace(target, lower=slow[0], upper=slow[1]), dt)
 
     def _asked(self, target: Target) -> float:
-        """Return how far a target asks the tip to move, m."""
+        """Return the displacement of the tip that a target asks for, m."""
         path, axes = target.path, self._shaping.setup.task.axes
         asked = path.at(target.end).position - path.at(target.start).position
         return float(np.linalg.norm(asked[axes]))
 
     def _try_piece(self, state: State, target: Target, dt: float, share: float, box: Box) -> Advance:
-        """Return what comes of a step towards a `share` of a target with other limits."""
+        """Return a step towards a `share` of a target with the limits `box`."""
         end = target.start + share * (target.end - target.start)
         return self._try(state, replace(target, end=end, lower=box[0], upper=box[1]), dt, share)
 
     def _try(self, state: State, target: Target, dt: float, share: float = 1.0) -> Advance:
-        """Return what comes of a step towards a target, a `share` of the one whose progress counts."""
+        """Return a step towards a target that is a `share` of the one that progress refers to."""
         step = self._attempt.run(state, target, share)
         if not step.moved:
             return Advance(step, None)
         if step.progress < WHOLE and self._tip_mode != "scaled":
-            # The tip stays on time: no part of the path will do.
+            # The tip must stay on time: a part of the path is not enough.
             return Advance(_blocked(step, state, "the tip cannot stay on time"), None)
         braking: Braking | None = None
         if not self._actuation.starts_at_once:
@@ -127,7 +127,7 @@ class Advancer:
                 path = path.continued(_BEYOND)
             braking = self.brakes(dt).find(step.state, path, reached, 2.0 * covered)
             if braking is None:
-                # A step may be too short to rest in what the longer one before it allowed.
+                # A shorter step than the one before it may be too short to stop in.
                 shorter = dt < (1.0 - 1e-9) * state.duration
                 why = f"{CANNOT_BRAKE} in {dt:g} s, less than the last step took" if shorter else CANNOT_BRAKE
                 return Advance(_blocked(step, state, why), None)
@@ -135,5 +135,5 @@ class Advancer:
 
 
 def _blocked(step: Step, state: State, reason: str) -> Step:
-    """Return a step that is not done although its QP allows it: the arm stays in `state`."""
+    """Return a blocked step in place of one that its QP allowed: the arm stays in `state`."""
     return replace(step, status=StepStatus.BLOCKED, progress=0.0, state=state, reason=reason)

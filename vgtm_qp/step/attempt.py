@@ -25,28 +25,28 @@ from vgtm_qp.step.target import QPInput, Target
 _MOST_QPS = 8
 
 _MOST_FRACTIONS = 8
-"""Times between two states for which a QP has rows, at most."""
+"""Greatest number of times between two states for which a QP has rows."""
 
 _MOTION_MARGIN = 2.5
-"""A body may move by so many times what is expected of it before a pair that matters can be missed."""
+"""Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
 
 _TOO_FAR = 1e3
-"""No answer of a QP that moves a node by so many times the arm's length means anything: the pose is singular."""
+"""Displacement of a node, over the arm's length, from which on the answer of a QP shows a singular pose."""
 
 _DEVIATION = 0.1
-"""An arm whose points may leave their chords by more than this turns too far in one step, m."""
+"""Greatest deviation of points from their chords in one step, m."""
 
 _SETTLING = 5e-3
-"""A tip that is further off than this share of the arm's length after a QP calls for another one."""
+"""Tip error after a QP, over the arm's length, above which another QP is solved."""
 
 _FURTHER = 1e-6
-"""Stations leave the curve for so much progress more, at least."""
+"""Least gain in progress for which stations leave the curve."""
 
 _ROUNDING = float(np.finfo(float).eps)
 
 
 class Phases:
-    """Seconds spent in each of the phases of a step, by their names."""
+    """Seconds spent in each phase of a step, by name."""
 
     def __init__(self, *names: str) -> None:
         self.seconds = dict.fromkeys(names, 0.0)
@@ -71,7 +71,7 @@ class Attempt:
         self._has_limit, self._too_long = setup.step_limit < np.inf, setup.too_long
         self.separation = separation
         self.phases = Phases("distance", "qp", "correction", "acceptance")
-        # Divided by the time twice, what is left of a length is an acceleration; but no less than rounding leaves.
+        # An error of a length, divided twice by the time, is an error of an acceleration: it is kept near rounding.
         exact = max(1e-12, 32.0 * _ROUNDING * setup.arm.height)
         member = 1e-10 if actuation.starts_at_once else exact
         self.accuracy = Accuracy(member, tip=1e-8, start=_SETTLING * setup.arm.height)
@@ -85,11 +85,11 @@ class Attempt:
         self._tracking = TrackingError(layout, setup.kinematics) if layout.hard_tracking else None
 
     def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Step:
-        """Return what a step from `state` along the target's piece of path does, with its progress on that.
+        """Return the step from `state` along the target's piece of path, with its progress on that piece.
 
-        `share` is the length of the piece as a part of the step before: it scales the motion guessed from that.
-        `progress` is how much of the piece lies behind the tip at the start. Where stations that are to be on the curve
-        hold the arm back they give way, if they may, and if it comes further then.
+        The motion of the step before, times `share`, predicts the motion of this one. `progress` is the part of the
+        piece that is covered at the start. If hard tracking holds the arm back, elastic tracking is tried too, if the
+        setup allows it, and used if the arm gets further.
         """
         self.phases.start()
         step = self._separated(state, target, share, progress, self._setup.engine, self._tracking)
@@ -107,7 +107,7 @@ class Attempt:
         engine: Engine,
         tracking: TrackingError | None,
     ) -> Step:
-        """Return the step of an engine, which drives pairs apart that are too near; without that where it fails."""
+        """Return the step of an engine that drives apart pairs too near each other; if that fails, only keeps them."""
         short = self.separation.shortfall_of(state)
         for gain in (RECOVERY, 0.0) if short else (0.0,):
             asked, reach = self._first(state, target, share, progress, short, gain)
@@ -117,21 +117,21 @@ class Attempt:
         return step
 
     def first_input(self, state: State, target: Target) -> QPInput:
-        """Return what the first QP of a step from `state` is linearised at."""
+        """Return the input of the first QP of a step from `state`."""
         short = self.separation.shortfall_of(state)
         return self._first(state, target, 1.0, 0.0, short, RECOVERY if short else 0.0)[0]
 
     def _first(
         self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
     ) -> tuple[QPInput, float]:
-        """Return the first input, and the distance, m, from which on no pair can become active."""
+        """Return the first input, and the distance, m, beyond which no pair can become active."""
         q, arm, goal, guess = state.q, self._arm, target.goal(progress), share * state.motion
         reach = self._influence
         if share >= 1.0:
             reach = _MOTION_MARGIN * self._expected(target, goal, guess)
         rows = self.separation.rows(q, state.time, target.time - state.time, reach, short, gain)
         if target.base is not None:
-            # What the base's own motion does to the rows is known.
+            # The displacement of nodes with the base is known.
             rows = rows.after(arm.nodes(arm.based(q, target.base)) - arm.nodes(q))
         curve = state.control_vertices, state.torsion
         return QPInput(q, q + 0.5 * guess, *curve, target, goal, progress, rows, True), reach
@@ -146,7 +146,7 @@ class Attempt:
         engine: Engine,
         tracking: TrackingError | None,
     ) -> Step:
-        """Run it from its first input; pairs that are too near at the start, `short`, are driven apart by `gain`, m."""
+        """Run the attempt from its first input; pairs too near at the start, `short`, are driven apart by `gain`, m."""
         phases, separation, target = self.phases, self.separation, asked.target
         q, fractions = state.q, list[float]()
         solution: StepSolution | None = None
@@ -184,7 +184,7 @@ class Attempt:
             is_finite = move.closed is not None or np.isfinite(q).all()
             if not move.furthest < _TOO_FAR * self._arm.height or not is_finite:
                 return blocked("singular pose")
-            # A pair that one correction pushes away must still be there in the next, or two of them alternate.
+            # A pair that one correction pushed apart must stay listed for the next, or two corrections alternate.
             reach = max(reach, move.furthest)
             if move.closed is None:
                 continue
@@ -192,7 +192,7 @@ class Attempt:
             if flaw:
                 return blocked(flaw, solver_failed=True)
             q, closed = move.closed.q, move.closed
-            # The linear rows leave a little between the curve's end and the tip.
+            # Linearised rows leave a small gap between the curve's end and the tip.
             vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
             if tracking is not None:
                 gap = tracking.greatest(q, vertices, move.torsion, target.base)
@@ -219,14 +219,14 @@ class Attempt:
         return blocked("no convergence")
 
     def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
-        """Return what is wrong with where a `move` leads from `state`, found anew; empty where nothing is."""
-        # An elastic tip that had to leave its path is where the QP put it.
+        """Return what is wrong with the configuration of a `move` from `state`, computed again; empty if nothing is."""
+        # An elastic tip with a slack is not held to its goal.
         on_path = move.solution.tip_slack <= self.accuracy.tip
         goal = target.goal(move.progress) if on_path else None
         return self.acceptance.flaw(closed, state.q, target, goal, move.vertices, move.torsion)
 
     def _expected(self, target: Target, goal: TipGoal, guess: Array) -> float:
-        """Return about how far a node moves in the step, m; the influence if the motion before does not show it."""
+        """Return the expected displacement of a node in the step, m; the influence if the guess is no prediction."""
         last = self._arm.travel(guess)
         if last == 0.0 or target.base is not None:
             return self._influence

@@ -1,9 +1,9 @@
-"""Braking: how an arm with limited accelerations comes to rest, proven before each step is taken.
+"""Braking: how an arm with limited accelerations comes to rest, proven before each step is accepted.
 
-A moving arm with limited accelerations cannot stay where it is. It is let into a state only if steps are known that
-bring it from there to rest, each within the limits and clear, so that what lies ahead can never trap it: where no
-other step is found the arm does the first of those. A tip that is held to its path brakes along it. An elastic tip,
-and one whose base moves on, may leave it: then every actuator brakes by itself, which strokes always allow.
+A moving arm with limited accelerations cannot stop at once. A step into a state is accepted only if further steps are
+known that bring the arm from there to rest, each within the limits and clear of obstacles. If no other step is found
+later, the arm does the first of those. A tip that is held to its path brakes along it. An elastic tip, or one whose
+base moves on, may leave the path: then every actuator brakes by itself, which strokes always allow.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step, StepStatus
 
 Steps = list[tuple[State, float]]
-"""States, and the values of a path there."""
+"""States, each with the value of the path reached there."""
 
 ANY_RANK = 2
 """The greatest rank of braking."""
 
 _MOST_STEPS = 60
 _SPARE_STEPS = 4
-"""Steps that braking may take, at most, and beyond those that the fastest actuator needs by itself."""
+"""Greatest number of braking steps, in total and beyond those that the fastest actuator needs by itself."""
 
 _GENTLER = (0.5, 0.75)
-"""Shares of the displacement of the step before that a step aims at where braking as hard as possible fails."""
+"""Shares of the previous step's displacement that a step aims at if braking as hard as possible fails."""
 
 _MOST_RIDING = 500
-"""Steps, at most, that an arm is followed on a base that moves on."""
+"""Greatest number of steps that are computed on a base that moves on."""
 
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
@@ -48,10 +48,10 @@ class Braking:
     Attributes
     ----------
     on_path : int
-        In so many steps the tip stays on the path; in the others it does not.
+        Number of steps, from the first, in which the tip stays on the path.
     rank : int
-        0 where the tip stays on its path to the end or need not, 1 where it comes to rest on it and leaves it
-        afterwards, since the base goes on, 2 where it leaves it at once. The lower the better.
+        0 if the tip stays on its path to the end or need not; 1 if it comes to rest on the path and leaves it
+        later, because the base moves on; 2 if it leaves the path at once. Lower is better.
     """
 
     origin: State
@@ -62,12 +62,12 @@ class Braking:
 
     @property
     def rest(self) -> Braking:
-        """What is left after the first step."""
+        """The steps after the first."""
         steps, on_path = self.steps[1:], max(self.on_path - 1, 0)
         return replace(self, origin=self.steps[0][0], steps=steps, on_path=on_path)
 
     def first(self, path: Path | None, start: float, end: float, blocked: Step) -> Step:
-        """Return the first step in the place of one that was `blocked`, with its progress on a piece of `path`."""
+        """Return the first step, instead of the `blocked` one, with its progress on a piece of `path`."""
         (state, value), on_path = self.steps[0], self.on_path > 0
         progress = (value - start) / (end - start) if on_path and path is self.path else 0.0
         return replace(
@@ -80,7 +80,7 @@ class Braking:
         )
 
     def changed(self, origin: State, change: Callable[[State], State]) -> Braking:
-        """Return the same from another state `origin`, with every other state changed as well."""
+        """Return these steps from another state `origin`, with `change` applied to every other state."""
         return replace(self, origin=origin, steps=[(change(state), value) for state, value in self.steps])
 
 
@@ -94,9 +94,9 @@ class Brakes:
     dt: float
 
     def find(self, state: State, path: Path, value: float, piece: float) -> Braking | None:
-        """Return the steps that bring the arm from `state` to where it may stay, or None where they were not found.
+        """Return the steps that bring the arm from `state` to rest; None if none were found.
 
-        The tip is at `value` of `path`, and goes on by at most `piece` in each step where it stays on it.
+        The tip is at `value` of `path`; while on the path it moves on by at most `piece` in each step.
         """
         setup, until = self.shaping.setup, self._until_the_base_rests()
         if setup.tip_mode == "elastic":
@@ -115,7 +115,7 @@ class Brakes:
         return self.letting_go(state, path, value)
 
     def letting_go(self, state: State, path: Path, value: float) -> Braking | None:
-        """Return the steps in which every actuator brakes by itself, or None where they were not found."""
+        """Return the steps in which every actuator brakes by itself; None if none were found."""
         steps = self._let_go(state, value)
         return None if steps is None else Braking(state, path, steps, 0, ANY_RANK)
 
@@ -125,16 +125,15 @@ class Brakes:
         return -np.inf if base is None else base.end - _INSTANT
 
     def _done(self, state: State, path: Path, start: float, end: float, box: Box, progress: float) -> Step:
-        """Return the attempt at a piece of path of which the tip has made some `progress` before."""
+        """Return the attempt at a piece of path of which the tip has already covered `progress`."""
         target = self.shaping.target(state, self.dt, path, start, end, box)
         return self.attempt.run(state, target, progress=progress)
 
     def _along(self, state: State, path: Path, value: float, piece: float, until: float) -> Steps | None:
         """Brake on the path, and stay on it until a time, s.
 
-        The steps aim at where the tip is, from further along the path: progress along it is what they avoid. That is
-        where many limits meet, and corrections may run in circles round such a corner; then they aim at a share of
-        what the step before covered.
+        Each step aims back at the tip's present place, so that it makes as little progress as limits allow. Many
+        limits are active there, and corrections may cycle; then a step aims at a share of the previous one's progress.
         """
         covered = 0.5 * piece
 
@@ -152,7 +151,7 @@ class Brakes:
         return self._follow(state, step, until)
 
     def _yielding(self, state: State, value: float) -> Steps | None:
-        """Brake an elastic tip: it is drawn along a line of its own, ever more slowly, and gives way to the limits."""
+        """Brake an elastic tip: its goal moves on along a line, ever more slowly, and its slack keeps the limits."""
         arm, kinematics = self.shaping.setup.arm, self.shaping.setup.kinematics
         kinematics.evaluate(state.q)
         here, rotation = arm.end_effector.position(state.nodes), kinematics.tip_rotation.copy()
@@ -172,7 +171,7 @@ class Brakes:
         return self._follow(state, step, self._until_the_base_rests())
 
     def _let_go(self, state: State, value: float) -> Steps | None:
-        """Brake every actuator by itself, whatever becomes of the tip; None where stations must stay on the curve."""
+        """Brake every actuator by itself, wherever the tip goes; None if stations must stay on the curve."""
         setup = self.shaping.setup
         if setup.layout.hard_tracking and setup.elastic is None:
             return None
@@ -187,7 +186,7 @@ class Brakes:
     def _follow(
         self, state: State, step: Callable[[State, Box], tuple[State, float] | None], until: float
     ) -> Steps | None:
-        """Step on until a time, s, and until the arm may stay; None where a step fails, or they are too many."""
+        """Add steps until a time, s, and until the arm may stay; None if a step fails or there are too many."""
         found: Steps = []
         most = _MOST_STEPS
         for count in range(_MOST_STEPS + _MOST_RIDING):
@@ -208,7 +207,7 @@ class Brakes:
     def _count(self, state: State, limits: Box) -> int:
         """Return how many steps the fastest actuator needs by itself.
 
-        Each takes as much off it as its box is wide on either side of its middle.
+        Each step reduces its speed by half the width of its box.
         """
         finite = np.isfinite(limits[0]) & np.isfinite(limits[1])
         lower, upper = limits[0][finite], limits[1][finite]
@@ -217,7 +216,7 @@ class Brakes:
         return int(np.ceil(min(float((speed / width).max(initial=0.0)), float(_MOST_STEPS))))
 
     def _released(self, state: State, limits: Box, closing: Closing) -> State | None:
-        """Return the state after every actuator moves as little as it may; None where that is not clear."""
+        """Return the state after every actuator moved as little as it may; None if that is not clear of obstacles."""
         setup, attempt = self.shaping.setup, self.attempt
         arm, base, separation = setup.arm, setup.base_motion, attempt.separation
         strokes = np.clip(self.actuation.values(state), *limits)
@@ -241,4 +240,4 @@ class Brakes:
 
 
 _NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
-"""The path of a tip that need not be anywhere."""
+"""The path of a free tip."""

@@ -1,4 +1,4 @@
-"""From a problem to an arm that is ready to move, its curve among it: the last place that sees a problem."""
+"""From a problem to an arm that is ready to move, and its curve: the last module that reads a problem."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ _CONDENSED_ALL_THE_SAME = (
 
 
 def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
-    """Return the arm of a problem, ready to move; not `compiled`, it is built sooner and steps more slowly.
+    """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
 
     Raises
     ------
     ProblemError
-        The problem asks for what this arm cannot do at all; each mistake is named.
+        The problem asks for something this arm cannot do at all; each mistake is named.
     TrussError
         The truss is not statically determinate.
     """
@@ -71,7 +71,7 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "by_fcl": clearance.distance == "fcl",
     }
     engine = make_engine(solver, home.layout, kinematics, task, tracking, compiled=compiled)
-    # Bays that follow the curve can do nothing else.
+    # A solver by bays has no solution with elastic tracking.
     is_exact = problem.method.tracking_mode == "exact" and not problem.method.goes_by_bays
     gives_way = home.layout.hard_tracking and is_exact
     elastic = elastic_engine(solver, home.layout, kinematics, task) if gives_way else None
@@ -120,7 +120,7 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
     Raises
     ------
     ProblemError
-        Stations are to keep on the curve exactly what the arm cannot.
+        The arm cannot keep its stations on the curve exactly as asked.
     """
     method, stations, spec = problem.method, arm.stations, problem.curve
     elastic = problem.end_effector.mode == "elastic"
@@ -131,7 +131,7 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
     is_hard, mistakes = method.holds_curve, list(_beyond_the_arm(problem, arm, task))
     may_give_way = method.tracking_mode == "exact" and not method.goes_by_bays
     if may_give_way and mistakes and method.hard_coordinates == ("position",):
-        # Nobody asked for more, and what this arm can hold exactly is the curve's end alone.
+        # By default: this arm can hold only the curve's end exactly.
         is_hard, mistakes = False, []
     if mistakes:
         raise problem.error(mistakes)
@@ -187,13 +187,13 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
 def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) -> tuple[Array, Array]:
     """Return s_k (K,) and control vertices (V, 3) at home: on the straight axis, or fitted to the faces of a bent arm.
 
-    `fractions` (K,) of the length from `start` (3,) through the `points` (K, 3) belong to these.
+    `fractions` (K,) are those of the length from `start` (3,) through the `points` (K, 3) at each point.
     """
     end, length = points[-1], float(np.linalg.norm(points[-1] - start))
     straight = straight_curve(family, start, end)
     off = points - start - fractions[:, None] * (end - start)
     if np.abs(off).max() <= 1e-9 * length:
-        # Families without linear precision run along the axis at a speed of their own.
+        # Families without linear precision run along the axis at a varying speed.
         even = np.abs(straight.position(fractions) - points).max() <= 1e-12 * length
         return fractions if even else straight.arc_parameter(fractions), straight.control_vertices
     weights = family.weights(fractions)
@@ -206,7 +206,7 @@ def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) 
 
 
 def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mistake]:
-    """Yield what stations are to keep on the curve although the arm has not the motions for it."""
+    """Yield the coordinates that stations shall keep on the curve but the arm has too few motions for."""
     method, curve = problem.method, problem.curve
     if not method.holds_curve:
         return
@@ -234,7 +234,7 @@ def make_engine(
     *,
     compiled: bool = True,
 ) -> Engine:
-    """Return the engine that solves the steps of an arm with the solver of that name, or by its bays.
+    """Return the engine that solves the steps of an arm with the QP solver of that name, or by its bays.
 
     Raises
     ------
@@ -259,9 +259,9 @@ def make_engine(
 def elastic_engine(
     solver: str, layout: Layout, kinematics: Kinematics, task: TipTask
 ) -> Callable[[], Engine]:
-    """Return what gives the engine of the same layout with elastic tracking, built when it is first asked for."""
+    """Return a function that gives the engine of the same layout with elastic tracking, built on its first call."""
     elastic = replace(layout, hard_tracking=False, hard_turns=False)
-    # It is seldom needed, and no compiler is kept waiting then.
+    # It is seldom needed: not compiled, it is built faster.
     return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False))
 
 

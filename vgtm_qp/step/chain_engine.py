@@ -1,7 +1,7 @@
 """The engine of long arms: from the positions of the nodes to the step and back by sweeps along the bays.
 
-Its QP is that of the general engine with the solvers of ``qp.long``; but the numbers of the QP are written where the
-sweeps read them, and lengths are closed with what the QP has factorised.
+Its QP is that of the general engine with the solvers of ``qp.long``. But the numbers of the QP are written directly
+into the sweeps' inputs, and lengths are closed with the factors of the QP.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class ChainEngine(Engine):
 
     @staticmethod
     def serves(solver: ChainSolver) -> bool:
-        """Whether the arm with that solver is one whose bays are all alike, with a base face that does not bend."""
+        """Whether all bays of the solver's arm are alike and its base face is rigid."""
         if solver.chain.member_places is None:
             return False
         layout, arm = solver.layout, solver.layout.arm
@@ -107,10 +107,10 @@ class ChainEngine(Engine):
         return solution
 
     def settle(self, X: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
-        """See ``engine.Engine``: each step corrects the lengths, and by the actuators what it leaves of the tip.
+        """See ``engine.Engine``: each step corrects the lengths, and the remaining tip error by the actuators.
 
-        The actuated lengths are those of the QP's answer and what brings the tip to its goal; with faces that are held
-        on the curve they follow from that, as far as bounds allow it.
+        The actuated lengths are those of the QP's answer plus a correction that brings the tip to its goal. With faces
+        held on the curve they follow from the curve, as far as bounds allow.
         """
         closing, solver, bounds = self._closing, self._solver, (target.lower, target.upper)
         enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)
@@ -146,9 +146,9 @@ class ChainEngine(Engine):
         return closed if off <= accuracy.tip and closed.error <= accuracy.member else None
 
     def _aim(self, strokes: Array, lower: Array, upper: Array) -> Array:
-        """Let actuated members aim at `strokes` (n_a,) in their bounds, m, the others at home, held faces at the curve.
+        """Set the targets: `strokes` (n_a,), m, within bounds, home lengths of the others, curve nodes of held faces.
 
-        Return the strokes that are aimed at.
+        Return the strokes within bounds.
         """
         lengths, *points = self._closing.aims
         aimed = self._aims[self.layout.arm.actuators] = np.minimum(np.maximum(strokes, lower), upper)
@@ -175,7 +175,7 @@ class ChainEngine(Engine):
 
 
 def _end_kernel(layout: Layout) -> Kernel:
-    """Return what the two ends of an arm make of a step.
+    """Return the function of the two ends of an arm: the tip's frame, and the curve's base.
 
     Arguments: the tip's nodes X, Y (3, K), where residuals and where Jacobians are evaluated; the nodes of the first
     station (3, 3) when the base has moved; control vertices (3, V). Results: rotation of the tip at X, its spin

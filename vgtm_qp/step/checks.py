@@ -1,4 +1,4 @@
-"""What is wrong with a problem although each value is right, as the home pose shows before any step."""
+"""Mistakes of a problem whose values are each valid, found at the home pose before any step."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def checked_arm(problem: Problem) -> Setup:
 
 
 def check_problem(problem: Problem, setup: Setup) -> list[Mistake]:
-    """Return what makes a problem hopeless: each is proven, so none refuses a problem that has a solution.
+    """Return the mistakes that make a problem impossible, each proven: no solvable problem is refused.
 
-    An obstacle, or a member that shares no node, inside the arm at home; a target farther from the base than
-    the members can be long; a target so deep inside an obstacle that no tip can be there.
+    These are overlaps at home of members with obstacles or other members; a target farther from the base than the
+    members can be long; a target so deep inside an obstacle that no tip can be there.
     """
     mistakes = [mistake for distance, mistake in _at_home(problem, setup) if distance <= 0.0]
     return [
@@ -80,10 +80,10 @@ def unreachable_tip(problem: Problem, setup: Setup) -> Iterator[Mistake]:
 
 
 def find_warnings(problem: Problem, setup: Setup) -> list[Mistake]:
-    """Return what makes a problem suspicious: a home pose nearer than ``safe``, a target at an obstacle.
+    """Return suspicious values of a problem: a home pose nearer than ``safe``, a target at an obstacle.
 
-    The resolver moves the arm away from what is too near at home, and a tip of three nodes may surround what
-    its centre is in.
+    Neither is impossible: the resolver moves the arm away from obstacles too near at home, and a tip of three nodes may
+    surround an obstacle that contains its centre.
     """
     certain = {mistake.key for mistake in check_problem(problem, setup)}
     near = [mistake for distance, mistake in _at_home(problem, setup) if distance > 0.0]
@@ -125,7 +125,7 @@ def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
 
 
 def _targets(problem: Problem) -> Iterator[tuple[Array, str, str]]:
-    """Yield each position that the tip is to reach (3,), its key path and its value as a person wrote it."""
+    """Yield each target position of the tip (3,), its key path and its value as written in the file."""
     maneuver = problem.maneuver
     if isinstance(maneuver, WaypointManeuver):
         for i, waypoint in enumerate(maneuver.waypoint):

@@ -17,22 +17,22 @@ from vgtm_qp.qp.lengths import LengthSolver
 MOST_STEPS = 12
 
 _TOO_FAR = 1e-2
-"""Quantities that are further off than this after a QP are not worth trying."""
+"""Error of a quantity after a QP above which Newton's iteration is not tried."""
 
 _ROUNDING = float(np.finfo(float).eps)
 
 
 def enough_length(q: Array, tolerance: float) -> float:
-    """Return the error of a quantity that nothing is gained by making smaller.
+    """Return the error of a quantity at which the iteration stops.
 
-    Divided by a short step's duration, once or twice, an error of `tolerance` is a rate that counts; but the lengths
-    of an arm that is a kilometre long are not known better than its nodes' places can be told apart.
+    It is far below `tolerance`, because division by a short step's duration makes errors of rates and accelerations of
+    it. For very long arms the rounding of node positions is the limit.
     """
     return max(1e-3 * tolerance, 8.0 * _ROUNDING * float(np.abs(q).max()))
 
 
 def within(values: Array, lower: Array, upper: Array, spare: float) -> bool:
-    """Return whether values (n_a,) are between their bounds, give or take `spare`."""
+    """Return whether values (n_a,) are within their bounds to a tolerance of `spare`."""
     return bool(np.all(values >= lower - spare) and np.all(values <= upper + spare))
 
 
@@ -42,10 +42,10 @@ Correct = Callable[[], Array]
 def converge(
     q: Array, measure: Callable[[Array], tuple[float, Correct | None]], too_far: float = _TOO_FAR
 ) -> tuple[Array, float]:
-    """Return where Newton's method leads from a configuration, and the error there, infinite in a singular pose.
+    """Return the configuration to which Newton's method leads, and its error, infinite in a singular pose.
 
-    `measure` gives the error of a configuration, and what makes the next one; None where it serves as it is. Errors
-    from `too_far` on are not worth trying.
+    `measure` returns the error of a configuration and the function that makes the next one, None to stop there. The
+    iteration ends at errors of `too_far` or more.
     """
     for count in range(MOST_STEPS + 1):
         worst, correct = measure(q)
@@ -82,8 +82,8 @@ class Closing:
     ) -> Closed:
         """Return the configuration near `q` whose actuators keep their values, or go to the nearest one allowed.
 
-        `lower`, `upper` (n_a,) are their bounds. The error is infinite in a singular pose, and errors beyond `too_far`
-        are not worth trying.
+        `lower`, `upper` (n_a,) are their bounds. The error is infinite in a singular pose; the iteration ends at errors
+        beyond `too_far`.
         """
         kinematics, wanted = self._kinematics, self._arm.home_quantities.copy()
 

@@ -1,7 +1,7 @@
-"""What an attempt asks of the QP: where its answer leads, with quantities closed and the tip at its goal.
+"""Engines: from a configuration through the QP's answer to the next one, quantities closed and the tip at its goal.
 
-The fused engine compiles everything between configuration and QP into one call; the general one linearises by one
-compiled call, serves every arm and every solver by name, and is what the fused one is tested against.
+The fused engine compiles everything between configuration and QP into one call. The general one linearises by one
+compiled call and serves every arm and solver; the fused engine is tested against it.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask, over_all_nodes, tip_response
 
 _SETTLED = 1e-3
-"""A tip this much nearer to its goal than it must be gains nothing by another iteration."""
+"""Ratio of tip error to tolerance below which settling stops."""
 
 _ROUNDING = float(np.finfo(float).eps)
 
 _ON_PATH = 1e-6
-"""Solvers leave slacks of this size, m or rad, where the answer's are zero."""
+"""Slack, m or rad, that counts as zero: solvers leave so much."""
 
 
 Spent = Callable[[str], None]
@@ -51,7 +51,7 @@ class Engine(ABC):
         self.layout = layout
 
     def qp(self, asked: QPInput) -> StepQP:
-        """Return the whole QP that an input asks for, every row and column with a name, in arrays of its own."""
+        """Return the whole QP of an input, every row and column with a name, in new arrays."""
         numbers = self._linearisation.numbers(asked.linear(self.layout), asked.rows)
         return self._builder.build(numbers)
 
@@ -61,7 +61,7 @@ class Engine(ABC):
 
     @cached_property
     def _linearisation(self) -> Linearisation:
-        # To be looked at, not to be run: no compiler is kept waiting.
+        # Built once to be read: compiling would take longer.
         return Linearisation(self.layout, compiled=False)
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
@@ -70,7 +70,7 @@ class Engine(ABC):
         Raises
         ------
         InfeasibleStepError, AnswerError, SolverError
-            The QP has no answer, or none that is good enough; the first two carry it.
+            The QP has no answer, or no accurate one; the first two carry the QP.
         """
         try:
             solution = self._least(asked)
@@ -88,7 +88,7 @@ class Engine(ABC):
             span, goal = target.end - target.start, asked.goal
             left = (1.0 - progress) * abs(span) * float(np.abs([goal.velocity, goal.spin]).max())
             if left <= LEFT:
-                # Interior-point solvers stop just short of the end, and so would the arm, for one more step.
+                # Interior-point solvers stop just short of the end; the arm would need one more step.
                 progress = 1.0
         furthest = float(np.abs(solution.nodes).max())
         closed = None
@@ -98,7 +98,7 @@ class Engine(ABC):
         return Move(solution, q, *curve, progress, furthest, closed)
 
     def _least(self, asked: QPInput) -> StepSolution:
-        """Return the QP's answer; where even a zero step is forbidden by the margin, without the margin."""
+        """Return the QP's answer; if the margin forbids even a zero step, the answer without the margin."""
         rows = asked.rows
         try:
             return self.solve(asked)
@@ -114,15 +114,15 @@ class Engine(ABC):
 
     @abstractmethod
     def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
-        """Return the configuration near `q`, its quantities closed and the tip at `goal`; None where a QP is due."""
+        """Return the configuration near `q`, quantities closed and the tip at `goal`; None if it takes another QP."""
 
     def drawn(self, layout: Layout) -> Engine | None:  # noqa: ARG002
-        """Return the engine for a layout that differs in its vertex goals alone; None if it is made anew."""
+        """Return the engine for a layout that differs only in its vertex goals; None if one must be built."""
         return None
 
 
 def enough_tip_error(q: Array, tolerance: float) -> float:
-    """Return the tip error, m or rad, that nothing is gained by making smaller; see ``closing.enough_length``."""
+    """Return the tip error, m or rad, at which settling stops; see ``closing.enough_length``."""
     return max(_SETTLED * tolerance, 1e3 * _ROUNDING * float(np.abs(q).max()))
 
 
@@ -142,7 +142,7 @@ class GeneralEngine(Engine):
         self._linearisation = Linearisation(layout, compiled=compiled)
         self._solver, self._task = solver, task
         self._closing = Closing(layout, kinematics)
-        # Stations that are held on the curve may determine the configuration with the fixed quantities.
+        # With hard tracking, stations and fixed quantities may determine the configuration.
         is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
         tracked = layout.tracked.tolist()
         self._on_curve = is_plain and layout.arm.symbols(Constants()).held(tracked) is not None
@@ -160,7 +160,7 @@ class GeneralEngine(Engine):
         return solution
 
     def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
-        """See :class:`Engine`; an elastic tip that had to leave its path is not moved."""
+        """See :class:`Engine`; an elastic tip with a slack is not moved."""
         assert self._last is not None
         slack = self._last[1].tip_slack
         closed = self._settled(q, target, goal, accuracy) if slack <= _ON_PATH else None
@@ -170,10 +170,10 @@ class GeneralEngine(Engine):
         return closed if closed.error <= accuracy.member else None
 
     def _settled(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
-        """Return the configuration near `q` with the tip at `goal`, by Newton steps whose Jacobian is kept.
+        """Return the configuration near `q` with the tip at `goal`, by Newton steps with a constant Jacobian.
 
-        Where the solver knows how actuators move the tip, these go where its answer said, and on from there. Otherwise
-        they go with the least motion of the nodes that moves the tip.
+        If the solver has a gain, actuators start from its answer and correct the tip by the gain. Otherwise they follow
+        the least motion of the nodes that moves the tip.
         """
         arm, bounds = self.layout.arm, (target.lower, target.upper)
         if self._on_curve:
@@ -205,9 +205,9 @@ class GeneralEngine(Engine):
         return closed if off <= accuracy.tip else None
 
     def _gain(self) -> tuple[Array | None, Array] | None:
-        """Return displacements per tip error after the last QP; None where another QP has to settle the tip.
+        """Return displacements per tip error after the last QP; None if another QP has to settle the tip.
 
-        Those of the nodes (N, 3, n_e), None where the solver knows no more than the actuators', and those (n_a, n_e).
+        Those of the nodes (N, 3, n_e), None if only the solver's gain is known, and those of the actuators (n_a, n_e).
         """
         assert self._last is not None
         layout, arm, weights, (numbers, solution) = (
@@ -246,9 +246,9 @@ class FusedEngine(Engine):
         return FusedEngine(layout, self._solver.drawn(layout))
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
-        """See :class:`Engine`; one compiled call after the QP settles its answer, if that applies.
+        """See :class:`Engine`; one compiled call after the QP settles its answer, if it applies.
 
-        It does not where the path turns within the step, the base moves, or too many rows are near.
+        It does not apply if the path turns within the step, the base moves, or too many rows are near.
         """
         near, target = len(asked.rows.lower), asked.target
         if near > NEAR or target.base is not None or not target.path.is_straight(target.start, target.end):
@@ -259,7 +259,7 @@ class FusedEngine(Engine):
             spent("qp")
             return self._solver.move(answer, near, asked.torsion, accuracy)
         except (InfeasibleStepError, EvaluationError):
-            # There may be an answer without the margin, or one that other steps settle.
+            # The general way may find an answer without the margin, or settle this one by more steps.
             return super().move(asked, accuracy, spent)
         except FailedStepError as error:
             error.build = lambda: self.qp(asked)

@@ -1,4 +1,4 @@
-"""What moves an arm step by step, whatever the method: the interface of a control loop, a maneuver and the page."""
+"""`Resolver`, the class of all methods: what control loops, maneuvers and the live page call."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.full import StepQP
+from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
@@ -22,13 +23,13 @@ from vgtm_qp.step.stops import Stop
 class Resolver:
     """Moves one arm step by step by the method of its problem. Not to be shared by threads: use one per thread.
 
-    ``Resolver(problem)`` is of the class that serves ``problem.method``, each a subclass of this one. What a method
-    cannot do raises GoalError, and says which can.
+    ``Resolver(problem)`` is an instance of the subclass that serves ``problem.method``. A call that a method cannot
+    serve raises GoalError, which names the methods that can.
 
     Attributes
     ----------
     setup, state
-        What was built for the problem, and where the arm is; the latter may be set to another state of this arm.
+        The arm ready to move, and its state, which may be set to another state of this arm.
     phases : dict of str to float
         Seconds spent so far in each phase.
     solver : str or None
@@ -46,6 +47,7 @@ class Resolver:
 
     rank: int | None = None
     draws_vertices = False
+    _actuation: Actuation
     _method = ""
     _served: ClassVar[dict[str, type[Resolver]]] = {}
 
@@ -55,7 +57,7 @@ class Resolver:
             Resolver._served[serves] = cls
 
     def __new__(cls, problem: Problem | Setup) -> Self:
-        """Return an instance of the class that serves the problem's method; of the QP's for a ``Setup``."""
+        """Return an instance of the subclass that serves the problem's method; for a ``Setup``, of the QP's."""
         chosen: type = cls
         if cls is Resolver:
             if isinstance(problem, Setup):
@@ -71,7 +73,7 @@ class Resolver:
 
     @property
     def setup(self) -> Setup:
-        """What was built for the problem: arm, curve, task, engine and clearance monitor."""
+        """The arm ready to move: arm, curve, task, engine and clearance monitor."""
         raise NotImplementedError
 
     @property
@@ -101,8 +103,8 @@ class Resolver:
 
     @property
     def locked(self) -> frozenset[str]:
-        """Names of the actuators that are stuck by now; members stuck from the start are fixed ones."""
-        raise NotImplementedError
+        """Names of the actuators locked so far; members locked from the start are fixed members."""
+        return frozenset(self._actuation.locked)
 
     def lock(self, name: str) -> None:
         """Hold an actuator at its present length or value from now on.
@@ -116,7 +118,7 @@ class Resolver:
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
-        """Where control vertices are drawn to, m, by their index; may be set as a whole where the method draws any."""
+        """Goals of control vertices, m, by index; may be set as a whole if the method draws control vertices."""
         return {}
 
     @control_vertex_goals.setter
@@ -125,7 +127,7 @@ class Resolver:
             self._refuse("draw control vertices")
 
     def set_control_vertex_goal(self, index: int, position: ArrayLike | None) -> None:
-        """Draw a control vertex to a place in the null space of the tip's motion; None lets it go.
+        """Draw a control vertex to a position in the null space of the tip's motion; None ends that.
 
         The arm follows as far as the tip's goal, limits and clearance let it.
 
@@ -134,7 +136,7 @@ class Resolver:
         index
             Control vertex, 0 at the base; p_0 and the direction of p_1 belong to the base.
         position
-            (3,) where it should go, m, or None.
+            (3,) goal, m, or None.
 
         Raises
         ------
@@ -148,7 +150,7 @@ class Resolver:
     def set_control_vertices(self, count: int) -> float:  # noqa: ARG002
         """Give the curve another number of control vertices where it is; return how far it moved, m.
 
-        More of them move a Bezier curve or B-spline by rounding only; fewer are fitted. Goals of control vertices end.
+        More of them change a Bezier curve or B-spline by rounding only; fewer are fitted. Control-vertex goals end.
 
         Raises
         ------
@@ -172,7 +174,7 @@ class Resolver:
         Parameters
         ----------
         position
-            (3,) wanted position, m; where the tip is, by default.
+            (3,) wanted position, m; by default the tip's own.
         pointing
             (3,) wanted direction of the tip's z-axis.
         rotation_vector
@@ -197,11 +199,10 @@ class Resolver:
         rotation_vector: ArrayLike | None = None,  # noqa: ARG002
         dt: float | None = None,  # noqa: ARG002
     ) -> StepQP:
-        """Return the QP that a step to a goal starts with, to read, to print or to solve elsewhere; nothing moves.
+        """Return the first QP of a step to a goal, to read, to print or to solve elsewhere; nothing moves.
 
-        Every row and column has a name, a kind and a unit. It is the QP that the step solves, whatever smaller one
-        with the same answer the solver is given. Parameters and errors are those of :meth:`step`; GoalError also where
-        the method solves no QP.
+        Every row and column has a name, a kind and a unit. The step solves this QP, or an equivalent condensed one.
+        Parameters and errors are those of :meth:`step`; GoalError also if the method solves no QP.
         """
         self._refuse("show the QP of a step, since it solves none")
 
@@ -224,10 +225,10 @@ class Resolver:
         raise NotImplementedError
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:  # noqa: ARG002
-        """Do the next of the steps that bring a moving arm with limited accelerations to rest.
+        """Do the next of the braking steps that bring a moving arm with limited accelerations to rest.
 
-        They were known before the last step was done, each within the limits and clear. None where the arm may stay
-        as it is; nothing moves then. Progress is counted from `start` to `end` of a `path` that it brakes on.
+        They were computed before the last step was accepted, each within the limits and clear of obstacles. If the arm
+        is at rest, nothing moves and the result is None. Progress is counted from `start` to `end` of a braking `path`.
         """
         return None
 
@@ -241,21 +242,21 @@ class Resolver:
         last: Step | None = None,
         state: State | None = None,
     ) -> Stop:
-        """Return why the arm does not get on from a state along `path` from its value `start` to `end`.
+        """Return why the arm stopped at a state on its way along `path` from the value `start` to `end`.
 
-        Worth asking after a `last` step that was blocked, hardly moved or braked. The state is the present one by
-        default; nothing moves.
+        Meant for a `last` step that was blocked, hardly moved or braked. The state is the present one by default;
+        nothing moves.
         """
         raise NotImplementedError
 
     def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
-        """Return the pairs below their clearance in a state that the method drives apart, with their distances, m."""
+        """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
         return {}
 
     def again(self, problem: Problem) -> Resolver | None:  # noqa: ARG002
-        """Return what tries a maneuver once more from home, for a problem that resolves the redundancy differently.
+        """Return a resolver at home for a second try of a maneuver, with other weights of the null space.
 
-        None where the method leaves no choice.
+        None if the method has no such choice.
         """
         return None
 

@@ -39,7 +39,7 @@ class Path:
 
     def __post_init__(self) -> None:
         knots, positions, rotations = self.knots, self.positions, self.rotations
-        # One number that is not finite makes the sum so.
+        # One entry that is not finite makes the sum so.
         if not math.isfinite(knots.sum() + positions.sum() + rotations.sum()):
             raise GoalError("a goal must be made of finite numbers; the state of the arm is unchanged")
         widths = (knots[1:] - knots[:-1])[:, None]
@@ -66,7 +66,7 @@ class Path:
         return float(self.knots[-1])
 
     def at(self, value: float) -> TipGoal:
-        """Return pose and rate at `value`; the rate is that of the piece which follows."""
+        """Return pose and rate at `value`; at a knot, the rate of the next piece."""
         knots = self._knots
         k = min(max(bisect_right(knots, value) - 1, 0), len(knots) - 2)
         along = min(max(value, knots[k]), knots[k + 1]) - knots[k]
@@ -90,7 +90,7 @@ class Path:
         return bisect_right(self._knots, low) >= bisect_left(self._knots, high)
 
     def continued(self, pieces: float) -> Path:
-        """Return the path that goes on as it ends, for so many times its last piece, but for less than half a turn."""
+        """Return the path extended by `pieces` times its last piece, with less than half a turn of it."""
         width, turn = float(self.knots[-1] - self.knots[-2]), self._spin[-1]
         angle = width * float(np.linalg.norm(turn))
         on = width * min(pieces, 3.0 / angle if angle > 0.0 else np.inf)

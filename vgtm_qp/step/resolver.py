@@ -27,7 +27,7 @@ from vgtm_qp.step.stops import Stop, explain
 from vgtm_qp.step.task import duration
 
 _SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
-"""The least shares of a piece of path that are tried: by any arm, and by one that can brake instead."""
+"""Least share of a piece of path that is tried by any arm, and by one that can brake instead."""
 
 
 class QPResolver(Resolver, serves="qp"):
@@ -53,7 +53,7 @@ class QPResolver(Resolver, serves="qp"):
 
     @property
     def setup(self) -> Setup:
-        """What was built for the problem: arm, curve, task, engine and clearance monitor."""
+        """The arm ready to move: arm, curve, task, engine and clearance monitor."""
         return self._shaping.setup
 
     @property
@@ -66,26 +66,21 @@ class QPResolver(Resolver, serves="qp"):
         """Seconds spent so far in each phase."""
         return self._attempt.phases.seconds
 
-    @property
-    def locked(self) -> frozenset[str]:
-        """Names of the actuators that are stuck by now; members stuck from the start are fixed ones."""
-        return frozenset(self._actuation.locked)
-
     def lock(self, name: str) -> None:
         """See :class:`Resolver`.
 
-        The QP keeps its shape: an actuator whose least and greatest values are one is fixed.
+        The QP keeps its columns: a locked actuator has a box of width zero.
         """
         self._actuation.lock(name, self.state)
         before, self._braking = self._known_braking(), None
         if before is not None:
-            # What jams stops at once, as it will; the others brake, each by itself.
+            # A jammed actuator stops at once; the others brake, each by itself.
             state, value = before.steps[0]
             self._braking = self._advancer.brakes(state.duration).letting_go(self.state, before.path, value)
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
-        """Where control vertices are drawn to, m, by their index; may be set as a whole."""
+        """Goals of control vertices, m, by index; may be set as a whole."""
         return self._shaping.goals
 
     @control_vertex_goals.setter
@@ -150,12 +145,12 @@ class QPResolver(Resolver, serves="qp"):
         return self._brake(braking, path, start, end, Step(StepStatus.BLOCKED, 0.0, self.state, "", 0))
 
     def _known_braking(self) -> Braking | None:
-        """Return the steps that bring the arm to rest from where it is; None if it may stay there."""
+        """Return the steps that bring the arm to rest; None if it is at rest."""
         braking = self._braking
         return braking if braking is not None and braking.origin is self._state and braking.steps else None
 
     def _brake(self, braking: Braking, path: Path | None, start: float, end: float, blocked: Step) -> Step:
-        """Do the first step of `braking` and return it, in the place of one that was not found."""
+        """Do the first step of `braking`, instead of the `blocked` one, and return it."""
         step = braking.first(path, start, end, blocked)
         self.state, self._braking = step.state, braking.rest
         return step

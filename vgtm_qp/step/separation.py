@@ -1,6 +1,6 @@
-"""What a step keeps apart: bodies and obstacles, bodies and bodies, and the angles between bodies that meet.
+"""Clearance in a step: bodies and obstacles, bodies and bodies, and the angles between bodies that meet.
 
-A pair that is already nearer than it may be does not stop the arm: it may not come nearer, and is driven apart.
+A pair that is already below its clearance does not stop the arm: it must not come nearer, and is driven apart.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 
 RECOVERY = 0.01
-"""A pair that is too near at the start of a step is driven apart by so much in it, m."""
+"""Distance by which a step drives apart a pair that is too near at its start, m."""
 
 _ROUNDING = 1e-10
-"""Clearances that are less by this are kept, m."""
+"""Shortfall of a clearance that counts as rounding, m."""
 
 _APPROACH = 0.4
 """Largest share of its remaining clearance that a pair may use in one step."""
 
 _LEAST_APPROACH = 2e-3
-"""A pair that slows down may come nearer by so much in one step all the same, m."""
+"""Approach that a slowing pair is always allowed in one step, m."""
 
 _MOST_PIECES = 16
-"""A motion whose points leave their chords is cut in so many pieces at most."""
+"""Greatest number of pieces into which a motion is cut if points leave their chords."""
 
 _NEAR_ANGLE = 0.3
-"""Bodies that meet at an angle larger than the least one by this, rad, have no row."""
+"""Excess over the least angle, rad, above which bodies that meet have no row."""
 
 _BETWEEN = 5e-5
-"""Bodies whose points leave their chords may come nearer by this between states, m.
+"""Approach between states that is allowed to bodies whose points leave their chords, m.
 
-That is half of the published tolerance.
+It is half of the published tolerance.
 """
 
 
 class Separation:
     """Rows, checks and proofs of clearance for the steps of one arm.
 
-    Where the `setup` slows down, a pair may use a share of its remaining clearance in one step: otherwise bodies come
-    at full speed and stop dead, which is a jump in the rates of all actuators.
+    If the `setup` slows down, a pair may use only a share of its remaining clearance in one step. Otherwise bodies
+    arrive at full speed and stop dead: the rates of all actuators jump.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -58,7 +58,7 @@ class Separation:
         self._corners = corners(meeting if setup.minimum_angle > 0.0 else meeting[:0])
 
     def shortfall(self, q: Array, time: float) -> Shortfall:
-        """Return the pairs that are too near at a configuration; empty as a rule."""
+        """Return the pairs that are too near at a configuration; usually there are none."""
         points, (floor, self_floor) = self._arm.points(q), self._floors
         if self._monitor.keeps(points, time, floor, self_floor):
             return {}
@@ -76,10 +76,10 @@ class Separation:
     def proof(
         self, state: State, q: Array, time: float, before: Shortfall
     ) -> tuple[BetweenReport, Shortfall | None]:
-        """Return the proof of :meth:`between` for the motion to `q`, and what is too near there.
+        """Return the proof of :meth:`between` for the motion to `q`, and the pairs that are too near there.
 
-        The latter is None where a pair is that was not `before`, or comes nearer. A proof of the motion holds at its
-        end too, but not where points leave their chords: bodies may then come a little nearer before it than there.
+        These are None if one of them was not too near `before`, or came nearer. The proof covers the end of the motion,
+        unless points leave their chords: it then allows a little less clearance than a state must have.
         """
         report = self.between(state.q, q, state.time, time, before)
         if not self._angles_hold(q):
@@ -94,7 +94,7 @@ class Separation:
     def between(
         self, start: Array, end: Array, start_time: float, end_time: float, before: Shortfall
     ) -> BetweenReport:
-        """Return the proof that no surfaces come nearer on the way than they may, or than the nearest are already."""
+        """Return the proof that no pair falls below its clearance on the way, or below the least one at the start."""
         floor, self_floor = self._setup.safe, self._setup.self_safe
         for pair, distance in before.items():
             if pair.is_self:
@@ -106,7 +106,7 @@ class Separation:
             floors = floor - _ROUNDING, max(self_floor - _ROUNDING, 0.0)
             return between(points(start), points(end), start_time, end_time, *floors)
         deviation = self.deviation(start, end)
-        # Cut in k pieces, the points leave their chords by 1 / k^2 of that.
+        # In k pieces, the deviation from the chords is 1 / k^2 of the whole.
         needed = math.ceil(math.sqrt(max(deviation / _BETWEEN, 1.0))) if deviation < 1.0 else 1
         pieces, lowest = min(needed, _MOST_PIECES), np.inf
         spare = deviation / pieces**2 - _BETWEEN
@@ -122,7 +122,7 @@ class Separation:
         return replace(report, clearance=lowest, fraction=(k + report.fraction) / pieces)
 
     def deviation(self, start: Array, end: Array) -> float:
-        """Return how far two points come nearer to each other than their chords do at most, m."""
+        """Return a bound of how much nearer two points come to each other than their chords do, m."""
         return self._arm.deviation(start, end) if self._arm.leaves_chords else 0.0
 
     def rows(
@@ -133,14 +133,14 @@ class Separation:
         Parameters
         ----------
         duration
-            How long the obstacles move on until the end of the step, s; zero at the end. Where it is not zero, a zero
-            step is allowed as far as the obstacles rest, except for the margin that the step before may have used
-            and for what is to be recovered; and pairs slow down before they touch.
+            Time from the configuration to the end of the step, s, in which the obstacles move; zero at the end. If it
+            is not zero, pairs slow down before they touch. A zero step is then allowed while obstacles rest, except for
+            a margin that the step before used and for pairs that are driven apart.
         reach
-            How far a node moves at most, m: a pair further from its floor than that cannot become active. One that
-            was missed because a body moved further is found by the check of the new state, and corrected.
+            Bound of the displacement of a node, m: a pair further from its floor cannot become active. If a body moves
+            further, the check of the new state finds the missed pair, and another QP corrects it.
         short, gain
-            Pairs that were too near at the start of the step, and how far they are driven apart in it, m.
+            Pairs that were too near at the start of the step, and the distance by which they are driven apart, m.
         """
         kept, motion, monitor = self._setup, duration > 0.0, self._monitor
         reach += monitor.pieces.fastest * duration
@@ -156,12 +156,12 @@ class Separation:
     def _allow(
         self, rows: ClearanceRows, contacts: Contacts, duration: float, short: Shortfall, gain: float
     ) -> None:
-        """Let pairs come nearer no faster than they may: overwrites ``rows.lower``; arguments as of :meth:`rows`."""
+        """Limit the approach of pairs in one step: overwrites ``rows.lower``; arguments as of :meth:`rows`."""
         kept, motion = self._setup, duration > 0.0
         if motion:
             np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
         if short:
-            # Those that were too near are driven apart by the gain, as far as they are short.
+            # Pairs that were too near are driven apart by the gain, but not beyond their clearance.
             floor = np.where(contacts.is_self, kept.self_safe, kept.safe)
             for k in np.flatnonzero(contacts.distance < floor).tolist():
                 before = short.get(contacts.pair(k))
@@ -170,13 +170,13 @@ class Separation:
         if motion:
             if self._monitor.pieces.moving:
                 rows.lower += contacts.normal_speed * duration
-            # Slow down by the clearance left when the obstacles have moved: those that only come nearer need no haste.
+            # The remaining clearance is that after the obstacles have moved.
             rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH)
 
     def with_rows_between(
         self, rows: ClearanceRows, state: State, q: Array, time: float, fractions: list[float]
     ) -> ClearanceRows:
-        """Return `rows`, and those at `fractions`, 0 to 1, of the way from a state to `q`: this moves them too."""
+        """Return `rows`, and the rows at `fractions`, 0 to 1, of the way from a state to `q`."""
         for s in fractions:
             at, now = state.q + s * (q - state.q), state.time + s * (time - state.time)
             contacts = self._monitor.near(self._arm.points(at), now, 1.5 * self._setup.safe, by_fcl=True)

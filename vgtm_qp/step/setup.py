@@ -27,34 +27,34 @@ class Setup:
     Attributes
     ----------
     kinematics : Kinematics
-        Of the arm; overwritten by whoever evaluates it.
+        The arm at one configuration; every call of ``evaluate`` overwrites it.
     layout, task, engine, monitor
-        The QP, the end effector's rows, what solves a step, and what measures clearance.
+        Layout of the QP, task of the end effector, engine of the steps, and monitor of clearance.
     elastic : callable or None
-        Gives what solves a step with elastic tracking where the engine's hard rows have none; None where they have to
-        hold, or there are none.
+        Returns an engine with elastic tracking, for steps that hard tracking blocks; None if tracking must stay hard
+        or is elastic already.
     solver, tracking : str
-        Names of the QP solver, and of how stations track the curve.
+        Names of the QP solver, and of the method by which stations track the curve.
     control_vertices, torsion : (V, 3), (T,)
         The curve at home, m and rad.
     vertex_goals : (V, 3) or None
-        Where the problem draws control vertices, m; NaN for those that it does not.
+        Goals of control vertices in the problem, m; NaN for those without one.
     safe, self_safe, influence, margin : float
-        Least clearance to obstacles and between bodies, the distance from which pairs enter the QP, and what this keeps
-        over the clearance for all that is not linear in its step, m.
+        Least clearance to obstacles and between bodies, the distance below which pairs enter the QP, and the margin of
+        the QP's rows for the nonlinearity of a step, m.
     dt, minimum_angle, step_limit : float
         Duration of a step, s, least angle between bodies that meet, rad, and greatest displacement of a node in one
-        step, m, infinite where it is free.
+        step, m, infinite without a limit.
     tip_mode : str
         How strictly the end effector follows its path: ``scaled``, ``hard`` or ``elastic``.
     base_motion : Path or None
-        Of the base over time; None where it rests.
+        Path of the base over time; None if it rests.
     slow_approach : bool
         Whether bodies slow down before they touch, and actuators before the ends of their strokes.
     jams : tuple of (str, float)
-        Actuators that lock later than at the start, and the times, s.
+        Actuators that lock during the maneuver, and the times, s.
     measure : Clearance or None
-        What the clearance of a state is measured with where the monitor does not see pairs of bodies.
+        Measures the clearance of a state if the monitor ignores pairs of bodies; None otherwise.
     """
 
     arm: Arm
@@ -83,13 +83,13 @@ class Setup:
     measure: Clearance | None
 
     def too_long(self, displacements: Array) -> str:
-        """Return why nodes (N, 3) may not be displaced so far in one step, m; empty where they may."""
+        """Return why displacements (N, 3) of the nodes, m, are too large for one step; empty if they are not."""
         moved = float(np.linalg.norm(displacements, axis=1).max())
         return "" if moved <= self.step_limit else f"{TOO_LONG}, {self.step_limit:g} m: by {moved:.3g} m"
 
     @property
     def slows_down(self) -> bool:
-        """Whether pairs and actuators slow down before contacts and ends of strokes: the tip has to be allowed to."""
+        """Whether pairs slow down before contacts and actuators before ends of strokes; needs a tip that may slow."""
         return self.slow_approach and self.tip_mode == "scaled"
 
     def least_clearance(self, q: Array, time: float, among: str = "all") -> float:

@@ -1,4 +1,4 @@
-"""The curve of an arm during its motion: goals of control vertices, and how many of them there are (section 4.7)."""
+"""Changes of an arm's curve during its motion: goals and number of control vertices (section 4.7)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vgtm_qp.step.task import vector
 
 
 class Shaping:
-    """Keeps what was built for each curve that an arm has had.
+    """Keeps the setup of each curve that an arm has had.
 
     Attributes
     ----------
@@ -45,12 +45,12 @@ class Shaping:
 
     @property
     def goals(self) -> dict[int, Array]:
-        """Where control vertices are drawn to, m, by their index."""
+        """Goals of control vertices, m, by index."""
         drawn = self.setup.layout.vertex_goals
         return {i: np.array(self._places[i]) for i in drawn} if self._places is not None else {}
 
     def draw(self, goals: Mapping[int, ArrayLike]) -> None:
-        """Draw control vertices to `goals`, m, and let all others go; see ``Resolver.control_vertex_goals``."""
+        """Draw control vertices to `goals`, m, and no others; see ``Resolver.control_vertex_goals``."""
         layout = self.setup.layout
         places = np.full((layout.vertices, 3), np.nan)
         for index, position in goals.items():
@@ -64,7 +64,7 @@ class Shaping:
         self._places = places if drawn else None
 
     def change(self, state: State, more: int) -> Refit:
-        """Give the curve of `state` so many control vertices more, or fewer, where it is; no goal is left.
+        """Add `more` control vertices to the curve of `state`, or remove them if negative; their goals end.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class Shaping:
         return change
 
     def with_vertices(self, state: State, family: CurveFamily, more: int) -> State:
-        """Return a state whose curve of a `family` has so many control vertices more, or fewer."""
+        """Return `state` with `more` control vertices, or fewer if negative, on a curve of `family`."""
         change = self._changed(family, state, more)
         return replace(state, control_vertices=frozen(change.curve.control_vertices))
 
@@ -93,7 +93,7 @@ class Shaping:
         return add_control_vertices(curve, more) if more >= 0 else remove_control_vertices(curve, -more)
 
     def _reshape(self, layout: Layout) -> None:
-        """Go on with another curve; what was built for one is kept for the next time."""
+        """Go on with another curve; the setup of each curve is kept for the next time."""
         setup = self.setup
         self._built[_key(setup.layout)] = setup
         if _key(layout) not in self._built:

@@ -13,7 +13,7 @@ from vgtm_qp.geometry.clearance import Pair
 from vgtm_qp.qp.answer import Closed
 
 Shortfall = Mapping[Pair, float]
-"""Pairs that are nearer than they may be, with their distances, m."""
+"""Pairs below their clearance, with their distances, m."""
 
 
 def frozen(array: Array) -> Array:
@@ -22,14 +22,14 @@ def frozen(array: Array) -> Array:
 
 
 def _sealed(array: Array) -> Array:
-    """Return `array` itself, read-only from now on: for one that nobody else writes to."""
+    """Return `array` itself, read-only from now on; nobody else may write to it."""
     array.setflags(write=False)
     return array
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the arm is.
+    """The state of an arm at one time.
 
     Attributes
     ----------
@@ -48,11 +48,11 @@ class State:
     rates : (M,)
         Rate of each over the step that led here, per second.
     motion : configuration
-        Displacement over that step: the guess for the next one, at whose middle it is linearised.
+        Displacement over that step: it predicts the next step, whose QP is linearised at the predicted middle.
     duration : float
         Duration of that step, s; 0 at home, where the arm rests.
     shortfall : Shortfall or None
-        Pairs that are too near; None where that is not known yet.
+        Pairs below their clearance; None if not computed yet.
     """
 
     time: float

@@ -1,4 +1,4 @@
-"""What one step did: how it ended, the state after it, and the rows that were active in its QP."""
+"""The result of one step: its status, the state after it, and the active rows of its QP."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.state import State
 
 WHOLE = 1.0 - 1e-9
-"""Progress from which on a goal counts as met."""
+"""Progress from which a goal counts as reached."""
 
 
 class StepStatus(StrEnum):
@@ -29,30 +29,30 @@ class StepStatus(StrEnum):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step:
-    """What one call of ``Resolver.step`` did.
+    """The result of one call of ``Resolver.step``.
 
     Attributes
     ----------
     status : StepStatus
-        ``reached``: the goal was met; ``slowed``: the arm moved on along its path to it, as far as the rows allow;
+        ``reached``: the goal was met; ``slowed``: the arm moved along its path to the goal, as far as the rows allow;
         ``blocked``: no safe motion was found and the state is unchanged.
     progress : float
         Share of the path that was covered, 0 to 1.
     state : State
         The state after the step.
     reason : str
-        Why the step was cut, empty where it was not.
+        Why the step was cut short; empty if it was not.
     qps : int
         QPs solved.
     solver_failed : bool
-        Whether it was blocked only because the QP solver gave no good answer.
+        True if the step was blocked only because the QP solver gave no accurate answer.
     braked : bool
-        Whether no other step was found than to brake on the path that the arm was on before: limited accelerations
-        do not let it leave that at once.
+        True if the only step found was to brake on the arm's previous path, which limited accelerations do not let it
+        leave at once.
     gave_way : bool
-        Whether stations left the curve, with ``method.tracking_mode`` exact, since the arm came further without it.
+        True if stations left the curve, with ``method.tracking_mode`` exact, because the arm got further that way.
     left_path : bool
-        Whether the tip left the path while braking: it is elastic, or its base moves on whatever happens.
+        True if the tip left the path while braking, because it is elastic or its base moves on.
     solution, rows, limits
         The answer of the QP that moved the arm, its clearance rows, and the limits of its actuators; or None.
     failure : FailedStepError or None
@@ -74,7 +74,7 @@ class Step:
     failure: FailedStepError | None = None
 
     def __str__(self) -> str:
-        """Return one line: how it ended, how far and when, and what held the arm back where something did."""
+        """Return one line: status, progress, time, and the rows that held the arm back."""
         text = f"{self.status}: {100.0 * self.progress:.4g} % of the way, time {self.state.time:.6g} s"
         held = "" if self.status is StepStatus.REACHED else ", ".join(self.blocked_by[:4])
         return f"{text}, held by {held}" if held else text
@@ -83,7 +83,7 @@ class Step:
         return f"<Step {self}>"
 
     def over(self, share: float, limits: Limits | None) -> Step:
-        """Return the same step as one over a piece of path of which it covers a `share`."""
+        """Return the step as one over a longer piece of path, of which its own piece is a `share`."""
         status, progress = self.status, share * self.progress
         if self.moved:
             status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
@@ -91,7 +91,7 @@ class Step:
 
     @property
     def moved(self) -> bool:
-        """Whether the state is another one than before."""
+        """Whether the state changed."""
         return self.status is not StepStatus.BLOCKED
 
     @cached_property
@@ -105,7 +105,7 @@ class Step:
             name = self.rows.name(int(k))
             found[name] = max(found.get(name, 0.0), float(pressing[k]))
         pull = self.solution.actuator_multipliers
-        # A share of a step has narrower bounds than the limits, so that an actuator without any may be held by one.
+        # A share of a step has narrower bounds than the limits: a bound may be active without a limit.
         limited = np.isfinite(np.where(pull > 0.0, self.limits.upper, self.limits.lower))
         for k in np.flatnonzero((np.abs(pull) > 1e-9) & limited):
             found[self.limits.name(int(k), upper=bool(pull[k] > 0.0))] = float(abs(pull[k]))
@@ -113,17 +113,17 @@ class Step:
 
     @property
     def fcl_rows(self) -> int:
-        """How many clearance rows of that QP FCL supplied, each proven."""
+        """Number of clearance rows of that QP that FCL supplied, each proven."""
         return 0 if self.rows is None else self.rows.by_fcl
 
     @property
     def exact_rows(self) -> int:
-        """How many of them are by closed forms: FCL was not to be asked, its answer was refused, or an axis touched."""
+        """Number of its clearance rows by closed forms: FCL was not used, its answer refused, or an axis touched."""
         return 0 if self.rows is None else self.rows.by_formula
 
     @property
     def failed_qp(self) -> StepQP | None:
-        """The last QP, where the step was blocked because it had no answer: every row and column with a name."""
+        """The last QP if the step was blocked because that had no answer: every row and column with a name."""
         return None if self.failure is None else self.failure.qp
 
     @property
@@ -133,5 +133,5 @@ class Step:
 
     @property
     def blocked_by(self) -> tuple[str, ...]:
-        """Names of the obstacles, members and limits that held the arm back; the reason where there are none."""
+        """Names of the obstacles, members and limits that held the arm back; the reason if there are none."""
         return self.active or ((self.reason,) if self.reason else ())

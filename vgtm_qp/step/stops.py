@@ -4,9 +4,9 @@ To first order the arm can cover the share alpha of a piece of path that is the 
 
     J d_rho = E d_a,   tip rows d_rho = alpha rate,   clearance and angle rows,   limits <= d_a <= limits,
 
-a linear program in the actuators' displacements. The rows with multipliers hold it back; those without which it is
-held as before are left out one after another, until each one that remains is needed. An arm may stop although a little
-way is left to first order: close to a fold of its motion the curvature takes what the rows leave.
+a linear program in the actuators' displacements. The rows with multipliers hold it back. Those that can be left out
+without letting the arm further are dropped one after another, until each remaining row is needed. An arm may stop
+although the linear program allows a little progress: near a fold of its motion the curvature uses that up.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from vgtm_qp.step.step import Step
 from vgtm_qp.step.task import over_all_nodes, tip_response
 
 _TRUST = 0.05
-"""How far actuators move in the linear program, m: further, its rows mean little."""
+"""Trust region: greatest displacement of an actuator in the linear program, m."""
 _BLOCKED = 0.02
-"""A share of the way, within the trust, below which the arm counts as blocked."""
+"""Share of the path, within the trust region, below which the arm counts as blocked."""
 _FREER = 2.0
-"""Rows without which the arm gets on by so many times more are those that hold it."""
+"""Growth of the share without a row from which on that row counts as one that holds the arm."""
 _SINGULAR = 0.1
-"""A share below which the tip moves far less than the actuators do."""
+"""Share below which the tip moves far less than the actuators do."""
 _PRESSES = 1e-7
 
 CANNOT_BRAKE = "the arm could not brake after it"
-"""The reason of a step that is refused since no steps were found that bring the arm to rest after it."""
+"""Reason of a step that is refused because no braking was found after it."""
 BASE_MOVES_ON = "its base moves on, and the tip cannot stay on its path with accelerations as limited"
 """The reason of a step in which the tip leaves its path."""
 
 
 class StopKind(StrEnum):
-    """What stops an arm."""
+    """The kind of cause that stops an arm."""
 
     OBSTACLE = "obstacle"
     MEMBERS = "members"
@@ -72,20 +72,19 @@ class Stop:
     Attributes
     ----------
     kind : StopKind
-        ``obstacle`` where one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose``
-        where the tip cannot start in that direction whatever the limits, or the fixed quantities do not determine the
-        nodes; ``out of reach`` where the arm is stretched towards a goal further away; ``nonlinear`` where no row
-        forbids the step to first order, ``acceleration`` if it is one after which the arm could not brake, and
-        ``step limit`` if it is longer than the problem allows;
-        ``solver`` where none does and the QP solver gave no good answer.
+        ``obstacle`` if one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose`` if the
+        tip cannot start in that direction even without limits, or the fixed quantities do not determine the nodes;
+        ``out of reach`` if the arm is stretched towards a goal further away. If no row forbids the step to first
+        order: ``acceleration`` if the arm could not brake after it, ``step limit`` if it is longer than the problem
+        allows, ``solver`` if the QP solver gave no accurate answer, else ``nonlinear``.
     multipliers : dict
-        Rows of the set, the most decisive first, and the share of the way that each costs per metre (radian).
+        Rows of the set, the most decisive first, and the share of the path that each costs per metre (radian).
     obstacles : tuple of str
         Names of the obstacles in the set.
     reason : str
-        What the last attempt said.
+        Reason of the last attempt.
     away : tuple of float
-        (3,) where the obstacles in the set push the arm, each as much as it costs; zero without any.
+        (3,) direction in which the obstacles in the set push the arm, weighted by multipliers; zero without obstacles.
     """
 
     kind: StopKind
@@ -96,7 +95,7 @@ class Stop:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the rows of the set, or the kind of the stop where there are none, with a solver's reason."""
+        """Names of the rows of the set, or else the kind of the stop, with a solver's reason."""
         return tuple(self.multipliers) or (str(self if self.kind is StopKind.SOLVER else self.kind),)
 
     def __str__(self) -> str:
@@ -122,9 +121,9 @@ def explain(
     limits: Limits,
     last: Step | None = None,
 ) -> Stop:
-    """Return why the arm does not get on from `state` towards a goal, with rates over a whole piece of path.
+    """Return why the arm stopped at `state` on its way to a goal, with rates over a whole piece of path.
 
-    Where no rows forbid it to first order, the answer is what the `last` step was held by, and its reason.
+    If no rows forbid it to first order, the answer is the active rows of the `last` step and its reason.
     """
     reason, pressing, solver_failed = "", dict[str, float](), False
     if last is not None:
@@ -168,12 +167,12 @@ def explain(
 
 
 def _is_braking(reason: str) -> bool:
-    """Return whether a step was refused, or left its path, for what the arm could do after it."""
+    """Return whether a step was refused, or left its path, because the arm could not brake after it."""
     return reason.startswith((CANNOT_BRAKE, BASE_MOVES_ON))
 
 
 def _first(kinds: Iterable[StopKind], other: StopKind) -> StopKind:
-    """Return the most telling of some kinds, the `other` one without any."""
+    """Return the first of `kinds` in the order of ``StopKind``, or `other` if there are none."""
     return next((kind for kind in StopKind if kind in kinds), other)
 
 
@@ -184,7 +183,7 @@ def _obstacles(setup: Setup, names: Iterable[str]) -> tuple[str, ...]:
 
 
 def _kind(setup: Setup, name: str) -> StopKind:
-    """Return what the row of that name is about."""
+    """Return the kind of stop by the row of that name."""
     first = name.split(":")[0]
     if first == "clearance":
         return StopKind.OBSTACLE if _obstacles(setup, [name]) else StopKind.MEMBERS
@@ -208,7 +207,7 @@ class _Program:
         every = over_all_nodes(arm, kinematics.motion().response()[0])
         tip = setup.task.rows(state.nodes, kinematics, goal)
         length = float(np.linalg.norm(tip.rate))
-        # Within the trust the arm covers about so much of the way.
+        # Share of the path that the arm covers within the trust region, roughly.
         self._unit = min(1.0, _TRUST / length) if length > 0.0 else 1.0
         self._equal = np.column_stack([tip_response(arm, tip.jacobian, every), -tip.rate * self._unit])
         self._rows = separation.rows(state.q, state.time, 0.0, 2.0 * _TRUST, {}, 0.0)
@@ -254,7 +253,7 @@ class _Program:
         return self._limits.name((k - near) % actuators, upper=k >= near + actuators)
 
     def normal(self, k: int) -> Array:
-        """Return (3,) the direction in which the arm as a whole leaves the obstacle of row `k`."""
+        """Return (3,) the direction in which a translation of the arm leaves the obstacle of row `k`."""
         return np.asarray(self._rows.coefficients[k].sum(axis=0))
 
 

@@ -1,4 +1,4 @@
-"""What one step is asked for, and what its QP is linearised at."""
+"""The target of one step, and the input of its QP."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vgtm_qp.step.path import Path
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What one step is asked for: a piece of a path, the time it takes and where the base will be.
+    """The target of one step: a piece of a path, the time at its end and the base's pose then.
 
     Attributes
     ----------
@@ -29,9 +29,9 @@ class Target:
     time : float
         Time at the end of the step, s.
     base : Pose or None
-        Where the base is then; None where it rests.
+        Pose of the base then; None if it rests.
     vertex_goals : (V, 3) or None
-        Where control vertices are drawn to, m; the rows in ``Layout.vertex_goals`` count.
+        Goals of control vertices, m; only the rows of ``Layout.vertex_goals`` are used.
     """
 
     path: Path
@@ -49,11 +49,11 @@ class Target:
 
 
 class QPInput(NamedTuple):
-    """What the QP of a step is linearised at and asked for.
+    """Where the QP of a step is linearised, and its target.
 
-    Residuals are those at `q` and Jacobians those `at` another configuration, the same for a correction. The curve is
-    (V, 3), m, and (T,), rad. The `goal` is that of the target at a `progress` of 0 to 1, which the tip has made. A QP
-    of `motion` moves the arm; a correction returns to the constraints by the least displacement.
+    Residuals are those at `q`, Jacobians those at `at`, which is `q` in a correction. The curve is (V, 3), m, and (T,),
+    rad. The `goal` is that of the target at the tip's `progress`, 0 to 1. A QP of `motion` moves the arm; a correction
+    returns to the constraints by the least displacement.
     """
 
     q: Array
@@ -67,7 +67,7 @@ class QPInput(NamedTuple):
     motion: bool
 
     def linear(self, layout: Layout) -> StepInput:
-        """Return the same in the terms of a QP of `layout`."""
+        """Return this input in the terms of a QP of `layout`."""
         arm, target, shape, curve = layout.arm, self.target, layout.general, None
         if shape is not None:
             curve = shape.rows(self.vertices, self.torsion, base_frame(arm, target.base))

@@ -1,4 +1,4 @@
-"""The end effector's coordinates that a problem tracks, at numbers, and the paths to goals for them."""
+"""The tracked coordinates of the end effector as numbers, and the paths to goals for them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vgtm_qp.step.path import Path
 _UNCHANGED = "the state of the arm is unchanged"
 
 _SHORTEST, _LONGEST = 1e-8, 1e8
-"""Durations of a step, s: shorter ones are lost in the rounding of the time and of the rates."""
+"""Least and greatest duration of a step, s: rates of a shorter one would be rounding errors."""
 
 
 class TipRows(NamedTuple):
@@ -58,8 +58,8 @@ class TipTask:
     ) -> tuple[Array, Array, Array, float]:
         """Return error (n_e,) goal minus value, rate (n_e,) along the path, turned axes (r, 3) and weight of progress.
 
-        The rows of the axes times the tip's angular velocity are the tracked turns. With `motion`, errors that are
-        not worth closing are zero.
+        The axes times the tip's angular velocity are the rates of the tracked turns. With `motion`, errors within an
+        accepted state's tolerance are zero.
         """
         inputs = self._rows.inputs
         inputs[0][:], inputs[1][:] = position, rotation.T.reshape(-1)
@@ -71,7 +71,7 @@ class TipTask:
         return error.copy(), rate.copy(), across.reshape(3, -1).T.copy(), float(weight[0])
 
     def error(self, position: Array, rotation: Array, goal: TipGoal) -> Array:
-        """Return the error (n_e,) alone, m or rad; it is asked for at every step of settling."""
+        """Return the error (n_e,) alone, m or rad, as every step of settling needs it."""
         if self.turns is None:
             return np.asarray(error(self.row_names, position, rotation, goal.position, goal.rotation))
         return self.residual(position, rotation, goal)[0]
@@ -99,7 +99,7 @@ class TipTask:
         Raises
         ------
         GoalError
-            The goal is not three finite numbers, or is for coordinates that no row of the QP steers, or two for one.
+            The goal is not three finite numbers, is for coordinates without a row in the QP, or there are two for one.
         """
         steered = {
             "position": (position, bool(len(self.axes))),
@@ -133,7 +133,7 @@ def over_all_nodes(arm: Arm, response: Array) -> Array:
 
 
 def tip_response(arm: Arm, jacobian: Array, every: Array) -> Array:
-    """Return (n_e, n) how the tip's rows, of `jacobian` (n_e, 3 K_tip), change with displacements (N, 3, n)."""
+    """Return (n_e, n) changes of the tip's coordinates, by `jacobian` (n_e, 3 K_tip), for displacements (N, 3, n)."""
     return np.asarray(jacobian @ every[arm.end_effector.nodes].reshape(jacobian.shape[1], every.shape[2]))
 
 

@@ -13,10 +13,10 @@ from vgtm_qp.errors import ResultError
 from vgtm_qp.result.chain import RecordedChain, extreme_values, numbers, same
 
 _TOLERANCE = 1e-9
-"""Of recorded lengths against those of the home nodes, m."""
+"""Tolerance of recorded lengths against those of the home nodes, m."""
 
 _DENSE_UNKNOWNS = 300
-"""Above this many free coordinates singular values come from a sparse factorisation."""
+"""Number of free coordinates above which singular values come from a sparse factorisation."""
 
 
 class RecordedArm:
@@ -33,7 +33,7 @@ class RecordedArm:
     actuated, stretches : (M,) bool
         True where a member changes its length.
     quantity_names, home_quantities : (M,)
-        Of what moves the arm and what is fixed: names and home lengths of the members.
+        Names and home lengths of the members, actuated and fixed.
     length, stroke, rate, acceleration, radius : (M,), (M, 2), (M,), (M,), (M,)
         Home lengths and limits; inf where there is no limit.
     corners, offset : (M, 2, 3) int or (M, 2, 1) int, (M, 2, 3)

@@ -36,11 +36,11 @@ from vgtm_qp.verify.path import (
 from vgtm_qp.verify.recovery import excuse_recovering
 
 MEMBER_TOLERANCE = 1e-9
-"""Fixed and locked members, base nodes, m."""
+"""Tolerance of fixed and locked members and of base nodes, m."""
 LIMIT_TOLERANCE = 1e-9
-"""Strokes, rates and accelerations, m, m/s, m/s^2."""
+"""Tolerance of strokes, rates and accelerations, m, m/s, m/s^2."""
 ARRAY_TOLERANCE = 1e-9
-"""Stored arrays against the same recomputed, m."""
+"""Tolerance of stored arrays against recomputed ones, m."""
 
 _SAFE = 0.05
 """Default of ``clearance.safe``, m."""
@@ -116,7 +116,7 @@ def verify(maneuver: Result) -> Certificate:
 
 
 def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
-    """Return how far lengths or joint values (T, M), and the base, are from where they are held, and from limits.
+    """Return errors of fixed lengths or joint values (T, M) and of the base, and violations of limits.
 
     A rate is the mean over a step. An acceleration is the change of the rate from step to step over the time between
     their middles; that of a member which stops because it locks does not count.
@@ -193,14 +193,14 @@ def _least_clearances(motion: RecordedMotion, encounters: Sequence[Encounters]) 
     for step in range(count - 1):
         for pairs in encounters:
             limit, bound = pairs.between(step, limit, bound)
-    # The bound is that of an interval; where it is as low as the clearance met there, the instant says more.
+    # The bound names an interval; if the clearance found there is as low, its instant is more precise.
     where = limit.where if bound.value >= limit.value - RESOLUTION else bound.where
     between = Least(min(bound.value, limit.value), where)
     return at, between, np.array([least.value for least in each])
 
 
 def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
-    """Return (T,) how far clearances differ; how deep a member is inside an obstacle is not compared."""
+    """Return (T,) differences of clearances; depths of members inside obstacles are not compared."""
     floor = -float(arm.radius.min(initial=np.inf))
     with np.errstate(invalid="ignore"):
         difference = np.abs(np.maximum(stored, floor) - np.maximum(found, floor))
@@ -208,7 +208,7 @@ def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
 
 
 def _locks(maneuver: Result) -> list[tuple[str, float]]:
-    """Return name and time, s, of what the problem locks."""
+    """Return name and time, s, of the actuators that the problem locks."""
     problem = maneuver.manifest["problem"]
     entries = (problem.get("truss") or problem.get("arm") or {}).get("locked") or ()
     tables = ({"member": entry} if isinstance(entry, str) else entry for entry in entries)
@@ -216,7 +216,7 @@ def _locks(maneuver: Result) -> list[tuple[str, float]]:
 
 
 def _jams_between_rows(maneuver: Result) -> list[str]:
-    """Return the members that lock at a time which no row has: nothing says what length they stuck at."""
+    """Return the members that lock between two rows, so that the length at which they locked is unknown."""
     return [
         f"{name} locks at {since:g} s, where there is no state"
         for name, since in _locks(maneuver)

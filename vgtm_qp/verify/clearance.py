@@ -25,7 +25,7 @@ CLEARANCE_TOLERANCE = 1e-9
 BETWEEN_TOLERANCE = 1e-4
 """Clearances between states, m."""
 RESOLUTION = 1e-6
-"""The bound between states is at most this much below the least clearance found there, m."""
+"""Greatest gap of the bound between states below the least clearance found there, m."""
 
 _GREATEST_DEPTH = 48
 _GREATEST_COUNT = 1_000_000
@@ -65,12 +65,12 @@ class Least:
 
 
 class Encounters(ABC):
-    """All pairs of one member and one other thing that must keep apart."""
+    """All pairs of a member and an obstacle or another member that must keep apart."""
 
     def __init__(self, motion: RecordedMotion) -> None:
         self.motion = motion
         self.held_from: dict[tuple[int, int], int] = {}
-        """First state at which each pair counts; pairs that are missing count from the first state on."""
+        """First state at which each pair counts; pairs not in it count from the first state on."""
 
     @abstractmethod
     def pairs_named(self, name: str) -> list[tuple[int, int]]:
@@ -96,9 +96,9 @@ class Encounters(ABC):
 
     @abstractmethod
     def _apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
-        """Return (P,) how far a plane across `normal` holds the surfaces apart, m.
+        """Return (P,) the gap between the surfaces' supporting planes across `normal`, m.
 
-        With a zero normal it is the value of axes that touch.
+        With a zero normal it is the value for axes that touch.
         """
 
     @abstractmethod
@@ -107,7 +107,7 @@ class Encounters(ABC):
 
     @abstractmethod
     def name(self, pair: tuple[int, int]) -> str:
-        """Return what the pair is called."""
+        """Return the name of the pair."""
 
     def distances(self, state: int, pair: Pairs) -> Array:
         """Return the exact distances (P,) of pairs at a state, m."""

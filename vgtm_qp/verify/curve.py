@@ -1,4 +1,4 @@
-"""How far the stations of an arm are from their nodes on the reference curve, and the curve's end from the tip."""
+"""Distances of an arm's stations from their nodes on the reference curve, and of the curve's end from the tip."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vgtm_qp.result.result import Result
 from vgtm_qp.verify.path import DIRECTION_TOLERANCE, angles
 
 TRACKING_TOLERANCE = 1e-6
-"""Stations that are to be on the curve exactly, and the curve's end, m."""
+"""Tolerance of stations with exact tracking and of the curve's end, m."""
 
 _PIECES = 400
 """Chords of each Bezier segment whose lengths make its arc length."""
@@ -84,7 +84,7 @@ class RecordedCurve(NamedTuple):
         points = self.at(np.tile(fine, (len(vertices), 1)), vertices)
         halves = np.linalg.norm(np.diff(points, axis=1), axis=2)
         whole = np.linalg.norm(np.diff(points[:, ::2], axis=1), axis=2)
-        # Twice as many chords are four times nearer to the arc.
+        # With twice as many chords the error of the length is a quarter: Richardson extrapolation.
         arcs = (4.0 * (halves[:, ::2] + halves[:, 1::2]) - whole) / 3.0
         travelled = np.pad(np.cumsum(arcs, axis=1), ((0, 0), (1, 0)))
         wanted = self.nodes * travelled[:, -1:]

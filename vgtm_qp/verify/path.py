@@ -14,9 +14,9 @@ from vgtm_qp.result.poses import rotation_matrix
 from vgtm_qp.result.result import Result
 
 TIP_TOLERANCE = 1e-6
-"""Tip position and its target's distance from the path, m."""
+"""Tolerance of the tip's position and of its target's distance from the path, m."""
 DIRECTION_TOLERANCE = 1e-6
-"""Tip direction and orientation, rad."""
+"""Tolerance of the tip's direction and orientation, rad."""
 
 _DIRECTIONS = {
     "orientation": ("tip_target_rotation", "rotation_vector"),
@@ -42,9 +42,9 @@ def direction_error(maneuver: Result, rotation: Array) -> Array | None:
 
 
 def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], list[str]]:
-    """Return what is wrong with the targets of a maneuver whose tip (T, 3), m, was at `tip`.
+    """Check the targets of a maneuver whose tip was at `tip` (T, 3), m.
 
-    That is the distance (T,) of each position target from the path, m, or None if there is no path of positions; then
+    Return the distance (T,) of each position target from the path, m, or None if there is no path of positions; then
     contradictions and notes, as in the certificate.
     """
     wanted = maneuver.manifest["problem"].get("maneuver") or {}
@@ -73,7 +73,7 @@ def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], l
 
 
 def _tracked(maneuver: Result) -> tuple[str, ...]:
-    """Return which coordinates of the tip its problem steers."""
+    """Return the coordinates of the tip that its problem tracks."""
     return tuple((maneuver.manifest["problem"].get("end_effector") or {}).get("track") or ("position",))
 
 

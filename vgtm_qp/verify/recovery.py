@@ -1,4 +1,4 @@
-"""Pairs that were nearer at home than they may be: held to come no nearer, and to their distance once they have it."""
+"""Pairs below their clearance at home: they must come no nearer, and keep their clearance once they have reached it."""
 
 from __future__ import annotations
 

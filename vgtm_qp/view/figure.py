@@ -86,7 +86,7 @@ def plot_frames(
     frames
         How many states, evenly spread, or which ones.
     azimuth, elevation
-        Where the view is taken from, rad; by default across the path of the tip.
+        Azimuth of the view, rad; by default across the path of the tip.
 
     Raises
     ------

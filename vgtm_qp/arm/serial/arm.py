@@ -1,4 +1,4 @@
-"""The second arm behind the door: joints one after another, from the ``[arm]`` table of a problem."""
+"""A serial arm: joints one after another, from the ``[arm]`` table of a problem."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vgtm_qp.problem.arm import ArmTable
 
 
 class SerialArm(JointSpaceArm):
-    """See ``arm.Arm``; joints of an ``[arm]`` table, of which those that are locked from the start are stuck at home.
+    """See ``arm.Arm``; joints of an ``[arm]`` table, of which those locked from the start stay at home.
 
     Its nodes are those of ``SerialChain.functions``.
     """
@@ -43,9 +43,9 @@ class SerialArm(JointSpaceArm):
         self.bodies = self._links(spec.link_radius)
 
     def _every(self, chain: SerialChain) -> int:
-        """Return the least distance of stations, in joints, at which all of them can keep to the curve at once at home.
+        """Return the least spacing of stations, in joints, with which all can stay on the curve at once at home.
 
-        Where there is none, as at the straight home of a snake, there is a station for every three actuators.
+        If there is none, as at the straight home of a snake, there is a station for every three actuators.
         """
         joints, (_, jacobian) = len(chain), chain.at(self.home_configuration)
         for every in range(1, joints + 1):
@@ -54,7 +54,7 @@ class SerialArm(JointSpaceArm):
         return -(-joints // max(1, len(self.actuators) // 3))
 
     def _can_hold(self, jacobian: Array) -> bool:
-        """Whether nodes whose Jacobian (K, 3, J) this is can be held in place one by one."""
+        """Whether nodes with a Jacobian (K, 3, J) can be held in place independently."""
         return has_full_rank(jacobian[:, :, self.actuators].reshape(3 * len(jacobian), len(self.actuators)))
 
     def _place_stations(self) -> None:
@@ -77,7 +77,7 @@ class SerialArm(JointSpaceArm):
         self.end_effector = Tip(nodes[-1], weights[-1], frames[-1])
 
     def _reaches(self) -> Array:
-        """Return (J + 1,) what :attr:`reaches` are: all slides as far out as they go, all links in one line."""
+        """Return (J + 1,) the :attr:`reaches`: all slides fully extended, all links in one line."""
         chain = self.chain
         slide = np.where(chain.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
         beyond = np.cumsum((chain.lengths[1:] + slide)[::-1])[::-1] + np.sqrt(2.0) * chain.spread

@@ -78,7 +78,7 @@ class SerialChain:
 
     @property
     def constants(self) -> dict[str, Array]:
-        """What :attr:`functions` takes beside the configuration, the columns of each as rows."""
+        """Arguments of :attr:`functions` besides the configuration, the columns of each as rows."""
         return {
             "axes": self.axis,
             "positions": self.position,
@@ -99,7 +99,7 @@ class SerialChain:
         positions, rotations = ca.SX.sym("positions", 3, count), ca.SX.sym("rotations", 3, 3 * count)
         tip = ca.SX.sym("tip", 3)
         origin, frame = q[count : count + 3], rotated(q[count + 3 :])
-        # Nodes and stations stand beside the number of joints that move them.
+        # Each node and station is paired with the number of joints that move it.
         nodes, stations, joints = [(origin, 0)], [(origin, frame, 0)], []
         for j, turns in enumerate(self.revolute.tolist()):
             origin = origin + frame @ positions[:, j]

@@ -1,4 +1,4 @@
-"""The first arm behind the door: a truss, whose configuration is the positions of its nodes, eqs. (7)-(10)."""
+"""A truss as an arm: its configuration is the positions of its nodes, eqs. (7)-(10)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
 from vgtm_qp.arm.symbols import Constants
-from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_ways
+from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_paths
 from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.symbols import TrussSymbols
@@ -86,7 +86,7 @@ class TrussArm(Arm):
         return q if self.truss.joints is None else self.truss.member_ends(q).reshape(-1, 3)
 
     def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:
-        """See ``arm.Arm``: an end in an offset joint is moved by the three nodes that orient that."""
+        """See ``arm.Arm``: the three nodes that orient an offset joint move the end in it."""
         ends, (count, slots) = self._ends, points.shape
         if ends is None:
             return points, coefficients
@@ -104,8 +104,8 @@ class TrussArm(Arm):
         return float(np.abs(motion).max())
 
     def reach(self) -> Array:
-        ways, tip = longest_ways(self.truss, np.flatnonzero(self.base)), self.end_effector
-        return np.asarray(ways[:, tip.nodes] @ np.abs(tip.weights))
+        bounds, tip = longest_paths(self.truss, np.flatnonzero(self.base)), self.end_effector
+        return np.asarray(bounds[:, tip.nodes] @ np.abs(tip.weights))
 
     def hollow(self) -> float:
         return hollow(self.truss)

@@ -13,11 +13,10 @@ from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
 
 
-def longest_ways(truss: Truss, sources: Index) -> Array:
+def longest_paths(truss: Truss, sources: Index) -> Array:
     """Return (S, N) bounds of the distances from nodes `sources` (S,) to all nodes in any pose, m.
 
-    The shortest way along members that are all as long as they can be, joint offsets included; inf where
-    there is none.
+    The shortest path along members at their greatest lengths, joint offsets included; inf if no path exists.
     """
     longest = truss.stroke[:, 1].copy()
     if truss.joints is not None:
@@ -42,11 +41,11 @@ def hollow(truss: Truss) -> float:
     is_triangle = len(tip) == 3 and np.count_nonzero(between) == 3
     if is_triangle and np.allclose(truss.tip_weights, 1.0 / 3.0) and not offset:
         return float(truss.stroke[between, 1].max()) / (2.0 * math.sqrt(3.0))
-    return float((longest_ways(truss, tip)[:, tip] @ np.abs(truss.tip_weights)).min()) + offset
+    return float((longest_paths(truss, tip)[:, tip] @ np.abs(truss.tip_weights)).min()) + offset
 
 
 class _Bounds(NamedTuple):
-    """Bounds of the first two derivatives of a unit vector, one per node; inf where there is none."""
+    """Bounds of the first two derivatives of a unit vector, one per node; inf if unbounded."""
 
     first: Array
     second: Array
@@ -56,7 +55,7 @@ def chord_deviation(truss: Truss, start: Array, end: Array) -> float:
     """Return a bound, m, of how far a member's end is from its chord where nodes (N, 3) move straight; inf without one.
 
     An end is r = rho + R o, eq. (13), and the axes of the joint's frame R are unit vectors of polynomials w of the
-    share of the way. From |w| >= m, |w'| <= a and |w''| <= b follow |(w/|w|)'| <= a/m and
+    share of the motion. From |w| >= m, |w'| <= a and |w''| <= b follow |(w/|w|)'| <= a/m and
     |(w/|w|)''| <= b/m + 3 (a/m)^2, and a curve is no further from its chord than an eighth of the greatest second
     derivative.
     """

@@ -23,8 +23,8 @@ class Joints:
     Attributes
     ----------
     triangle : (N, 3) int
-        Joint frame of node i: origin at node ``triangle[i, 0]`` (= i), z along the normal of the three nodes taken
-        counter-clockwise, x along the outward bisector at node i.
+        Joint frame of node i: origin at node ``triangle[i, 0]`` (= i), z along the normal of the three nodes in
+        counter-clockwise order, x along the outward bisector at node i.
     offset : (M, 2, 3)
         Constant position of each member's two ends in those frames, m.
     """

@@ -13,7 +13,7 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.rows.members import end_function, member_function
 
 _DENSE = 150
-"""Up to so many node coordinates LAPACK is faster than any use of the structure."""
+"""Greatest number of node coordinates for which dense LAPACK is faster than a sparse factorisation."""
 
 _SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 

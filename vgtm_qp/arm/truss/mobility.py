@@ -1,4 +1,4 @@
-"""What a truss can move: its counts, free motions, and the coordinates of tip and faces that they reach."""
+"""Mobility of a truss: its counts, free motions, and the coordinates of tip and faces that they reach."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm as a chain of equal periods, each hung on the one before."""
+"""An arm as a chain of equal periods, each standing on the one before."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _MOST_BASE_NODES = 4
 class Chain:
     """Periods of p stages; its members and tracked stations use nodes of it and of the period before.
 
-    Places within a period: first the w nodes that it uses of the one before, then its own m by stage. Where the arm
-    allows it, the nodes and members of every period are put in the order in which all periods are alike.
+    Places within a period: first the w nodes of the period before that it uses, then its own m nodes by stage. If the
+    arm allows it, nodes and members of every period are ordered so that all periods are alike.
 
     Attributes
     ----------
@@ -38,21 +38,21 @@ class Chain:
     carried : (w,) int
         Which of a period's nodes the next period uses.
     window : (n, w + m) int
-        The node at each place; before the first period base nodes where all periods are alike, else any.
+        The node at each place; places before the first period hold base nodes if all periods are alike, else any node.
     pattern : (3m, 3w + 3m) bool
-        Which coordinates a member's length depends on, in any of the periods.
+        Coordinates that a member's length depends on in at least one period.
     member_places : (3m, 2) int or None
-        The places that a period's members join; None where the periods are not alike.
+        The places that a period's members join; None if the periods are not alike.
     actuated : (3m,) bool
         The places of actuated members.
     locked : (l,) int
-        Fixed members that stand where other periods have an actuated one.
+        Fixed members at places where other periods have an actuated member.
     stations : (n, f) int
         Positions in ``layout.tracked`` of the stations that each period completes.
     station_places, station_weights : (f, 3) int, (f, 3)
         Places of those stations' nodes, in rising order, and their weights.
     station_order : (n, f, 3) int
-        Which of a station's nodes stand at those places.
+        Which of a station's nodes are at those places.
     """
 
     layout: Layout
@@ -85,7 +85,7 @@ class Chain:
 
     @property
     def before(self) -> int:
-        """Number of displacement coordinates that a period takes over from the one before, 3w."""
+        """Number of displacement coordinates of the nodes of the period before that a period uses, 3w."""
         return 3 * len(self.carried)
 
     @cached_property
@@ -97,7 +97,7 @@ class Chain:
 
     @cached_property
     def gathered(self) -> Index:
-        """(E,) where the entries of ``LengthScatter`` stand among the nonzeros of all periods."""
+        """(E,) places of the entries of ``LengthScatter`` among the nonzeros of all periods."""
         scatter = self.bays.scatter
         period, row = np.divmod(np.argsort(self.members.reshape(-1))[scatter.member], self.own)
         node = self.bays.free[scatter.column // 3]
@@ -114,7 +114,7 @@ class Chain:
 
 @lru_cache(maxsize=4)
 def find_chain(layout: Layout) -> Chain | None:
-    """Return the chain of `layout`, with the shortest period; None where the arm is none."""
+    """Return the chain of `layout` with the shortest period; None if the arm is not a chain."""
     bays = layout.arm.bays
     if bays is None:
         return None
@@ -133,7 +133,7 @@ def _places(period: Index, place: Index, here: Index, carried: Index) -> Index:
 
 
 def _chain(layout: Layout, bays: Bays, stages: int, length: int) -> Chain | None:
-    """Return the chain of periods of `length` stages, None where the arm is none."""
+    """Return the chain of periods of `length` stages; None if the arm is not a chain of these."""
     periods = stages // length
     counts = np.bincount(bays.stage[bays.free], minlength=stages)
     member_stage = bays.stage[bays.member_nodes].max(axis=1)
@@ -155,8 +155,8 @@ def _alike(
 ) -> tuple[Index, Index, Index] | None:
     """Return base nodes, nodes (n, m) and members (n, 3m) in the order in which all periods are alike, if any.
 
-    Base nodes are those of a period before the first one. Nodes of a stage are told apart by what they hang on, so that
-    a bay that is the mirror image of the one before comes in another order of its nodes.
+    Base nodes are those of a period before the first one. Nodes of a stage are distinguished by the nodes they stand
+    on, so that a bay that mirrors the one before has its nodes in another order.
     """
     base = np.flatnonzero(bays.base).tolist()
     if bays.joints is not None or len(nodes) < 2 or len(base) > _MOST_BASE_NODES:
@@ -182,7 +182,7 @@ def _alike(
 def _ordered_period(
     before: list[int], names: list[int], members: list[int], ends: list[list[int]], sizes: tuple[int, ...]
 ) -> tuple[list[int], list[int], list[tuple[int, int]]]:
-    """Return a period's nodes and members in order and the places that these join; nothing where those go further back.
+    """Return a period's nodes and members in order, and the places they join; nothing if these reach further back.
 
     Places of nodes `before` are negative, and a period's own count from zero.
     """
@@ -212,7 +212,7 @@ def _ordered_period(
 def _of_ordered(
     layout: Layout, bays: Bays, sizes: tuple[int, ...], base: Index, nodes: Index, members: Index
 ) -> Chain | None:
-    """Return the chain of these periods behind the nodes `base`, None where they are none."""
+    """Return the chain of these periods after the nodes `base`; None if they do not form one."""
     poses, (periods, own) = layout.arm.stations, nodes.shape
     period, place = np.full(bays.node_count, -2, dtype=np.int64), np.zeros(bays.node_count, dtype=np.int64)
     period[base], place[base] = -1, np.arange(len(base))

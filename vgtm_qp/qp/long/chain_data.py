@@ -1,7 +1,6 @@
-"""The numbers of a step laid out period by period, as the eliminations along a chain read them.
+"""The numbers of a step, period by period, as the eliminations along a chain read them.
 
-They are those of a QP's numbers, or are found from the positions of the nodes: every period by one mapped, compiled
-function.
+They are copied from a QP's numbers, or computed from the nodes' positions by one compiled function mapped over periods.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from vgtm_qp.rows.curve import free_basis
 
 
 class ChainData:
-    """The numbers of every period as rows of three arrays, and the curve's own terms.
+    """The numbers of every period as rows of three arrays, and the terms in the curve alone.
 
     Attributes
     ----------
@@ -116,7 +115,7 @@ class ChainData:
         )
 
     def hold_base(self, offset: Array, normal: Array) -> None:
-        """Set what the base makes of the curve: `offset` (V, 3) and `normal` (3,)."""
+        """Set the curve's base: `offset` (V, 3) and `normal` (3,), see the class."""
         self.offset[:], self.normal[:] = offset, normal
         self._free[3:6, 0] = normal
         self.part["normal"][:] = normal
@@ -133,7 +132,7 @@ class ChainData:
         return self.offset + (self._free @ free).reshape(-1, 3)
 
     def end_rows(self) -> EndRows:
-        """Return the rows that keep the curve's end in the end effector, but those that hold by elimination."""
+        """Return the rows that keep the curve's end in the end effector, except those that elimination satisfies."""
         layout = self._chain.layout
         gaps, tilts = layout.ends_at_tip and not layout.hard_tracking, layout.ends_along_tip
         if not (gaps or tilts):
@@ -163,7 +162,7 @@ class ChainData:
         return self._free.T @ self._polygon_hessian @ self._free, self.polygon_gradient(self.offset)
 
     def polygon_gradient(self, vertices: Array) -> Array:
-        """Return (3V - 5,) the gradient of those terms where the vertices are displaced so."""
+        """Return (3V - 5,) the gradient of those terms at displacements `vertices` (V, 3)."""
         gradient = self._polygon @ vertices + self.vertex_gradient
         return np.asarray(gradient.reshape(-1) @ self._free)
 
@@ -234,13 +233,13 @@ class PeriodValues:
         inputs = [array.reshape(chain.periods, -1) for array in self._kernel.inputs]
         self._X, self._Y = (array.reshape(-1, 3) for array in inputs[:2])
         self._curve, self._motion = inputs[6].reshape(-1, 2, 6), inputs[7]
-        # One pair of switches for each station, for gap and angles: what is hard is closed by corrections too.
+        # Two switches for each station, for gap and angles: corrections close hard rows too.
         self._closes, tracked = inputs[8].reshape(-1, 2), data.stations
         self._is_hard = np.stack([layout.hard_gaps[tracked, 0], layout.hard_tilts[tracked, 0]], axis=1)
         inputs[2][:], inputs[3][:] = layout.arm.home_quantities[data.members], ~bays.actuated[data.members]
         for array, constants in zip(inputs[4:6], _frame_constants(chain, data), strict=True):
             array[:] = constants.reshape(array.shape)
-        # What the first period's members hang on does not move by itself.
+        # Base nodes, on which the first period's members stand, are no unknowns.
         self._first = -1 if data.is_reversed else 0
         self._base_row, self._base_column = np.nonzero(chain.pattern[:, : chain.before])
         self._of_base = chain.entry[self._base_row, self._base_column]
@@ -249,8 +248,8 @@ class PeriodValues:
     def fill(self, X: Array, Y: Array, vertices: Array, moved: Array | None, *, motion: bool) -> None:
         """Overwrite the QP's numbers with those at `X` (N, 3), with Jacobians at `Y` (N, 3), m.
 
-        What the base makes of the curve is in the data already. `moved` (N, 3) are displacements of the base nodes, m,
-        None where they rest.
+        The curve's base is already set, see :meth:`ChainData.hold_base`. `moved` (N, 3) are displacements of the base
+        nodes, m; None if they rest.
         """
         chain, data = self._chain, self._data
         window = data.window.reshape(-1)
@@ -272,7 +271,7 @@ class PeriodValues:
 
 
 def period_values(chain: Chain) -> ca.Function:
-    """Return one period's numbers as a function of where its nodes are.
+    """Return one period's numbers as a function of its nodes' positions.
 
     Arguments: X, Y (3, w + m), where residuals and where Jacobians are evaluated; home (3m), lengths, and fixed (3m),
     1 where a member keeps it; angles (6f), polar angles' cosines and sines of each station; alignment (3, 3f); curve
@@ -319,7 +318,7 @@ def period_values(chain: Chain) -> ca.Function:
 def _frame_constants(chain: Chain, data: ChainData) -> tuple[Array, Array]:
     """Return angles (K, 6) and alignments (K, 3, 3), columns first, of the stations in the order of `data`.
 
-    A station whose nodes are named the other way round has y- and z-axis of its fitted frame reversed.
+    A station whose nodes are named clockwise has y- and z-axis of its fitted frame reversed.
     """
     arm, angles, alignments = chain.layout.arm, [], []
     for station, order in zip(

@@ -37,7 +37,7 @@ NewtonStep = Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ca.SX]]
 class Stage:
     """One stage of a period: its own coordinates, those before, the rows of its fixed and its actuated members.
 
-    T says how the fixed members follow the nodes before, and rhs what they lack; G and N are those of the file's head.
+    T couples the fixed members to the nodes before, rhs are their errors; G and N are as in the module docstring.
     """
 
     own: list[int]
@@ -66,7 +66,7 @@ class Inputs:
     weights, slopes : lists of (V,)
         Of the control vertices, by station.
     tangent_face, tangent_curve, gap, tilt : lists of (2, 9), (2, 3), (3,), (2,)
-        Gap and angles are as they are where no unknown moves.
+        Gap and angles are those without any displacement.
     normal : (3,)
         The direction of the second control vertex.
     sizes : dict of dicts
@@ -301,7 +301,7 @@ class Elimination:
         )
 
     def _moved(self, u: ca.SX, z: ca.SX, gains: list[list[ca.SX]], rhs: list[ca.SX]) -> ca.SX:
-        """Return displacements (3w + 3m, c) behind those `u` (3w, c) before, for free motions `z` (freedom, c)."""
+        """Return displacements (3w + 3m, c) for free motions `z` (freedom, c) and displacements `u` (3w, c) before."""
         motions = ca.vertsplit(z, offsets(stage.freedom for stage in self.stages))
         for stage, (free, G, W, Wb, _), motion, wanted in zip(self.stages, gains, motions, rhs, strict=True):
             followed = stage.T @ u
@@ -355,7 +355,7 @@ class Elimination:
 
 
 def member_lengths(chain: Chain, points: ca.SX) -> ca.SX:
-    """Return (3m,) the lengths of a period's members where its nodes are at `points` (3, w + m)."""
+    """Return (3m,) the lengths of a period's members with nodes at `points` (3, w + m)."""
     if chain.member_places is None:
         raise ValueError("the periods of this chain are not alike")
     return ca.vertcat(*[ca.norm_2(points[:, a] - points[:, b]) for a, b in chain.member_places.tolist()])

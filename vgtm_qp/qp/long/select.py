@@ -1,4 +1,4 @@
-"""Which arms are long enough, and regular enough, for a solver whose cost is linear in the bays."""
+"""Choice of arms that are long and regular enough for a solver whose cost is linear in the bays."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 
 STAGED_ACTUATORS = 46
-"""From so many actuators on, elimination along the chain is faster than condensing onto the actuators."""
+"""Least number of actuators with which elimination along the chain is faster than condensing onto the actuators."""
 
 
 def chain_solver(layout: Layout) -> StagedSolver | TrackedSolver | None:
-    """Return the solver along the chain of `layout`; None where it is none or its rows are not those of one."""
+    """Return the solver along the chain of `layout`; None if it is no chain, or has rows that chains do not serve."""
     if layout.general is not None or layout.hard_turns or layout.elastic_tip:
         return None
     chain = find_chain(layout)

@@ -1,4 +1,4 @@
-"""The step's QP of a long arm, exactly and at a cost linear in its bays; the eliminations along them differ."""
+"""The step's QP of a long arm, solved exactly at a cost linear in its bays, by one of two eliminations along them."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that 
 
 
 class ChainSolver(ABC):
-    """Solves the QP of a step with its unknowns eliminated: its Hessian is L L' for an L that a subclass knows.
+    """Solves the QP of a step with its unknowns eliminated: its Hessian is L L' for an L that a subclass computes.
 
-    Rows with bounds meet in a small dense QP of their own. The progress is the last of the unknowns, and no other
-    term of the objective knows it.
+    Rows with bounds form a small dense QP. The progress is the last of the unknowns, and is not coupled to others by
+    the objective.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class ChainSolver(ABC):
         def values(combined: Array) -> Array:
             nonlocal progress
             progress = -scale * (scale * numbers.progress_gradient + float(combined[-1]))
-            # What is least is found before the curve's coordinates there are read.
+            # The minimiser must be computed before the curve's coordinates there are read.
             least = self._least(combined[:-1])
             return table.values(*least, self._free, progress)
 
@@ -124,7 +124,7 @@ class ChainSolver(ABC):
 
     @abstractmethod
     def closing(self) -> ChainClosing:
-        """Return what brings members to their lengths with what the QP solved last has factorised."""
+        """Return the iteration that closes member lengths with the factors of the QP solved last."""
 
     @abstractmethod
     def _eliminate(self) -> None:
@@ -136,20 +136,20 @@ class ChainSolver(ABC):
 
     @abstractmethod
     def _least(self, combined: Array) -> tuple[Moved, Array, Array]:
-        """Go where the Lagrangian is least, given columns times multipliers (size,).
+        """Minimise the Lagrangian, given columns times multipliers (size,).
 
-        Return the nodes' displacements there and the changes of actuated (n_a,) and locked (l,) members.
+        Return the nodes' displacements and the changes of actuated (n_a,) and locked (l,) members at the minimum.
         """
 
     @abstractmethod
     def displacements(self) -> Array:
-        """Return (N, 3) the nodes' displacements where the Lagrangian is least, m."""
+        """Return (N, 3) the nodes' displacements at the minimum of the Lagrangian, m."""
 
     @abstractmethod
     def _residuals(
         self, nodes: Array, vertices: Array, strokes: Array, nodal: Array, forces: Array
     ) -> tuple[Array, Array]:
-        """Return what is left of the equalities, m, and of stationarity, last in the curve's free coordinates.
+        """Return the residuals of the equalities, m, and of stationarity, the curve's free coordinates last.
 
         Given are displacements (N, 3), (V, 3), (n_a,), and gradients by nodes (N, 3) and members (n, 3m).
         """

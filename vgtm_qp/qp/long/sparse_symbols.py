@@ -50,12 +50,12 @@ def nonzeros(A: ca.SX) -> ca.SX:
 
 
 def symmetric(A: ca.SX) -> ca.SX:
-    """Return `A`, known to be symmetric, with its lower half the very expressions of the upper one."""
+    """Return `A`, known to be symmetric, with the expressions of its upper half in the lower half too."""
     return ca.triu2symm(ca.triu(A))
 
 
 def offsets(sizes: Iterable[int]) -> list[int]:
-    """Return where pieces of these sizes begin, and where the last one ends."""
+    """Return the offsets at which pieces of these sizes begin, and the end of the last."""
     return [0, *np.cumsum(list(sizes)).tolist()]
 
 

@@ -1,4 +1,4 @@
-"""The step's QP of a long arm with elastic tracking, or none.
+"""The step's QP of a long arm with elastic tracking or without a curve.
 
 A Riccati recursion from the tip to the base eliminates the free motions of every bay; the curve's coordinates
 are global unknowns beside them.
@@ -42,13 +42,13 @@ class StagedSolver(ChainSolver):
         self._forward = Sweep(elimination.forward(), periods, *ahead)
         self._strokes = Sweep(elimination.strokes(len(self.layout.tip_rows)), periods, *ahead)
         self._motions = self._forward.inputs[3].reshape(periods, -1)
-        # Rows of base nodes, which answer to no displacement, go to places behind the last one that is read.
+        # Rows of base nodes, which are no unknowns, go to places behind the last one that is read.
         self._rows = np.zeros(((periods + 1) * BLOCK * own, 3))
         self._through.bind_input(3, self._rows[: periods * BLOCK * own])
         is_free = chain.node_period >= 0
         first = np.where(is_free, periods - 1 - chain.node_period, periods) * BLOCK * own
         self._row_place = first + chain.node_place * is_free
-        # A row of zeros behind those of the free nodes: base nodes do not move.
+        # A row of zeros after those of the free nodes, for base nodes, which do not move.
         self._moved = np.zeros((chain.nodes.size + 1, 3))
         self._forward.bind_output(1, self._moved[:-1])
         self._moved_at = np.where(is_free, chain.node_period * own + chain.node_place, -1)
@@ -58,8 +58,8 @@ class StagedSolver(ChainSolver):
     def gain(self, held: NDArray[np.bool_]) -> Array | None:
         """Return the changes (n_a, n_e) of the actuated lengths that move the tip by one unit of each of its rows.
 
-        Those of the least motion in the metric of the QP solved last; its progress and the `held` actuators (n_a,)
-        stay as they are. None where they leave no such motion.
+        They are those of the least motion in the metric of the QP solved last; its progress and the `held` actuators
+        (n_a,) do not change. None if there is no such motion.
         """
         if self._last is None:
             return None
@@ -126,7 +126,7 @@ class StagedSolver(ChainSolver):
         return self._moved.take(self._moved_at, axis=0)
 
     def _eliminate(self) -> None:
-        """Run the recursion and factorise what is left, in the curve's coordinates."""
+        """Run the recursion and factorise the remaining Hessian, in the curve's coordinates."""
         self._factor()
         if not np.all(np.isfinite(self._outer[-1])):
             raise SolverError(SINGULAR)

@@ -13,13 +13,13 @@ from vgtm_qp.qp.long.chain import Chain
 class Sweep(Kernel):
     """A period's function run along the chain: its first argument is its first result for the period before.
 
-    CasADi maps a function in order and the two share memory, shifted by one period: the map is a recursion. Arrays
-    given are what the arguments after the first one are read from.
+    CasADi maps a function in order, and first argument and first result share memory, shifted by one period: the map is
+    a recursion. The arguments after the first one are read from the given arrays.
 
     Attributes
     ----------
     carry : (n + 1, size)
-        What was handed over; row 0 is the start.
+        Results handed to the next period; row 0 is the start.
     """
 
     def __init__(self, function: ca.Function, periods: int, *arguments: Array) -> None:
@@ -33,15 +33,15 @@ class Sweep(Kernel):
 
 
 class ChainClosing(Sweep):
-    """Brings members to their lengths by Newton steps with the Jacobian that a QP has factorised.
+    """Closes member lengths by Newton steps with the Jacobian that a QP has factorised.
 
-    What is left after a QP is small, so that such steps converge fast, and each costs one substitution. The function
-    is one of ``Elimination.newton``.
+    Errors after a QP are small, so that such steps converge fast; each costs one substitution. The function is one of
+    ``Elimination.newton``.
 
     Attributes
     ----------
     aims : tuple of (n, ...) arrays
-        Arguments behind the positions: what a step aims at.
+        Arguments after the positions: target lengths and points.
     lengths : (n, 3m)
         Of the members in the configuration that the last step started from, m.
     """

@@ -23,8 +23,8 @@ from vgtm_qp.qp.long.working_set import Moved
 class Following:
     """The graphs of a period that follows the curve.
 
-    Where its stations are to be somewhere, the displacements of a period are u = placed + B (gap - C placed):
-    `placed` by its fixed members alone, C the Jacobian of the stations' centres, B of the free motions that shift them.
+    With given positions of its stations, the displacements of a period are u = placed + B (gap - C placed): `placed` by
+    its fixed members alone, C the Jacobian of the stations' centres, B the free motions that shift them by one unit.
     """
 
     def __init__(self, elimination: Elimination) -> None:
@@ -40,14 +40,14 @@ class Following:
         self._gains = [*(stage.G for stage in elimination.stages), ca.sparsify(motions @ inverse)]
 
     def _placed(self, before: ca.SX, rhs: list[ca.SX], gains: list[ca.SX], gap: ca.SX) -> ca.SX:
-        """Return (3w + 3m, c) displacements behind those `before` (3w, c), for each stage's `rhs` and for `gap`."""
+        """Return (3w + 3m, c) displacements after those `before` (3w, c), for each stage's `rhs` and for `gap`."""
         moved = before
         for stage, G, wanted in zip(self._elimination.stages, gains[:-1], rhs, strict=True):
             moved = ca.vertcat(moved, G @ (stage.T @ moved + wanted))
         return moved + gains[-1] @ (gap - self._centre @ moved)
 
     def response(self) -> ca.Function:
-        """Return (carry, head, tail, table) -> (carry, gains, D, R, U): what follows from the curve.
+        """Return (carry, head, tail, table) -> (carry, gains, D, R, U): the responses to the curve.
 
         D (actuated, 3V - 5 + 1), strokes, R (2f, ...), angles, and U (3m, ...), displacements, are stored by rows, as
         is the carry, the displacements of the live nodes; their last columns are constants. U is left out where the

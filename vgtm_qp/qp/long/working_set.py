@@ -1,4 +1,4 @@
-"""The rows with bounds of a long arm's QP: the few that are near them meet in a small dense QP."""
+"""The rows with bounds of a long arm's QP: those near a bound form a small dense QP."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from vgtm_qp.qp.numbers import UNBOUNDED, RowNumbers
 from vgtm_qp.qp.residual import InfeasibleStepError
 
 BLOCK = 8
-"""Rows that enter the dual QP at once, at least."""
+"""Least number of violated rows that enter the dual QP at once."""
 
 _NO_ROW = 1e-11
 _DEPENDENT = 1e-14
 _INDEPENDENT = 1e-4
-"""Rows whose Cholesky pivots differ by less than this are far from dependent."""
+"""Ratio of the least to the greatest Cholesky pivot above which rows are far from dependent."""
 _VIOLATED = 1e-10
 _REFINEMENTS = 4
 
@@ -45,7 +45,7 @@ class RowTable:
     ----------
     numbers : RowNumbers
     locked, end, actuators, clearance : slice
-        The first are fixed members that are held by a row of their own.
+        Rows of each kind; `locked` are fixed members that a separate row holds.
     equal : int
         Number of equalities, which come first; the progress is the next row.
     lower, upper : (total,)
@@ -95,9 +95,9 @@ class RowTable:
         return np.concatenate([tip - numbers.tip_rate * progress, held, end, [progress], legs, strokes, near])
 
     def coefficients(self, rows: Index) -> tuple[Index, Array, Array, Array]:
-        """Return nodes (R, Q) of rows and what they have over them, (R, Q, 3), zero where spare.
+        """Return nodes (R, Q) of rows and their coefficients (R, Q, 3), zero at unused places.
 
-        Then what they have over the curve's free coordinates (R, 3V - 5) and the progress (R,).
+        Then the coefficients of the curve's free coordinates (R, 3V - 5) and of the progress (R,).
         """
         numbers, clearance, tip_nodes = self.numbers, self.numbers.clearance, self._arm.end_effector.nodes
         progress = (rows == self.equal).astype(float)
@@ -150,7 +150,7 @@ class RowTable:
         return forces
 
     def key(self, row: int) -> Key:
-        """Return what names the row in the next QP, where clearance rows may be others."""
+        """Return a key of the row that holds in the next QP, whose clearance rows may be others."""
         near = row - self.clearance.start
         return row if near < 0 else self.numbers.clearance.nodes[near].tobytes()
 
@@ -165,7 +165,7 @@ class RowTable:
 def _all_active(
     gram: Array, values: Array, lower: Array, upper: Array, equal: NDArray[np.bool_]
 ) -> Array | None:
-    """Return the multipliers where all rows are active at the bounds they violate; None where they may not be."""
+    """Return the multipliers with all rows active at the bounds they violate; None if that may not be the answer."""
     above = equal | (values > upper)
     if not np.all(above | (values < lower)):
         return None
@@ -226,16 +226,16 @@ def dual_solution(
 
 
 class Answer(NamedTuple):
-    """The dual answer of a QP, and its rows where the Lagrangian is least.
+    """The dual answer of a QP, and its row values at the minimum of the Lagrangian.
 
     Attributes
     ----------
     values, multipliers : (total,)
         Multipliers are positive at upper and negative at lower bounds.
     rows : list of int
-        Those that were in the dual QP, equalities first.
+        Rows of the dual QP, equalities first.
     columns : (size, R)
-        Their columns.
+        L^-1 times those rows transposed.
     iterations : int
         Of the dual QPs.
     """
@@ -256,7 +256,7 @@ def solve_rows(
 ) -> Answer:
     """Return the answer of a QP with the rows of `table`; `remembered` are keys of those active before.
 
-    Rows enter the dual QP when they are violated, the worst first, and stay: so it ends.
+    Violated rows enter the dual QP, the worst first, and stay in it, so that the iteration ends.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def solve_rows(
     find_columns
         Gives L^-1 A' (size, R) of rows A.
     find_values
-        Gives the row values (total,) where the Lagrangian is least, from columns times multipliers (size,).
+        Gives the row values (total,) at the minimum of the Lagrangian, from columns times multipliers (size,).
 
     Raises
     ------
