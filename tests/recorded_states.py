@@ -52,6 +52,7 @@ KEPT = 6
 BY_CLOSED_FORMS = (
     "bundled five_bay_blocked_by_wall",
     "octahedral 5",
+    "double-octahedral 4",
     "longeron 5, hard tip",
     "octahedral 6, pointing",
     "octahedral 6, jams",
@@ -64,6 +65,13 @@ BY_CLOSED_FORMS = (
 )
 """Cases with no rows by FCL: its iterations at the rim of a cylinder end at some 1e-5 of the normal, wherever rounding
 leads them, and which of two members that touch in one node is named first is rounding too."""
+
+BY_ELASTIC_TRACKING = (
+    "tetrahedral 5, two actuated",
+    "octahedral 6, moving obstacle",
+    "loop octahedral 5",
+)
+"""Cases of elastic tracking: on the curve exactly rounding grows in them, or limits tie for the first place."""
 
 HEIGHT = {
     "octahedral": 0.8165,
@@ -101,6 +109,8 @@ class Case:
     def load(self) -> vq.Problem:
         """Return the problem."""
         changes = {"clearance.distance": "exact"} if self.name in BY_CLOSED_FORMS else {}
+        if self.name in BY_ELASTIC_TRACKING:
+            changes["method.tracking_mode"] = "elastic"
         if self.file:
             return vq.load_problem(PROBLEMS / f"{self.file}.toml").replace(self.problem | changes)
         return vq.Problem.from_dict(self.problem).replace(changes)
@@ -314,7 +324,7 @@ def _coupled_scenes() -> Iterator[Case]:
     yield Case("longeron 6", _scene(5, "longeron", 6))
     yield Case("tetrahedral 4", _scene(6, "tetrahedral", 4))
     two = {"truss__actuated": [2, 3], "curve__control_vertices": 4}
-    yield Case("tetrahedral 5, two actuated", _scene(7, "tetrahedral", 5, **two))
+    yield Case("tetrahedral 5, two actuated", _scene(7, "tetrahedral", 5, **two), tolerance=ITERATIVE)
     yield Case("octahedral 5, hard tip", _scene(8, "octahedral", 5, end_effector__mode="hard"))
     yield Case("octahedral 5, elastic tip", _scene(9, "octahedral", 5, end_effector__mode="elastic"))
     yield Case("hexapod 4, elastic tip", _scene(10, "hexapod", 4, end_effector__mode="elastic"))
@@ -428,7 +438,7 @@ def _methods() -> Iterator[Case]:
 
 def _loops() -> Iterator[Case]:
     """Yield the control loops: goals that wander at random from a seed."""
-    yield Case("loop octahedral 5", _scene(61, "octahedral", 5), loop={"steps": 50, "seed": 1, "size": 0.1})
+    yield Case("loop octahedral 5", _free(62, "octahedral", 5), loop={"steps": 50, "seed": 7, "size": 0.1})
     yield Case(
         "loop hexapod 4, vertex goals",
         _scene(62, "hexapod", 4),

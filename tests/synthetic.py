@@ -75,16 +75,39 @@ def tripod(joints: Joints | None = None, home_lengths: Array | None = None) -> T
     )
 
 
-def problem_of(changes: dict[str, Any]) -> dict[str, Any]:
-    """Return a problem of the tripod as JSON data, with `changes`."""
+def graph_table(truss: Truss) -> dict[str, Any]:
+    """Return the table of a truss as a graph."""
+    nodes = zip(truss.node_names, truss.home.tolist(), truss.base.tolist(), strict=True)
+    members = []
+    for k, name in enumerate(truss.member_names):
+        ends = [truss.node_names[i] for i in truss.members[k]]
+        moves = {"actuated": True, "stroke": truss.stroke[k].tolist()} if truss.actuated[k] else {}
+        limits = (
+            {"rate": 0.2, "acceleration": 0.2} if truss.actuated[k] and np.isfinite(truss.rate[k]) else {}
+        )
+        members.append({"name": name, "nodes": ends, **moves, **limits})
+    return {
+        "module": "graph",
+        "member_radius": float(truss.radius[0]),
+        "node": [{"name": name, "position": at, "fixed": fixed} for name, at, fixed in nodes],
+        "member": members,
+        "tip": [truss.node_names[i] for i in truss.tip],
+    }
+
+
+def problem_of(truss: Truss, changes: dict[str, Any]) -> dict[str, Any]:
+    """Return a problem of `truss` as JSON data, with `changes`; those of a graph are added to its table."""
     problem: dict[str, Any] = {
         "schema_version": 1,
         "name": "tripod",
-        "truss": {"module": "graph", "member_radius": RADIUS, "rate": 0.2, "acceleration": 0.2},
+        "truss": graph_table(truss),
         "end_effector": {"track": ["position"], "mode": "scaled"},
         "obstacle": [],
         "clearance": {"safe": 0.05, "self_collision": True},
     }
+    table = changes.get("truss", {})
+    if table.get("module", "graph") == "graph":
+        changes = {**changes, "truss": {**problem["truss"], **table}}
     return problem | changes
 
 
@@ -108,7 +131,7 @@ def maneuver_of(
     ends = nodes[:, truss.members]
     lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
     waypoints = [{"time": float(t), "position": p.tolist()} for t, p in zip(time[1:], tip[1:], strict=True)]
-    whole = {"maneuver": {"steps": count - 1, "waypoint": waypoints}, **problem_of(problem or {})}
+    whole = {"maneuver": {"steps": count - 1, "waypoint": waypoints}, **problem_of(truss, problem or {})}
     manifest = {
         "schema_version": SCHEMA_VERSION,
         "problem": whole,

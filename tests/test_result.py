@@ -233,7 +233,7 @@ def test_malformed_manifest_is_named(saved: Path, text: str, message: str) -> No
     [
         ({"status": "done"}, "expected one of solved, blocked, infeasible"),
         ({"reached": 1.5}, "from 0 to 1"),
-        ({"blocked_by": "cube"}, "not a list of names"),
+        ({"blocked_by": "cube"}, "blocked_by is 'cube'; expected a list of names"),
         ({"certificate": {"ok": True}}, "certificate is not complete"),
     ],
 )

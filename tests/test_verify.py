@@ -207,7 +207,10 @@ def test_blocked_maneuver_can_be_verified() -> None:
 def test_pointing_is_held() -> None:
     truss = octahedral(2)
     nodes = np.tile(truss.home, (3, 1, 1))
-    rules = {"truss": {"module": "octahedral"}, "end_effector": {"track": ["position", "pointing"]}}
+    rules = {
+        "truss": {"module": "octahedral", "bays": 2},
+        "end_effector": {"track": ["position", "pointing"]},
+    }
     maneuver = found_clearances(maneuver_of(nodes, np.arange(3.0), truss, problem=rules))
     assert any("tip_target_pointing" in line for line in verify(maneuver).failures())
     straight = np.tile([0.0, 0.0, 1.0], (3, 1))

@@ -38,28 +38,37 @@ def verify(
     results: Annotated[list[Path], Parameter(name="RESULT", help="result files, .npz")],
     /,
     *,
+    problem: Annotated[
+        str | None, Parameter(help="problem file or name to hold them against, not the one in each result")
+    ] = None,
     json: Json = False,
 ) -> int:
     """Check results again from their nodes alone, with none of the solver's code.
+
+    Without ``--problem`` a result is held against the problem that it holds itself, which its author may have changed.
 
     A file that is no result file is wrong usage (exit code 2); one that is altered or outside a tolerance
     fails the verification (4); a maneuver that is right as far as it goes, but was blocked, gives 3.
     """
     from vgtm_qp.errors import ResultError
     from vgtm_qp.maneuver.maneuver import load_result
+    from vgtm_qp.problem import load_problem
     from vgtm_qp.verify import verify as certify
+    from vgtm_qp.verify.held import describe_problem
 
+    real = None if problem is None else load_problem(problem)
     codes: list[ExitCode] = []
     entries: list[dict[str, Any]] = []
     for path in results:
         try:
             maneuver = load_result(path)
-            certificate = certify(maneuver)
+            certificate = certify(maneuver, problem=real)
         except ResultError as error:
             codes.append(ExitCode.UNVERIFIED if zipfile.is_zipfile(path) else ExitCode.USAGE)
             entries.append({"result": str(path), "verified": False, "error": str(error)})
             note(f"vgtm: {error}")
             continue
+        held = describe_problem(maneuver, real)
         codes.append(outcome_code(maneuver.with_certificate(certificate)))
         entries.append(
             {
@@ -69,14 +78,24 @@ def verify(
                 "reached": maneuver.reached,
                 "blocked_by": list(maneuver.blocked_by),
                 "certificate": certificate.to_dict(),
+                "held_against": held,
             }
         )
         if not json:
             say(f"{path}: {maneuver.status}, {'verified' if certificate.ok else 'VERIFICATION FAILED'}")
+            say(f"  held against {_held(held)}")
             say("\n".join(f"  {line}" for line in str(certificate).splitlines()))
     if json:
         document({"verified": all(entry["verified"] for entry in entries), "results": entries})
     return next(code for code in _WORST_FIRST if code in codes)
+
+
+def _held(held: dict[str, Any]) -> str:
+    """Return in words what a result was held against."""
+    if held["problem"] is None:
+        return f"the problem in the result itself, SHA-256 {held['sha256']}; --problem FILE holds it against a file"
+    same = "the" if held["sha256"] == held["solved_from"] else "not the very"
+    return f"{held['problem']}, SHA-256 {held['sha256']}, {same} file that it was solved from"
 
 
 def outcome_code(maneuver: Maneuver) -> ExitCode:

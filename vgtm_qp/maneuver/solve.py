@@ -19,7 +19,7 @@ from vgtm_qp.maneuver.retries import DeadEnd, retries
 from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
-from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, recorded_versions
+from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, problem_digests, recorded_versions
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step, StepStatus
@@ -52,6 +52,8 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     """
     check_is_problem(problem)
     started = perf_counter()
+    # The files as they are when they are read, not as they may be at the end.
+    digests = problem_digests(problem.to_dict(), problem.source, getattr(problem.maneuver, "path", None))
     resolver = Resolver(problem)
     mistakes = check_problem(problem, resolver.setup)
     if mistakes:
@@ -66,7 +68,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
             way, attempt, stop = _retry(problem, attempt, stop, progress)
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
-    maneuver = _assemble(problem, resolver, attempt, stop, setup_time, way)
+    maneuver = _assemble(problem, resolver, attempt, stop, setup_time, way, digests)
     return maneuver.with_certificate(check(maneuver)) if verify else maneuver
 
 
@@ -231,7 +233,13 @@ def _retry(
 
 
 def _assemble(
-    problem: Problem, resolver: Resolver, attempt: _Attempt, stop: Stop | None, setup_time: float, way: str
+    problem: Problem,
+    resolver: Resolver,
+    attempt: _Attempt,
+    stop: Stop | None,
+    setup_time: float,
+    way: str,
+    digests: dict[str, str | None],
 ) -> Maneuver:
     setup = resolver.setup
     meshes = {
@@ -242,6 +250,7 @@ def _assemble(
     manifest = {
         "schema_version": SCHEMA_VERSION,
         "problem": problem.to_dict(),
+        "problem_digests": digests,
         "arm": setup.arm.record(),
         "curve": attempt.resolver.setup.layout.record(),
         "status": "solved" if stop is None else "blocked",

@@ -153,13 +153,13 @@ class Certificate:
         texts = {"contradictions", "notes"}
         try:
             values: dict[str, Any] = {
-                f.name: tuple(data[f.name]) if f.name in texts else Measure(**data[f.name])
+                f.name: _lines(data[f.name]) if f.name in texts else _measure(data[f.name])
                 for f in fields(cls)
                 # Files of earlier versions lack what has a default.
                 if f.name in data or f.default is MISSING or f.name in texts
             }
             return cls(**values)
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, OverflowError) as error:
             raise ResultError(f"the certificate is not complete: {error}") from None
 
     def __str__(self) -> str:
@@ -170,6 +170,23 @@ class Certificate:
         rows += [f"FAIL  {line}" for line in self.contradictions]
         rows += [f"note  {line}" for line in self.notes]
         return "\n".join(rows)
+
+
+def _lines(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(line, str) for line in value):
+        raise TypeError("contradictions and notes are lists of strings")
+    return tuple(value)
+
+
+def _measure(value: Any) -> Measure:
+    numbers = (value[key] for key in ("value", "bound"))
+    if not all(x is None or (isinstance(x, int | float) and type(x) is not bool) for x in numbers):
+        raise TypeError("value and bound of a measure are numbers or null")
+    if value["side"] not in ("most", "least") or not all(
+        isinstance(value[key], str) for key in ("unit", "where")
+    ):
+        raise TypeError('the side of a measure is "most" or "least", its unit and place are strings')
+    return Measure(**value)
 
 
 def _label(name: str) -> str:

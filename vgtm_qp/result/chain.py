@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.poses import rotation_matrix, rotations
+from vgtm_qp.result.record import Record
 
 
 class RecordedChain:
@@ -41,33 +42,22 @@ class RecordedChain:
     def __init__(self, record: Mapping[str, Any]) -> None:
         if record.get("kind") != self.kind:
             raise ResultError("manifest.arm is not the record of a serial arm")
-        try:
-            self.quantity_names = tuple(str(name) for name in record["joint_names"])
-            self.member_names = tuple(str(name) for name in record["body_names"])
-            joints, links = len(self.quantity_names), len(self.member_names)
-            self.revolute = np.asarray(record["revolute"], dtype=np.bool_)
-            self.actuated = np.asarray(record["actuated"], dtype=np.bool_)
-            self.axis = numbers(record, "axis", (joints, 3))
-            self.position = numbers(record, "position", (joints, 3))
-            self.rotation = numbers(record, "rotation", (joints, 3, 3))
-            self.home_quantities = numbers(record, "home", (joints,))
-            self.stroke = numbers(record, "stroke", (joints, 2))
-            self.stroke[np.isinf(self.stroke[:, 0]), 0] = -np.inf
-            self.rate = numbers(record, "rate", (joints,))
-            self.acceleration = numbers(record, "acceleration", (joints,))
-            self.tip = numbers(record, "tip", (3,))
-            self.tip_frame = numbers(record, "tip_frame", (3, 3))
-            self.radius = numbers(record, "radius", (links,))
-            self.links = np.asarray(record["links"], dtype=np.int64).reshape(links, 2)
-            self.members = np.asarray(record["joined"], dtype=np.int64).reshape(links, 2)
-        except KeyError as error:
-            raise ResultError(f"manifest.arm lacks {error}") from None
-        except (TypeError, ValueError) as error:
-            raise ResultError(f"manifest.arm is malformed: {error}") from None
-        if self.revolute.shape != (joints,) or self.actuated.shape != (joints,):
-            raise ResultError(f"manifest.arm does not describe {joints} joints")
-        if links and not (self.links.min() >= 0 and self.links.max() < joints + 2):
-            raise ResultError(f"manifest.arm.links names a point outside 0..{joints + 1}")
+        table = Record(record, "manifest.arm")
+        self.quantity_names, self.member_names = table.names("joint_names"), table.names("body_names")
+        joints, links = len(self.quantity_names), len(self.member_names)
+        self.revolute, self.actuated = table.flags("revolute", (joints,)), table.flags("actuated", (joints,))
+        self.axis = table.numbers("axis", (joints, 3))
+        self.position = table.numbers("position", (joints, 3))
+        self.rotation = table.numbers("rotation", (joints, 3, 3))
+        self.home_quantities = table.numbers("home", (joints,))
+        self.stroke = table.numbers("stroke", (joints, 2), limits=True)
+        self.stroke[np.isinf(self.stroke[:, 0]), 0] = -np.inf
+        self.rate = table.numbers("rate", (joints,), limits=True)
+        self.acceleration = table.numbers("acceleration", (joints,), limits=True)
+        self.tip, self.tip_frame = table.numbers("tip", (3,)), table.numbers("tip_frame", (3, 3))
+        self.radius = table.numbers("radius", (links,))
+        self.links = table.integers("links", (links, 2), joints + 2)
+        self.members = table.integers("joined", (links, 2), 2 * links + joints + 2)
         self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
         self.stretches = np.zeros(links, dtype=np.bool_)
         home = np.concatenate([self.home_quantities, np.zeros(6)])[None]
@@ -191,17 +181,6 @@ class RecordedChain:
 def same(recorded: ArrayLike, given: ArrayLike) -> bool:
     """Whether the numbers of a record are those of the problem, to 1e-9."""
     return bool(np.allclose(recorded, given, rtol=0.0, atol=1e-9))
-
-
-def numbers(record: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-    """Return ``record[key]`` as floats of that shape, inf for None."""
-    array = np.asarray(record[key], dtype=np.float64)
-    array = np.where(np.isnan(array), np.inf, array)
-    if array.ndim != len(shape) or any(
-        size not in (None, found) for size, found in zip(shape, array.shape, strict=True)
-    ):
-        raise ResultError(f"manifest.arm.{key} has shape {array.shape}; expected {shape}")
-    return array
 
 
 def extreme_values(jacobian: NDArray[Any]) -> tuple[float, float]:

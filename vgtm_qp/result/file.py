@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import secrets
@@ -12,15 +13,21 @@ import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.errors import ExportError, ResultError
-from vgtm_qp.result.manifest import check_manifest, dump_manifest, parse_manifest
+from vgtm_qp.result.manifest import check_manifest, dump_manifest, parse_manifest, stored_problem
 
 _STALE_SECONDS = 60.0
+_WIDEST = 8
+"""Bytes of a number, at most."""
+_GREATEST_MANIFEST = 1 << 28
+"""Bytes of a manifest, at four a letter."""
+_FREE_BYTES, _GREATEST_RATIO, _GREATEST_BYTES = 1 << 26, 100, 1 << 32
+"""Bytes that any result file may inflate to, and those more for each of its own, and bytes of the greatest of all."""
 _UNREADABLE = (
     OSError,
     EOFError,
@@ -104,10 +111,18 @@ def replacing(path: Path, error: type[ResultError | ExportError] = ResultError) 
         raise error(f"{path}: cannot be written: {reason.strerror or reason}") from None
 
 
+class _Header(NamedTuple):
+    """What the first bytes of an array in a result file say of it."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+
 def read_result(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Return the arrays and the manifest of a result file, read without pickle and checked; see `Result.load`."""
     try:
         with zipfile.ZipFile(path) as archive:
+            _check_headers(path, archive)
             broken = archive.testzip()
             if broken is not None:
                 raise ResultError(f"{path}: {broken} is damaged")
@@ -121,14 +136,13 @@ def read_result(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         raise ResultError(f"{path}: may not be read: permission denied") from None
     except _UNREADABLE:
         raise ResultError(f"{path}: not a whole result file: cut, damaged, or of another kind") from None
-    if "manifest" not in arrays:
-        raise ResultError(f"{path}: has no manifest, so it is not a result file")
     try:
         manifest = check_manifest(parse_manifest(arrays.pop("manifest")))
         check_arrays(arrays)
         digest = content_digest(arrays, {key: value for key, value in manifest.items() if key != "digest"})
         if manifest.get("digest") != digest:
             raise ResultError("the content does not match its digest: an array or the manifest was altered")
+        stored_problem(manifest["problem"])
     except ResultError as error:
         raise ResultError(f"{path}: {error}") from None
     return arrays, manifest
@@ -148,39 +162,102 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Raise ResultError for the first array that is missing, unknown, malformed or holds no number."""
-    possible = names_of(arrays)
-    for name in arrays:
-        if name not in possible:
-            raise ResultError(f"array {name} is not one of a result file; those are {', '.join(possible)}")
-    sizes: dict[str, int] = {}
-    for name in possible:
-        layout = LAYOUTS[name]
-        if name not in arrays:
-            if layout.required:
-                raise ResultError(f"array {name} is missing")
-            continue
-        array = arrays[name]
-        if array.dtype.kind not in layout.kinds:
-            raise ResultError(f"array {name} holds {array.dtype}; expected kind {' or '.join(layout.kinds)}")
-        expected = tuple(sizes.get(a, a) if isinstance(a, str) else a for a in layout.axes)
-        if array.ndim != len(expected) or any(
-            isinstance(e, int) and e != size for e, size in zip(expected, array.shape, strict=True)
-        ):
-            axes = ", ".join(f"{a} = {sizes[a]}" if a in sizes else str(a) for a in layout.axes)
-            raise ResultError(f"array {name} has shape {array.shape}; expected ({axes})")
-        sizes |= {a: size for a, size in zip(layout.axes, array.shape, strict=True) if isinstance(a, str)}
-        if array.dtype.kind == "f" and (np.isnan(array).any() or (layout.finite and np.isinf(array).any())):
+    sizes = _check_layout({name: _Header(array.shape, array.dtype) for name, array in arrays.items()})
+    for name, array in arrays.items():
+        unbounded = not LAYOUTS[name].finite
+        if array.dtype.kind == "f" and (np.isnan(array).any() or (not unbounded and np.isinf(array).any())):
             row = int(np.argwhere(~np.isfinite(array))[0][0])
             raise ResultError(f"array {name} holds a value that is not a number, row {row}")
-    states = "joints" if "joints" in arrays else "nodes"
-    if min(arrays[states].shape[:2]) < 1:
-        raise ResultError(f"there is no state in it: array {states} is empty")
     members = arrays.get("members", np.zeros(0))
     if members.size and (members.min() < 0 or members.max() >= sizes["N"]):
         raise ResultError(f"array members names a node outside 0..{sizes['N'] - 1}")
     if (np.diff(arrays["time"]) <= 0.0).any():
         row = int(np.argmax(np.diff(arrays["time"]) <= 0.0)) + 1
         raise ResultError(f"array time does not increase at row {row}")
+
+
+def _check_layout(headers: Mapping[str, _Header]) -> dict[str, int]:
+    """Return the sizes of the axes by name; ResultError for the first array that is missing, unknown or malformed."""
+    possible = names_of(headers)
+    for name in headers:
+        if name not in possible:
+            raise ResultError(f"array {name} is not one of a result file; those are {', '.join(possible)}")
+    sizes: dict[str, int] = {}
+    for name in possible:
+        layout = LAYOUTS[name]
+        if name not in headers:
+            if layout.required:
+                raise ResultError(f"array {name} is missing")
+            continue
+        shape, dtype = headers[name]
+        if dtype.kind not in layout.kinds or (dtype.kind != "U" and dtype.itemsize > _WIDEST):
+            raise ResultError(f"array {name} holds {dtype}; expected kind {' or '.join(layout.kinds)}")
+        expected = tuple(sizes.get(a, a) if isinstance(a, str) else a for a in layout.axes)
+        if len(shape) != len(expected) or any(
+            isinstance(e, int) and e != size for e, size in zip(expected, shape, strict=True)
+        ):
+            axes = ", ".join(f"{a} = {sizes[a]}" if a in sizes else str(a) for a in layout.axes)
+            raise ResultError(f"array {name} has shape {shape}; expected ({axes})")
+        sizes |= {a: size for a, size in zip(layout.axes, shape, strict=True) if isinstance(a, str)}
+    states = "joints" if "joints" in headers else "nodes"
+    if min(headers[states].shape[:2]) < 1:
+        raise ResultError(f"there is no state in it: array {states} is empty")
+    return sizes
+
+
+def _check_headers(path: Path, archive: zipfile.ZipFile) -> None:
+    """Raise ResultError where an archive is not that of a result file; only the headers of its arrays are inflated.
+
+    Names, kinds and shapes are those of a result file. Every array has just the bytes that its header says, and all of
+    them together are no more than what a file of that size can hold of a maneuver.
+    """
+    if "manifest.npy" not in archive.namelist():
+        raise ResultError(f"{path}: has no manifest, so it is not a result file")
+    headers: dict[str, _Header] = {}
+    total = 0
+    for entry in archive.infolist():
+        name = entry.filename.removesuffix(".npy")
+        if name in headers or not entry.filename.endswith(".npy") or name not in (*LAYOUTS, "manifest"):
+            possible = ", ".join((*names_of(headers), "manifest"))
+            found = "is there twice" if name in headers else "is not one of a result file"
+            raise ResultError(f"{path}: array {name[:60]} {found}; those are {possible}")
+        with archive.open(entry) as stream:
+            headers[name] = _header(f"{path}: array {name}", stream, entry.file_size)
+        total += entry.file_size
+    manifest = headers.pop("manifest")
+    if manifest.shape or manifest.dtype.kind != "U" or manifest.dtype.itemsize > _GREATEST_MANIFEST:
+        raise ResultError(
+            f"{path}: the manifest is not one string of at most {_GREATEST_MANIFEST // 4} letters"
+        )
+    try:
+        _check_layout(headers)
+    except ResultError as error:
+        raise ResultError(f"{path}: {error}") from None
+    greatest = min(_GREATEST_BYTES, _FREE_BYTES + _GREATEST_RATIO * path.stat().st_size)
+    if total > greatest:
+        raise ResultError(
+            f"{path}: holds {total} bytes of arrays; expected at most {greatest} in a file of its size"
+        )
+
+
+def _header(about: str, stream: IO[bytes], size: int) -> _Header:
+    """Return the header at the start of an entry of `size` bytes; ResultError where it claims others than these."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, _, dtype = read(stream)
+        begin = stream.tell()
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+        raise ResultError(f"{about} cannot be read: {str(error)[:200]}") from None
+    bytes_claimed = math.prod(shape) * dtype.itemsize
+    # Of items without bytes there may be any number.
+    if min(shape, default=0) < 0 or dtype.hasobject or not dtype.itemsize or begin + bytes_claimed != size:
+        raise ResultError(
+            f"{about} is of {dtype} and shape {shape}, {bytes_claimed} bytes; the file holds {size - begin} of it"
+        )
+    return _Header(shape, dtype)
 
 
 def content_digest(arrays: Mapping[str, NDArray[Any]], manifest: Mapping[str, Any]) -> str:

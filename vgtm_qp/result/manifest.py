@@ -1,13 +1,13 @@
 """The manifest of a result file: problem, arm, outcome and versions as strict JSON data.
 
-It has `schema_version`; the `problem` in the form of its file; the `arm` as its `record` gives it; the `curve` as
-``Layout.record`` gives it, null without one; `status`, `reached`, the share of the path covered, 0 to 1, and
-`blocked_by`, the names of what stopped the arm; the `stop` as its `to_dict` gives it; `way_out`, the change of the
-problem with which a retry came further; `recovered`, pairs below their clearance in the home pose and their distances
-there, m; `method` and `solver`; `setup_time`, s; `directory`, where relative paths of the problem start; `meshes`, what
-`mesh_record` returns for each; `versions`; the `certificate`, null before verification; `jacobian_rank`, that of the
-last step where the method reveals it; and `clearance_rows`, how many rows of the QPs that moved the arm were supplied
-by `fcl`, and how many were `exact`.
+It has `schema_version`; the `problem` in the form of its file, and `problem_digests`, what the function of that name
+returns; the `arm` as its `record` gives it; the `curve` as ``Layout.record`` gives it, null without one; `status`,
+`reached`, the share of the path covered, 0 to 1, and `blocked_by`, the names of what stopped the arm; the `stop` as its
+`to_dict` gives it; `way_out`, the change of the problem with which a retry came further; `recovered`, pairs below their
+clearance in the home pose and their distances there, m; `method` and `solver`; `setup_time`, s; `directory`, where
+relative paths of the problem start; `meshes`, what `mesh_record` returns for each; `versions`; the `certificate`, null
+before verification; `jacobian_rank`, that of the last step where the method reveals it; and `clearance_rows`, how many
+rows of the QPs that moved the arm were supplied by `fcl`, and how many were `exact`.
 """
 
 from __future__ import annotations
@@ -15,15 +15,18 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import ResultError
+from vgtm_qp.errors import ProblemError, ResultError
 from vgtm_qp.machine import versions
 from vgtm_qp.result.certificate import Certificate
+
+if TYPE_CHECKING:
+    from vgtm_qp.problem import Problem
 
 SCHEMA_VERSION = 1
 """Version of the result file that this package writes and reads."""
@@ -34,9 +37,83 @@ _PACKAGES = ("vgtm-qp", "numpy", "casadi", "daqp", "osqp", "piqp", "python-fcl",
 _MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "blocked_by", "versions")
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e15
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**53
+
+
+def _is_table(value: Any, is_right: Callable[[Any], bool]) -> bool:
+    return isinstance(value, dict) and all(is_right(entry) for entry in value.values())
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_mesh(value: Any) -> bool:
+    return isinstance(value, dict) and _is_text(value.get("sha256")) and _is_count(value.get("triangles"))
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, dict) and _is_text(value.get("pair")) and _is_number(value.get("distance"))
+
+
+def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and all(is_right(entry) for entry in value)
+
+
+_VALUES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "blocked_by": (lambda value: _is_list(value, _is_text), "a list of names"),
+    "curve": (lambda value: isinstance(value, dict), "a JSON object, or null"),
+    "stop": (lambda value: isinstance(value, dict), "a JSON object, or null"),
+    "way_out": (_is_text, "a string"),
+    "recovered": (lambda value: _is_list(value, _is_pair), "a list of pairs and distances"),
+    "problem_digests": (
+        lambda value: _is_table(value, lambda x: x is None or _is_text(x)),
+        "SHA-256 by name",
+    ),
+    "method": (_is_text, "a string"),
+    "solver": (_is_text, "a string"),
+    "setup_time": (_is_number, "a number"),
+    "directory": (_is_text, "a string"),
+    "meshes": (lambda value: _is_table(value, _is_mesh), "SHA-256 and number of triangles by obstacle"),
+    "versions": (lambda value: _is_table(value, _is_text), "strings by name"),
+    "jacobian_rank": (_is_count, "a count"),
+    "clearance_rows": (lambda value: _is_table(value, _is_count), "numbers of rows by name"),
+    "digest": (_is_text, "a string"),
+}
+"""What the values of a manifest have to be, where they are not null; of what is not here `check_manifest` says it."""
+
+
 def mesh_record(path: str | Path, triangles: int) -> dict[str, Any]:
     """Return what ties a result to a mesh file: its SHA-256 and the number of its triangles."""
     return {"sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(), "triangles": int(triangles)}
+
+
+def problem_digests(
+    problem: Mapping[str, Any], source: str | Path | None, path: str | Path | None
+) -> dict[str, str | None]:
+    """Return the SHA-256 that tie a result to its problem; None where there is no such file, or none any more.
+
+    They are of the canonical text of `problem` as the manifest holds it, of the problem's file `source` and of the file
+    `path` of its path. Those of meshes are in their records.
+    """
+    return {
+        "problem": hashlib.sha256(dump_manifest(problem).encode()).hexdigest(),
+        "file": file_digest(source),
+        "path": file_digest(path),
+    }
+
+
+def file_digest(path: str | Path | None) -> str | None:
+    """Return the SHA-256 of a file, or None where there is none that can be read."""
+    try:
+        return None if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except (OSError, ValueError):
+        return None
 
 
 def recorded_versions() -> dict[str, str]:
@@ -63,22 +140,32 @@ def check_manifest(manifest: Any) -> dict[str, Any]:
     for key in ("problem", "arm", "versions"):
         if not isinstance(copy[key], dict):
             raise ResultError(f"manifest.{key} is not a JSON object")
+    if copy["blocked_by"] is None:
+        raise ResultError("manifest.blocked_by is null; expected a list of names")
     if copy["status"] not in STATUSES:
         raise ResultError(f"manifest.status is {copy['status']!r}; expected one of {', '.join(STATUSES)}")
     reached = copy["reached"]
     if isinstance(reached, bool) or not isinstance(reached, int | float) or not 0.0 <= reached <= 1.0:
         raise ResultError(f"manifest.reached is {reached!r}; expected a number from 0 to 1")
-    names = copy["blocked_by"]
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ResultError("manifest.blocked_by is not a list of names")
-    rows = copy.get("clearance_rows", {})
-    if not isinstance(rows, dict) or not all(type(count) is int and count >= 0 for count in rows.values()):
-        raise ResultError(f"manifest.clearance_rows is {rows!r}; expected numbers of rows by name")
+    for key, (is_right, expected) in _VALUES.items():
+        if copy.get(key) is not None and not is_right(copy[key]):
+            raise ResultError(f"manifest.{key} is {str(copy[key])[:80]!r}; expected {expected}")
     if copy.get("certificate") is not None:
         if not isinstance(copy["certificate"], dict):
             raise ResultError("manifest.certificate is not a JSON object")
         Certificate.from_dict(copy["certificate"])
     return copy
+
+
+def stored_problem(data: Any) -> Problem:
+    """Return the problem of a manifest, held against the schema of problem files; ResultError with the keys."""
+    from vgtm_qp.problem import Problem
+
+    try:
+        return Problem.from_dict(data)
+    except ProblemError as error:
+        mistakes = "; ".join(f"manifest.problem.{mistake}" for mistake in error.mistakes[:8])
+        raise ResultError(mistakes) from None
 
 
 def dump_manifest(manifest: Mapping[str, Any]) -> str:
@@ -87,7 +174,7 @@ def dump_manifest(manifest: Mapping[str, Any]) -> str:
         return json.dumps(
             manifest, allow_nan=False, sort_keys=True, separators=(",", ":"), ensure_ascii=False
         )
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ResultError(f"the manifest is not strict JSON: {error}") from None
 
 

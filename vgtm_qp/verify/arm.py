@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
-from vgtm_qp.result.chain import RecordedChain, extreme_values, numbers, same
+from vgtm_qp.result.chain import RecordedChain, extreme_values
+from vgtm_qp.result.record import Record
+from vgtm_qp.verify.truss_table import table_contradictions
 
 _TOLERANCE = 1e-9
 """Tolerance of recorded lengths against those of the home nodes, m."""
@@ -47,33 +49,28 @@ class RecordedArm:
         count = len(members)
         if kind := record.get("kind"):
             raise ResultError(f"this is the result of a {kind} arm; expected that of a truss")
-        try:
-            self.home = numbers(record, "home", (None, 3))
-            nodes = len(self.home)
-            self.base = _indices(record["base"], "base", nodes)
-            self.member_names = tuple(str(name) for name in record["member_names"])
-            self.actuated = self.stretches = np.asarray(record["actuated"], dtype=np.bool_)
-            self.length = numbers(record, "length", (count,))
-            self.stroke = numbers(record, "stroke", (count, 2))
-            self.rate = numbers(record, "rate", (count,))
-            self.acceleration = numbers(record, "acceleration", (count,))
-            self.radius = numbers(record, "radius", (count,))
-            tip, joints = record["tip"], record["joints"]
-            self.tip = _indices(tip["nodes"], "tip.nodes", nodes)
-            self.tip_weights = numbers(tip, "weights", (len(self.tip),))
-            self.tip_frame = numbers(tip, "frame", (3, 3))
-            if joints is None:
-                triangle = np.arange(nodes)[:, None]
-                self.offset = np.zeros((count, 2, 3))
-            else:
-                triangle = _indices(joints["triangle"], "joints.triangle", nodes).reshape(nodes, 3)
-                self.offset = numbers(joints, "offset", (count, 2, 3))
-        except KeyError as error:
-            raise ResultError(f"manifest.arm lacks {error}") from None
-        except (TypeError, ValueError) as error:
-            raise ResultError(f"manifest.arm is malformed: {error}") from None
-        if len(self.member_names) != count or self.actuated.shape != (count,):
-            raise ResultError(f"manifest.arm does not describe {count} members, as array members does")
+        table = Record(record, "manifest.arm")
+        self.home = table.numbers("home", (None, 3))
+        nodes = len(self.home)
+        self.base = table.integers("base", (None,), nodes)
+        self.member_names = table.names("member_names", count)
+        self.actuated = self.stretches = table.flags("actuated", (count,))
+        self.length = table.numbers("length", (count,))
+        self.stroke = table.numbers("stroke", (count, 2), limits=True)
+        self.rate = table.numbers("rate", (count,), limits=True)
+        self.acceleration = table.numbers("acceleration", (count,), limits=True)
+        self.radius = table.numbers("radius", (count,))
+        tip = table.table("tip")
+        self.tip = tip.integers("nodes", (None,), nodes)
+        self.tip_weights = tip.numbers("weights", (len(self.tip),))
+        self.tip_frame = tip.numbers("frame", (3, 3))
+        triangle, self.offset = np.arange(nodes)[:, None], np.zeros((count, 2, 3))
+        if table.has("joints"):
+            joints = table.table("joints")
+            triangle = joints.integers("triangle", (nodes, 3), nodes)
+            self.offset = joints.numbers("offset", (count, 2, 3))
+        if len(members) and members.max() >= nodes:
+            raise ResultError(f"array members names a node outside 0..{nodes - 1} of manifest.arm.home")
         self.members, self.corners = members, triangle[members]
         self.quantity_names, self.home_quantities = self.member_names, self.length
         self.free = np.setdiff1d(np.arange(nodes), self.base)
@@ -93,27 +90,7 @@ class RecordedArm:
             found.append(
                 f"the arm record's length of {self.member_names[k]} is {off[k]:.3g} m off its home nodes"
             )
-        truss = problem.get("truss") or {}
-        entries = {str(entry["name"]): entry for entry in truss.get("member") or ()}
-        if entries and set(entries) != set(self.member_names):
-            found.append("the members of the arm record are not those of the problem")
-        for name, recorded in (
-            ("member_radius", self.radius),
-            ("stroke", self.stroke),
-            ("rate", self.rate),
-            ("acceleration", self.acceleration),
-        ):
-            differing = []
-            for k, member in enumerate(self.member_names):
-                if name != "member_radius" and not self.actuated[k]:
-                    continue
-                given = entries.get(member, {}).get(name.removeprefix("member_"))
-                wanted = truss.get(name) if given is None else given
-                if wanted is not None and not same(recorded[k], wanted):
-                    differing.append(f"{member} (problem: {wanted})")
-            if differing:
-                more = f" and {len(differing) - 1} more members" if len(differing) > 1 else ""
-                found.append(f"the arm record's {name} differs from the problem's at {differing[0]}{more}")
+        found += table_contradictions(self, problem.get("truss") or {})
         return found
 
     @property
@@ -228,9 +205,10 @@ class RecordedArm:
             return self._sparse_values(J, tip)
         dense = J.toarray()
         least = float(np.linalg.svd(dense, compute_uv=False)[-1])
-        if least == 0.0:
+        try:
+            return least, *extreme_values(np.linalg.solve(dense.T, tip)[self.actuated])
+        except np.linalg.LinAlgError:
             return 0.0, 0.0, np.inf
-        return least, *extreme_values(np.linalg.solve(dense.T, tip)[self.actuated])
 
     def _sparse_values(self, J: Any, tip: Array) -> tuple[float, float, float]:
         """Inverse power iteration on J^T J: it comes down to the least singular value from above."""
@@ -318,10 +296,3 @@ def _norm(vectors: Array) -> Array:
 
 def _unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
-def _indices(values: Any, key: str, nodes: int) -> Index:
-    array = np.asarray(values, dtype=np.int64)
-    if array.size and not (array.min() >= 0 and array.max() < nodes):
-        raise ResultError(f"manifest.arm.{key} names a node outside 0..{nodes - 1}")
-    return array

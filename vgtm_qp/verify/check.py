@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from vgtm_qp.verify.clearance import (
     RecordedMotion,
 )
 from vgtm_qp.verify.curve import curve_measures
+from vgtm_qp.verify.held import held_against
 from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.verify.path import (
     DIRECTION_TOLERANCE,
@@ -34,6 +36,9 @@ from vgtm_qp.verify.path import (
     tip_error,
 )
 from vgtm_qp.verify.recovery import excuse_recovering
+
+if TYPE_CHECKING:
+    from vgtm_qp.problem import Problem
 
 MEMBER_TOLERANCE = 1e-9
 """Tolerance of fixed and locked members and of base nodes, m."""
@@ -52,19 +57,23 @@ _MANY_UNKNOWNS = 2000
 _FEW_STATES = 21
 
 
-def verify_file(path: str | Path) -> Certificate:
+def verify_file(path: str | Path, *, problem: Problem | None = None) -> Certificate:
     """Load a result file and verify it; ResultError where it cannot be loaded, or its arm record is malformed."""
-    return verify(Result.load(path))
+    return verify(Result.load(path), problem=problem)
 
 
-def verify(maneuver: Result) -> Certificate:
-    """Return the certificate of `maneuver`, recomputed from its nodes and the problem in its manifest.
+def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
+    """Return the certificate of `maneuver`, recomputed from its nodes and a problem.
+
+    That is the problem in its manifest, or `problem` in its place: then the certificate names every value in which the
+    two differ, but notes alone say so of those that only say how the maneuver was solved.
 
     Raises
     ------
     ResultError
         The arm record in the manifest is malformed, or describes another number of nodes.
     """
+    maneuver, foreign, differing = held_against(maneuver, problem)
     arm = recorded_arm(maneuver.manifest["arm"], maneuver.members)
     if maneuver.nodes.shape[1] != len(arm.home):
         raise ResultError(
@@ -105,13 +114,14 @@ def verify(maneuver: Result) -> Certificate:
         fcl_rows=Measure(reported.get("fcl"), ""),
         exact_rows=Measure(reported.get("exact"), ""),
         contradictions=(
+            *foreign,
             *wrong,
             *astray,
             *arm.contradictions(maneuver.manifest["problem"], maneuver.arrays),
             *_jams_between_rows(maneuver),
             *_outcome_contradictions(maneuver),
         ),
-        notes=(*notes, *remarks),
+        notes=(*differing, *notes, *remarks),
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Measure
+from vgtm_qp.result.record import Record
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.path import DIRECTION_TOLERANCE, angles
 
@@ -47,19 +48,19 @@ class RecordedCurve(NamedTuple):
     @classmethod
     def of(cls, record: Mapping[str, Any], nodes: int, vertices: int) -> RecordedCurve:
         """Read ``Layout.record``; ResultError where it does not fit so many nodes and control vertices."""
-        try:
-            names = "breaks", "extraction", "nodes", "weights"
-            breaks, extraction, at, weights = (np.asarray(record[name], dtype=float) for name in names)
-            stations = np.asarray(record["stations"], dtype=np.int64)
-            curve = cls(breaks, extraction, at, bool(record["by_arc_length"]), stations, weights)
-        except (KeyError, TypeError, ValueError) as error:
-            raise ResultError(f"manifest.curve is malformed: {error}") from None
-        segments = len(curve.breaks) - 1
-        fits = curve.extraction.ndim == 3 and curve.extraction.shape[::2] == (segments, vertices)
-        fits = fits and stations.shape == weights.shape == (len(curve.nodes), stations.shape[-1])
-        if not fits or (stations.size and not (stations.min() >= 0 and stations.max() < nodes)):
-            raise ResultError(f"manifest.curve does not fit {nodes} nodes and {vertices} control vertices")
-        return curve
+        table = Record(record, "manifest.curve")
+        breaks = table.numbers("breaks", (None,))
+        if len(breaks) < 2 or (np.diff(breaks) <= 0.0).any():
+            raise ResultError("manifest.curve.breaks do not increase from the begin of a segment to its end")
+        extraction = table.numbers("extraction", (len(breaks) - 1, None, vertices))
+        if extraction.shape[1] < 2:
+            raise ResultError("manifest.curve.extraction has less than two points of a segment")
+        at = table.numbers("nodes", (None,))
+        if not len(at):
+            raise ResultError("manifest.curve.nodes is empty")
+        stations = table.integers("stations", (len(at), None), nodes)
+        weights = table.numbers("weights", stations.shape)
+        return cls(breaks, extraction, at, table.flag("by_arc_length"), stations, weights)
 
     def at(self, s: Array, vertices: Array) -> Array:
         """Return (T, K, 3) the points at parameters `s` (T, K) of curves with control vertices (T, V, 3), m."""
@@ -108,9 +109,11 @@ class RecordedCurve(NamedTuple):
 def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
     """Return the measures of a maneuver's curve, whose tip has the attitudes `rotation` (T, 3, 3)."""
     record, vertices = maneuver.manifest.get("curve"), maneuver.control_vertices
-    if not record or not vertices.shape[1]:
+    if record is None or not vertices.shape[1]:
         return {}
+    table = Record(record, "manifest.curve")
     curve = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices.shape[1])
+    is_held, *_ = (table.flag(key) for key in ("held", "ends_at_tip", "ends_along_tip"))
     stations = np.einsum("kq,tkqc->tkc", curve.weights, maneuver.nodes[:, curve.stations])
     off = np.linalg.norm(stations - curve.points(vertices), axis=2)
     # At home the curve is fitted to the arm, however that is bent.
@@ -118,7 +121,7 @@ def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
     row, k = divmod(int(np.argmax(moved)), moved.shape[1])
     row += len(off) - len(moved)
     method = maneuver.manifest["problem"].get("method") or {}
-    is_hard = method.get("tracking_mode") == "hard" and bool(record["held"])
+    is_hard = method.get("tracking_mode") == "hard" and is_held
     found = {
         "tracking_gap": Measure(
             float(off[row, k]),
@@ -139,7 +142,7 @@ def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
         ),
     }
     for name, (key, errors, unit, bound) in ends.items():
-        if record[key]:
+        if table.flag(key):
             row = int(np.argmax(errors))
             found[name] = Measure(float(errors[row]), unit, bound, "most", f"row {row}")
     return found

@@ -10,6 +10,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ProblemError
+from vgtm_qp.result.manifest import file_digest
 from vgtm_qp.result.poses import rotation_matrix
 from vgtm_qp.result.result import Result
 
@@ -61,6 +62,10 @@ def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], l
             corners = _corners(maneuver.manifest, tip[0])
         except (ProblemError, ValueError) as error:
             contradictions.append(f"the path cannot be read: {error}")
+    if wanted.get("path") and (recorded := (maneuver.manifest.get("problem_digests") or {}).get("path")):
+        file = Path(maneuver.manifest.get("directory") or ".") / str(wanted["path"])
+        if file_digest(file) != recorded:
+            contradictions.append(f"maneuver.path: {file} is not the file that the result was made with")
     target_error = None
     if corners is not None:
         targets = maneuver.tip_target_position
