@@ -215,9 +215,11 @@ def test_members_that_touch_at_full_speed_jolt_all_actuators():
     assert slow.sum() <= 0.9 * abrupt.sum()
 
 
-@pytest.mark.parametrize(("mode", "within", "jolt"), [("elastic", 2.6, 0.4), ("exact", 3.0, 0.9)])
+@pytest.mark.parametrize(
+    ("mode", "within", "jolt", "sum_of"), [("elastic", 2.6, 0.4, 0.9), ("exact", 3.0, 0.9, 0.95)]
+)
 def test_contacts_with_two_cubes_do_not_jolt_the_arm_and_what_they_add_is_within_free_motion(
-    mode, within, jolt
+    mode, within, jolt, sum_of
 ):
     """Free of the ends of its strokes: those add as much again as the cubes."""
     cubes = vq.load_problem("five_bay_two_cubes").replace({"method.tracking_mode": mode})
@@ -228,7 +230,7 @@ def test_contacts_with_two_cubes_do_not_jolt_the_arm_and_what_they_add_is_within
     assert changes.sum() <= within * free
     _, abrupt = changes_of_rates(cubes.replace({"method.slow_approach": False}))
     assert changes.max() <= jolt * abrupt.max()
-    assert changes.sum() <= 0.9 * abrupt.sum()
+    assert changes.sum() <= sum_of * abrupt.sum()
 
 
 def test_an_arm_at_rest_need_not_flee_from_an_obstacle_that_only_comes_nearer():
