@@ -171,7 +171,7 @@ def curve_contradictions(maneuver: Result) -> Iterator[str]:
             yield "manifest.curve is missing, but the problem keeps stations on the curve"
         return
     table = Record(record, "manifest.curve")
-    curve = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices)
+    curve, held = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices), table.flag("held")
     for name, shares in (("extraction", curve.extraction), ("weights", curve.weights)):
         if np.abs(shares.sum(axis=-1) - 1.0).max() > _ROUNDING:
             yield f"manifest.curve.{name} are not those of means: they do not add up to 1"
@@ -179,7 +179,7 @@ def curve_contradictions(maneuver: Result) -> Iterator[str]:
         if np.abs(values[[0, -1]] - [0.0, 1.0]).max() > _ROUNDING or (np.diff(values) <= 0.0).any():
             yield f"manifest.curve.{name} do not increase to 1"
     if "bays" in truss:
-        count = truss["bays"] // (2 if truss["module"] == "longeron" and table.flag("held") else 1)
+        count = truss["bays"] // (2 if truss["module"] == "longeron" and held else 1)
         if len(curve.nodes) != count:
             yield f"manifest.curve has {len(curve.nodes)} stations; this truss has {count}"
     tip = maneuver.manifest["arm"]["tip"]
