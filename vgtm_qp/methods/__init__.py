@@ -3,8 +3,8 @@
 from vgtm_qp.methods.conventional import ConventionalResolver
 from vgtm_qp.methods.curve_first import CurveFirstResolver
 from vgtm_qp.methods.presets import DEFAULT_METHODS, PRESETS, method_name, methods_for, with_method
-from vgtm_qp.step.mover import Resolver
-from vgtm_qp.step.resolver import QPResolver
+from vgtm_qp.step.qp_resolver import QPResolver
+from vgtm_qp.step.resolver import Resolver
 
 __all__ = [
     "DEFAULT_METHODS",

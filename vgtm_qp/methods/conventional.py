@@ -224,7 +224,11 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
         self._correct = method.correct
         self._lengths = self.setup.arm.home_quantities[self._fixed]
 
-    def _hold(self, members: Index, held: Mask) -> None:
+    def lock(self, name: str) -> None:
+        """See :class:`Resolver`: a locked actuator is a fixed member from then on."""
+        super().lock(name)
+        held = np.isin(self._actuation.names, list(self._actuation.locked))
+        members = self.setup.arm.actuators[held]
         self._solution.hold(members, held)
         fixed = truss_of(self.setup.arm).fixed
         kept = dict(zip(self._fixed.tolist(), self._lengths.tolist(), strict=True))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
 
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import vector_from_rotation
@@ -15,13 +16,11 @@ from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.mover import Resolver
 from vgtm_qp.step.path import Path
+from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.step.stops import Stop, StopKind
-from vgtm_qp.step.task import duration
 
 _COLLAPSED = 1e-3
 LENGTH_TOLERANCE = 1e-11
@@ -37,7 +36,7 @@ class Moved(NamedTuple):
     torsion: Array
 
 
-class MethodResolver(Resolver):
+class MethodResolver(Resolver, ABC):
     """Moves an arm step by step by one of the other methods.
 
     Its steps do not brake, drive pairs apart or follow goals of control vertices.
@@ -50,29 +49,8 @@ class MethodResolver(Resolver):
         self._clock = Phases("kinematics", "solve", "correction", "acceptance")
         self._steps = 0
 
-    @property
-    def setup(self) -> Setup:
-        """The arm ready to move; its engine is never called."""
-        return self._setup
-
-    @property
-    def phases(self) -> dict[str, float]:
-        """Seconds spent so far in each phase."""
-        return self._clock.seconds
-
-    def lock(self, name: str) -> None:
-        """See :class:`Resolver`: a locked actuator is a fixed member from then on."""
-        self._actuation.lock(name, self.state)
-        held = np.isin(self._actuation.names, list(self._actuation.locked))
-        self._hold(self.setup.arm.actuators[held], held)
-
-    def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
+    def _follow(self, path: Path, start: float, end: float, dt: float, whole: float) -> Step:
         """See :class:`Resolver`; a blocked step has its reason."""
-        dt = duration(self.setup.dt if dt is None else dt)
-        for name in self._actuation.jammed(self.state.time):
-            self.lock(name)
-        whole = self._actuation.until_jam(self.state.time, dt)
-        dt, end = whole * dt, start + whole * (end - start)
         self._steps += 1
         self._clock.start()
         try:
@@ -97,28 +75,9 @@ class MethodResolver(Resolver):
         self._clock.add("kinematics")
         return Step(StepStatus.REACHED, 1.0, self.state, "", 0).over(whole, None)
 
-    def explain(
-        self,
-        path: Path,  # noqa: ARG002
-        start: float,  # noqa: ARG002
-        end: float,  # noqa: ARG002
-        *,
-        dt: float | None = None,  # noqa: ARG002
-        last: Step | None = None,
-        state: State | None = None,  # noqa: ARG002
-    ) -> Stop:
-        """Return the reason of the `last` step: the method has no rows that hold the arm."""
-        if last is None:
-            return Stop(StopKind.NONLINEAR)
-        return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
-
+    @abstractmethod
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         """Return where the step leads, or raise SolverError."""
-        raise NotImplementedError
-
-    def _hold(self, members: Index, held: Mask) -> None:
-        """Keep the present lengths of some members (h,), the actuators that `held` (n_a,) marks."""
-        raise NotImplementedError
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
         truss, lengths = truss_of(self.setup.arm), self.setup.arm.home_quantities

@@ -1,181 +1,272 @@
-"""A resolver for a control loop: one call, one certified step, or a stop that says why."""
+"""`Resolver`, the class of all methods: what control loops, maneuvers and the live page call."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from typing import ClassVar, NoReturn, Self
 
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
+from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.step.actuation import Actuation
-from vgtm_qp.step.advance import Advancer
-from vgtm_qp.step.attempt import Attempt
-from vgtm_qp.step.braking import ANY_RANK, Braking
-from vgtm_qp.step.build import build_arm
-from vgtm_qp.step.checks import checked_arm
-from vgtm_qp.step.mover import Resolver
+from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.path import Path
-from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.shaping import Shaping
-from vgtm_qp.step.state import Shortfall, State, frozen
-from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.step.stops import Stop, explain
+from vgtm_qp.step.state import Shortfall, State
+from vgtm_qp.step.step import Step
+from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.step.task import duration
 
-_SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
-"""Least share of a piece of path that is tried by any arm, and by one that can brake instead."""
 
+class Resolver:
+    """Moves one arm step by step by the method of its problem. Not to be shared by threads: use one per thread.
 
-class QPResolver(Resolver, serves="qp"):
-    """Moves one arm by the QP of a step; see :class:`vgtm_qp.step.mover.Resolver`.
+    ``Resolver(problem)`` is an instance of the subclass that serves ``problem.method``. A call that a method cannot
+    serve raises GoalError, which names the methods that can.
+
+    Attributes
+    ----------
+    setup, state
+        The arm ready to move, and its state, which may be set to another state of this arm.
+    phases : dict of str to float
+        Seconds spent so far in each phase.
+    solver : str or None
+        Name of the QP solver; None where the method solves no QP.
+    rank : int or None
+        Rank of the Jacobian of eq. (26) in the last step; None where the method does not reveal it.
+    draws_vertices : bool
+        Whether control vertices follow goals of their own.
 
     Raises
     ------
-    ProblemError
-        The end effector is asked for coordinates that no actuator can start to change.
+    CurveError, ProblemError, SolverError, TrussError
+        The arm cannot be built, or not moved by that method.
     """
 
-    draws_vertices = True
+    rank: int | None = None
+    draws_vertices = False
+    _setup: Setup
+    _actuation: Actuation
+    _clock: Phases
+    _follow: Callable[[Path, float, float, float, float], Step]
+    """Moves along a path from one value to another in a duration, s, the last argument's share of the whole step."""
+    _method = ""
+    _served: ClassVar[dict[str, type[Resolver]]] = {}
 
-    def __init__(self, problem: Problem | Setup) -> None:
-        setup = problem if isinstance(problem, Setup) else checked_arm(problem)
-        self._separation = Separation(setup)
-        self._actuation = Actuation(setup)
-        self._shaping = Shaping(setup)
-        self._attempt = Attempt(setup, self._separation, self._actuation)
-        self._advancer = Advancer(self._attempt, self._actuation, self._shaping)
-        self._state = setup.home_state()
-        self._braking: Braking | None = None
+    def __init_subclass__(cls, *, serves: str = "") -> None:
+        if serves:
+            cls._method = serves
+            Resolver._served[serves] = cls
+
+    def __new__(cls, problem: Problem | Setup) -> Self:
+        """Return an instance of the subclass that serves the problem's method; for a ``Setup``, of the QP's."""
+        chosen: type = cls
+        if cls is Resolver:
+            if isinstance(problem, Setup):
+                chosen = Resolver._served["qp"]
+            else:
+                check_is_problem(problem)
+                chosen = Resolver._served[problem.method.name]
+        return object.__new__(chosen)
 
     @property
     def setup(self) -> Setup:
         """The arm ready to move: arm, curve, task, engine and clearance monitor."""
-        return self._shaping.setup
+        return self._setup
 
     @property
     def solver(self) -> str | None:
         """Name of the QP solver."""
-        return self.setup.solver
+        return None
 
     @property
     def phases(self) -> dict[str, float]:
         """Seconds spent so far in each phase."""
-        return self._attempt.phases.seconds
+        return self._clock.seconds
+
+    @property
+    def state(self) -> State:
+        """Where the arm is; may be set to another state of this arm."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        vertices, nodes = self.setup.layout.vertices, len(self.setup.arm.node_names)
+        if len(state.control_vertices) != vertices or len(state.nodes) != nodes:
+            raise GoalError(
+                f"this state has {len(state.nodes)} nodes and {len(state.control_vertices)} control vertices; the arm "
+                f"has {nodes} and its curve {vertices}"
+            )
+        self._state = state
+
+    @property
+    def locked(self) -> frozenset[str]:
+        """Names of the actuators locked so far; members locked from the start are fixed members."""
+        return frozenset(self._actuation.locked)
 
     def lock(self, name: str) -> None:
-        """See :class:`Resolver`.
+        """Hold an actuator at its present length or value from now on.
 
-        The QP keeps its columns: a locked actuator has a box of width zero.
+        Raises
+        ------
+        GoalError
+            No actuator has that name, or the method cannot hold one.
         """
         self._actuation.lock(name, self.state)
-        before, self._braking = self._known_braking(), None
-        if before is not None:
-            # A jammed actuator stops at once; the others brake, each by itself.
-            state, value = before.steps[0]
-            self._braking = self._advancer.brakes(state.duration).letting_go(self.state, before.path, value)
 
     @property
     def control_vertex_goals(self) -> dict[int, Array]:
-        """Goals of control vertices, m, by index; may be set as a whole."""
-        return self._shaping.goals
+        """Goals of control vertices, m, by index; may be set as a whole if the method draws control vertices."""
+        return {}
 
     @control_vertex_goals.setter
     def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
-        self._shaping.draw(goals)
-        self._attempt.use(self.setup)
+        if goals:
+            self._refuse("draw control vertices")
 
-    def set_control_vertices(self, count: int) -> float:
-        """See :class:`Resolver`."""
-        state, braking, family = self.state, self._known_braking(), self.setup.layout.family
-        more = count - len(state.control_vertices)
-        change = self._shaping.change(state, more)
-        self._attempt.use(self.setup)
-        if more:
-            self.state = replace(state, control_vertices=frozen(change.curve.control_vertices))
-            if braking is not None and family is not None:
-                self._braking = braking.changed(
-                    self.state, lambda then: self._shaping.with_vertices(then, family, more)
-                )
-        return change.change
+    def set_control_vertex_goal(self, index: int, position: ArrayLike | None) -> None:
+        """Draw a control vertex to a position in the null space of the tip's motion; None ends that.
 
-    def build(
+        The arm follows as far as the tip's goal, limits and clearance let it.
+
+        Parameters
+        ----------
+        index
+            Control vertex, 0 at the base; p_0 and the direction of p_1 belong to the base.
+        position
+            (3,) goal, m, or None.
+
+        Raises
+        ------
+        GoalError
+            There is no such control vertex, the position is not three finite numbers, or the method draws none.
+        """
+        goals: dict[int, ArrayLike] = dict(self.control_vertex_goals)
+        goals.pop(index, None)
+        self.control_vertex_goals = goals if position is None else {**goals, index: position}
+
+    def set_control_vertices(self, count: int) -> float:  # noqa: ARG002
+        """Give the curve another number of control vertices where it is; return how far it moved, m.
+
+        More of them change a Bezier curve or B-spline by rounding only; fewer are fitted. Control-vertex goals end.
+
+        Raises
+        ------
+        GoalError
+            The arm has no curve, or the method keeps the number.
+        CurveError
+            So few control vertices cannot keep both ends and the base tangent.
+        """
+        self._refuse("change the number of control vertices")
+
+    def step(
         self,
         *,
         position: ArrayLike | None = None,
         pointing: ArrayLike | None = None,
         rotation_vector: ArrayLike | None = None,
         dt: float | None = None,
-    ) -> StepQP:
-        """See :class:`Resolver`."""
+    ) -> Step:
+        """Move towards a goal of the end effector in one step and return what was done.
+
+        Parameters
+        ----------
+        position
+            (3,) wanted position, m; by default the tip's own.
+        pointing
+            (3,) wanted direction of the tip's z-axis.
+        rotation_vector
+            (3,) wanted orientation, rad.
+        dt
+            Duration of the step, s; the problem's by default.
+
+        Raises
+        ------
+        GoalError
+            The goal is not three finite numbers, names a coordinate that is not tracked or the direction twice, or
+            `dt` is not a positive number; the state is unchanged.
+        """
         path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
-        dt = duration(self.setup.dt if dt is None else dt)
-        limits = self._actuation.limits(self.state, dt, slowing=True)
-        target = self._shaping.target(self.state, dt, path, 0.0, 1.0, limits[:2])
-        return self.setup.engine.qp(self._attempt.first_input(self.state, target))
+        return self.follow(path, 0.0, 1.0, dt=dt)
+
+    def build(
+        self,
+        *,
+        position: ArrayLike | None = None,  # noqa: ARG002
+        pointing: ArrayLike | None = None,  # noqa: ARG002
+        rotation_vector: ArrayLike | None = None,  # noqa: ARG002
+        dt: float | None = None,  # noqa: ARG002
+    ) -> StepQP:
+        """Return the first QP of a step to a goal, to read, to print or to solve elsewhere; nothing moves.
+
+        Every row and column has a name, a kind and a unit. The step solves this QP, or an equivalent condensed one.
+        Parameters and errors are those of :meth:`step`; GoalError also if the method solves no QP.
+        """
+        self._refuse("show the QP of a step, since it solves none")
+
+    def tip(self) -> tuple[Array, Array]:
+        """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
+        kinematics = self.setup.kinematics
+        kinematics.evaluate(self.state.q)
+        return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
-        """See :class:`Resolver`; pieces are halved until one is safe."""
+        """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's.
+
+        A step in which an actuator of the problem jams ends at that time, with the share of the path until then.
+
+        Raises
+        ------
+        GoalError
+            `dt` is not a positive number; the state is unchanged.
+        """
         dt = duration(self.setup.dt if dt is None else dt)
-        state, actuation = self._state, self._actuation
-        for name in actuation.jammed(state.time):
+        for name in self._actuation.jammed(self.state.time):
             self.lock(name)
-        whole = actuation.until_jam(state.time, dt)
-        dt *= whole
-        limits = actuation.limits(state, dt, slowing=True)
-        brake, smallest, worst = None, _SMALLEST, ANY_RANK
-        if whole == 1.0 and (brake := self._known_braking()) is not None:
-            smallest, worst = _SMALLEST_MOVING, brake.rank
-        target = self._shaping.target(state, dt, path, start, start + whole * (end - start), limits[:2])
-        step, braking = self._advancer.first_accepted(state, target, dt, smallest, worst)
-        if step.moved:
-            self._state, self._braking = step.state, braking
-            return step.over(whole, limits)
-        step = step.over(0.0, limits)
-        return step if brake is None else self._brake(brake, path, start, end, step)
+        whole = self._actuation.until_jam(self.state.time, dt)
+        return self._follow(path, start, start + whole * (end - start), whole * dt, whole)
 
-    def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:
-        """See :class:`Resolver`."""
-        braking = self._known_braking()
-        if braking is None:
-            return None
-        return self._brake(braking, path, start, end, Step(StepStatus.BLOCKED, 0.0, self.state, "", 0))
+    def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:  # noqa: ARG002
+        """Do the next of the braking steps that bring a moving arm with limited accelerations to rest.
 
-    def _known_braking(self) -> Braking | None:
-        """Return the steps that bring the arm to rest; None if it is at rest."""
-        braking = self._braking
-        return braking if braking is not None and braking.origin is self._state and braking.steps else None
-
-    def _brake(self, braking: Braking, path: Path | None, start: float, end: float, blocked: Step) -> Step:
-        """Do the first step of `braking`, instead of the `blocked` one, and return it."""
-        step = braking.first(path, start, end, blocked)
-        self.state, self._braking = step.state, braking.rest
-        return replace(step, gave_way=self._attempt.gave_way(step.state))
+        They were computed before the last step was accepted, each within the limits and clear of obstacles. If the arm
+        is at rest, nothing moves and the result is None. Progress is counted from `start` to `end` of a braking `path`.
+        """
+        return None
 
     def explain(
         self,
-        path: Path,
-        start: float,
-        end: float,
+        path: Path,  # noqa: ARG002
+        start: float,  # noqa: ARG002
+        end: float,  # noqa: ARG002
         *,
-        dt: float | None = None,
+        dt: float | None = None,  # noqa: ARG002
         last: Step | None = None,
-        state: State | None = None,
+        state: State | None = None,  # noqa: ARG002
     ) -> Stop:
-        """See :class:`Resolver`."""
-        state = state or self.state
-        limits = self._actuation.limits(state, self.setup.dt if dt is None else dt).of_stop()
-        goal = path.at(start).over(end - start)
-        return explain(self.setup, self._separation, state, goal, limits, last)
+        """Return why the arm stopped at a state on its way along `path` from the value `start` to `end`.
 
-    def too_near(self, state: State) -> Shortfall:
+        Meant for a `last` step that was blocked, hardly moved or braked. The state is the present one by default;
+        nothing moves. A method without rows that hold the arm gives the reason of the last step.
+        """
+        if last is None:
+            return Stop(StopKind.NONLINEAR)
+        return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
+
+    def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
-        return self._separation.shortfall(state.q, state.time)
+        return {}
 
-    def again(self, problem: Problem) -> QPResolver:
-        """See :class:`Resolver`."""
-        # A kernel takes longer to compile than a maneuver to solve without it.
-        return QPResolver(build_arm(problem, compiled=False))
+    def again(self, problem: Problem) -> Resolver | None:  # noqa: ARG002
+        """Return a resolver at home for a second try of a maneuver, with other weights of the null space.
+
+        None if the method has no such choice.
+        """
+        return None
+
+    def _refuse(self, what: str, serving: str = '"qp"') -> NoReturn:
+        raise GoalError(f'the method "{self._method}" cannot {what}; methods that can: {serving}')

@@ -1,0 +1,171 @@
+"""A resolver for a control loop: one call, one certified step, or a stop that says why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from numpy.typing import ArrayLike
+
+from vgtm_qp.arrays import Array
+from vgtm_qp.problem import Problem
+from vgtm_qp.qp.full import StepQP
+from vgtm_qp.step.actuation import Actuation
+from vgtm_qp.step.advance import Advancer
+from vgtm_qp.step.attempt import Attempt
+from vgtm_qp.step.braking import ANY_RANK, Braking
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.checks import checked_arm
+from vgtm_qp.step.path import Path
+from vgtm_qp.step.resolver import Resolver
+from vgtm_qp.step.separation import Separation
+from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.shaping import Shaping
+from vgtm_qp.step.state import Shortfall, State, frozen
+from vgtm_qp.step.step import Step, StepStatus
+from vgtm_qp.step.stops import Stop, explain
+from vgtm_qp.step.task import duration
+
+_SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
+"""Least share of a piece of path that is tried by any arm, and by one that can brake instead."""
+
+
+class QPResolver(Resolver, serves="qp"):
+    """Moves one arm by the QP of a step; see :class:`vgtm_qp.step.resolver.Resolver`.
+
+    Raises
+    ------
+    ProblemError
+        The end effector is asked for coordinates that no actuator can start to change.
+    """
+
+    draws_vertices = True
+
+    def __init__(self, problem: Problem | Setup) -> None:
+        setup = problem if isinstance(problem, Setup) else checked_arm(problem)
+        self._separation = Separation(setup)
+        self._actuation = Actuation(setup)
+        self._shaping = Shaping(setup)
+        self._attempt = Attempt(setup, self._separation, self._actuation)
+        self._clock = self._attempt.phases
+        self._advancer = Advancer(self._attempt, self._actuation, self._shaping)
+        self._state = setup.home_state()
+        self._braking: Braking | None = None
+
+    @property
+    def setup(self) -> Setup:
+        """The arm ready to move: arm, curve, task, engine and clearance monitor."""
+        return self._shaping.setup
+
+    @property
+    def solver(self) -> str | None:
+        """Name of the QP solver."""
+        return self.setup.solver
+
+    def lock(self, name: str) -> None:
+        """See :class:`Resolver`.
+
+        The QP keeps its columns: a locked actuator has a box of width zero.
+        """
+        super().lock(name)
+        before, self._braking = self._known_braking(), None
+        if before is not None:
+            # A jammed actuator stops at once; the others brake, each by itself.
+            state, value = before.steps[0]
+            self._braking = self._advancer.brakes(state.duration).letting_go(self.state, before.path, value)
+
+    @property
+    def control_vertex_goals(self) -> dict[int, Array]:
+        """Goals of control vertices, m, by index; may be set as a whole."""
+        return self._shaping.goals
+
+    @control_vertex_goals.setter
+    def control_vertex_goals(self, goals: Mapping[int, ArrayLike]) -> None:
+        self._shaping.draw(goals)
+        self._attempt.use(self.setup)
+
+    def set_control_vertices(self, count: int) -> float:
+        """See :class:`Resolver`."""
+        state, braking, family = self.state, self._known_braking(), self.setup.layout.family
+        more = count - len(state.control_vertices)
+        change = self._shaping.change(state, more)
+        self._attempt.use(self.setup)
+        if more:
+            self.state = replace(state, control_vertices=frozen(change.curve.control_vertices))
+            if braking is not None and family is not None:
+                self._braking = braking.changed(
+                    self.state, lambda then: self._shaping.with_vertices(then, family, more)
+                )
+        return change.change
+
+    def build(
+        self,
+        *,
+        position: ArrayLike | None = None,
+        pointing: ArrayLike | None = None,
+        rotation_vector: ArrayLike | None = None,
+        dt: float | None = None,
+    ) -> StepQP:
+        """See :class:`Resolver`."""
+        path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
+        dt = duration(self.setup.dt if dt is None else dt)
+        limits = self._actuation.limits(self.state, dt, slowing=True)
+        target = self._shaping.target(self.state, dt, path, 0.0, 1.0, limits[:2])
+        return self.setup.engine.qp(self._attempt.first_input(self.state, target))
+
+    def _follow(self, path: Path, start: float, end: float, dt: float, whole: float) -> Step:
+        """See :class:`Resolver`; pieces are halved until one is safe."""
+        state, limits = self._state, self._actuation.limits(self._state, dt, slowing=True)
+        brake, smallest, worst = None, _SMALLEST, ANY_RANK
+        if whole == 1.0 and (brake := self._known_braking()) is not None:
+            smallest, worst = _SMALLEST_MOVING, brake.rank
+        target = self._shaping.target(state, dt, path, start, end, limits[:2])
+        step, braking = self._advancer.first_accepted(state, target, dt, smallest, worst)
+        if step.moved:
+            self._state, self._braking = step.state, braking
+            return step.over(whole, limits)
+        step = step.over(0.0, limits)
+        return step if brake is None else self._brake(brake, path, start, end, step)
+
+    def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:
+        """See :class:`Resolver`."""
+        braking = self._known_braking()
+        if braking is None:
+            return None
+        return self._brake(braking, path, start, end, Step(StepStatus.BLOCKED, 0.0, self.state, "", 0))
+
+    def _known_braking(self) -> Braking | None:
+        """Return the steps that bring the arm to rest; None if it is at rest."""
+        braking = self._braking
+        return braking if braking is not None and braking.origin is self._state and braking.steps else None
+
+    def _brake(self, braking: Braking, path: Path | None, start: float, end: float, blocked: Step) -> Step:
+        """Do the first step of `braking`, instead of the `blocked` one, and return it."""
+        step = braking.first(path, start, end, blocked)
+        self.state, self._braking = step.state, braking.rest
+        return replace(step, gave_way=self._attempt.gave_way(step.state))
+
+    def explain(
+        self,
+        path: Path,
+        start: float,
+        end: float,
+        *,
+        dt: float | None = None,
+        last: Step | None = None,
+        state: State | None = None,
+    ) -> Stop:
+        """See :class:`Resolver`."""
+        state = state or self.state
+        limits = self._actuation.limits(state, self.setup.dt if dt is None else dt).of_stop()
+        goal = path.at(start).over(end - start)
+        return explain(self.setup, self._separation, state, goal, limits, last)
+
+    def too_near(self, state: State) -> Shortfall:
+        """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
+        return self._separation.shortfall(state.q, state.time)
+
+    def again(self, problem: Problem) -> QPResolver:
+        """See :class:`Resolver`."""
+        # A kernel takes longer to compile than a maneuver to solve without it.
+        return QPResolver(build_arm(problem, compiled=False))
