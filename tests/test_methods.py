@@ -9,7 +9,7 @@ from steps import numbers_at
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.errors import CurveError
+from vgtm_qp.errors import CurveError, ProblemError
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.methods import PRESETS, Resolver, with_method
 from vgtm_qp.methods.conventional import ConventionalResolver
@@ -431,3 +431,22 @@ def test_a_curve_that_is_put_into_a_state_moves_on_from_there(correct: bool) -> 
     np.testing.assert_allclose(*found, atol=1e-12)
     resolver.state = resolver.setup.home_state()
     np.testing.assert_allclose(resolver.curve.position(1.0), resolver.tip()[0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("problem", "changes", "message"),
+    [
+        ("tetrahedral_truss_circle", {}, r"method\.name: found .*this arm has none"),
+        ("moving_base", {}, r"truss\.base_motion: .*a base at rest"),
+        ("five_bay_free", {"curve.control_vertices": 3, "end_effector.track": ["position", "pointing"],
+          "maneuver.waypoint": [{"time": 1.0, "position": [0.1, 0.0, 4.0], "pointing": [0, 0, 1]}]},
+         r"curve\.control_vertices: found 3; expected 4 or more: base and tip fix 10 coordinates"),
+        ("five_bay_free", {"end_effector.track": ["orientation"],
+          "maneuver.waypoint": [{"time": 1.0, "rotation_vector": [0.0, 0.0, 0.1]}]},
+         r"curve\.torsion_vertices: found 0; expected 1 or more"),
+    ],
+)  # fmt: skip
+def test_what_the_curve_first_method_cannot_do_is_named_by_its_key(problem, changes, message):
+    asked = vq.load_problem(problem).replace(changes)
+    with pytest.raises(ProblemError, match=message):
+        vq.Resolver(with_method(asked, "curve-pseudoinverse"))

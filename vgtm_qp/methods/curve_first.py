@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from vgtm_qp.curve.curve import Curve
-from vgtm_qp.errors import CurveError
 from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
 from vgtm_qp.methods.curve_motion import CurveMotion
 from vgtm_qp.methods.resolver import MethodResolver, Moved, displacement_to
@@ -32,13 +31,20 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
         # The solver is never called; this one compiles no kernels.
         coupled = {**method.kept_by("qp", "coupled"), "solver": "piqp"}
         super().__init__(build_arm(problem.replace({"method": coupled})))
-        setup = self.setup
+        setup, mistakes = self.setup, []
+        if not setup.layout.vertices:
+            text = (
+                '"qp" or "pseudoinverse": this method moves a curve that faces track, and this arm has none'
+            )
+            mistakes.append(problem.mistake(("method", "name"), text))
         if setup.base_motion is not None:
-            raise CurveError("a moving base takes the method qp, with any tracking, or pseudoinverse")
+            text = "a base at rest: the methods qp and pseudoinverse know a moving one"
+            mistakes.append(problem.mistake(("truss", "base_motion"), text))
         if setup.jams:
             text = "no actuator that jams on the way: the methods qp and pseudoinverse hold one"
-            mistake = problem.mistake(("truss", "locked"), text)
-            raise problem.error([mistake])
+            mistakes.append(problem.mistake(("truss", "locked"), text))
+        if mistakes:
+            raise problem.error(mistakes)
         self.motion = CurveMotion(problem, setup)
         segments = make_segments(setup.layout, setup.task.turns)
         self.tracker = Tracker(

@@ -10,7 +10,7 @@ from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
-from vgtm_qp.errors import CurveError, SolverError
+from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE
@@ -29,24 +29,26 @@ class CurveMotion:
 
     Raises
     ------
-    CurveError
-        The curve has too few control vertices for its base and the end effector.
+    ProblemError
+        The curve has too few control vertices for its base and the end effector, or no torsion for the tip's roll.
     """
 
     def __init__(self, problem: Problem, setup: Setup) -> None:
         method, spec, truss = problem.method, problem.curve, truss_of(setup.arm)
-        if not len(truss.faces):
-            raise CurveError("this method needs a reference curve and a truss with faces")
         family = setup.layout.family
-        assert family is not None, "an arm with faces and a curve is laid out with its family"
+        assert family is not None, "an arm with faces is laid out with its curve"
         self._setup, self._task = setup, setup.task
-        spare = degree_of_redundancy(spec.control_vertices, len(setup.task.row_names), spec.torsion_vertices)
+        mistakes, rows = [], len(setup.task.row_names)
+        spare = degree_of_redundancy(spec.control_vertices, rows, spec.torsion_vertices)
         if spare < 0:
-            raise CurveError(
-                f"{spec.control_vertices} control vertices are {-spare} coordinates too few for base and tip"
-            )
+            least = spec.control_vertices + -(spare // 3)
+            text = f"{least} or more: base and tip fix {BASE_ROWS + rows} coordinates"
+            mistakes.append(problem.mistake(("curve", "control_vertices"), text))
         if setup.task.turns == "orientation" and not spec.torsion_vertices:
-            raise CurveError("orientation at the tip takes curve.torsion_vertices of 1 or more")
+            text = "1 or more, since the orientation of the tip is tracked"
+            mistakes.append(problem.mistake(("curve", "torsion_vertices"), text))
+        if mistakes:
+            raise problem.error(mistakes)
         centres = setup.arm.stations.centres(truss.home)
         steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
         self.s = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
