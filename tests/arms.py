@@ -22,17 +22,20 @@ from vgtm_qp.step.task import TipTask
 Array = NDArray[np.float64]
 
 
+UNEQUAL = {
+    "g1": [1.0, 0.1, 0.0],
+    "g2": [-0.5, 0.9, 0.1],
+    "g3": [-0.6, -0.8, 0.0],
+    "m1": [0.5, 0.9, 0.8],
+    "m2": [-0.9, 0.1, 0.9],
+    "m3": [0.45, -0.8, 1.0],
+}
+"""Nodes of an octahedral bay between unequal triangles."""
+
+
 def mast(joint_offset: float = 0.0) -> Truss:
     """A graph without symmetry: an octahedral layer between unequal triangles, and a tip of one node."""
-    positions = {
-        "g1": [1.0, 0.1, 0.0],
-        "g2": [-0.5, 0.9, 0.1],
-        "g3": [-0.6, -0.8, 0.0],
-        "m1": [0.5, 0.9, 0.8],
-        "m2": [-0.9, 0.1, 0.9],
-        "m3": [0.45, -0.8, 1.0],
-        "top": [0.1, 0.05, 1.9],
-    }
+    positions = {**UNEQUAL, "top": [0.1, 0.05, 1.9]}
     nodes = [{"name": k, "position": p, "fixed": k[0] == "g"} for k, p in positions.items()]
     zigzag = [("g1", "m1"), ("g2", "m1"), ("g2", "m2"), ("g3", "m2"), ("g3", "m3"), ("g1", "m3")]
     ring = [("m1", "m2"), ("m2", "m3"), ("m3", "m1")]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from arms import UNEQUAL
 
 import vgtm_qp as vq
 from vgtm_qp.methods import with_method
@@ -52,14 +53,6 @@ OBJ = "v 0 0 0\nv 0.2 0 0\nv 0 0.2 0\nv 0 0 0.2\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 
 
 def graph() -> dict[str, Any]:
     """An octahedral bay between unequal triangles, and a tip of three nodes."""
-    places = {
-        "g1": [1.0, 0.1, 0.0],
-        "g2": [-0.5, 0.9, 0.1],
-        "g3": [-0.6, -0.8, 0.0],
-        "m1": [0.5, 0.9, 0.8],
-        "m2": [-0.9, 0.1, 0.9],
-        "m3": [0.45, -0.8, 1.0],
-    }
     pairs = ["g1 m1", "g2 m1", "g2 m2", "g3 m2", "g3 m3", "g1 m3", "m1 m2", "m2 m3", "m3 m1"]
     members: list[dict[str, Any]] = [
         {"name": pair.replace(" ", "-"), "nodes": pair.split(), "actuated": pair.count("m") == 2}
@@ -67,7 +60,7 @@ def graph() -> dict[str, Any]:
     ]
     for member in members[6:]:
         member["stroke"] = [0.6, 3.0]
-    nodes = [{"name": name, "position": place, "fixed": name[0] == "g"} for name, place in places.items()]
+    nodes = [{"name": name, "position": place, "fixed": name[0] == "g"} for name, place in UNEQUAL.items()]
     for name, others in {"m1": ["m2", "m3"], "g1": ["g2", "g3"]}.items():
         next(node for node in nodes if node["name"] == name)["joint"] = others
     tip = ["m1", "m2", "m3"]
