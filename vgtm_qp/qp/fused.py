@@ -19,7 +19,7 @@ from vgtm_qp.qp.fused_rows import row_function
 from vgtm_qp.qp.fused_settle import NEAR, settle_function
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
-from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows
+from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, Legs
 from vgtm_qp.qp.residual import refuse_large
 from vgtm_qp.rows.curve import free_basis
 from vgtm_qp.rows.tip import TipGoal
@@ -166,7 +166,7 @@ class FusedSolver:
             held = slice(size + self._tip, size + self._equal)
             upper[held] = lower[held] = -block[-1]
         if self._legs:
-            axes, least = self.layout.leg_bounds(self._vertices, self._normal)
+            axes, least = Legs.at(self.layout, self._vertices, self._normal)
             if self._legs > 1:
                 # Control vertices come after the leg at the base.
                 last = self._torsion - 6

@@ -14,14 +14,10 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
-from vgtm_qp.rows.curve import legs
 from vgtm_qp.rows.tip import axes as tip_axes
 
 _ENDS_AT_TIP = 3
 """Fewest control vertices with which a curve can begin at the base, along its normal, and end anywhere."""
-
-_LEAST_LEG = 0.1
-"""Least length of a leg with a given direction, as a share of a leg of the straight polygon at home."""
 
 _GOAL_REACH = 0.01
 """Greatest share of the arm's length by which a control vertex is drawn towards its goal in one step."""
@@ -194,14 +190,6 @@ class Layout:
         last = self.vertices - 1
         legs = [(0, 1), (last - 1, last)][: int(last > 0) + self.ends_along_tip]
         return np.array(legs, dtype=np.int64).reshape(-1, 2)
-
-    def leg_bounds(self, vertices: Array, normal: Array) -> tuple[Array, Array]:
-        """Return axes (G, 3) of the :attr:`legs`, and lower bounds (G,) of the changes of their lengths, m."""
-        if not len(self.legs):
-            return np.zeros((0, 3)), np.zeros(0)
-        axes, lengths = legs(vertices, normal, both=len(self.legs) > 1)
-        least = _LEAST_LEG * self.arm.height / (self.vertices - 1)
-        return axes, np.minimum(least - lengths, 0.0)
 
     def record(self) -> dict[str, Any] | None:
         """Return the curve and its stations as JSON data for verification; None without a curve.

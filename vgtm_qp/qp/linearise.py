@@ -132,7 +132,7 @@ class Linearisation:
             base_axes=base_axes,
             base_rhs=base_rhs,
             clearance=clearance,
-            legs=Legs(*layout.leg_bounds(vertices, np.cross(base_axes[0], base_axes[1]))),
+            legs=Legs.at(layout, vertices, np.cross(base_axes[0], base_axes[1])),
             spacing_rhs=spacing if moves else 0.0 * spacing,
             curve=asked.curve,
         )

@@ -17,11 +17,11 @@ from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import PeriodValues
 from vgtm_qp.qp.long.solver import ChainSolver
-from vgtm_qp.qp.numbers import Legs, RowNumbers
+from vgtm_qp.qp.numbers import Legs, RowNumbers, beyond
 from vgtm_qp.qp.settle import held
 from vgtm_qp.rows.curve import base_offset
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
-from vgtm_qp.step.closing import Closing, Correct, converge, enough_length, within
+from vgtm_qp.step.closing import Closing, Correct, converge, enough_length
 from vgtm_qp.step.engine import Engine, enough_tip_error
 from vgtm_qp.step.state import frozen
 from vgtm_qp.step.target import QPInput, Target
@@ -98,7 +98,7 @@ class ChainEngine(Engine):
             progress_gradient=progress_gradient(curvature, progress),
             progress_curvature=curvature,
             clearance=rows,
-            legs=Legs(*layout.leg_bounds(vertices, normal)),
+            legs=Legs.at(layout, vertices, normal),
         )
         solution = self._solver.solve_filled(numbers)
         self._answer = solution.actuators, numbers.lower, numbers.upper
@@ -140,7 +140,10 @@ class ChainEngine(Engine):
         own, worst = converge(first, measure)
         closed = self._closed(X, own, worst)
         strokes = closed.quantities[self.layout.arm.actuators]
-        if not (solver.knows_gain or (worst <= accuracy.member and within(strokes, *bounds, enough))):
+        if not (
+            solver.knows_gain
+            or (worst <= accuracy.member and np.abs(beyond(strokes, *bounds)).max() <= enough)
+        ):
             closed = self._any_closing.close(closed.q, *bounds, accuracy.member)
         off = float(np.abs(self._task.error(closed.tip_position, closed.tip_rotation, goal)).max())
         return closed if off <= accuracy.tip and closed.error <= accuracy.member else None

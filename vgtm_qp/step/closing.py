@@ -31,11 +31,6 @@ def enough_length(q: Array, tolerance: float) -> float:
     return max(1e-3 * tolerance, 8.0 * _ROUNDING * float(np.abs(q).max()))
 
 
-def within(values: Array, lower: Array, upper: Array, spare: float) -> bool:
-    """Return whether values (n_a,) are within their bounds to a tolerance of `spare`."""
-    return bool(np.all(values >= lower - spare) and np.all(values <= upper + spare))
-
-
 Correct = Callable[[], Array]
 
 
