@@ -12,7 +12,7 @@ import pytest
 
 import vgtm_qp as vq
 from vgtm_qp.cli import main
-from vgtm_qp.live.page import _Page, view
+from vgtm_qp.live.page import Page, view
 from vgtm_qp.live.session import Session
 from vgtm_qp.view.server import refusal, viser_server
 
@@ -130,29 +130,29 @@ def test_a_port_that_is_taken_gives_the_next_and_the_last_is_refused():
 def act(page: Any, *actions: Any) -> None:
     """Let the loop of a page run actions as those of its widgets."""
     for action in actions:
-        page._inbox.put(action)
-    page._read_inbox()
+        page.post(action)
+    page.read_inbox()
 
 
 def test_whatever_a_widget_raises_is_shown_and_the_page_goes_on(capsys: pytest.CaptureFixture[str]):
     with viser_server() as server:
-        page = _Page(server, Session(vq.load_problem("five_bay_free")), None)
-        act(page, lambda: [][1], page._draw)
-        assert "IndexError" in page._message
+        page = Page(server, Session(vq.load_problem("five_bay_free")), None)
+        act(page, lambda: [][1], page.draw)
+        assert "IndexError" in page.message
         assert "IndexError" in capsys.readouterr().err
-        page._settings["clearance.safe"] = object()
+        page.set("clearance.safe", object())
         act(page)
-        assert page._message
+        assert page.message
 
 
 @pytest.mark.parametrize("method", ["pseudoinverse", "curve-pseudoinverse", "qp-none"])
 def test_a_maneuver_of_another_method_is_solved_and_played(method: str):
     problem = vq.load_problem("five_bay_free").replace({"maneuver.steps": 4})
     with viser_server() as server:
-        page = _Page(server, Session(problem), None)
-        act(page, lambda: page._session.use_method(method), page._solve)
+        page = Page(server, Session(problem), None)
+        act(page, lambda: page.session.use_method(method), page.solve)
         for _ in range(3):
-            act(page, lambda: page._play(0.5))
-        act(page, lambda: page._session.use_method("qp"), lambda: page._play(0.5), page._draw)
-        assert "error" not in page._message, page._message
-        assert page._moment > 1.0
+            act(page, lambda: page.play(0.5))
+        act(page, lambda: page.session.use_method("qp"), lambda: page.play(0.5), page.draw)
+        assert "error" not in page.message, page.message
+        assert page.moment > 1.0

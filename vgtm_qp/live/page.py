@@ -68,21 +68,30 @@ def view(
     problem = stored_problem(maneuver.manifest["problem"]) if maneuver else shown
     assert isinstance(problem, Problem)
     with viser_server(port, host) as server:
-        page = _Page(server, Session(problem), maneuver)
+        page = Page(server, Session(problem), maneuver)
         if ready is not None:
             name = LOOPBACK if is_unspecified(host) else f"[{host}]" if ":" in host else host
             ready(f"http://{name}:{server.get_port()}")
         page.run(stop or Event())
 
 
-class _Page:
-    """Widgets and loop. Callbacks only put actions into the inbox; the loop alone touches the session."""
+class Page:
+    """Widgets and loop. Callbacks only put actions into the inbox; the loop alone touches the session.
+
+    Attributes
+    ----------
+    session : Session
+    moment : float
+        Time up to which a solved maneuver was played, s.
+    message : str
+        What the page says last, errors of its widgets among it.
+    """
 
     def __init__(self, server: Any, session: Session, maneuver: Maneuver | None) -> None:
-        self._server, self._session, self._maneuver = server, session, maneuver
+        self._server, self.session, self._maneuver = server, session, maneuver
         self._inbox: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._settings: dict[str, Any] = {}
-        self._playing, self._moment, self._message = False, 0.0, ""
+        self._playing, self.moment, self.message = False, 0.0, ""
         state = session.state
         self._scene = ArmScene(server, session.drawing, session.nodes, session.control_vertices)
         path = make_plan(session.problem, *session.pose()).path.positions
@@ -108,35 +117,44 @@ class _Page:
     def run(self, stop: Event) -> None:
         """Step, draw and wait for the rest of the frame, until `stop` is set."""
         read_at = 0.0
-        self._draw()
+        self.draw()
         while not stop.is_set():
             started = perf_counter()
-            changed = self._read_inbox()
+            changed = self.read_inbox()
             if self._playing:
-                self._survive(lambda: self._play(_PERIOD))
+                self._survive(lambda: self.play(_PERIOD))
             else:
                 self._survive(partial(self._advance, changed))
             if started - read_at > _READ_OUT_PERIOD:
-                self._read_out.content = read_out(self._session, self._message)
+                self._read_out.content = read_out(self.session, self.message)
                 read_at = started
             stop.wait(max(0.0, _PERIOD - (perf_counter() - started)))
 
     def _advance(self, changed: bool) -> None:
         """Step towards what is wanted, and draw the arm if it moved or something else `changed`."""
-        if self._session.advance(_PERIOD) or changed:
-            self._draw()
+        if self.session.advance(_PERIOD) or changed:
+            self.draw()
 
-    def _read_inbox(self) -> bool:
+    def post(self, action: Callable[[], None]) -> None:
+        """Let the loop do an action, as widgets do."""
+        self._inbox.put(action)
+
+    def set(self, key: str, value: Any) -> None:
+        """Let the loop change a key of the problem."""
+        self._settings[key] = value
+
+    def read_inbox(self) -> bool:
+        """Do what was posted and set since the last call; return whether anything was posted."""
         found = not self._inbox.empty()
         while not self._inbox.empty():
             self._survive(self._inbox.get())
         if self._settings:
             settings, self._settings = self._settings, {}
-            self._try(lambda: self._session.change(settings))
+            self._try(lambda: self.session.change(settings))
         return found
 
     def _try(self, action: Callable[[], None]) -> None:
-        self._message = ""
+        self.message = ""
         self._survive(action)
 
     def _survive(self, action: Callable[[], None]) -> None:
@@ -144,17 +162,18 @@ class _Page:
         try:
             action()
         except VgtmError as error:
-            self._message = str(error)
+            self.message = str(error)
         except Exception as error:
             said = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
-            if said != self._message:
+            if said != self.message:
                 # Once, not thirty times a second.
                 traceback.print_exc()
             self._pause()
-            self._message = said
+            self.message = said
 
-    def _draw(self) -> None:
-        session = self._session
+    def draw(self) -> None:
+        """Draw arm, tip target and control vertices where they are."""
+        session = self.session
         self._scene.move(session.nodes, session.control_vertices, session.state.time)
         self._target.position = session.target
         for i, handle in self._vertices.items():
@@ -172,14 +191,14 @@ class _Page:
         return handle
 
     def _drag_vertex(self, index: int, position: Array, released: bool) -> None:
-        if self._session.vertices_can_be_wanted:
-            self._session.want_vertex(index, None if released else position)
+        if self.session.vertices_can_be_wanted:
+            self.session.want_vertex(index, None if released else position)
         else:
-            method = method_name(self._session.problem)
-            self._message = f"the method {method} takes no goals of control vertices"
+            method = method_name(self.session.problem)
+            self.message = f"the method {method} takes no goals of control vertices"
 
     def _add_widgets(self) -> None:
-        gui, session = self._server.gui, self._session
+        gui, session = self._server.gui, self.session
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.set_panel_label(session.drawing.name or "vgtm")
@@ -202,13 +221,13 @@ class _Page:
                 self._add_weight(name)
         self._on(self._play_button.on_click, lambda _: self._toggle())
         self._on(self._slider.on_update, self._scrub)
-        self._on(again.on_click, lambda _: self._solve())
+        self._on(again.on_click, lambda _: self.solve())
         self._on(home.on_click, lambda _: self._go_home())
         self._on(method.on_update, lambda _: self._try(lambda: session.use_method(method.value)))
         self._set_by(safe, "clearance.safe", float)
 
     def _add_weight(self, name: str) -> None:
-        weights = self._session.problem.method.weights
+        weights = self.session.problem.method.weights
         exponent = max(_LEAST_EXPONENT, np.log10(max(float(getattr(weights, name)), 1e-12)))
         slider = self._server.gui.add_slider(
             name.replace("_", " "),
@@ -222,34 +241,35 @@ class _Page:
 
     def _set_by(self, widget: Any, key: str, meaning: Callable[[Any], Any]) -> None:
         """Let a key of the problem be what the value of a widget means."""
-        self._on(widget.on_update, lambda _: self._settings.update({key: meaning(widget.value)}))
+        self._on(widget.on_update, lambda _: self.set(key, meaning(widget.value)))
 
     def _on(self, register: Any, act: Callable[[Any], Any]) -> None:
         """Let `act` run in the loop whenever the event comes."""
 
         async def callback(event: Any) -> None:
-            self._inbox.put(lambda: act(event))
+            self.post(lambda: act(event))
 
         register(callback)
 
     def _show(self, maneuver: Maneuver) -> None:
         """Make `maneuver` the one that is played back."""
-        self._maneuver, self._moment = maneuver, 0.0
+        self._maneuver, self.moment = maneuver, 0.0
         self._slider.max, self._slider.disabled = max(float(maneuver.time[-1]), 0.01), False
         if len(maneuver.time) > 1:
             self._scene.add_path("/tip path", maneuver.tip_position, thickness=0.02)
 
-    def _solve(self) -> None:
+    def solve(self) -> None:
+        """Solve the session's problem from home, and play what comes of it."""
         self._pause()
-        self._message = "solving ..."
-        self._read_out.content = read_out(self._session, self._message)
+        self.message = "solving ..."
+        self._read_out.content = read_out(self.session, self.message)
 
         def run() -> None:
-            maneuver = solve(self._session.problem)
+            maneuver = solve(self.session.problem)
             self._show(maneuver)
             self._toggle()
             if maneuver.status != "solved":
-                self._message = f"{maneuver.status} at {100 * maneuver.reached:.0f} % of the path"
+                self.message = f"{maneuver.status} at {100 * maneuver.reached:.0f} % of the path"
 
         self._try(run)
 
@@ -257,23 +277,24 @@ class _Page:
         if self._playing:
             self._pause()
         elif self._maneuver is not None:
-            if self._moment >= self._maneuver.time[-1]:
-                self._moment = 0.0
+            if self.moment >= self._maneuver.time[-1]:
+                self.moment = 0.0
             self._playing, self._play_button.label = True, "Pause"
         else:
-            self._message = "nothing to play yet: press Solve and play"
+            self.message = "nothing to play yet: press Solve and play"
 
     def _go_home(self) -> None:
         self._pause()
-        self._session.go_home()
+        self.session.go_home()
 
     def _pause(self) -> None:
         self._playing, self._play_button.label = False, "Play"
 
-    def _play(self, duration: float) -> None:
-        self._put(self._moment + duration)
-        self._slider.value = round(self._moment, 2)
-        if self._maneuver is None or self._moment >= self._maneuver.time[-1]:
+    def play(self, duration: float) -> None:
+        """Show the maneuver as it is `duration`, s, later; at its end playing stops."""
+        self._put(self.moment + duration)
+        self._slider.value = round(self.moment, 2)
+        if self._maneuver is None or self.moment >= self._maneuver.time[-1]:
             self._pause()
 
     def _scrub(self, event: Any) -> None:
@@ -287,12 +308,12 @@ class _Page:
         maneuver = self._maneuver
         if maneuver is None:
             return
-        self._moment = min(moment, float(maneuver.time[-1]))
-        at = np.array([self._moment])
+        self.moment = min(moment, float(maneuver.time[-1]))
+        at = np.array([self.moment])
         q = resampled(maneuver.time, maneuver.configurations, at)[0]
         vertices = resampled(maneuver.time, maneuver.control_vertices, at)[0]
-        self._session.put_at(self._moment, q, vertices)
-        self._draw()
+        self.session.put_at(self.moment, q, vertices)
+        self.draw()
 
 
 def read_out(session: Session, message: str) -> str:
