@@ -90,7 +90,7 @@ def test_a_method_that_an_arm_cannot_have_is_refused_in_its_row() -> None:
     )
     report = vq.compare(problem, methods=["curve-pseudoinverse", "pseudoinverse"])
     assert report.rows[0].status == "refused"
-    assert "moving base" in report.rows[0].reason
+    assert "truss.base_motion" in report.rows[0].reason
     assert report.rows[1].status == "solved"
     assert "refused" in report.json()
     report.figure()
