@@ -1,8 +1,8 @@
 """Timing: one resolver by itself over whole maneuvers, then in turn with a baseline, step by step.
 
 A step is ``Resolver.step(position=...)``, with ``pointing`` where a direction is tracked, as a control loop calls it:
-to the next mark of the maneuver, there and back, warm, from the state that the last one left. An arm that is stuck
-goes on from home.
+to the next mark of the maneuver, there and back, from the state that the last one left; an arm that is stuck goes on
+from home. All is warm: the kernels are compiled, and nothing is done for the first time.
 
 In turn, both take each step from the state that the resolver had reached, and which of them is first alternates:
 a machine that slows down slows both, and the ratio of their medians holds. The content of the processor's caches
@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from vgtm_qp.bench.contestants import Contestant
 from vgtm_qp.bench.tour import Goal, Tour
+from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.methods import Resolver
 from vgtm_qp.step.state import State
@@ -29,6 +30,8 @@ from vgtm_qp.step.step import Step
 
 _Answer = TypeVar("_Answer")
 
+_BY_CLOCK = ("median", "p95", "p99", "max")
+_BY_CPU = ("cpu", "cpu_p95", "cpu_p99", "cpu_max")
 _LEAST_STEPS = 10
 _OVERRUN = 5.0
 """A run ends after this many times its duration, however few steps it had."""
@@ -51,10 +54,6 @@ def timing(spent: Sequence[Spent]) -> dict[str, float]:
     for names, times in zip((_BY_CLOCK, _BY_CPU), np.array(spent, dtype=float).T, strict=True):
         found |= zip(names, np.percentile(times, (50, 95, 99, 100)).tolist(), strict=True)
     return found | {"steps": len(spent)}
-
-
-_BY_CLOCK = ("median", "p95", "p99", "max")
-_BY_CPU = ("cpu", "cpu_p95", "cpu_p99", "cpu_max")
 
 
 def breakdown(seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> dict[str, Any]:
@@ -143,6 +142,7 @@ def run_alone(resolver: Resolver, goals: list[Goal], *, seconds: float, steps: i
     walk, found = _Walk(resolver, goals), Steps()
     for _ in walk.repeat(seconds, min(steps, walk.tour.round_trip)):
         walk.step()
+    finish_compiling()
     before = dict(resolver.phases)
     for _ in walk.repeat(seconds, steps):
         spent, step = walk.step()
@@ -165,6 +165,7 @@ def run_in_turn(
     """Return the times of a baseline and of the resolver over the same steps, in alternation."""
     walk, found = _Walk(resolver, goals), Pairs()
     _take(baseline, resolver.state, walk.tour.goal)
+    finish_compiling()
     for count in walk.repeat(seconds, steps):
         state, goal = resolver.state, walk.tour.goal
         if count % 2:
