@@ -182,7 +182,7 @@ def bench(
         float,
         Parameter(
             validator=Number(gt=0),
-            help="duration of a run in turn with a baseline, at most; 30 times it alone",
+            help="greatest duration of a run in turn with a baseline; alone it is 30 times as long",
         ),
     ] = 2.0,
     steps: Annotated[int, Parameter(validator=Number(gte=1), help="steps of each run, at most")] = 2000,
