@@ -168,11 +168,13 @@ def test_goals_are_those_of_the_maneuver_as_a_control_loop_asks_for_them() -> No
 
 
 def test_phases_sum_to_the_total_and_an_interrupted_step_does_not_decide() -> None:
-    seconds = [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1000.0]
-    found = breakdown(seconds, {"qp": [0.5] * 7 + [999.0], "distance": [0.25] * 8})
+    spent = [Spent(1.0, 1.0)] * 10 + [Spent(1000.0, 1.0)] * 30
+    found = breakdown(spent, {"qp": [0.5] * 10 + [999.0] * 30, "distance": [0.25] * 40})
     assert found["total"] == 1.0
     assert found["phases"] == {"qp": 0.5, "distance": 0.25, "other": 0.25}
-    assert breakdown([3.0], {"qp": [1.0]})["phases"] == {"qp": 1.0, "other": 2.0}
+    assert breakdown([Spent(3.0, 3.0)], {"qp": [1.0]})["phases"] == {"qp": 1.0, "other": 2.0}
+    rare = breakdown([Spent(1.0, 1.0)] * 19 + [Spent(9.0, 9.0)], {"qp": [0.5] * 20})
+    assert rare == {"total": 1.0, "phases": {"qp": 0.5, "other": 0.5}}
 
 
 def test_a_run_alone_covers_the_maneuver_and_its_phases_are_parts_of_its_steps(free: vq.Problem) -> None:
@@ -187,7 +189,7 @@ def test_a_run_alone_covers_the_maneuver_and_its_phases_are_parts_of_its_steps(f
     wall = np.array([spent.wall for spent in steps.spent])
     assert np.all(within > 0.0)
     assert np.all(within <= wall + 1e-9)
-    found = breakdown(wall, steps.phases)
+    found = breakdown(steps.spent, steps.phases)
     assert sum(found["phases"].values()) == pytest.approx(found["total"], rel=1e-12)
 
 

@@ -33,6 +33,8 @@ _Answer = TypeVar("_Answer")
 _BY_CLOCK = ("median", "p95", "p99", "max")
 _BY_CPU = ("cpu", "cpu_p95", "cpu_p99", "cpu_max")
 _LEAST_STEPS = 10
+_INTERRUPTED = 1.05
+"""Ratio of a step's time by the clock to its CPU time, from which on it counts as interrupted."""
 _OVERRUN = 5.0
 """A run ends after this many times its duration, however few steps it had."""
 
@@ -56,16 +58,18 @@ def timing(spent: Sequence[Spent]) -> dict[str, float]:
     return found | {"steps": len(spent)}
 
 
-def breakdown(seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> dict[str, Any]:
-    """Return where the time of steps (S,) goes: mean seconds in each of the ``phases``, which sum to the ``total``.
+def breakdown(spent: Sequence[Spent], phases: Mapping[str, ArrayLike]) -> dict[str, Any]:
+    """Return where the time of S steps goes: mean seconds in each of the ``phases`` (S,), which sum to the ``total``.
 
-    The mean is that of the middle half of the steps in the order of their time, so that one which the system
-    interrupted does not decide. Phase ``other`` is what the resolver does outside its phases.
+    Of the steps that the system did not interrupt, by clock and CPU time, the mean is that of the middle half in the
+    order of their time. Phase ``other`` is what the resolver does outside its phases.
     """
-    times = np.asarray(seconds, dtype=float)
-    count = len(times)
-    middle = np.argsort(times, kind="stable")[count // 4 : max(count - count // 4, count // 4 + 1)]
-    total = float(times[middle].mean())
+    wall, cpu = np.array(spent, dtype=float).T
+    delay = wall / np.maximum(cpu, 1e-9)
+    kept = np.argsort(delay, kind="stable")[: max(int(np.sum(delay < _INTERRUPTED)), _LEAST_STEPS)]
+    kept, count = kept[np.argsort(wall[kept], kind="stable")], len(kept)
+    middle = kept[count // 4 : max(count - count // 4, count // 4 + 1)]
+    total = float(wall[middle].mean())
     means = {name: float(np.asarray(values, dtype=float)[middle].mean()) for name, values in phases.items()}
     return {"total": total, "phases": means | {"other": total - sum(means.values())}}
 

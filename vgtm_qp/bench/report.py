@@ -64,7 +64,7 @@ def measure_scene(
         "covered": alone.covered,
         "stopped_by": alone.stopped_by,
         "step": timing(alone.spent),
-        "breakdown": breakdown([spent.wall for spent in alone.spent], alone.phases),
+        "breakdown": breakdown(alone.spent, alone.phases),
         "qps": float(np.mean(alone.qps)),
         "fcl_rows": float(np.mean(alone.fcl_rows)),
         "exact_rows": float(np.mean(alone.exact_rows)),

@@ -33,9 +33,9 @@ _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 Variant = tuple[TrackingName, DistanceName]
 VARIANTS: dict[SceneKind, tuple[Variant, ...]] = {
     "free": (("exact", "fcl"),),
-    "cubes": (("exact", "fcl"), ("exact", "exact"), ("elastic", "fcl"), ("hard", "fcl")),
+    "cubes": (("exact", "fcl"), ("elastic", "fcl")),
     "pointing": (("elastic", "fcl"), ("elastic", "exact")),
-    "clutter": (("exact", "fcl"), ("exact", "exact")),
+    "clutter": (("exact", "fcl"),),
     "tetrahedral": (("exact", "fcl"),),
     "serial": (("exact", "fcl"), ("exact", "exact")),
 }
@@ -44,6 +44,11 @@ VARIANTS: dict[SceneKind, tuple[Variant, ...]] = {
 Between the cubes a direction of the tip needs elastic tracking all the way: an arm that keeps to its curve while it can
 is blocked half way.
 """
+MORE_BETWEEN_CUBES: dict[int, tuple[Variant, ...]] = {
+    5: (("hard", "fcl"), ("exact", "exact")),
+    1000: (("hard", "fcl"),),
+}
+"""Further variants of ``cubes`` by the number of bays."""
 
 _WITHOUT_CURVE = ("tetrahedral", "serial")
 _JOINTS = 7
@@ -77,20 +82,21 @@ def make_scenes(
 ) -> list[BenchScene]:
     """Return the scenes of these kinds; `bays` are those of the arms between two cubes.
 
-    Without `trackings` and `distances` they are the `VARIANTS`; otherwise each mode with each kind of distance, by
+    Without `trackings` and `distances` each has its `VARIANTS`; otherwise each mode with each kind of distance, by
     default exact tracking and FCL.
     """
     scenes = []
     for kind in dict.fromkeys(kinds):
-        variants: Iterable[Variant] = VARIANTS[kind]
-        if trackings or distances:
-            variants = product(trackings or ("exact",), distances or ("fcl",))
-        if kind in _WITHOUT_CURVE:
-            variants = (("exact", distance) for _, distance in variants)
-        variants = list(dict.fromkeys(variants))
         for count in dict.fromkeys(bays if kind == "cubes" else [_count(kind)]):
+            variants: Iterable[Variant] = VARIANTS[kind]
+            if kind == "cubes":
+                variants = (*variants, *MORE_BETWEEN_CUBES.get(count, ()))
+            if trackings or distances:
+                variants = product(trackings or ("exact",), distances or ("fcl",))
+            if kind in _WITHOUT_CURVE:
+                variants = (("exact", distance) for _, distance in variants)
             problem = _problem(kind, count)
-            scenes += [_scene(problem, kind, count, *variant) for variant in variants]
+            scenes += [_scene(problem, kind, count, *variant) for variant in dict.fromkeys(variants)]
     return scenes
 
 
