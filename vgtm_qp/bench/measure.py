@@ -1,13 +1,14 @@
-"""Timing: one resolver by itself over whole maneuvers, then in turn with a baseline, step by step.
+"""Timing: one resolver by itself over whole maneuvers, then in turn with a baseline, by blocks of steps.
 
 A step is ``Resolver.step(position=...)``, with ``pointing`` where a direction is tracked, as a control loop calls it:
 to the next mark of the maneuver, there and back, from the state that the last one left; an arm that is stuck goes on
 from home. All is warm: the kernels are compiled, and nothing is done for the first time.
 
-In turn, both take each step from the state that the resolver had reached, and which of them is first alternates:
-a machine that slows down slows both, and the ratio of their medians holds. The content of the processor's caches
-differs: after a large baseline the smaller contestant may take half as long again. Ratios are those of the thread's
-CPU time, because longer steps are interrupted more often. Garbage is collected as usual.
+In turn, both take the same steps from the states that the resolver reached: it takes ten, then the baseline those ten,
+and at the end it takes ten more. A machine that slows down slows both, and the ratio of their medians holds. Steps of
+one block are as warm as in a control loop: right after a large baseline a step may take twice as long, because the
+processor's caches are filled with other things. Ratios are those of the thread's CPU time, because longer steps are
+interrupted more often. Garbage is collected as usual.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ _Answer = TypeVar("_Answer")
 _BY_CLOCK = ("median", "p95", "p99", "max")
 _BY_CPU = ("cpu", "cpu_p95", "cpu_p99", "cpu_max")
 _LEAST_STEPS = 10
+_BLOCK = 10
+"""Steps of one contestant before the other has its turn."""
 _INTERRUPTED = 1.05
 """Ratio of a step's time by the clock to its CPU time, from which on it counts as interrupted."""
 _OVERRUN = 5.0
@@ -93,7 +96,7 @@ class Steps:
 
 @dataclass
 class Pairs:
-    """Times of a baseline and of the resolver, of the same steps; `failed` counts steps without an answer."""
+    """Times of a baseline and of the resolver; `failed` counts the steps left out, to which the baseline has no answer."""
 
     theirs: list[Spent] = field(default_factory=list)
     ours: list[Spent] = field(default_factory=list)
@@ -101,8 +104,18 @@ class Pairs:
 
     @property
     def ratio(self) -> float:
-        """Median CPU time of the baseline over that of the resolver, of the same steps."""
+        """Median CPU time of the baseline over that of the resolver."""
         return timing(self.theirs)["cpu"] / timing(self.ours)["cpu"]
+
+    def add(self, baseline: Contestant, block: list[tuple[State, Goal, Spent]]) -> None:
+        """Let the baseline take steps that the resolver took, from the states where they began."""
+        for state, goal, ours in block:
+            theirs, answered = _take(baseline, state, goal)
+            if answered:
+                self.theirs.append(theirs)
+                self.ours.append(ours)
+            else:
+                self.failed += 1
 
 
 class _Walk:
@@ -166,23 +179,20 @@ def run_alone(resolver: Resolver, goals: list[Goal], *, seconds: float, steps: i
 def run_in_turn(
     resolver: Resolver, baseline: Contestant, goals: list[Goal], *, seconds: float, steps: int
 ) -> Pairs:
-    """Return the times of a baseline and of the resolver over the same steps, in alternation."""
+    """Return the times of a baseline and of the resolver over the same steps, by blocks in turn; the last is ours."""
     walk, found = _Walk(resolver, goals), Pairs()
     _take(baseline, resolver.state, walk.tour.goal)
     finish_compiling()
+    block: list[tuple[State, Goal, Spent]] = []
     for count in walk.repeat(seconds, steps):
         state, goal = resolver.state, walk.tour.goal
-        if count % 2:
-            ours, _ = walk.step()
-            theirs, answered = _take(baseline, state, goal)
-        else:
-            theirs, answered = _take(baseline, state, goal)
-            ours, _ = walk.step()
-        if answered:
-            found.theirs.append(theirs)
-            found.ours.append(ours)
-        else:
-            found.failed += 1
+        ours, _ = walk.step()
+        block.append((state, goal, ours))
+        if len(block) == _BLOCK or count == steps - 1:
+            found.add(baseline, block)
+            block = []
+    found.add(baseline, block)
+    found.ours += [walk.step()[0] for _ in walk.repeat(seconds, min(steps, _BLOCK))]
     return found
 
 

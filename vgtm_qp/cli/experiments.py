@@ -199,7 +199,7 @@ def bench(
 
     A step is one call of Resolver.step, as a control loop makes it: to the next mark of the maneuver, there and back,
     warm. BLAS is held to one thread. Each scene is run by itself, for percentiles and phases, then in turn with each
-    baseline, step by step from the same states, for the ratios. Set-up and memory are those of a fresh process.
+    baseline, ten steps each from the same states, for the ratios. Set-up and memory are those of a fresh process.
     """
     from vgtm_qp.machine import pin_threads
 
