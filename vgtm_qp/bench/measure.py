@@ -96,7 +96,7 @@ class Steps:
 
 @dataclass
 class Pairs:
-    """Times of a baseline and of the resolver; `failed` counts the steps left out, to which the baseline has no answer."""
+    """Times of a baseline and of the resolver; `failed` counts steps that are left out: the baseline has no answer."""
 
     theirs: list[Spent] = field(default_factory=list)
     ours: list[Spent] = field(default_factory=list)
