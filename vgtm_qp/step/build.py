@@ -255,7 +255,7 @@ def make_engine(
         warnings.warn(_CONDENSED_ALL_THE_SAME, stacklevel=2)
     is_quick = is_default and compiled and not layout.elastic_tip
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
-        return FusedEngine(layout)
+        return FusedEngine(layout, kinematics, task)
     along = chain_solver(layout) if is_quick and prefers_staged(layout) else None
     if along is not None and ChainEngine.serves(along):
         return ChainEngine(along, kinematics, task)
