@@ -66,9 +66,10 @@ typedef struct {
     double *torsions;                          /* (T) changes */
     double *started, *started_points;          /* q and the curve before they were settled */
 
-    double member, tip, start, enough_length, enough_tip;
+    /* Tolerances; errors of quantities that count as closed, as nearly closed; errors of equalities that are enough. */
+    double member, tip, start, enough_length, nearly, enough_tip;
 
-    double primal, dual, reached, furthest, off, first_off;
+    double primal, dual, reached, furthest, off;
     int flag, iterations;
     double *work;
 } Fused;
@@ -254,114 +255,108 @@ static int factorise(double *A, int n)
     return 1;
 }
 
-/* Gain (m, n): row k has the least changes that change the value of equality k by one; see settling_gain. */
-static int gain_of(Fused *f, double *gain, double *work)
+/* The gain of settling_gain in factors: L of the Hessian of the free unknowns, half = rows L^-T, and the factor of
+   half half^T. */
+typedef struct {
+    int free, *of;
+    double *factor, *half, *normal;
+} Gain;
+
+static int gain_of(Fused *f, Gain *g, double *work)
 {
     int n = f->unknowns, m = f->tips + f->hard, last = n - 1, free = 0;
-    double *factor = work, *halves = factor + n * n, *normal = halves + m * n, *inverse = normal + m * m;
-    int *of = (int *)(inverse + m * m);
+    g->factor = work;
+    g->half = work + n * n;
+    g->normal = g->half + m * n;
+    g->of = (int *)(g->normal + m * m);
     for (int k = 0; k < last; k++)
         if (k >= f->actuators || (f->x[k] > f->lower[k] + f->at_bound && f->x[k] < f->upper[k] - f->at_bound))
-            of[free++] = k;
+            g->of[free++] = k;
+    g->free = free;
     if (free < m) return 0;
     for (int i = 0; i < free; i++)
-        for (int j = 0; j <= i; j++) factor[i * free + j] = f->hessian[of[i] * n + of[j]];
-    if (!factorise(factor, free)) return 0;
-    /* halves = rows L^-T, so that normal = halves halves^T. */
+        for (int j = 0; j <= i; j++) g->factor[i * free + j] = f->hessian[g->of[i] * n + g->of[j]];
+    if (!factorise(g->factor, free)) return 0;
     for (int k = 0; k < m; k++) {
-        double *half = halves + k * free;
+        double *half = g->half + k * free;
         for (int i = 0; i < free; i++)
-            half[i] = (f->constraint[k * n + of[i]] - dot(factor + i * free, half, i)) / factor[i * free + i];
+            half[i] = (f->constraint[k * n + g->of[i]] - dot(g->factor + i * free, half, i)) / g->factor[i * free + i];
     }
-    double greatest = 0.0, greatest_inverse = 0.0;
     for (int i = 0; i < m; i++)
-        for (int j = 0; j < m; j++) {
-            normal[i * m + j] = dot(halves + i * free, halves + j * free, free);
-            greatest = fmax(greatest, fabs(normal[i * m + j]));
-        }
-    if (!factorise(normal, m)) return 0;
-    for (int k = 0; k < m; k++) {
-        double *column = inverse + k * m;
-        for (int i = 0; i < m; i++)
-            column[i] = ((i == k) - dot(normal + i * m, column, i)) / normal[i * m + i];
-        for (int i = m - 1; i >= 0; i--) {
-            double sum = column[i];
-            for (int j = i + 1; j < m; j++) sum -= normal[j * m + i] * column[j];
-            column[i] = sum / normal[i * m + i];
-            greatest_inverse = fmax(greatest_inverse, fabs(column[i]));
-        }
+        for (int j = 0; j <= i; j++) g->normal[i * m + j] = dot(g->half + i * free, g->half + j * free, free);
+    if (!factorise(g->normal, m)) return 0;
+    double least = INFINITY, greatest = 0.0;
+    for (int i = 0; i < m; i++) {
+        least = fmin(least, g->normal[i * m + i]);
+        greatest = fmax(greatest, g->normal[i * m + i]);
     }
-    if (!(greatest * greatest_inverse < f->worst_condition)) return 0;
-    memset(gain, 0, sizeof(double) * m * n);
-    for (int k = 0; k < m; k++) {
-        double *row = gain + k * n, *part = factor + free * free;
-        memset(part, 0, sizeof(double) * free);
-        for (int j = 0; j < m; j++)
-            for (int i = 0; i < free; i++) part[i] += inverse[k * m + j] * halves[j * free + i];
-        for (int i = free - 1; i >= 0; i--) {
-            double sum = part[i];
-            for (int j = i + 1; j < free; j++) sum -= factor[j * free + i] * part[j];
-            part[i] = sum / factor[i * free + i];
-        }
-        for (int i = 0; i < free; i++) row[of[i]] = part[i];
-    }
-    return 1;
+    return greatest * greatest < f->worst_condition * least * least;
 }
 
-/* Newton's iteration to exact quantities at q; 0 if it does not get there. */
-static int closed(Fused *f)
+/* The least changes (n) of the unknowns that make good what is missing (m). */
+static void change_by(const Fused *f, const Gain *g, const double *missing, double *change, double *work)
 {
-    for (int count = 0;; count++) {
-        if (call(&f->close)) return 0;
-        if (*f->error <= f->enough_length || count == f->closing_steps) break;
-        if (!(*f->error < f->too_far)) return 0;
-        memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
+    int n = f->unknowns, m = f->tips + f->hard, free = g->free;
+    double *shares = work, *part = work + m;
+    for (int i = 0; i < m; i++)
+        shares[i] = (missing[i] - dot(g->normal + i * m, shares, i)) / g->normal[i * m + i];
+    memset(part, 0, sizeof(double) * free);
+    for (int i = m - 1; i >= 0; i--) {
+        shares[i] /= g->normal[i * m + i];
+        for (int j = 0; j < i; j++) shares[j] -= g->normal[i * m + j] * shares[i];
+        for (int k = 0; k < free; k++) part[k] += shares[i] * g->half[i * free + k];
     }
-    return *f->error <= f->member;
+    memset(change, 0, sizeof(double) * n);
+    for (int i = free - 1; i >= 0; i--) {
+        part[i] /= g->factor[i * free + i];
+        for (int j = 0; j < i; j++) part[j] -= g->factor[i * free + j] * part[i];
+        change[g->of[i]] = part[i];
+    }
 }
 
-/* Broyden's update of a gain (m, n) after a change (n) that made good `less` (m) of what was missing. */
-static void update(double *gain, const double *change, const double *less, double *work, int m, int n)
-{
-    double *off = work, *along = off + n, scale = 0.0;
-    memcpy(off, change, sizeof(double) * n);
-    for (int k = 0; k < m; k++) {
-        along[k] = dot(gain + k * n, change, n);
-        scale += along[k] * less[k];
-        for (int i = 0; i < n; i++) off[i] -= less[k] * gain[k * n + i];
-    }
-    if (scale == 0.0) return;
-    for (int k = 0; k < m; k++)
-        for (int i = 0; i < n; i++) gain[k * n + i] += off[i] * along[k] / scale;
-}
-
-/* Settle q and the curve: quantities exact, equalities satisfied. */
+/* Settle q and the curve: quantities exact, equalities satisfied. Each step closes the quantities too. Steps (n) after
+   the first have Broyden's updates of the gain, in the form that needs the steps alone. */
 EXPORT int settle(Fused *f)
 {
-    int n = f->unknowns, m = f->tips + f->hard, has_gain = 0;
-    double *change = f->work + f->nodes + n * f->squares, *before = change + n, *gain = before + m;
-    double *work = gain + m * n;
-    for (int step = 0;; step++) {
-        if (!closed(f) || call(&f->missing)) return UNSETTLED;
-        f->off = norm(f->missed, m);
-        if (!step) f->first_off = f->off;
-        if (!(f->off <= f->start)) return UNSETTLED;
-        if (step == f->settling_steps || f->off <= f->enough_tip) break;
-        if (!has_gain) {
-            if (!(has_gain = gain_of(f, gain, work))) break;
-        } else {
-            for (int k = 0; k < m; k++) before[k] -= f->missed[k];
-            update(gain, change, before, work, m, n);
+    int n = f->unknowns, m = f->tips + f->hard, steps = 0, counted = 0;
+    double *step = f->work + f->nodes + n * f->squares, *work = step + (f->settling_steps + 1) * n;
+    double furthest = f->furthest;
+    Gain gain;
+    for (;;) {
+        if (call(&f->close)) return UNSETTLED;
+        double error = *f->error;
+        if (!(error < f->too_far)) return UNSETTLED;
+        if (error > f->nearly) {
+            /* What is missing now is not yet what the equalities lack. */
+            if (counted++ == f->closing_steps) return UNSETTLED;
+            memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
+            continue;
         }
-        memcpy(before, f->missed, sizeof(double) * m);
-        memset(change, 0, sizeof(double) * n);
-        for (int k = 0; k < m; k++)
-            for (int i = 0; i < n; i++) change[i] += f->missed[k] * gain[k * n + i];
-        double furthest = f->furthest;
-        advance(f, change, 0);
-        f->furthest = furthest;
+        if (call(&f->missing)) return UNSETTLED;
+        f->off = norm(f->missed, m);
+        if (!(f->off <= f->start)) return UNSETTLED;
+        int is_off = f->off > f->enough_tip && steps < f->settling_steps;
+        if (is_off && !steps && !gain_of(f, &gain, work)) is_off = 0;
+        int is_open = error > f->enough_length && counted < f->closing_steps;
+        if (!is_off && !is_open) break;
+        if (is_open || is_off) memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
+        counted += !is_off;
+        if (!is_off) continue;
+        double *next = step + steps * n;
+        change_by(f, &gain, f->missed, next, work + n * n + m * (n + m) + n);
+        for (int k = 0; k < steps; k++) {
+            const double *before = step + k * n;
+            double share = dot(before, next, n) / dot(before, before, n);
+            if (k < steps - 1)
+                for (int i = 0; i < n; i++) next[i] += share * before[n + i];
+            else if (share < 1.0)
+                for (int i = 0; i < n; i++) next[i] /= 1.0 - share;
+        }
+        steps++;
+        advance(f, next, 0);
     }
-    return f->off <= f->tip ? DONE : UNSETTLED;
+    f->furthest = furthest;
+    return *f->error <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
 }
 
 /* Solve, follow the answer from q, and settle. */

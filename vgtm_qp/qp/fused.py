@@ -46,6 +46,9 @@ from vgtm_qp.rows.tip import TipGoal
 
 SOURCE = Path(__file__).with_name("fused.c")
 _NOWHERE: Array = np.zeros((0, 3))
+_NEARLY = 1e-9
+"""Error of quantities, m or rad, below which settling corrects them together with tip and stations."""
+
 _ROOM, _SLOTS = 24, 4
 """Rows of clearance for which there is room at first, and nodes of each."""
 
@@ -263,6 +266,7 @@ class _Workspace:
                 tip=accuracy.tip,
                 start=accuracy.start,
                 enough_length=enough_length(home, accuracy.member),
+                nearly=_NEARLY,
                 enough_tip=enough_tip_error(home, accuracy.tip),
             )
 
@@ -306,7 +310,7 @@ class _Workspace:
             out[7],
         )
         place, by_nodes = _places(layout)
-        work = nodes + size * (rows + size + 2 * equal + 3) + equal * (2 * equal + 1)
+        work = nodes + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
         self._program = Program(SOURCE, "Fused")
         self._program.set(
             unknowns=size,
