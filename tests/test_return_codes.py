@@ -24,6 +24,7 @@ from vgtm_qp.qp.answer import Accuracy, CurvePoint
 from vgtm_qp.qp.fused import SOURCE, FusedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.tip import TipGoal
+from vgtm_qp.step.engine import Equalities
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.step import StepStatus
 from vgtm_qp.step.stops import StopKind
@@ -157,8 +158,8 @@ def test_an_attempt_whose_function_has_no_value_falls_back_or_is_refused(monkeyp
         raise EvaluationError("no value")
 
     with monkeypatch.context() as patch:
-        for method in ("move", "settle"):
-            patch.setattr(FusedSolver, method, fail)
+        for one, method in ((FusedSolver, "move"), (Equalities, "settle")):
+            patch.setattr(one, method, fail)
         step = resolver.step(position=goal)
         assert step.status is StepStatus.BLOCKED
         assert step.solver_failed
