@@ -293,12 +293,10 @@ class FusedEngine(Engine):
     Until it is compiled, and where no compiler works, an interpreted engine gives the same answers.
     """
 
-    def __init__(
-        self, layout: Layout, kinematics: Kinematics, task: TipTask, solver: FusedSolver | None = None
-    ) -> None:
+    def __init__(self, layout: Layout, kinematics: Kinematics, task: TipTask, solver: FusedSolver) -> None:
         super().__init__(layout)
         self._kinematics, self._task = kinematics, task
-        self._solver = FusedSolver(layout) if solver is None else solver
+        self._solver = solver
         self._last: QPInput | None = None
 
     @cached_property
