@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.compiled import Building, Kernel
+from vgtm_qp.compiled import Building, Kernel, cache_directory, compiler
 from vgtm_qp.errors import EvaluationError
 
 _STRUCT = re.compile(r"typedef struct \{((?:(?!typedef).)*?)\} (\w+);", re.DOTALL)
@@ -53,9 +53,13 @@ def structure(source: Path, name: str) -> type[ctypes.Structure]:
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
-@cache
 def building(source: Path) -> Building:
-    """Begin to compile a C source, once in a process."""
+    """Begin to compile a C source, once in a process for each compiler."""
+    return _building(source, compiler(), cache_directory())
+
+
+@cache
+def _building(source: Path, *_: object) -> Building:
     return Building(source.stem, source.read_text(), (f"-I{INCLUDES}",))
 
 

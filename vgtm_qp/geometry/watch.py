@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.compiled import Compiling, Kernel
+from vgtm_qp.compiled import Compiling, Kernel, compiler
 from vgtm_qp.errors import EvaluationError
 from vgtm_qp.geometry.candidates import every_pair
 from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
@@ -47,8 +47,8 @@ def can_be_watched(scene: Scene) -> bool:
 
 
 @cache
-def _contact(shape: str) -> tuple[ca.Function, Compiling]:
-    """Return the function that evaluates one pair, and what compiles it, once for all scenes."""
+def _contact(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
+    """Return the function that evaluates one pair, and what compiles it, once for all scenes and each compiler."""
     function = follow_function(shape)
     return function, Compiling(function)
 
@@ -56,7 +56,7 @@ def _contact(shape: str) -> tuple[ca.Function, Compiling]:
 def is_ready(shapes: Iterable[str]) -> bool:
     """Whether scenes of these shapes can be watched: false for ever where nothing can be compiled."""
     for shape in shapes:
-        _contact(shape)
+        _contact(shape, compiler())
     source = building(_SOURCE)
     return source.is_done and source.result() is not None
 
@@ -69,7 +69,7 @@ class _WatchedGroup:
         self.group = group
         piece = np.zeros((count, WIDTH)) if group.is_self else group.scene.pieces.parameters[group.other]
         normal = np.tile([0.0, 0.0, 1.0], (count, 1))
-        function, compiling = _contact(group.shape)
+        function, compiling = _contact(group.shape, compiler())
         contact = Kernel(function, compiled=compiling)
         self._rows, self._contacts = np.zeros(count, dtype=np.int64), np.zeros((2 * count, CONTACT))
         self._program = Program(_SOURCE, "Pairs")

@@ -82,9 +82,10 @@ def check(
     """
     x, y = answer.x, answer.multipliers
     size = len(x)
-    primal = norm(beyond(np.concatenate((x, constraint @ x)), lower, upper))
-    stationarity = hessian @ x
-    stationarity += gradient
-    stationarity += y[:size]
-    stationarity += y[size:] @ constraint
+    with np.errstate(invalid="ignore"):  # An answer may be NaN.
+        primal = norm(beyond(np.concatenate((x, constraint @ x)), lower, upper))
+        stationarity = hessian @ x
+        stationarity += gradient
+        stationarity += y[:size]
+        stationarity += y[size:] @ constraint
     refuse_large(primal, relative(norm(stationarity), gradient, y), answer.name)

@@ -88,8 +88,9 @@ class Advancer:
         if is_slow and limit < np.inf:
             first = min(1.0, limit / max(self._asked(target), _INSTANT))
         tracking = Tracking.EITHER
-        if is_slow and self._attempt.gives_way:
-            # Stations leave the curve only if they do not stay on it on shorter pieces either.
+        if is_slow and self._attempt.gives_way and self._actuation.starts_at_once:
+            # Stations leave the curve only if they do not stay on it on shorter pieces either. An arm that cannot stop
+            # at once must not be led into a corner in that way.
             yield from self._pieces(state, target, dt, first, max(smallest, _LEAST_HELD), Tracking.HARD)
             tracking = Tracking.ELASTIC
         yield from self._pieces(state, target, dt, first, smallest if is_slow else first, tracking)
