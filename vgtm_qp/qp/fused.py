@@ -1,4 +1,4 @@
-"""The fast path of a step: one compiled call linearises and condenses, BLAS makes the Hessian, DAQP solves.
+"""The fast path of a step: one compiled call linearises and condenses, BLAS makes the Hessian, a dense solver solves.
 
 It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in 10 to 20 times less time for short arms.
 """
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.qp import daqp
 from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
-from vgtm_qp.qp.daqp import EQUALITY, DenseAnswer
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.dense import EQUALITY, DenseAnswer, DenseSolver, check
 from vgtm_qp.qp.fused_rows import row_function
 from vgtm_qp.qp.fused_settle import NEAR, settle_function
 from vgtm_qp.qp.layout import Layout
@@ -42,8 +42,8 @@ class _Room:
 class FusedSolver:
     """Linearises, condenses and solves; for arms whose symbols ``can_eliminate``."""
 
-    def __init__(self, layout: Layout) -> None:
-        arm = layout.arm
+    def __init__(self, layout: Layout, solver: DenseSolver = DAQP) -> None:
+        arm, self._solver = layout.arm, solver
         self._rows = row_function(layout).kernel()
         nodes, actuators = layout.node_columns, len(arm.actuators)
         self._actuators = actuators
@@ -119,7 +119,7 @@ class FusedSolver:
         answer = self.ask(clearance)
         x, rows = answer.x, self._equal + self._legs + len(clearance)
         bounds = self._room.lower[: self._size + rows], self._room.upper[: self._size + rows]
-        daqp.check(answer, self._hessian, self._gradient, self._room.constraint[:rows], *bounds)
+        check(answer, self._hessian, self._gradient, self._room.constraint[:rows], *bounds)
         count = self._actuators
         nodes = np.zeros((len(self.layout.arm.node_names), 3))
         moved = np.dot(x[:count], self._response[:count])
@@ -146,12 +146,14 @@ class FusedSolver:
         )
 
     def ask(self, clearance: ClearanceRows) -> DenseAnswer:
-        """Return DAQP's answer to the QP at the configuration loaded last, not checked yet.
+        """Return the answer to the QP at the configuration loaded last, not checked yet.
 
         Raises
         ------
         InfeasibleStepError
             The hard rows contradict one another.
+        AnswerError
+            The solver failed.
         """
         size, count, hard, near = self._size, self._actuators, self._hard, len(clearance.lower)
         hessian, gradient = self._assemble()
@@ -180,7 +182,7 @@ class FusedSolver:
         self._room.used, before = size + rows, self._room.used
         if before > size + rows:
             lower[size + rows : before] = -UNBOUNDED
-        answer = daqp.ask(
+        answer = self._solver.ask(
             hessian,
             gradient,
             constraint,
@@ -207,7 +209,7 @@ class FusedSolver:
         self._settle(1.0)
         out = self._settled.outputs
         error, before, after, progress, moved, primal, dual = out[5].tolist()
-        refuse_large(primal, dual, answer.name)
+        refuse_large(primal, dual, answer.status)
         solution = self._solution(answer, near, _NOWHERE, _NOWHERE)
         torsion = torsion + solution.torsion if len(torsion) else torsion
         q, vertices = out[6].reshape(self._shape).copy(), out[4].reshape(-1, 3).copy()

@@ -1,0 +1,166 @@
+"""OSQP on the dense QP of a step: set up once, updated by values, and started from its last answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import osqp
+from numpy.typing import NDArray
+from scipy import sparse
+
+from vgtm_qp.arrays import Array
+from vgtm_qp.qp.dense import DenseAnswer, check_question, residuals
+from vgtm_qp.qp.numbers import UNBOUNDED
+from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, refuse_large
+
+_SPARE = 8
+"""Rows that a new workspace has beyond those of the first QP."""
+
+_SETTINGS = {
+    "verbose": False,
+    "polishing": True,
+    "check_termination": 10,
+    "eps_prim_inf": 1e-9,
+    # Unknowns and rows are in m and rad already. Scaling by OSQP takes several times the iterations.
+    "scaling": 0,
+}
+
+_FIRST = {"eps_abs": 1e-6, "eps_rel": 1e-6, "max_iter": 2_000, "adaptive_rho_interval": 50}
+"""Settings with which polishing finds the answer of nearly every QP. Intervals are in iterations, not by time."""
+
+_AGAIN = {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20_000, "adaptive_rho_interval": 1_000}
+"""Settings of a second try, where polishing failed, or where the step size went to and fro."""
+
+
+class Osqp:
+    """See :class:`vgtm_qp.qp.dense.DenseSolver`; answers are checked.
+
+    All rows of the workspace are dense. Those that a QP does not use are zero and have infinite bounds, so that the
+    sparsity stays while near pairs come and go.
+    """
+
+    accuracy = 1e-8
+
+    def __init__(self) -> None:
+        self._workspace: _Workspace | None = None
+
+    def ask(
+        self,
+        hessian: Array,
+        gradient: Array,
+        constraint: Array,
+        lower: Array,
+        upper: Array,
+        sense: NDArray[np.int32],  # noqa: ARG002
+    ) -> DenseAnswer:
+        """See :class:`vgtm_qp.qp.dense.DenseSolver`."""
+        check_question("osqp", hessian, gradient, constraint, lower, upper)
+        qp = hessian, gradient, constraint, lower, upper
+        workspace = self._workspace_for(len(gradient), len(lower) - len(constraint), len(constraint))
+        # A workspace is used again only after an accurate answer, or none: others may start the next QP far off.
+        self._workspace = None
+        try:
+            answer = workspace.solved(*qp)
+            primal, dual = residuals(answer, *qp)
+            if not max(primal, dual) <= self.accuracy:
+                answer = _Workspace(*workspace.sizes, _AGAIN, start=answer).solved(*qp)
+                primal, dual = residuals(answer, *qp)
+                workspace.start(answer)
+        except InfeasibleStepError:
+            self._workspace = workspace
+            raise
+        refuse_large(primal, dual, answer.status)
+        self._workspace = workspace
+        return answer
+
+    def _workspace_for(self, size: int, bounded: int, rows: int) -> _Workspace:
+        """Return the workspace in use, or one with more room that starts from its answer, or an unused one."""
+        old = self._workspace
+        if old is None or old.sizes[:2] != (size, bounded):
+            return _Workspace(size, bounded, rows + _SPARE)
+        if rows <= old.sizes[2]:
+            return old
+        return _Workspace(size, bounded, max(rows, 2 * old.sizes[2]), start=old.last)
+
+
+class _Workspace:
+    """OSQP with room for QPs of `size` unknowns, the first `bounded` of them with bounds, and `capacity` rows.
+
+    Its constraints are an identity over the unknowns with bounds, and dense rows below it.
+
+    Attributes
+    ----------
+    sizes : tuple of int
+        ``size``, ``bounded``, ``capacity``.
+    last : DenseAnswer or None
+        The last answer, from which iterations start.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        bounded: int,
+        capacity: int,
+        settings: Mapping[str, float] = _FIRST,
+        *,
+        start: DenseAnswer | None = None,
+    ) -> None:
+        self.sizes, self.last, self._settings = (size, bounded, capacity), start, settings
+        self._bounded, self._used = bounded, bounded + capacity
+        self._hessian = sparse.triu(np.ones((size, size)), format="csc")
+        self._upper_triangle = np.flatnonzero(np.tri(size).reshape(-1))
+        self._constraint = sparse.vstack([sparse.eye(bounded, size), np.ones((capacity, size))], format="csc")
+        self._constraint.sort_indices()
+        # Columns one after another, those of unknowns with bounds first: these begin with an entry of the identity.
+        first, rest = np.split(self._constraint.data, [bounded * (capacity + 1)])
+        self._first = first.reshape(bounded, capacity + 1)[:, 1:]
+        self._rest = rest.reshape(size - bounded, capacity)
+        self._lower, self._upper = np.zeros(self._used), np.zeros(self._used)
+        self._solver: Any = None
+
+    def start(self, answer: DenseAnswer) -> None:
+        """Let the iterations for the next QP start from `answer`."""
+        multipliers = np.zeros(len(self._lower))
+        multipliers[: len(answer.multipliers)] = answer.multipliers
+        self._solver.warm_start(x=answer.x, y=multipliers)
+
+    def solved(
+        self, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
+    ) -> DenseAnswer:
+        """Return the answer by iterations from the last one, and by polishing.
+
+        Raises
+        ------
+        InfeasibleStepError, AnswerError
+            OSQP says that there is no answer, or has none.
+        """
+        self._load(hessian, gradient, constraint, lower, upper)
+        result = self._solver.solve(raise_error=False)
+        status, x, y, self.last = f"osqp: {result.info.status}", result.x, result.y, None
+        if "primal infeasible" in status:
+            raise InfeasibleStepError(status)
+        if x is None or not (np.isfinite(x).all() and np.isfinite(y).all()):
+            raise AnswerError(status)
+        multipliers = np.array(y[: self._used])
+        self.last = DenseAnswer(np.array(x), multipliers, int(result.info.iter), status)
+        return self.last
+
+    def _load(self, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array) -> None:
+        """Write a QP; unknowns and multipliers stay those of the last answer."""
+        rows, self._used = len(constraint), len(lower)
+        np.take(hessian, self._upper_triangle, out=self._hessian.data)
+        self._first[:, :rows] = constraint[:, : self._bounded].T
+        self._rest[:, :rows] = constraint[:, self._bounded :].T
+        self._first[:, rows:] = self._rest[:, rows:] = 0.0
+        self._lower[: self._used], self._lower[self._used :] = lower, -UNBOUNDED
+        self._upper[: self._used], self._upper[self._used :] = upper, UNBOUNDED
+        vectors = {"q": gradient, "l": self._lower, "u": self._upper}
+        if self._solver is not None:
+            self._solver.update(**vectors, Px=self._hessian.data, Ax=self._constraint.data)
+            return
+        self._solver = osqp.OSQP()
+        self._solver.setup(self._hessian, A=self._constraint, **vectors, **_SETTINGS, **self._settings)
+        if self.last is not None:
+            self.start(self.last)
