@@ -84,7 +84,7 @@ def make_solver(name: str, layout: Layout) -> StepSolver:
 
 
 _TIGHT: Mapping[str, Mapping[str, float]] = {
-    "clarabel": {"tol_feas": 1e-9, "tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9},
+    "clarabel": {"tol_feas": 1e-10, "tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12},
     # The complementarity gap must be small enough to tell an active row from a nearly active one.
     "piqp": {
         "eps_abs": 1e-10,
