@@ -129,7 +129,7 @@ def numbers_at(
 class WholeSolver:
     """Solves the whole QP of a step, not condensed, by PIQP behind qpsolvers: the oracle of all other forms."""
 
-    knows_gain = False
+    settles = "equalities"
 
     def __init__(self, layout: Layout) -> None:
         self.builder = FullBuilder(layout)

@@ -91,6 +91,8 @@ def residuals(
     from its bound, at most 1. A multiplier of the wrong sign has the distance from the other bound.
     """
     x, y = answer.x, answer.multipliers
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        return np.nan, np.nan
     bounded = len(y) - len(constraint)
     values = np.concatenate((x[:bounded], constraint @ x))
     stationarity = hessian @ x

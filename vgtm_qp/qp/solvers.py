@@ -16,7 +16,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError, nearest
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
-from vgtm_qp.qp.daqp import Daqp
+from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.dense import DenseAnswer, DenseSolver, check, check_question
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import chain_solver, prefers_staged
@@ -31,11 +31,12 @@ class StepSolver(Protocol):
 
     Attributes
     ----------
-    knows_gain : bool
-        Whether :meth:`gain` may return an array.
+    settles : str
+        How its answers are settled: by all "equalities", by the "curve" that stations follow, or by the "strokes" that
+        :meth:`gain` changes.
     """
 
-    knows_gain: bool
+    settles: str
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Return the solution; raise ``InfeasibleStepError`` or ``SolverError`` instead of a wrong one."""
@@ -62,7 +63,7 @@ def dense_solver(name: str) -> DenseSolver:
         There is no such solver, or it is not installed; the message lists those that are.
     """
     if name == DEFAULT_SOLVER:
-        return Daqp()
+        return DAQP
     choices = available_solvers()
     if name not in choices:
         raise SolverError(

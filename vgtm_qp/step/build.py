@@ -46,10 +46,11 @@ _CONDENSED_ALL_THE_SAME = (
 )
 
 
-def build_arm(problem: Problem, *, compiled: bool = True, solves: bool = True) -> Setup:
+def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, solves: bool = True) -> Setup:
     """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
 
-    If the caller never `solves` a QP, the engine is the one that is built fastest.
+    A `plain` arm does not step in one call of C: its answers are the same. If the caller never `solves` a QP, the
+    engine is the one that is built fastest.
 
     Raises
     ------
@@ -75,11 +76,12 @@ def build_arm(problem: Problem, *, compiled: bool = True, solves: bool = True) -
         "by_fcl": clearance.distance == "fcl",
     }
     if solves:
-        engine = make_engine(solver, home.layout, kinematics, task, tracking, compiled=compiled)
+        how = {"compiled": compiled, "plain": plain}
+        engine = make_engine(solver, home.layout, kinematics, task, tracking, **how)
     else:
         engine = GeneralEngine(home.layout, kinematics, task, CondensedSolver(home.layout), compiled=False)
     gives_way = home.layout.hard_tracking and problem.method.gives_way
-    elastic = elastic_engine(solver, home.layout, kinematics, task) if gives_way else None
+    elastic = elastic_engine(solver, home.layout, kinematics, task, plain=plain) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     finish_compiling()
     return Setup(
@@ -246,8 +248,11 @@ def make_engine(
     tracking: str = "coupled",
     *,
     compiled: bool = True,
+    plain: bool = False,
 ) -> Engine:
     """Return the engine that solves the steps of an arm with the QP solver of that name, or by its bays.
+
+    `compiled` and `plain` are as for :func:`build_arm`.
 
     Raises
     ------
@@ -260,22 +265,24 @@ def make_engine(
     is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
     if layout.elastic_tip and not is_short:
         warnings.warn(_CONDENSED_ALL_THE_SAME, stacklevel=2)
-    is_quick = compiled and not layout.elastic_tip
+    is_quick = not plain and not layout.elastic_tip
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
-        return FusedEngine(layout, FusedSolver(layout, dense_solver(solver)))
-    along = chain_solver(layout, dense_solver(solver)) if is_quick and prefers_staged(layout) else None
+        fused = FusedSolver(layout, dense_solver(solver), compiled=compiled)
+        return FusedEngine(layout, kinematics, task, fused)
+    is_staged = is_quick and compiled and prefers_staged(layout)
+    along = chain_solver(layout, dense_solver(solver)) if is_staged else None
     if along is not None and ChainEngine.serves(along):
         return ChainEngine(along, kinematics, task)
     return GeneralEngine(layout, kinematics, task, along or make_solver(solver, layout), compiled=compiled)
 
 
 def elastic_engine(
-    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask
+    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask, *, plain: bool = False
 ) -> Callable[[], Engine]:
     """Return a function that gives the engine of the same layout with elastic tracking, built on its first call."""
     elastic = replace(layout, hard_tracking=False, hard_turns=False)
     # It is seldom needed: not compiled, it is built faster.
-    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False))
+    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False, plain=plain))
 
 
 def check_solver(problem: Problem) -> None:

@@ -38,7 +38,7 @@ class ChainSolver(ABC):
         The numbers of the QP except those of ``RowNumbers``.
     """
 
-    knows_gain = False
+    settles = "curve"
 
     def __init__(
         self, elimination: Elimination, size: int, solver: DenseSolver, *, is_reversed: bool
