@@ -213,8 +213,7 @@ def test_parallel_member_has_two_rows():
     np.testing.assert_allclose(near.normal, [[0, 0, 1], [0, 0, 1]], atol=1e-12)
 
 
-def test_rows_predict_the_change_of_distance():
-    rng = np.random.default_rng(3)
+def test_rows_predict_the_change_of_distance(rng):
     X, clearance = random_scene(rng)
     near = clearance.near(X, 0.0, reach=1.5, self_reach=1.0)
     step = 1e-6
@@ -280,7 +279,7 @@ def test_neighbours_are_those_with_a_joint_in_common():
     assert pairs == {"joints": {(0, 2)}, "points": {(0, 1), (0, 2), (1, 2)}}
 
 
-def test_closed_mesh_equals_the_box_it_bounds_and_is_solid():
+def test_closed_mesh_equals_the_box_it_bounds_and_is_solid(rng):
     import trimesh
 
     surface = trimesh.creation.box((1.0, 0.8, 0.6))
@@ -289,7 +288,6 @@ def test_closed_mesh_equals_the_box_it_bounds_and_is_solid():
     cube = Clearance(
         capsules([(0, 1)], 0.02), [box("part", (0, 0, 0), (1.0, 0.8, 0.6))], safe=0.08, influence=2.0
     )
-    rng = np.random.default_rng(0)
     outside = 0
     for _ in range(60):
         X = rng.uniform(-1.2, 1.2, size=(2, 3))

@@ -258,8 +258,7 @@ def test_a_pair_that_is_followed_has_its_contacts_and_a_bound_whatever_normal_it
 
 
 @pytest.mark.parametrize("count", [1, 16, 17, 65, 300, 1500])
-def test_batches_of_any_size_equal_single_rows(count):
-    rng = np.random.default_rng(count)
+def test_batches_of_any_size_equal_single_rows(count, rng):
     ends, others = rng.normal(size=(count, 6)), rng.normal(size=(count, 6))
     pairs = np.column_stack([ends, others, np.zeros(count)])
     rows = BATCH["segment"](pairs)
@@ -268,10 +267,9 @@ def test_batches_of_any_size_equal_single_rows(count):
         np.testing.assert_array_equal(rows[k], BATCH["segment"](pairs[k : k + 1])[0])
 
 
-def test_a_batch_that_is_often_large_changes_over_to_the_same_answers():
+def test_a_batch_that_is_often_large_changes_over_to_the_same_answers(rng):
     batch = Batch(distance_function("segment"))
     batch.prepare(1)
-    rng = np.random.default_rng(0)
     pairs = rng.normal(size=(130, 13))
     expected = batch(pairs)
     assert set(batch.kernels) == {16}

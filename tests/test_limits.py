@@ -99,8 +99,7 @@ def test_an_actuator_outside_its_stroke_comes_back_by_its_own_limits():
     assert length[0] == pytest.approx(0.6, abs=1e-9)
 
 
-def test_each_actuator_has_its_own_box():
-    rng = np.random.default_rng(0)
+def test_each_actuator_has_its_own_box(rng):
     count = 20
     stroke = np.sort(rng.uniform(0.5, 2.0, (count, 2)), axis=1)
     length = stroke[:, 0] + rng.uniform(size=count) * np.diff(stroke, axis=1)[:, 0]

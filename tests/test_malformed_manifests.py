@@ -72,12 +72,15 @@ def write(path: Path, content: dict[str, Any], manifest: dict[str, Any]) -> None
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_wrong_value_anywhere_is_refused_with_its_key(
-    name: str, files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    files: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    rng: np.random.Generator,
 ) -> None:
     with np.load(files[name]) as file:
         content = dict(file)
     manifest = json.loads(str(content.pop("manifest")))
-    rng = np.random.default_rng()
     every = list(places(manifest))
     chosen = [every[k] for k in rng.permutation(len(every))[:40]]
     path = tmp_path / "wrong.npz"

@@ -52,16 +52,15 @@ def test_weighted_inverse_is_the_least_weighted_norm(seed: int) -> None:
     np.testing.assert_allclose(free @ (W @ d), 0.0, atol=1e-8 * np.abs(W @ d).max())
 
 
-def test_damped_inverse_solves_the_damped_least_squares_problem() -> None:
-    random = np.random.default_rng(3)
-    J, W, x, damping = random.normal(size=(4, 9)), random_metric(random, 9), random.normal(size=4), 0.3
+def test_damped_inverse_solves_the_damped_least_squares_problem(rng) -> None:
+    J, W, x, damping = rng.normal(size=(4, 9)), random_metric(rng, 9), rng.normal(size=4), 0.3
     d = weighted(J, W, damping=damping).matrix @ x
     expected = np.linalg.solve(J.T @ J / damping**2 + W, J.T @ x / damping**2)
     np.testing.assert_allclose(d, expected, atol=1e-10)
 
 
-def test_truncated_inverse_drops_the_small_singular_values() -> None:
-    u, v = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0], np.eye(3, 5)
+def test_truncated_inverse_drops_the_small_singular_values(rng) -> None:
+    u, v = np.linalg.qr(rng.normal(size=(3, 3)))[0], np.eye(3, 5)
     J = u @ np.diag([1.0, 0.1, 1e-4]) @ v
     inverse = moore_penrose(J, truncation=1e-3)
     assert inverse.rank == 2
