@@ -391,22 +391,6 @@ def test_culling_changes_nothing(rng) -> None:
         assert pairs[-1].at_state(state).value == pytest.approx(least, abs=1e-14)
 
 
-def test_members_as_far_apart_as_their_boxes_are_not_lost_by_rounding(rng) -> None:
-    """Two members that cross in parallel planes: their distance is that of their boxes."""
-    truss = octahedral(4)
-    a, b = np.triu_indices(truss.member_count, 1)
-    apart = ~(truss.members[a][:, :, None] == truss.members[b][:, None, :]).any(axis=(1, 2))
-    index = (a[apart], b[apart])
-    for _ in range(40):
-        nodes, above = 9.0 * rng.normal(size=truss.home.shape), rng.uniform(0.0, 0.5)
-        chosen = rng.integers(len(index[0]))
-        nodes[truss.members[index[0][chosen]]] = [[-1.0, 0.1, 0.0], [1.0, 0.1, 0.0]]
-        nodes[truss.members[index[1][chosen]]] = [[0.3, -1.0, above], [0.3, 1.0, above]]
-        (pair,) = encounters(truss, nodes[None], [])[1]
-        points = np.concatenate([pair.motion.ends[0][k] for k in index], axis=1)
-        assert pair.at_state(0).value == pytest.approx(pair.separation(points, index)[0].min(), abs=1e-14)
-
-
 def test_self_collision_and_angles_are_held() -> None:
     maneuver = good_maneuver()
     rules = {"safe": 0.05, "self_safe": 5.0, "minimum_angle": 1.0}
