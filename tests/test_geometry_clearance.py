@@ -38,7 +38,7 @@ def random_scene(rng, *, still=False, round_numbers=False):
     return nodes, Clearance(capsules(members, 0.03), obstacles, safe=0.08, influence=0.5)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(0, 2**31), st.booleans())
 def test_near_pairs_and_least_distances_along_a_walk(seed, round_numbers):
     rng = np.random.default_rng(seed)
@@ -76,7 +76,7 @@ def test_near_pairs_and_least_distances_along_a_walk(seed, round_numbers):
         )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**31))
 def test_carried_bounds_never_exceed_the_distance(seed):
     rng = np.random.default_rng(seed)
