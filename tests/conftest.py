@@ -37,6 +37,12 @@ def pytest_report_header(config: pytest.Config) -> str:
     return f"random cases: --seed={config.option.seed} draws them again"
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Tell the seed once more beside what failed; a quiet run has no header."""
+    if terminalreporter.stats.get("failed") or terminalreporter.stats.get("error"):
+        terminalreporter.write_line(pytest_report_header(config))
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """Use all cores; for files and tests that are named, and for what is printed by ``-s``, this process alone."""
     named = config.args_source is pytest.Config.ArgsSource.ARGS and all(".py" in each for each in config.args)
