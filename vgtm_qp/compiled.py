@@ -57,6 +57,9 @@ _FLAGS = (
 _QUICK = ("-O1",)
 """Flags for long code that calls the straight-line functions: half the compile time, at little cost in speed."""
 
+_OWN = ("-O3", "-fno-signed-zeros", "-fassociative-math")
+"""Flags for our own C: sums may be vectorised; NaN and infinity keep their meaning."""
+
 _LONG = 100_000
 """Length of a source text, in characters, from which compiling lasts seconds."""
 
@@ -344,11 +347,37 @@ def _begin(function: ca.Function, cc: str) -> Future[Path | None]:
     return _workers.linkers.submit(_workers.link, cc, objects, library)
 
 
+class Building:
+    """A C source on its way to a shared library; `flags` are the compiler's beside those of every kernel."""
+
+    def __init__(self, name: str, text: str, flags: tuple[str, ...]) -> None:
+        self._name, self._text, self._flags, self._cc = name, text, flags, compiler()
+        self._library: Future[Path | None] | None = None
+        if self._cc is not None and not _warned_of(cache_directory()):
+            library = cache_directory() / f"{name}-{_hash(text, self._cc, *flags, *_OWN)}.so"
+            objects = {}
+            if not _is_sound(library):
+                target = library.with_suffix(".o")
+                objects[target] = _workers.compile(self._cc, text, target, (*flags, *_OWN))
+            self._library = _workers.linkers.submit(_workers.link, self._cc, objects, library)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether :meth:`result` does not wait."""
+        return self._library is None or self._library.done()
+
+    def result(self) -> Path | None:
+        """Return the library; None where no compiler works."""
+        return None if self._library is None else self._library.result()
+
+
 class Compiling:
     """A function on its way to machine code; several kernels may wait for the same."""
 
     def __init__(self, function: ca.Function) -> None:
         self._function, self._cc = function, compiler()
+        self.library: Path | None = None
+        """The shared library, once it is loaded."""
         self._found: ca.Function | None = None
         self._begin()
 
@@ -357,6 +386,11 @@ class Compiling:
         self._library: Future[Path | None] | None = None
         if self._cc is not None and not _warned_of(cache_directory()):
             self._library = _begin(self._function, self._cc)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether :meth:`result` does not wait."""
+        return self._found is not None or self._library is None or self._library.done()
 
     def result(self) -> ca.Function:
         """Return the compiled function when it is there, or the one it comes from where no compiler works."""
@@ -379,7 +413,9 @@ class Compiling:
             if library is None:
                 break
             try:
-                return ca.external(self._function.name(), str(library))
+                found = ca.external(self._function.name(), str(library))
+                self.library = library
+                return found
             except RuntimeError:
                 # Cut short by a full disk, or from a machine with another C library: compiled once more.
                 with contextlib.suppress(OSError):
@@ -431,7 +467,8 @@ class Kernel:
     def __init__(
         self, function: ca.Function, *, compiled: bool | Compiling = True, for_later: bool = False
     ) -> None:
-        self._given = function
+        self._given, self.name = function, function.name()
+        self.library: Path | None = None
         self._compiling = Compiling(function) if compiled is True else compiled or None
         self._found: ca.Function | None = None
         self._buffer: Any = None
@@ -447,6 +484,8 @@ class Kernel:
         with _workers.resolving:
             if self._found is None:
                 found = self._given if self._compiling is None else self._compiling.result()
+                if self._compiling is not None:
+                    self.library = self._compiling.library
                 self._buffer, self._evaluate = found.buffer()
                 self._code = self._buffer.ret
                 for i, array in enumerate(self.inputs):
@@ -456,6 +495,11 @@ class Kernel:
                 self._found, self._compiling = found, None
                 _waiting.discard(self)
             return self._found
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it is compiled, or never will be."""
+        return self._compiling is None or self._compiling.is_done
 
     @property
     def is_compiled(self) -> bool:

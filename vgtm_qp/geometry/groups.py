@@ -16,7 +16,6 @@ from vgtm_qp.geometry.exact import (
     NORMAL,
     PROOF,
     distance_function,
-    follow_function,
     proof_function,
     sweep_function,
     width,
@@ -34,7 +33,7 @@ _FIRST = 16
 _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
 """From the shifts of both ends of two bodies to that of one middle from the other, and half the turns of both."""
 
-_WATCHED = ((follow_function, (1, 128)), (distance_function, (1,)), (sweep_function, (1,)))
+_WATCHED = ((distance_function, (1,)), (sweep_function, (1,)))
 """Functions evaluated in a watched scene, and for how many pairs at once,"""
 _LISTED = ((distance_function, (1, 64, 1024)), (sweep_function, (1, 64)))
 """and in any other,"""
@@ -53,6 +52,8 @@ class Scene:
         Supplies contacts; None if only closed forms are used.
     nothing : Contacts
         No rows.
+    shapes : list of str
+        Of the others in its pairs; ``"segment"`` is a body.
     """
 
     def __init__(self, bodies: Bodies, obstacles: Sequence[Obstacle], has_self: bool, by_fcl: bool) -> None:
@@ -62,13 +63,13 @@ class Scene:
         self.names = PairNames(bodies, names, tuple(self.pieces.obstacle.tolist()))
         self.fcl = FclQueries(self.pieces) if by_fcl else None
         self.nothing = self._contacts(np.zeros((0, 8), dtype=np.int64), np.zeros((0, CONTACT)))
+        self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if has_self else set()))
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
 
     def prepare(self, *, watched: bool) -> None:
         """Begin to compile the functions of steps: of a watched scene, or for few and for many pairs."""
-        shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
         for make, counts in (*(_WATCHED if watched else _LISTED), *(_PROVEN if self.fcl else ())):
-            for shape in shapes:
+            for shape in self.shapes:
                 for count in counts:
                     # A watch rarely needs this: only for a motion that it cannot prove itself.
                     for_later = watched and make is sweep_function
