@@ -2,6 +2,7 @@
 
 import os
 import secrets
+import signal
 import zlib
 
 # Each process of the tests has a core of its own. NumPy reads this when it is first imported.
@@ -10,6 +11,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pytest
 from hypothesis import is_hypothesis_test, settings
+
+# A shell starts what it runs in the background deaf to interrupts, and the programs that tests start would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("property", derandomize=False, print_blob=True)
 settings.load_profile("property")

@@ -88,12 +88,14 @@ def resolver_and_plan(problem: vq.Problem) -> tuple[vq.Resolver, Plan]:
     return resolver, make_plan(problem, *resolver.tip())
 
 
+@pytest.mark.smoke
 def test_percentiles_are_of_the_clock_and_of_the_processor_apart() -> None:
     found = timing([Spent(k, 200.0 - k) for k in range(1, 101)])
     assert (found["median"], found["cpu"], found["steps"]) == (50.5, 149.5, 100)
     assert found["median"] < found["p95"] < found["p99"] < 100.0
 
 
+@pytest.mark.smoke
 def test_phases_sum_to_the_total_and_an_interrupted_step_does_not_decide() -> None:
     seconds = [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1000.0]
     found = breakdown(seconds, {"qp": [0.5] * 7 + [999.0], "distance": [0.25] * 8})
@@ -281,6 +283,7 @@ def test_a_baseline_is_not_tried_on_longer_arms_than_it_says(free: vq.Problem) -
         make_baseline("ipopt", free, 21)
 
 
+@pytest.mark.smoke
 def test_scenes_have_names_of_their_own_and_the_bays_that_were_asked_for() -> None:
     found = scenes.make_scenes(("cubes", "pointing", "free"), (5, 12, 12), ("exact", "hard"))
     assert [scene.name for scene in found] == [

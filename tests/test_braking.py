@@ -51,7 +51,7 @@ def test_limited_accelerations_stretch_a_maneuver_round_a_corner(acceleration, l
 
 def test_a_maneuver_that_is_blocked_ends_where_the_arm_may_rest():
     goal = [{"time": 6.0, "position": [1.2, 0.0, 2.0]}]
-    maneuver = vq.solve(problem(0.1, **{"obstacle": [WALL], "maneuver.waypoint": goal}))
+    maneuver = vq.solve(problem(0.1, **{"obstacle": [WALL], "maneuver.waypoint": goal, "maneuver.steps": 20}))
     assert maneuver.status == "blocked"
     assert maneuver.certificate.ok, maneuver.certificate.failures()
     rate = np.diff(maneuver.member_lengths[-2:], axis=0)[0] / np.diff(maneuver.time[-2:])

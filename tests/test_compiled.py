@@ -140,6 +140,7 @@ def _source(function: ca.Function) -> str:
     return str(generator.dump())
 
 
+@pytest.mark.smoke
 def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     kernel = Kernel(_square())
@@ -151,6 +152,7 @@ def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, mo
     assert kernel.outputs[0] is result
 
 
+@pytest.mark.smoke
 @needs_compiler
 def test_finishing_leaves_nothing_to_wait_for(tmp_path, monkeypatch):
     cache = tmp_path / "cache"

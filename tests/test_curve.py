@@ -50,6 +50,7 @@ def angular_velocity_rows(curve, nodes, h=1e-5):
     return np.stack(columns, axis=-1)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
 def test_jacobians_agree_with_differences(family, rng):
     curve = bent_curve(family, rng)
@@ -83,6 +84,7 @@ def test_orientation_rows_on_a_turned_base(rng):
     )
 
 
+@pytest.mark.smoke
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(FAMILIES), st.integers(0, 10**6), st.floats(0.01, 0.99))
 def test_frames_are_rotations_with_the_tangent_as_third_axis(family, seed, s):

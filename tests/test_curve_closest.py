@@ -76,6 +76,7 @@ def test_all_closest_points_to_a_box(family, seed, turned):
     assert_all_minima(curve, closest, lambda r: box_distance(r, center, size, rotation))
 
 
+@pytest.mark.smoke
 def test_straight_curve_beside_and_through_a_box():
     curve = straight_curve(bezier(6), [0, 0, 0], [0, 0, 4])
     beside = closest_to_box(curve, [1.15, 0, 2.2], 0.9)

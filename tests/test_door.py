@@ -136,6 +136,7 @@ def check_motion(arm, seed):
     np.testing.assert_allclose(evaluated(arm, q).quantities, arm.measured(q), atol=1e-12)
 
 
+@pytest.mark.smoke
 @pytest.mark.property
 def test_nodes_and_quantities_move_with_the_actuators(arm):
     check_motion(arm)
@@ -144,6 +145,7 @@ def test_nodes_and_quantities_move_with_the_actuators(arm):
 TRACKS = [("position",), ("position", "orientation"), ("x", "z", "pointing")]
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("track", TRACKS, ids="+".join)
 def test_rows_of_tip_and_stations_are_the_derivatives_of_their_residuals(arm, track, rng):
     layout, _ = make_layout(arm, track, vertices=5)

@@ -238,6 +238,7 @@ def test_no_small_lie_gets_further_than_its_proof(seed, shape, size, number):
     assert (bend**2 * gap <= 8.0 * PROOF)[found.by_fcl].all()
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("watch", [True, False])
 def test_poses_that_fcl_errs_at_fall_to_the_closed_form_and_are_counted(watch):
     """FCL issue 508: it says 0.6124 m."""
@@ -251,6 +252,7 @@ def test_poses_that_fcl_errs_at_fall_to_the_closed_form_and_are_counted(watch):
     assert (monitor.fcl.asked, monitor.fcl.refused) == (2, 1)
 
 
+@pytest.mark.smoke
 def test_of_a_body_that_lies_in_the_flat_end_of_a_cylinder_the_closed_form_has_the_rows():
     """The normal from FCL's points was what these were rounded by, and its place on the body added a row."""
     X = np.array([[-0.5, 0.5, 1.0], [-0.5, 0.5, -0.75]])
@@ -264,6 +266,7 @@ def test_of_a_body_that_lies_in_the_flat_end_of_a_cylinder_the_closed_form_has_t
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, atol=1e-12)
 
 
+@pytest.mark.smoke
 def test_of_what_overlaps_the_closed_form_gives_the_way_out():
     X = np.array([[-0.5, 0.0, 0.2], [0.5, 0.01, 0.2]])
     monitor = Clearance(capsules([(0, 1)], 0.03), [box("cube", (0, 0, 0), 0.5)], safe=0.08, influence=1.0)

@@ -155,6 +155,7 @@ def test_between_certifies_what_is_clear_and_shows_where_it_is_not():
     assert not chasing.between(X, X, 0.0, 1.0, 0.08).certified
 
 
+@pytest.mark.smoke
 def test_a_path_round_an_edge_is_certified_down_to_its_dip():
     clearance = Clearance(
         capsules([(0, 1)], 0.03), [box("cube", (0.0, 0.0, 0.0), 1.0)], safe=0.08, influence=0.5

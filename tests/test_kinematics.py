@@ -65,6 +65,7 @@ def test_at_home_everything_is_as_the_truss_says(truss, kinematics):
     np.testing.assert_allclose(arm.measured(truss.home), truss.home_lengths, atol=1e-14)
 
 
+@pytest.mark.smoke
 def test_lengths_are_those_between_member_ends_and_gradients_their_derivatives(truss, kinematics, rng):
     X = random_pose(truss, rng)
     kinematics.evaluate(X)
@@ -127,6 +128,7 @@ def test_face_spins_are_the_angular_velocity_rows_of_the_face_frames(truss, kine
         np.testing.assert_allclose(rows, wanted[face], atol=5e-9)
 
 
+@pytest.mark.smoke
 def test_tip_spin_is_the_angular_velocity_rows_of_the_tip_frame(truss, kinematics, rng):
     X = random_pose(truss, rng)
 

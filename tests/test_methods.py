@@ -160,6 +160,7 @@ def test_pointing_is_tracked_by_three_octahedral_bays_together() -> None:
     np.testing.assert_allclose(states[0], states[1], atol=1e-9)
 
 
+@pytest.mark.smoke
 def test_the_curve_keeps_its_base_and_its_null_space_vector_does_not_move_the_tip() -> None:
     ends = []
     for terms in ([], ["curve_rate", "spacing", "smoothness"]):

@@ -237,6 +237,7 @@ def test_a_compiled_linearisation_has_the_numbers_of_the_equations(rng):
         oracle.check_numbers(found, oracle.numbers(layout, asked), layout)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("off", [0.0, 1e-8, 1e-7])
 @pytest.mark.parametrize("motion", [True, False])
 def test_a_tip_that_is_there_within_what_is_accepted_need_not_move(motion, off, rng):
@@ -269,6 +270,7 @@ def test_half_a_turn_of_the_tip_is_an_error_of_half_a_turn(track, rng):
             assert np.linalg.norm(found.tip_rhs) == pytest.approx(angle, abs=1e-5), (axis, angle)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(("name", "curve"), CASES)
 def test_condensed_answer_satisfies_the_full_qp(name, curve, rng):
     clearance = strokes = 0

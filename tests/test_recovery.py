@@ -141,6 +141,7 @@ def test_self_clearance_is_reported_where_it_is_not_kept():
     assert np.all(np.isfinite(maneuver.self_clearance))
 
 
+@pytest.mark.smoke
 def test_the_least_angle_between_members_that_meet_is_kept():
     goal = {"maneuver.waypoint": [{"time": 4.0, "position": [0.9, 0.0, 1.9]}]}
     free = vq.solve(problem(**goal)).certificate.member_angle.value

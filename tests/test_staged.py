@@ -233,6 +233,7 @@ def test_a_long_arm_with_many_rows_at_once(rng):
     assert clearances > 5
 
 
+@pytest.mark.smoke
 @given(st.integers(0, 10**6), st.floats(0.005, 0.3), st.floats(0.0, 0.05), st.booleans())
 @settings(max_examples=25, deadline=None)
 def test_any_qp_of_one_arm(shared, seed, box, slack, motion):

@@ -100,6 +100,7 @@ class Scene:
         return [lengths, error, start, axes0 @ (vertices[1] - vertices[0]), gap, tilt]
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("joint_offset", [0.0, 0.1])
 @pytest.mark.parametrize(
     ("name", "track"),
@@ -238,6 +239,7 @@ def pair_distance(monitor, member, other, is_self, X):
     return float(np.min(pairs.distance[chosen]))
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("fraction", [1.0, 0.35])
 @pytest.mark.parametrize("name", ["octahedral", "tetrahedral-123"])
 def test_clearance_rows_are_the_derivatives_of_the_exact_distances(name, fraction, rng):
@@ -346,6 +348,7 @@ WRONG_GOALS = [
 ]
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("goal", WRONG_GOALS, ids=str)
 def test_a_goal_that_is_no_goal_is_refused_and_nothing_moves(crate_problem, goal):
     resolver = Resolver(crate_problem)

@@ -34,6 +34,7 @@ def random_pose(rng, turn=1.0):
     return rng.normal(size=3), rotation_from_vector(turn * rng.normal(size=3))
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("track", TRACKS, ids="+".join)
 def test_the_rows_of_a_tip_are_those_of_the_formulas(track, rng):
     task = TipTask(track, TrussArm(modules.octahedral(2)))

@@ -36,6 +36,7 @@ def node_distances(truss):
     return np.linalg.norm(truss.home[truss.members[:, 0]] - truss.home[truss.members[:, 1]], axis=1)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("bays", range(1, 13))
 @pytest.mark.parametrize("module", MODULES)
 def test_every_module_is_determinate_in_counts_rank_and_stages(module, bays):

@@ -34,6 +34,7 @@ def again(maneuver: Maneuver, nodes: Any) -> Maneuver:
     return found_clearances(replace(other, tip_target_position=maneuver.tip_target_position))
 
 
+@pytest.mark.smoke
 def test_good_maneuver_passes() -> None:
     certificate = verify(good_maneuver())
     assert certificate.ok, str(certificate)
@@ -46,6 +47,7 @@ def test_verify_file(tmp_path: Path) -> None:
     assert verify_file(good_maneuver().save(tmp_path / "r.npz")).ok
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("node", [3, 4])
 def test_moved_node_is_found(node: int) -> None:
     maneuver = good_maneuver()
@@ -75,6 +77,7 @@ def test_stroke_is_held_to_a_nanometre(beyond: float, found: set[str]) -> None:
     assert broken(driven(lengths, duration=10.0)) == found
 
 
+@pytest.mark.smoke
 def test_rate_is_held() -> None:
     lengths = np.tile(LENGTHS, (11, 1))
     lengths[:, 5] += 0.1 * np.linspace(0.0, 1.0, 11)
@@ -121,6 +124,7 @@ def test_targets_must_lie_on_the_path_and_end_there() -> None:
     assert any("end of the path" in line for line in certificate.contradictions)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     "name", ["member_lengths", "tip_position", "tip_rotation", "clearance", "self_clearance"]
 )
@@ -135,6 +139,7 @@ def test_changed_array_is_found(name: str) -> None:
 CUBE = {"name": "cube", "shape": "box", "center": [2.0, 0.0, 1.0], "size": 0.4}
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     "shape",
     [

@@ -108,6 +108,7 @@ def test_what_is_proven_on_the_way_holds_at_every_instant(rng):
     assert proven >= 20
 
 
+@pytest.mark.smoke
 def test_a_way_into_an_obstacle_is_not_proven():
     wall = box("wall", [1.0, 0.0, 0.0], [0.1, 4.0, 4.0])
     monitor = Clearance(capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False)
