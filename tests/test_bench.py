@@ -108,6 +108,7 @@ def walk_to(resolver: vq.Resolver, goals: list[Goal], count: int) -> None:
         assert resolver.step(position=goal.pose.position, pointing=goal.pointing).status == "reached"
 
 
+@pytest.mark.smoke
 def test_percentiles_are_of_the_clock_and_of_the_processor_apart() -> None:
     found = timing([Spent(k, 201.0 - k) for k in range(1, 102)])
     assert (found["median"], found["cpu"], found["steps"]) == (51.0, 150.0, 101)
@@ -167,6 +168,7 @@ def test_goals_are_those_of_the_maneuver_as_a_control_loop_asks_for_them() -> No
     assert resolver.tip()[0] == pytest.approx(goals[3].pose.position, abs=1e-7)
 
 
+@pytest.mark.smoke
 def test_phases_sum_to_the_total_and_an_interrupted_step_does_not_decide() -> None:
     spent = [Spent(1.0, 1.0)] * 10 + [Spent(1000.0, 1.0)] * 30
     found = breakdown(spent, {"qp": [0.5] * 10 + [999.0] * 30, "distance": [0.25] * 40})
@@ -354,6 +356,7 @@ def test_a_baseline_is_not_tried_on_longer_arms_than_it_says(free: vq.Problem) -
         make_baseline("ipopt", free, 21)
 
 
+@pytest.mark.smoke
 def test_scenes_have_names_of_their_own_and_the_bays_that_were_asked_for() -> None:
     found = scenes.make_scenes(("cubes", "serial", "free"), (5, 12, 12), ("exact", "hard"))
     assert [scene.name for scene in found] == [
