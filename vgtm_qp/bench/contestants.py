@@ -100,8 +100,8 @@ BASELINES: dict[BaselineName, Baseline] = {
         partial(ResolverStep, method="curve-pseudoinverse"),
     ),
     "ipopt": Baseline("one nonlinear program a step, IPOPT", 20, NonlinearStep),
-    "osqp": Baseline("the same QPs, sparse, OSQP", 200, partial(ResolverStep, solver="osqp")),
-    "piqp": Baseline("the same QPs, sparse, PIQP", 200, partial(ResolverStep, solver="piqp")),
+    "osqp": Baseline("the same QPs, OSQP", 200, partial(ResolverStep, solver="osqp")),
+    "piqp": Baseline("the same QPs, PIQP", 200, partial(ResolverStep, solver="piqp")),
 }
 
 
