@@ -114,14 +114,14 @@ def test_what_two_kernels_share_is_compiled_once(tmp_path, monkeypatch):
 
 
 @needs_compiler
-def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, monkeypatch):
+def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, monkeypatch, rng):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     a, b = ca.MX.sym("a", 4, 4), ca.MX.sym("b", 4, 4)
     product = a
     for k in range(300):
         product = 0.25 * product @ b + ca.fmin(a + k, b)
     function = ca.Function("product", [a, b], [product])
-    kernel, rng = Kernel(function), np.random.default_rng(0)
+    kernel = Kernel(function)
     assert len(_source(function)) > 100_000
     assert kernel.is_compiled
     for array in kernel.inputs:
@@ -140,6 +140,7 @@ def _source(function: ca.Function) -> str:
     return str(generator.dump())
 
 
+@pytest.mark.smoke
 def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     kernel = Kernel(_square())
@@ -151,6 +152,7 @@ def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, mo
     assert kernel.outputs[0] is result
 
 
+@pytest.mark.smoke
 @needs_compiler
 def test_finishing_leaves_nothing_to_wait_for(tmp_path, monkeypatch):
     cache = tmp_path / "cache"

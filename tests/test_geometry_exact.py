@@ -79,6 +79,7 @@ cases = st.sampled_from(sorted(FORMULAS)).flatmap(
 )
 
 
+@pytest.mark.smoke
 @settings(max_examples=500, deadline=None)
 @given(cases)
 def test_distance_is_exact_and_never_over_estimated(case):
@@ -257,9 +258,9 @@ def test_a_pair_that_is_followed_has_its_contacts_and_a_bound_whatever_normal_it
         np.testing.assert_allclose(row[1:3] @ after[:2] - other, row[5:8] * one["distance"], atol=1e-9)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("count", [1, 16, 17, 65, 300, 1500])
-def test_batches_of_any_size_equal_single_rows(count):
-    rng = np.random.default_rng(count)
+def test_batches_of_any_size_equal_single_rows(count, rng):
     ends, others = rng.normal(size=(count, 6)), rng.normal(size=(count, 6))
     pairs = np.column_stack([ends, others, np.zeros(count)])
     rows = BATCH["segment"](pairs)
@@ -268,10 +269,9 @@ def test_batches_of_any_size_equal_single_rows(count):
         np.testing.assert_array_equal(rows[k], BATCH["segment"](pairs[k : k + 1])[0])
 
 
-def test_a_batch_that_is_often_large_changes_over_to_the_same_answers():
+def test_a_batch_that_is_often_large_changes_over_to_the_same_answers(rng):
     batch = Batch(distance_function("segment"))
     batch.prepare(1)
-    rng = np.random.default_rng(0)
     pairs = rng.normal(size=(130, 13))
     expected = batch(pairs)
     assert set(batch.kernels) == {16}

@@ -52,6 +52,7 @@ def one_qp(penalty):
     return arm, CondensedSolver(arm.layout), numbers
 
 
+@pytest.mark.smoke
 def test_an_elastic_goal_holds_exactly_while_its_penalty_exceeds_the_multiplier():
     arm, _, numbers = one_qp(1.0)
     qp = FullBuilder(replace(arm.layout, elastic_tip=False)).build(numbers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from operator import attrgetter
 
@@ -214,7 +215,7 @@ def random_step(layout, rng, *, motion=True, base=False):
 
 @pytest.mark.parametrize("joint_offset", [0.0, 0.1])
 @pytest.mark.parametrize(("name", "curve", "track"), LINEAR, ids=str)
-def test_a_linearisation_has_the_numbers_of_the_equations(name, curve, track, joint_offset):
+def test_a_linearisation_has_the_numbers_of_the_equations(name, curve, track, joint_offset, rng):
     arm = TrussArm(TRUSSES[name](joint_offset=joint_offset))
     weights = Weights(progress=2.0, smoothness=0.3, stroke_centring=0.2)
     layout, _ = make_layout(
@@ -222,28 +223,29 @@ def test_a_linearisation_has_the_numbers_of_the_equations(name, curve, track, jo
     )
     layout = replace(layout, hard_turns=curve == "hard" and len(track) > 1, elastic_tip=curve == "elastic")
     linearisation, none = Linearisation(layout, compiled=False), ClearanceRows()
-    for seed, (motion, base) in enumerate([(True, False), (True, True), (False, False), (False, True)]):
-        asked = random_step(layout, np.random.default_rng(seed), motion=motion, base=base)
+    for motion, base in itertools.product((True, False), repeat=2):
+        asked = random_step(layout, rng, motion=motion, base=base)
         found = linearisation.numbers(asked, none)
         oracle.check_numbers(found, oracle.numbers(layout, asked), layout)
         assert found.clearance is none
         np.testing.assert_allclose(linearisation.quantities, oracle.lengths(arm.truss, asked.q), atol=1e-14)
 
 
-def test_a_compiled_linearisation_has_the_numbers_of_the_equations():
+def test_a_compiled_linearisation_has_the_numbers_of_the_equations(rng):
     layout, _ = make_layout(TRUSSES["hexapod"](joint_offset=0.1), ("position", "orientation"))
     linearisation = Linearisation(layout)
-    for seed in range(3):
-        asked = random_step(layout, np.random.default_rng(seed), base=True)
+    for _ in range(3):
+        asked = random_step(layout, rng, base=True)
         found = linearisation.numbers(asked, ClearanceRows())
         oracle.check_numbers(found, oracle.numbers(layout, asked), layout)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("off", [0.0, 1e-8, 1e-7])
 @pytest.mark.parametrize("motion", [True, False])
-def test_a_tip_that_is_there_within_what_is_accepted_need_not_move(motion, off):
+def test_a_tip_that_is_there_within_what_is_accepted_need_not_move(motion, off, rng):
     layout, _ = make_layout(TRUSSES["hexapod"](), ("position", "orientation"))
-    asked = random_step(layout, np.random.default_rng(0), motion=motion)
+    asked = random_step(layout, rng, motion=motion)
     truss, X = layout.arm.truss, asked.q
     position = truss.tip_weights @ X[truss.tip] + [off, 0.0, 0.0]
     still = TipGoal(position, oracle.tip_rotation(truss, X), np.zeros(3), np.zeros(3))
@@ -255,11 +257,11 @@ def test_a_tip_that_is_there_within_what_is_accepted_need_not_move(motion, off):
 
 
 @pytest.mark.parametrize("track", ["pointing", "orientation"])
-def test_half_a_turn_of_the_tip_is_an_error_of_half_a_turn(track):
+def test_half_a_turn_of_the_tip_is_an_error_of_half_a_turn(track, rng):
     """Every way there is as long, and none is nothing: a tip that points backwards has not arrived."""
     layout, _ = make_layout(TRUSSES["hexapod"](), (track,))
     arm = layout.arm
-    asked = random_step(layout, np.random.default_rng(0))._replace(q=arm.home_configuration)
+    asked = random_step(layout, rng)._replace(q=arm.home_configuration)
     linearisation = Linearisation(layout, compiled=False)
     for axis in (*np.eye(3)[: 2 if track == "pointing" else 3], np.array([0.6, 0.8, 0.0])):
         for angle in (np.pi - 1e-3, np.pi - 1e-9, np.pi):
@@ -271,11 +273,12 @@ def test_half_a_turn_of_the_tip_is_an_error_of_half_a_turn(track):
             assert np.linalg.norm(found.tip_rhs) == pytest.approx(angle, abs=1e-5), (axis, angle)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(("name", "curve"), CASES)
-def test_condensed_answer_satisfies_the_full_qp(name, curve):
+def test_condensed_answer_satisfies_the_full_qp(name, curve, rng):
     clearance = strokes = 0
-    for seed in range(4):
-        layout, numbers = make_case(name, curve, seed=seed, joint_offset=0.1 * (seed % 2))
+    for seed, joint_offset in zip(rng.integers(2**32, size=4), (0.0, 0.1, 0.0, 0.1), strict=True):
+        layout, numbers = make_case(name, curve, seed=seed, joint_offset=joint_offset)
         solution = make_solver("daqp", layout).solve(numbers)
         builder = FullBuilder(layout)
         qp = builder.build(numbers)
