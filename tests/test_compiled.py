@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from vgtm_qp.builder import source_of
 from vgtm_qp.compiled import Kernel, compiler, finish_compiling, stop_compilers
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -35,12 +36,12 @@ def _value(kernel: Kernel) -> float:
 @needs_compiler
 def test_a_library_that_cannot_be_loaded_is_compiled_again(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     (library,) = tmp_path.glob("*.so")
     library.unlink()
     library.write_bytes(b"cut short")
     kernel = Kernel(_square())
-    assert kernel.is_compiled
+    assert kernel.compile()
     assert _value(kernel) == 9.0
 
 
@@ -49,7 +50,7 @@ def test_where_the_cache_is_no_folder_the_virtual_machine_serves(tmp_path, monke
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "file" / "cache"))
     (tmp_path / "file").write_text("in the way")
     kernel = Kernel(_square())
-    assert not kernel.is_compiled
+    assert not kernel.compile()
     assert _value(kernel) == 9.0
 
 
@@ -61,7 +62,7 @@ def test_the_compiler_may_have_flags(tmp_path, monkeypatch, as_given):
     monkeypatch.setenv("VGTM_CC", as_given.format(cc=found))
     assert shlex.split(compiler() or "") == shlex.split(as_given.format(cc=found))
     kernel = Kernel(_square())
-    assert kernel.is_compiled
+    assert kernel.compile()
     assert _value(kernel) == 9.0
 
 
@@ -76,7 +77,7 @@ def test_the_folder_of_the_compiler_may_have_a_space(tmp_path, monkeypatch, as_g
     wrapper.chmod(0o755)
     monkeypatch.setenv("VGTM_CC", as_given.format(cc=wrapper))
     kernel = Kernel(_square())
-    assert kernel.is_compiled
+    assert kernel.compile()
     assert _value(kernel) == 9.0
     assert (tmp_path / "ran").exists()
 
@@ -101,7 +102,7 @@ def _long(name: str, scale: float) -> ca.Function:
 def test_what_two_kernels_share_is_compiled_once(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     kernels = [Kernel(_long(name, scale)) for name, scale in (("one", 1.0), ("other", 2.0))]
-    assert all(kernel.is_compiled for kernel in kernels)
+    assert all(kernel.compile() for kernel in kernels)
     assert len(list(tmp_path.glob("*.so"))) == 2
     assert len(list(tmp_path.glob("*.o"))) == 1
     interpreted = Kernel(_long("one", 1.0), compiled=False)
@@ -122,8 +123,8 @@ def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, mon
         product = 0.25 * product @ b + ca.fmin(a + k, b)
     function = ca.Function("product", [a, b], [product])
     kernel, rng = Kernel(function), np.random.default_rng(0)
-    assert len(_source(function)) > 100_000
-    assert kernel.is_compiled
+    assert len(source_of(function)) > 100_000
+    assert kernel.compile()
     for array in kernel.inputs:
         array[:] = rng.uniform(-1.0, 1.0, size=16)
     kernel()
@@ -132,12 +133,6 @@ def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, mon
     for k in range(300):
         wanted = 0.25 * wanted @ second + np.minimum(first + k, second)
     np.testing.assert_allclose(kernel.outputs[0].reshape(4, 4).T, wanted, rtol=1e-12)
-
-
-def _source(function: ca.Function) -> str:
-    generator = ca.CodeGenerator("product.c")
-    generator.add(function)
-    return str(generator.dump())
 
 
 def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, monkeypatch):
@@ -155,13 +150,16 @@ def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, mo
 def test_finishing_leaves_nothing_to_wait_for(tmp_path, monkeypatch):
     cache = tmp_path / "cache"
     monkeypatch.setenv("VGTM_CACHE", str(cache))
-    kernel = Kernel(_long("awaited", 3.0))
+    kernel, unused = Kernel(_long("awaited", 3.0)), Kernel(_long("unused", 3.0))
+    kernel()
     finish_compiling()
     assert list(cache.glob("awaited-*.so"))
     # With a file in the place of the cache nothing could be compiled or loaded any more.
     shutil.rmtree(cache)
     cache.write_text("in the way")
+    kernel()
     assert kernel.is_compiled
+    assert not unused.is_compiled
 
 
 @needs_compiler
@@ -171,9 +169,9 @@ def test_a_forked_process_does_not_wait_for_the_compilers_of_its_parent(tmp_path
     kernel = Kernel(_long("forked", 1.5))
     child = os.fork()
     if child == 0:
-        os._exit(0 if kernel.is_compiled else 1)
+        os._exit(0 if kernel.compile() else 1)
     assert os.waitpid(child, 0)[1] == 0
-    assert kernel.is_compiled
+    assert kernel.compile()
 
 
 def _run(code: str, cache: Path, **settings: str) -> subprocess.CompletedProcess[str]:
@@ -191,7 +189,7 @@ x = ca.SX.sym("x")
 kernel = Kernel(ca.Function("square", [x], [x * x]))
 kernel.inputs[0][:] = 3.0
 kernel()
-print(kernel.is_compiled, kernel.outputs[0][0])
+print(kernel.compile(), kernel.outputs[0][0])
 """
 
 
@@ -210,13 +208,13 @@ def test_a_damaged_library_is_made_again_and_never_loaded(tmp_path):
 @needs_compiler
 def test_a_library_without_its_checksum_is_made_again(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     (library,), (digest,) = tmp_path.glob("*.so"), tmp_path.glob("*.so.sha256")
     before = library.stat().st_ino
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     assert library.stat().st_ino == before
     digest.unlink()
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     assert library.stat().st_ino != before
     assert digest.exists()
 
@@ -238,11 +236,11 @@ def test_a_cache_that_others_may_write_is_not_used(tmp_path, mode):
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root gives files away")
 def test_what_others_own_is_not_loaded(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     (library,) = tmp_path.glob("*.so")
     before = library.stat().st_ino
     os.chown(library, 12345, 12345)
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     assert library.stat().st_ino != before
     assert library.stat().st_uid == 0
     os.chown(tmp_path, 12345, 12345)
@@ -256,7 +254,7 @@ def test_files_of_the_cache_that_others_may_write_are_made_again(tmp_path, monke
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
     mask = os.umask(0o000)
     try:
-        assert Kernel(_long("open", 1.0)).is_compiled
+        assert Kernel(_long("open", 1.0)).compile()
     finally:
         os.umask(mask)
     for path in (tmp_path / "cache", *(tmp_path / "cache").iterdir()):
@@ -264,7 +262,7 @@ def test_files_of_the_cache_that_others_may_write_are_made_again(tmp_path, monke
     (library,) = (tmp_path / "cache").glob("*.so")
     before = library.stat().st_ino
     library.chmod(0o666)
-    assert Kernel(_long("open", 1.0)).is_compiled
+    assert Kernel(_long("open", 1.0)).compile()
     assert library.stat().st_ino != before
 
 
@@ -309,10 +307,10 @@ def test_a_compiler_that_hangs_is_ended_with_its_children_and_not_asked_again(tm
     monkeypatch.setenv("VGTM_CC", str(_hanging(tmp_path)))
     try:
         with pytest.warns(UserWarning, match="did not end within 1 s"):
-            assert _value(Kernel(_square())) == 9.0
+            assert not Kernel(_square()).compile()
         _wait(lambda: not _is_running(int((tmp_path / "child").read_text())))
         (tmp_path / "child").unlink()
-        assert not Kernel(_long("after", 2.0)).is_compiled
+        assert not Kernel(_long("after", 2.0)).compile()
         assert not (tmp_path / "child").exists()
     finally:
         stop_compilers()

@@ -34,12 +34,10 @@ _FIRST = 16
 _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
 """From the shifts of both ends of two bodies to that of one middle from the other, and half the turns of both."""
 
-_WATCHED = ((follow_function, (1, 128)), (distance_function, (1,)), (sweep_function, (1,)))
-"""Functions evaluated in a watched scene, and for how many pairs at once,"""
-_LISTED = ((distance_function, (1, 64, 1024)), (sweep_function, (1, 64)))
-"""and in any other,"""
-_PROVEN = ((proof_function, (1,)),)
-"""and those for FCL's answers."""
+_WATCHED = (follow_function, distance_function, sweep_function)
+"""Functions evaluated in a watched scene,"""
+_LISTED = (distance_function, sweep_function)
+"""and in any other."""
 
 
 class Scene:
@@ -65,14 +63,11 @@ class Scene:
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
 
     def prepare(self, *, watched: bool) -> None:
-        """Begin to compile the functions of steps: of a watched scene, or for few and for many pairs."""
+        """Make the functions of steps, so that no step has to."""
         shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
-        for make, counts in (*(_WATCHED if watched else _LISTED), *(_PROVEN if self.fcl else ())):
+        for make in (*(_WATCHED if watched else _LISTED), *((proof_function,) if self.fcl else ())):
             for shape in shapes:
-                for count in counts:
-                    # A watch rarely needs this: only for a motion that it cannot prove itself.
-                    for_later = watched and make is sweep_function
-                    self.batch(make, shape).prepare(count, for_later=for_later)
+                self.batch(make, shape)
 
     def contacts(self, parts: Sequence[Found]) -> Contacts:
         """Return the contacts of all `parts`, one part after the other."""

@@ -14,7 +14,6 @@ from vgtm_qp.arm.arm import Arm, Kinematics
 from vgtm_qp.arm.build import make_arm
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
-from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
 from vgtm_qp.errors import Mistake, nearest
@@ -74,7 +73,6 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
     gives_way = home.layout.hard_tracking and problem.method.gives_way
     elastic = elastic_engine(solver, home.layout, kinematics, task) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
-    finish_compiling()
     return Setup(
         arm=arm,
         kinematics=kinematics,
