@@ -129,7 +129,6 @@ class Builder:
         """Begin to make the `library` of a serialised `function`; `key` tells compilers and machines apart."""
         if is_sound(library):
             return
-        library.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         rest, units = split(source_of(ca.Function.deserialize(function)))
         texts = {library.with_name(f"{name}-{key}.o"): text for name, text in units.items()}
         # Objects of a library are its own, whichever process makes them.

@@ -278,6 +278,8 @@ class Compiling:
 
     Attributes
     ----------
+    given : ca.Function
+        The function itself.
     found : ca.Function or None
         The compiled function, or the given one where no compiler works; None as long as neither is known.
     calls : int
@@ -287,7 +289,7 @@ class Compiling:
     def __init__(self, function: ca.Function) -> None:
         self.found: ca.Function | None = None
         self.calls = 0
-        self._given = function
+        self.given = function
         self._builder: _Builder | None = None
         cc, folder = compiler(), cache_directory()
         if cc is None or cc in _hanging or _warned_of(folder):
@@ -316,8 +318,10 @@ class Compiling:
         with _lock:
             if self.found is None and self._builder is None:
                 if self._job["cc"] in _hanging:
-                    self.found = self._given
+                    self.found = self.given
                 else:
+                    with contextlib.suppress(OSError):
+                        self._library.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
                     self._builder = _hand_over({**self._job, "patience": _PATIENCE})
 
     def finish(self) -> ca.Function:
@@ -346,7 +350,7 @@ class Compiling:
             if builder.is_lost:
                 self._builder = None
             elif has_ended:
-                self.found = self._given
+                self.found = self.given
                 if builder.hung:
                     _hanging.add(self._job["cc"])
                     _warn(
@@ -362,11 +366,11 @@ class Compiling:
         if not is_sound(self._library):
             return False
         try:
-            self.found = ca.external(self._given.name(), str(self._library))
+            self.found = ca.external(self.given.name(), str(self._library))
         except RuntimeError:
             with contextlib.suppress(OSError):
                 self._library.unlink(missing_ok=True)
-            self.found = None if self._may_fail else self._given
+            self.found = None if self._may_fail else self.given
             self._may_fail, self._builder = False, None
         return True
 
@@ -376,8 +380,8 @@ _hanging: set[str] = set()
 """Compilers that hung, and are not asked again by this process."""
 
 
-def finish_compiling() -> None:
-    """Compile all kernels that this process has called, and wait for the end of it.
+def finish_compiling() -> bool:
+    """Compile all kernels that this process has called, wait for the end of it, and return whether none failed.
 
     Each begins to run compiled at its next call.
     """
@@ -387,8 +391,8 @@ def finish_compiling() -> None:
         used = [one for one in _waiting if one.calls and one.found is None]
     for one in used:
         one.begin()
-    for one in used:
-        one.finish()
+    every = [one.finish() is not one.given for one in used]
+    return all(every)
 
 
 @cache

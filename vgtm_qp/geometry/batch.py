@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.compiled import Compiling, Kernel
+from vgtm_qp.compiled import Compiling, Kernel, cache_directory, compiler
 
 _LEAST, _MOST = 8, 1024
 """Capacities are the powers of two between these."""
 
-_compilings: dict[str, Compiling] = {}
+_compilings: dict[tuple[str, str | None, Path], Compiling] = {}
 
 
 class Batch:
@@ -27,10 +29,10 @@ class Batch:
 
     def __init__(self, function: ca.Function) -> None:
         self._function = function
-        name = function.name()
-        if name not in _compilings:
-            _compilings[name] = Compiling(function)
-        self._compiling = _compilings[name]
+        key = function.name(), compiler(), cache_directory()
+        if key not in _compilings:
+            _compilings[key] = Compiling(function)
+        self._compiling = _compilings[key]
         self.kernels: dict[int, tuple[Kernel, list[Array], Array]] = {}
 
     def __call__(self, *rows: Array) -> Array:
