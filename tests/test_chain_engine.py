@@ -13,7 +13,7 @@ from steps import assert_same_answer, make_step, pressing
 from vgtm_qp.arm.truss.build import lock_members
 from vgtm_qp.bench.scenes import make_scenes
 from vgtm_qp.methods import Resolver
-from vgtm_qp.qp.answer import Accuracy
+from vgtm_qp.qp.answer import Accuracy, CurvePoint
 from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.chain_data import ChainData, PeriodValues
 from vgtm_qp.qp.long.elimination import Elimination
@@ -109,7 +109,9 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
         asked = QPInput(home, home, points, np.zeros(0), target, path.at(0.0), 0.0, rows, True)
         answer = engine.solve(asked)
         goal = path.at(max(answer.progress, 0.0))
-        ends.append(engine.settle(home + answer.nodes, target, goal, ACCURACY))
+        curve = CurvePoint(points, np.zeros(0)).after(answer)
+        settled = engine.settle(home + answer.nodes, curve, target, goal, ACCURACY)
+        ends.append(None if settled is None else settled.closed)
     if ends[0] is None:
         assert tight or hard
         assert ends[1] is None
@@ -127,8 +129,8 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
     assert (strokes >= target.lower - 1e-12).all()
     assert (strokes <= target.upper + 1e-12).all()
     if hard:
-        curve = layout.curve_weights @ (points + answer.vertices)
-        np.testing.assert_allclose(arm.stations.centres(ends[1].q)[layout.tracked], curve, atol=1e-10)
+        on_curve = layout.curve_weights @ (points + answer.vertices)
+        np.testing.assert_allclose(arm.stations.centres(ends[1].q)[layout.tracked], on_curve, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["octahedral", "hexapod", "tetrahedral-23"])

@@ -286,7 +286,7 @@ def test_steps_reach_their_goals_keep_their_limits_and_stay_clear(name, solver):
 def test_both_engines_take_the_same_steps(name, hard):
     method = {"tracking_mode": "hard" if hard else "elastic"}
     problem = problem_of(name, method=method, **CLUTTER)
-    fast, plain = vq.Resolver(build_arm(problem)), vq.Resolver(build_arm(problem, compiled=False))
+    fast, plain = vq.Resolver(build_arm(problem)), vq.Resolver(build_arm(problem, compiled=False, plain=True))
     assert isinstance(fast.setup.engine, FusedEngine)
     assert isinstance(plain.setup.engine, GeneralEngine)
     for _ in range(4):

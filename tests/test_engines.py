@@ -10,9 +10,11 @@ import pytest
 from arms import TRUSSES, make_layout
 from steps import SHAPES, assert_same_answer, make_step, pressing, shaped
 
-from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.curve.families import make_family
-from vgtm_qp.qp.answer import Accuracy
+from vgtm_qp.native import building
+from vgtm_qp.qp.answer import Accuracy, CurvePoint
+from vgtm_qp.qp.fused import SOURCE, FusedSolver
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.staged import StagedSolver
@@ -29,9 +31,10 @@ TRACKS = {"hexapod": ("position", "orientation"), "longeron": ("x", "pointing")}
 
 
 @pytest.fixture(autouse=True)
-def _without_a_compiler(monkeypatch):
+def _interpreted(monkeypatch):
     """The graphs themselves are what is compared; so many of them would keep a compiler busy for minutes."""
-    monkeypatch.setenv("VGTM_CC", "none")
+    compile_ = Bound.kernel
+    monkeypatch.setattr(Bound, "kernel", lambda bound, **_: compile_(bound, compiled=False))
 
 
 def engines(name, *, joint_offset=0.0, track=None, vertices=5, **options):
@@ -41,7 +44,15 @@ def engines(name, *, joint_offset=0.0, track=None, vertices=5, **options):
         layout = shaped(layout, **options)
     assert layout.arm.symbols(Constants()).can_eliminate
     kinematics = layout.arm.kinematics()
-    return layout, kinematics, task, general(layout, kinematics, task), FusedEngine(layout)
+    return layout, kinematics, task, general(layout, kinematics, task), fused_engine(layout, kinematics, task)
+
+
+def fused_engine(layout, kinematics, task):
+    """An engine whose C is there, if there is a compiler."""
+    assert building(SOURCE).result() is not None
+    engine = FusedEngine(layout, kinematics, task, FusedSolver(layout))
+    assert engine.is_ready
+    return engine
 
 
 def general(layout, kinematics, task, solver="daqp"):
@@ -68,19 +79,26 @@ def test_both_engines_give_one_answer(name, joint_offset, base):
             answers[0].clearance_multipliers, answers[1].clearance_multipliers, atol=1e-8
         )
         assert answers[0].clearance_multipliers.max() > 0.0
-    near = arm.home + 1e-3 * rng.normal(size=X.shape)
+    done, near = 0, arm.home + 1e-3 * rng.normal(size=X.shape)
     near[arm.base] = arm.home[arm.base]
     for pose in (arm.home, near):
         kinematics.evaluate(pose)
         goal = target.path.at(0.0)._replace(position=arm.end_effector.position(pose) + 1e-6)
         box = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0)
-        closed = [engine.settle(pose, box, goal, Accuracy(1e-12, 1e-7, np.inf)) for engine in (fused, plain)]
-        if name == "tetrahedral-2" and None in closed:
-            # From so far off its kept Jacobian leads nowhere: both engines must say that another QP is due.
-            assert closed == [None, None]
+        accuracy, curve = Accuracy(1e-12, 1e-7, np.inf), CurvePoint(vertices, np.zeros(0))
+        settled = []
+        for engine in (fused, plain):
+            settled.append(engine.settle(pose, curve, box, goal, accuracy))
+        if None in settled:
+            # From so far off a kept Jacobian may lead nowhere: both engines must say that another QP is due.
+            assert settled == [None, None]
             continue
-        np.testing.assert_allclose(closed[0].q, closed[1].q, atol=1e-9)
-        np.testing.assert_allclose(closed[0].quantities, closed[1].quantities, atol=1e-10)
+        done += 1
+        first, second = (one.closed for one in settled)
+        np.testing.assert_allclose(first.q, second.q, atol=1e-9)
+        np.testing.assert_allclose(first.quantities, second.quantities, atol=1e-10)
+        np.testing.assert_allclose(settled[0].curve.vertices, settled[1].curve.vertices, atol=1e-9)
+    assert done or name == "tetrahedral-2"
 
 
 @pytest.mark.parametrize(
@@ -115,7 +133,7 @@ def test_both_engines_give_one_answer_on_every_curve(name, shape, family):
 def test_both_engines_hold_faces_on_the_curve_where_these_determine_the_nodes(name):
     layout, task = make_layout(TRUSSES[name](), vertices=5, hard_tracking=True)
     arm, kinematics = layout.arm, layout.arm.kinematics()
-    plain, fused = general(layout, kinematics, task), FusedEngine(layout)
+    plain, fused = general(layout, kinematics, task), fused_engine(layout, kinematics, task)
     X = arm.home
     kinematics.evaluate(X)
     lengths, here = kinematics.quantities[arm.actuators].copy(), arm.end_effector.position(X)
@@ -129,10 +147,12 @@ def test_both_engines_hold_faces_on_the_curve_where_these_determine_the_nodes(na
     for engine in (fused, plain):
         answer = engine.solve(asked)
         goal = path.at(answer.progress)
-        closed.append(engine.settle(X + answer.nodes, target, goal, accuracy))
+        curve = CurvePoint(vertices, np.zeros(0)).after(answer)
+        settled = engine.settle(X + answer.nodes, curve, target, goal, accuracy)
+        closed.append(settled.closed)
         gap = arm.stations.centres(closed[-1].q)[layout.tracked]
-        gap -= layout.curve_weights @ (vertices + answer.vertices)
-        assert np.abs(gap).max() < 1e-12
+        gap -= layout.curve_weights @ settled.curve.vertices
+        assert np.abs(gap).max() < 1e-10
         assert np.abs(answer.nodes).max() > 0.01
     np.testing.assert_allclose(closed[0].q, closed[1].q, atol=1e-10)
     move = fused.move(asked, accuracy, lambda _: None)
@@ -289,7 +309,7 @@ def test_all_engines_keep_legs_of_the_control_polygon_from_turning_round(name):
     plain = general(layout, kinematics, task)
     chain = GeneralEngine(layout, kinematics, task, StagedSolver(find_chain(layout)))
     wanted = plain.solve(asked)
-    for engine in (FusedEngine(layout), chain):
+    for engine in (fused_engine(layout, kinematics, task), chain):
         assert_same_answer(engine.solve(asked), wanted, 1e-9)
     qp, legs = plain.qp(asked), np.diff(wanted.vertices, axis=0)
     least = [bound for label, bound in zip(qp.rows, qp.row_lower, strict=True) if label.kind == "curve leg"]

@@ -24,7 +24,7 @@ SCENES = [
 @pytest.mark.parametrize(("name", "changes"), SCENES)
 def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, changes):
     problem = vq.load_problem(name).replace(changes)
-    slow = build_arm(problem, compiled=False)
+    slow = build_arm(problem, compiled=False, plain=True)
     monitor = slow.monitor
     options = {key: getattr(monitor, key) for key in ("safe", "influence", "self_collision")}
     listed = Clearance(monitor.bodies, monitor.obstacles, watch=False, **options)

@@ -13,6 +13,7 @@ from steps import SHAPES, make_step, shaped
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.fused_rows import row_function
 from vgtm_qp.qp.linearise import Linearisation
+from vgtm_qp.rows.curve import free_basis
 from vgtm_qp.step.target import QPInput
 
 FRAMED = [name for name in TRUSSES if name != "graph"]
@@ -60,7 +61,14 @@ def compare(layout, seeds=range(1)):
             wanted = oracle.condensed(layout, asked, given)
             asked.load(kernel)
             kernel()
-            stack, tip, *rest = (output.copy() for output in kernel.outputs)
+            stack, tip, *rest, legs, least = (output.copy() for output in kernel.outputs)
+            numbers = linearisation.numbers(asked, rows)
+            basis = free_basis(rest[-1], 3 * layout.vertices + layout.torsion)
+            of_legs = np.pad(numbers.legs.over_vertices(layout), ((0, 0), (0, layout.torsion)))
+            np.testing.assert_allclose(
+                legs.reshape(len(least), layout.free_curve), of_legs @ basis, atol=1e-12
+            )
+            np.testing.assert_allclose(least, numbers.legs.lower, atol=1e-12)
             size = len(wanted["gradient"])
             found = {"rows": stack.reshape(size, -1).T, "tip": tip.reshape(-1, size)}
             names = "lower", "upper", "gradient", "curvature", "offset", "normal"

@@ -125,18 +125,26 @@ class Builder:
         self._objects: dict[Path, Future[bool]] = {}
         self._running: set[subprocess.Popen[bytes]] = set()
 
-    def build(self, library: Path, function: str, cc: str, key: str) -> None:
-        """Begin to make the `library` of a serialised `function`; `key` tells compilers and machines apart."""
+    def build(self, job: dict[str, Any]) -> None:
+        """Begin to make a ``library`` by the compiler ``cc`` of a serialised ``function``, or of a ``text`` of C.
+
+        The job's ``key`` tells compilers and machines apart; a text has ``flags`` of its own.
+        """
+        library, cc = Path(job["library"]), job["cc"]
         if is_sound(library):
             return
-        rest, units = split(source_of(ca.Function.deserialize(function)))
-        texts = {library.with_name(f"{name}-{key}.o"): text for name, text in units.items()}
-        # Objects of a library are its own, whichever process makes them.
-        main, quick = library.with_suffix(".o"), QUICK if len(rest) > _LONG else ()
-        texts[main] = _with_fast_helpers(rest) if quick else rest
+        main, texts = library.with_suffix(".o"), {}
+        if "text" in job:
+            rest, flags = job["text"], job["flags"]
+        else:
+            rest, units = split(source_of(ca.Function.deserialize(job["function"])))
+            texts = {library.with_name(f"{name}-{job['key']}.o"): text for name, text in units.items()}
+            flags = QUICK if len(rest) > _LONG else ()
+            rest = _with_fast_helpers(rest) if flags else rest
+        texts[main] = rest
         # The longest first: nothing waits for it at the end.
         objects = {
-            path: self._compile(cc, texts[path], path, quick if path == main else ())
+            path: self._compile(cc, texts[path], path, flags if path == main else ())
             for path in sorted(texts, key=lambda path: -len(texts[path]))
         }
         self._linkers.submit(self._link, cc, objects, library)
@@ -267,6 +275,6 @@ def main() -> int:
         while (job := pickle.load(sys.stdin.buffer)) is not None:
             builder.patience = job["patience"]
             with contextlib.suppress(OSError, RuntimeError):
-                builder.build(Path(job["library"]), job["function"], job["cc"], job["key"])
+                builder.build(job)
     builder.finish()
     return HUNG if builder.hung else 0

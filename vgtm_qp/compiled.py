@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import gc
 import hashlib
 import os
@@ -56,6 +57,9 @@ FLAGS = (
 QUICK = ("-O1",)
 """Flags for long code that calls the straight-line functions: half the compile time, at little cost in speed."""
 
+OWN = ("-O3", "-fno-signed-zeros", "-fassociative-math")
+"""Flags for our own C: sums may be vectorised; NaN and infinity keep their meaning."""
+
 HUNG = 3
 """Exit code of a builder whose compiler hung."""
 
@@ -86,7 +90,11 @@ def compiler() -> str | None:
     It is ``$VGTM_CC``, a program or one with flags, else the first of cc, gcc, clang. ``VGTM_CC=none`` asks for the
     virtual machine.
     """
-    wanted = os.environ.get("VGTM_CC")
+    return _found(os.environ.get("VGTM_CC"), os.environ.get("PATH"))
+
+
+@cache
+def _found(wanted: str | None, _: str | None) -> str | None:
     if wanted in ("", "none"):
         return None
     commands = [["cc"], ["gcc"], ["clang"]] if wanted is None else [[wanted]]
@@ -273,84 +281,87 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_start_anew)
 
 
-class Compiling:
-    """A function on its way to machine code; several kernels may wait for the same.
+class Building:
+    """C code on its way to a shared library.
 
     Attributes
     ----------
-    given : ca.Function
-        The function itself.
-    found : ca.Function or None
-        The compiled function, or the given one where no compiler works; None as long as neither is known.
+    library : Path or None
+        The library once it is there.
+    is_settled : bool
+        Whether it is there, or is known never to be.
     calls : int
-        Number of calls that were made without it.
+        Number of calls for which it was asked so far in vain.
     """
 
-    def __init__(self, function: ca.Function) -> None:
-        self.found: ca.Function | None = None
-        self.calls = 0
-        self.given = function
+    def __init__(self, name: str, text: str, flags: tuple[str, ...]) -> None:
+        self._plan(name, text, {"text": text, "flags": (*flags, *OWN)}, *flags, *OWN)
+
+    def _plan(self, name: str, code: str, job: dict[str, Any], *more: str) -> None:
+        """Use the library that is in the cache already, or prepare the `job` of making it."""
+        self.library: Path | None = None
+        self.is_settled, self.calls, self._may_fail = False, 0, True
         self._builder: _Builder | None = None
         cc, folder = compiler(), cache_directory()
         if cc is None or cc in _hanging or _warned_of(folder):
-            self.found = function
+            self.is_settled = True
             return
-        name, text = function.name(), function.serialize()
-        self._library = folder / f"{name}-{_hash(name, text, cc)}.so"
-        self._job = {"library": str(self._library), "function": text, "cc": cc, "key": _hash(cc)[:8]}
-        self._may_fail = True
+        self._target = folder / f"{name}-{_hash(name, code, cc, *more)}.so"
+        self._job = {**job, "library": str(self._target), "cc": cc, "key": _hash(cc)[:8]}
         self._load()
-        if self.found is None:
+        if not self.is_settled:
             with _lock:
                 _waiting.add(self)
 
-    def ask(self) -> ca.Function | None:
-        """Return `found` for a call, without waiting; a function that is asked for often enough is compiled."""
-        self.calls += 1
-        if self._builder is not None:
-            self._look()
-        elif self.calls >= _OFTEN:
-            self.begin()
-        return self.found
+    def ask(self) -> bool:
+        """Return whether it is settled, without waiting; what is asked for often enough is made."""
+        if not self.is_settled:
+            self.calls += 1
+            if self._builder is not None:
+                self._look()
+            elif self.calls >= _OFTEN:
+                self.begin()
+        return self.is_settled
 
     def begin(self) -> None:
-        """Begin to compile, unless that was done."""
+        """Begin to make it, unless that was done."""
         with _lock:
-            if self.found is None and self._builder is None:
-                if self._job["cc"] in _hanging:
-                    self.found = self.given
-                else:
-                    with contextlib.suppress(OSError):
-                        self._library.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-                    self._builder = _hand_over({**self._job, "patience": _PATIENCE})
+            if self.is_settled or self._builder is not None:
+                return
+            if self._job["cc"] in _hanging:
+                self.is_settled = True
+                return
+            with contextlib.suppress(OSError):
+                self._target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._builder = _hand_over({**self._job, "patience": _PATIENCE})
 
-    def finish(self) -> ca.Function:
-        """Compile now, wait for the end of it, and return `found`."""
+    def finish(self) -> Path | None:
+        """Make it now, wait for the end of it, and return `library`."""
         try:
-            while self.found is None:
+            while not self.is_settled:
                 self.begin()
                 self._look()
-                if (builder := self._builder) is not None and self.found is None:
+                if (builder := self._builder) is not None and not self.is_settled:
                     builder.ended.wait(_TICK)
         except KeyboardInterrupt:
             stop_compilers()
             raise
-        return self.found
+        return self.library
 
     def _look(self) -> None:
-        """Load the library if it is there by now; take the function as it is if there will be none."""
+        """Load the library if it is there by now; settle for none if there will be none."""
         with _lock:
             builder = self._builder
-            if self.found is not None or builder is None:
+            if self.is_settled or builder is None:
                 return
             # In this order, for a library may come just before the end.
             has_ended = builder.ended.is_set()
-            if self._library.exists() and self._load():
+            if self._target.exists() and self._load():
                 return
             if builder.is_lost:
                 self._builder = None
             elif has_ended:
-                self.found = self.given
+                self.is_settled = True
                 if builder.hung:
                     _hanging.add(self._job["cc"])
                     _warn(
@@ -361,21 +372,42 @@ class Compiling:
     def _load(self) -> bool:
         """Load the library and return True; False if it is not whole.
 
-        The library of a machine with another C library cannot be loaded: it is compiled once more.
+        The library of a machine with another C library cannot be loaded: it is made once more.
         """
-        if not is_sound(self._library):
+        if not is_sound(self._target):
             return False
         try:
-            self.found = ca.external(self.given.name(), str(self._library))
-        except RuntimeError:
+            self._accept(self._target)
+            self.library, self.is_settled = self._target, True
+        except (OSError, RuntimeError):
             with contextlib.suppress(OSError):
-                self._library.unlink(missing_ok=True)
-            self.found = None if self._may_fail else self.given
-            self._may_fail, self._builder = False, None
+                self._target.unlink(missing_ok=True)
+            self.is_settled, self._may_fail, self._builder = not self._may_fail, False, None
         return True
 
+    def _accept(self, library: Path) -> None:
+        ctypes.CDLL(str(library))
 
-_waiting: weakref.WeakSet[Compiling] = weakref.WeakSet()
+
+class Compiling(Building):
+    """A function on its way to machine code; several kernels may wait for the same.
+
+    Attributes
+    ----------
+    given, found : ca.Function
+        The function itself, and its compiled form once that is loaded.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        self.given = self.found = function
+        text = "" if compiler() is None else function.serialize()
+        self._plan(function.name(), text, {"function": text})
+
+    def _accept(self, library: Path) -> None:
+        self.found = ca.external(self.given.name(), str(library))
+
+
+_waiting: weakref.WeakSet[Building] = weakref.WeakSet()
 _hanging: set[str] = set()
 """Compilers that hung, and are not asked again by this process."""
 
@@ -388,10 +420,10 @@ def finish_compiling() -> bool:
     # What is only kept by a circle of references is not worth waiting for.
     gc.collect()
     with _lock:
-        used = [one for one in _waiting if one.calls and one.found is None]
+        used = [one for one in _waiting if one.calls and not one.is_settled]
     for one in used:
         one.begin()
-    every = [one.finish() is not one.given for one in used]
+    every = [one.finish() is not None for one in used]
     return all(every)
 
 
@@ -424,16 +456,23 @@ class Kernel:
         Number of columns of arguments on which it is evaluated in one call, as by ``function.map(times)``.
     compiled
         Whether it may become machine code, or the function's compilation, which kernels may share.
+
+    Attributes
+    ----------
+    name : str
+        Of the function.
+    library : Path or None
+        The shared library once it is machine code.
     """
 
     def __init__(self, function: ca.Function, *, times: int = 1, compiled: bool | Compiling = True) -> None:
-        self._given, self._times = function, times
-        compiling = Compiling(function) if compiled is True else compiled or None
-        found = function if compiling is None else compiling.found
-        self._compiling = compiling if found is None else None
+        self._given, self._times, self.name = function, times, function.name()
+        self.library: Path | None = None
+        self._compiling = Compiling(function) if compiled is True else compiled or None
         self.inputs: list[Array] = [np.zeros(times * function.nnz_in(i)) for i in range(function.n_in())]
         self.outputs: list[Array] = [np.zeros(times * function.nnz_out(i)) for i in range(function.n_out())]
-        self._use(found or function)
+        self._use(function if self._compiling is None else self._compiling.found)
+        self._settle()
 
     def _use(self, function: ca.Function) -> None:
         """Evaluate by `function` from now on."""
@@ -446,12 +485,25 @@ class Kernel:
         for i, array in enumerate(self.outputs):
             self._buffer.set_res(i, array.reshape(-1).data)
 
-    def _exchange(self, found: ca.Function | None) -> None:
-        """Go on with the compilation's result, if there is one."""
-        if found is not None:
-            self._compiling = None
-            if found is not self._function:
-                self._use(found)
+    def _settle(self) -> None:
+        """Go on with what became of the compilation, if that is settled."""
+        compiling = self._compiling
+        if compiling is not None and compiling.is_settled:
+            self._compiling, self.library = None, compiling.library
+            if compiling.found is not self._function:
+                self._use(compiling.found)
+
+    def prepare(self) -> None:
+        """Count a call: what is called often enough is compiled, and changes over when that is there."""
+        if self._compiling is not None:
+            self._compiling.ask()
+            self._settle()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it is machine code by now, or never will be."""
+        self._settle()
+        return self._compiling is None
 
     @property
     def is_compiled(self) -> bool:
@@ -461,7 +513,8 @@ class Kernel:
     def compile(self) -> bool:
         """Compile now, wait for the end of it, and return whether it is machine code."""
         if self._compiling is not None:
-            self._exchange(self._compiling.finish())
+            self._compiling.finish()
+            self._settle()
         return self.is_compiled
 
     def __call__(self) -> None:
@@ -470,7 +523,7 @@ class Kernel:
         EvaluationError, with all outputs NaN, where the function could not be evaluated, at a singular matrix say.
         """
         if self._compiling is not None:
-            self._exchange(self._compiling.ask())
+            self.prepare()
         self._evaluate()
         if self._code():
             # Old outputs must not be read as an answer.

@@ -21,6 +21,10 @@ _GAUSS_POINTS = 6
 _OUTSIDE = 1e-12
 
 
+_MOST_KNOWN = 64
+"""Number of arrays of weights that a family keeps."""
+
+
 @dataclass(frozen=True, eq=False)
 class CurveFamily:
     """The weights w_i(s), 0 <= s <= 1, of eqs. (29)-(30): non-negative, with sum 1."""
@@ -55,9 +59,23 @@ class CurveFamily:
         """Weights w_i, eq. (30), or their derivatives of `order` by s, at s of any shape: (..., V).
 
         At a break where a derivative jumps it is the one of the segment that begins there. CurveError where some s is
-        outside 0 <= s <= 1 or is not a number.
+        outside 0 <= s <= 1 or is not a number. The array is read-only: curves ask for the same parameters again and
+        again, and get the same array.
         """
         given = np.asarray(s, dtype=float)
+        key = given.tobytes(), given.shape, order
+        if (known := self._known.get(key)) is None:
+            if len(self._known) >= _MOST_KNOWN:
+                self._known.clear()
+            known = self._known[key] = self._weights(given, order)
+            known.setflags(write=False)
+        return known
+
+    @cached_property
+    def _known(self) -> dict[tuple[bytes, tuple[int, ...], int], Array]:
+        return {}
+
+    def _weights(self, given: Array, order: int) -> Array:
         if not np.all((given >= -_OUTSIDE) & (given <= 1.0 + _OUTSIDE)):
             raise CurveError("the curve parameter s must be within 0 <= s <= 1")
         at = np.clip(given, 0.0, 1.0)

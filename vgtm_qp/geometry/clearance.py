@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vgtm_qp.arrays import Array, Index
+from vgtm_qp.compiled import compiler
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.exact import NORMAL
@@ -16,7 +17,7 @@ from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair
 from vgtm_qp.geometry.shapes import Obstacle
 from vgtm_qp.geometry.solids import Solids
 from vgtm_qp.geometry.sweep import sweep_group
-from vgtm_qp.geometry.watch import Watch, can_be_watched
+from vgtm_qp.geometry.watch import Watch, can_be_watched, is_ready
 
 __all__ = ["BetweenReport", "Clearance", "Contacts", "Pair"]
 
@@ -62,11 +63,17 @@ class Clearance:
         self.pieces, self.names, self.fcl = self.scene.pieces, self.scene.names, self.scene.fcl
         self.safe, self.influence = safe, influence
         self.self_influence = min(influence, 2.0 * (safe + float(bodies.radius.max(initial=0.0))))
-        self.is_watched = watch and can_be_watched(self.scene)
-        self.scene.prepare(watched=self.is_watched)
-        self._watch = Watch(self.scene) if self.is_watched else None
+        self.is_watched = watch and compiler() is not None and can_be_watched(self.scene)
+        self.scene.prepare()
+        self._watching: Watch | None = None
         self._candidates = Candidates(self.scene, influence, self.self_influence)
         self._solids = Solids(self.scene)
+
+    def _watch(self) -> Watch | None:
+        """Return what watches the scene, once that is compiled."""
+        if self._watching is None and self.is_watched and is_ready(self.scene.shapes):
+            self._watching = Watch(self.scene)
+        return self._watching
 
     def near(
         self,
@@ -99,8 +106,8 @@ class Clearance:
         """
         reach = self.influence if reach is None else reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
-        if tracked and self._watch is not None:
-            watched = self._watch.near(X, reach, self_reach, by_fcl=by_fcl)
+        if tracked and (watch := self._watch()) is not None:
+            watched = watch.near(X, reach, self_reach, by_fcl=by_fcl)
             if watched is not None:
                 return watched
         candidates = self._candidates
@@ -211,7 +218,7 @@ class Clearance:
             A position is not finite; so do `near` and `least`.
         """
         self_floor = floor if self_floor is None else self_floor
-        if self._watch is not None and self._watch.follow(start, end, floor, self_floor):
+        if (watch := self._watch()) is not None and watch.follow(start, end, floor, self_floor):
             return BetweenReport(True, min(floor, self_floor), np.zeros(0), self.scene.nothing)
         floor, self_floor = max(floor, 0.0), max(self_floor, 0.0)
         motion = self._candidates.cover(start, start_time, floor, self_floor, end, end_time)

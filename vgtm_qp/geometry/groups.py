@@ -16,7 +16,6 @@ from vgtm_qp.geometry.exact import (
     NORMAL,
     PROOF,
     distance_function,
-    follow_function,
     proof_function,
     sweep_function,
     width,
@@ -34,11 +33,6 @@ _FIRST = 16
 _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
 """From the shifts of both ends of two bodies to that of one middle from the other, and half the turns of both."""
 
-_WATCHED = (follow_function, distance_function, sweep_function)
-"""Functions evaluated in a watched scene,"""
-_LISTED = (distance_function, sweep_function)
-"""and in any other."""
-
 
 class Scene:
     """Bodies of an arm and obstacles, with the functions that evaluate pairs of them.
@@ -51,6 +45,8 @@ class Scene:
         Supplies contacts; None if only closed forms are used.
     nothing : Contacts
         No rows.
+    shapes : list of str
+        Of the others in its pairs; ``"segment"`` is a body.
     """
 
     def __init__(self, bodies: Bodies, obstacles: Sequence[Obstacle], has_self: bool, by_fcl: bool) -> None:
@@ -60,13 +56,13 @@ class Scene:
         self.names = PairNames(bodies, names, tuple(self.pieces.obstacle.tolist()))
         self.fcl = FclQueries(self.pieces) if by_fcl else None
         self.nothing = self._contacts(np.zeros((0, 8), dtype=np.int64), np.zeros((0, CONTACT)))
+        self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if has_self else set()))
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
 
-    def prepare(self, *, watched: bool) -> None:
+    def prepare(self) -> None:
         """Make the functions of steps, so that no step has to."""
-        shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
-        for make in (*(_WATCHED if watched else _LISTED), *((proof_function,) if self.fcl else ())):
-            for shape in shapes:
+        for make in (distance_function, sweep_function, *((proof_function,) if self.fcl else ())):
+            for shape in self.shapes:
                 self.batch(make, shape)
 
     def contacts(self, parts: Sequence[Found]) -> Contacts:

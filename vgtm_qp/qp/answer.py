@@ -67,6 +67,24 @@ class Closed:
     tip_rotation: Array
 
 
+class CurvePoint(NamedTuple):
+    """A reference curve: its control vertices (V, 3), m, and torsion (T,), rad."""
+
+    vertices: Array
+    torsion: Array
+
+    def after(self, solution: StepSolution) -> CurvePoint:
+        """Return the curve after the displacements of a solution."""
+        return CurvePoint(self.vertices + solution.vertices, self.torsion + solution.torsion)
+
+
+class Settled(NamedTuple):
+    """A closed configuration with the tip at its goal, and its curve."""
+
+    closed: Closed
+    curve: CurvePoint
+
+
 class Accuracy(NamedTuple):
     """Tolerances to which quantities, the tip, and stations with hard tracking are settled, m or rad.
 

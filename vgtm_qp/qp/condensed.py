@@ -16,13 +16,14 @@ from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers
+from vgtm_qp.qp.settle import Gain, settling_gain
 from vgtm_qp.rows.curve import free_basis
 
 
 class CondensedSolver:
     """Solves the QP of a step in the unknowns x with DAQP."""
 
-    knows_gain = False
+    settles = "equalities"
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -74,6 +75,22 @@ class CondensedSolver:
         is_column = self._unknown >= 0
         w[self._unknown[is_column]] = answer.multipliers[:size][is_column]
         return builder.solution(Z @ answer.x + start, y, w, answer.iterations)
+
+    def gain_of(self, numbers: StepNumbers, at_bound: NDArray[np.bool_]) -> Gain | None:
+        """Return the least changes that make good what the equalities lack, see ``settle.missing_function``.
+
+        Actuators `at_bound` (n_a,) rest, and so does the progress. None if no changes do.
+        """
+        builder = self.builder
+        qp = builder.build(numbers)
+        Z, _ = self._reduction(numbers, qp)
+        free = np.ones(len(self._unknown), dtype=bool)
+        free[: len(at_bound)], free[-len(self._after) :] = ~at_bound, False
+        # A gap is the station less the curve.
+        rows = np.concatenate([(qp.A @ Z)[builder.tip_rows], Z[builder.hard_gaps]])
+        gain = settling_gain(Z.T @ (qp.P @ Z), rows, free)
+        nothing = np.zeros(len(qp.row_lower)), np.zeros(builder.size), 0
+        return None if gain is None else Gain(gain, lambda x: builder.solution(Z @ x, *nothing))
 
     def gain(self, held: NDArray[np.bool_]) -> Array | None:  # noqa: ARG002
         """See ``solvers.StepSolver``."""

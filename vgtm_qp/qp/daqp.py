@@ -15,7 +15,7 @@ from vgtm_qp.qp.residual import InfeasibleStepError, refuse_large, relative
 EQUALITY = 5
 """DAQP's mark for a row that is always active."""
 
-_FEASIBILITY = 1e-10
+FEASIBILITY = 1e-10
 
 
 class DenseAnswer(NamedTuple):
@@ -63,7 +63,7 @@ def ask(
         The rows contradict one another.
     """
     x, _, flag, info = daqp.solve(
-        hessian, gradient, constraint, upper, lower, sense, primal_tol=_FEASIBILITY, eps_prox=0.0
+        hessian, gradient, constraint, upper, lower, sense, primal_tol=FEASIBILITY, eps_prox=0.0
     )
     if flag == -1:
         raise InfeasibleStepError("the hard rows of the step contradict one another")
@@ -82,9 +82,10 @@ def check(
     """
     x, y = answer.x, answer.multipliers
     size = len(x)
-    primal = norm(beyond(np.concatenate((x, constraint @ x)), lower, upper))
-    stationarity = hessian @ x
-    stationarity += gradient
-    stationarity += y[:size]
-    stationarity += y[size:] @ constraint
+    with np.errstate(invalid="ignore"):  # An answer may be NaN.
+        primal = norm(beyond(np.concatenate((x, constraint @ x)), lower, upper))
+        stationarity = hessian @ x
+        stationarity += gradient
+        stationarity += y[:size]
+        stationarity += y[size:] @ constraint
     refuse_large(primal, relative(norm(stationarity), gradient, y), answer.name)

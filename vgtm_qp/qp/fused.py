@@ -1,316 +1,406 @@
-"""The fast path of a step: one compiled call linearises and condenses, BLAS makes the Hessian, DAQP solves.
+"""The fast path of a step: one call of C linearises, condenses, solves by DAQP, checks the answer and settles it.
 
-It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in 10 to 20 times less time for short arms.
+It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in a tenth of the time for short arms; see ``fused.c``.
 """
 
 from __future__ import annotations
 
-import copy
+import ctypes
+from enum import IntEnum
+from functools import cache
+from pathlib import Path
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
+from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
-from vgtm_qp.qp import daqp
-from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
-from vgtm_qp.qp.daqp import EQUALITY, DenseAnswer
+from vgtm_qp.errors import EvaluationError
+from vgtm_qp.native import Program, building
+from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
+from vgtm_qp.qp.daqp import EQUALITY, FEASIBILITY
 from vgtm_qp.qp.fused_rows import row_function
-from vgtm_qp.qp.fused_settle import NEAR, settle_function
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
-from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows, Legs
-from vgtm_qp.qp.residual import refuse_large
-from vgtm_qp.rows.curve import free_basis
+from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows
+from vgtm_qp.qp.residual import TOLERANCE, InfeasibleStepError, refuse_large
+from vgtm_qp.qp.settle import (
+    AT_BOUND,
+    LEFT,
+    MOST_STEPS,
+    SETTLING_STEPS,
+    TOO_FAR,
+    WORST_CONDITION,
+    Gain,
+    closing_function,
+    enough_length,
+    enough_tip_error,
+    held,
+    missing_function,
+    settling_gain,
+)
+from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rows.tip import TipGoal
 
-_AXES = np.arange(3)
+SOURCE = Path(__file__).with_name("fused.c")
 _NOWHERE: Array = np.zeros((0, 3))
+_NEARLY = 1e-9
+"""Error of quantities, m or rad, below which settling corrects them together with tip and stations."""
+
+_ROOM, _SLOTS = 24, 4
+"""Rows of clearance for which there is room at first, and nodes of each."""
 
 
-class _Room:
-    """Rows and bounds of the QP that compiled functions write and read; solvers with the same functions share them."""
+class _Code(IntEnum):
+    """What a function of ``fused.c`` returns."""
 
-    constraint: Array
-    lower: Array
-    upper: Array
-    sense: NDArray[np.int32]
-    row_start: NDArray[np.int64]
-    used: int
+    DONE = 0
+    NO_VALUE = 1
+    INFEASIBLE = 2
+    INACCURATE = 3
+    UNSETTLED = 4
+
+
+@cache
+def _daqp() -> dict[str, int]:
+    """Return the addresses of the functions of DAQP in CasADi's wheel, whose headers ``fused.c`` includes."""
+    library = ctypes.CDLL(str(next(Path(ca.__file__).parent.glob("*daqp.so*"))))
+    names = {"quadprog": "daqp_quadprog", "defaults": "daqp_default_settings"}
+    return {field: ctypes.cast(library[name], ctypes.c_void_p).value or 0 for field, name in names.items()}
 
 
 class FusedSolver:
-    """Linearises, condenses and solves; for arms whose symbols ``can_eliminate``."""
+    """Linearises, condenses, solves and settles; for arms whose symbols ``can_eliminate``.
 
-    def __init__(self, layout: Layout) -> None:
-        arm = layout.arm
-        self._rows = row_function(layout).kernel()
-        nodes, actuators = layout.node_columns, len(arm.actuators)
-        self._actuators = actuators
-        self._free_curve = layout.free_curve
-        self._size = size = actuators + self._free_curve + 1
-        self._torsion = size - 1 - layout.torsion
-        self._shape = arm.home_configuration.shape
-        self._tip = len(layout.tip_rows)
-        self._hard = len(layout.hard)
-        self._equal, self._legs = self._tip + self._hard, len(layout.legs)
-        self._hard_at = nodes + layout.hard
-        out = self._rows.outputs
-        self._stack = out[0].reshape(size, -1)
-        self._response = self._stack[:, :nodes]
-        self._linear, self._curvature = out[4], out[5]
-        self._offset, self._normal = out[6].reshape(layout.vertices, 3), out[7]
-        self._hessian = np.zeros((size, size))
-        self._gradient = np.zeros(size)
-        self._constant = np.zeros((size, size))
-        self._scale = 1.0 / np.sqrt(layout.weights.node_rate)
-        self._width = nodes + 3
-        self._place = 3 * np.where(arm.base, len(arm.free), layout.node_column // 3)
-        self._settled = settled = settle_function(layout).kernel()
-        for argument, shared in enumerate((0, 4, 5, 8, 9, 10, 11, 7)):
-            settled.bind_input(argument, self._rows.inputs[shared])
-        for argument, result in ((8, 0), (12, 6), (13, 7)):
-            settled.bind_input(argument, out[result])
-        settled.bind_input(14, self._rows.inputs[3])
-        settled.bind_input(15, self._hessian)
-        settled.bind_input(16, self._gradient)
-        self._answer, self._multipliers = settled.inputs[17], settled.inputs[18]
-        self._gram, self._follows = settled.inputs[19].reshape(actuators, actuators), settled.inputs[20]
-        self._room = _Room()
-        self._reserve(size + self._equal + self._legs + NEAR)
-        self._draw(layout)
-        if self._hard:
-            self._elastic = np.ones(self._stack.shape[1])
-            self._elastic[self._hard_at] = 0.0
+    ``settle`` and ``move`` are for curves of constant tables; others have rows that only Python can compute. Solvers
+    that differ in their goals of control vertices share one workspace.
+    """
+
+    def __init__(self, layout: Layout, *, compiled: bool = True, workspace: _Workspace | None = None) -> None:
+        self.layout = layout
+        self._workspace = _Workspace(layout, compiled) if workspace is None else workspace
+        self._pull = np.zeros((layout.vertices, 3))
+        weight = np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
+        self._goals = {
+            "goal_pull": self._pull,
+            "goal_weight": np.asarray(weight, dtype=float),
+            "curve_hessian": np.ascontiguousarray(layout.curve_hessian),
+        }
 
     def drawn(self, layout: Layout) -> FusedSolver:
-        """Return the solver of a layout in which only other control vertices have goals; buffers are shared."""
-        other = copy.copy(self)
-        other._draw(layout)
-        return other
+        """Return the solver of a layout in which only other control vertices have goals."""
+        return FusedSolver(layout, workspace=self._workspace)
 
-    def _draw(self, layout: Layout) -> None:
-        self.layout = layout
-        self._goal_pull = np.zeros((layout.vertices, 3))
-        self._goal_weight = (
-            np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
-        )
-        self._constant = np.zeros((self._size, self._size))
-        self._constant_normal = b""
+    @property
+    def is_ready(self) -> bool:
+        """Whether the C is there to be called; false for ever where it cannot be compiled."""
+        return self._workspace.is_ready
 
     def load(self, asked: StepInput) -> None:
-        """Linearise and condense."""
-        asked.load(self._rows)
-        self._vertices = asked.vertices
-        self._rows()
+        """Set the state, the goal and the boxes of the next QP."""
+        self._workspace.use(self._goals)
+        asked.load(self._workspace.condense)
         if self.layout.vertex_goals:
-            self._goal_pull = self._goal_weight[:, None] * self._offset
+            self._pull[:] = 0.0
             if asked.motion:
-                self._goal_pull += self.layout.goal_pull(asked.vertices, asked.vertex_goals)
+                self._pull += self.layout.goal_pull(asked.vertices, asked.vertex_goals)
+
+    def aim(self, accuracy: Accuracy) -> None:
+        """Settle to that `accuracy` from now on."""
+        self._workspace.aim(accuracy)
 
     def solve(self, clearance: ClearanceRows) -> StepSolution:
-        """Solve the QP at the configuration loaded last.
+        """Solve the QP at the state loaded last.
 
         Raises
         ------
         InfeasibleStepError, SolverError
             As ``CondensedSolver.solve``.
         """
-        answer = self.ask(clearance)
-        x, rows = answer.x, self._equal + self._legs + len(clearance)
-        bounds = self._room.lower[: self._size + rows], self._room.upper[: self._size + rows]
-        daqp.check(answer, self._hessian, self._gradient, self._room.constraint[:rows], *bounds)
-        count = self._actuators
-        nodes = np.zeros((len(self.layout.arm.node_names), 3))
-        moved = np.dot(x[:count], self._response[:count])
-        moved += self._response[-1]
-        moved *= self._scale
-        nodes[self.layout.arm.free] = moved.reshape(-1, 3)
-        vertices = self._offset.copy()
-        if self._free_curve:
-            vertices[1] += self._normal * x[count]
-            vertices[2:] += x[count + 1 : self._torsion].reshape(-1, 3)
-        return self._solution(answer, len(clearance), nodes, vertices)
+        near, work = self._workspace.take(clearance), self._workspace
+        _check(work.call("solve"))
+        data = work.data
+        refuse_large(data.primal, data.dual, f"daqp (exit flag {data.flag})")
+        return self._whole(work.x, near)
 
-    def _solution(self, answer: DenseAnswer, near: int, nodes: Array, vertices: Array) -> StepSolution:
-        x, multipliers, count = answer.x, answer.multipliers, self._actuators
-        return StepSolution(
-            nodes=nodes,
-            actuators=x[:count],
-            vertices=vertices,
-            progress=float(x[-1]),
-            actuator_multipliers=multipliers[:count],
-            clearance_multipliers=-multipliers[len(multipliers) - near :],
-            iterations=answer.iterations,
-            torsion=x[self._torsion : -1],
-        )
-
-    def ask(self, clearance: ClearanceRows) -> DenseAnswer:
-        """Return DAQP's answer to the QP at the configuration loaded last, not checked yet.
-
-        Raises
-        ------
-        InfeasibleStepError
-            The hard rows contradict one another.
-        """
-        size, count, hard, near = self._size, self._actuators, self._hard, len(clearance.lower)
-        hessian, gradient = self._assemble()
-        first = self._equal + self._legs
-        rows = first + near
-        if size + rows > len(self._room.lower):
-            self._reserve(2 * (size + rows))
-        constraint, lower, upper = self._room.constraint[:rows], self._room.lower, self._room.upper
-        if hard:
-            block = self._stack[:, self._hard_at]
-            constraint[self._tip : self._equal, :-1] = block[:-1].T
-            held = slice(size + self._tip, size + self._equal)
-            upper[held] = lower[held] = -block[-1]
-        if self._legs:
-            axes, least = Legs.at(self.layout, self._vertices, self._normal)
-            if self._legs > 1:
-                # Control vertices come after the leg at the base.
-                last = self._torsion - 6
-                constraint[self._equal + 1, last : last + 6] = np.concatenate([-axes[1], axes[1]])
-            lower[size + self._equal : size + first] = least
-        if near:
-            moved = np.dot(self._spread_rows(clearance), self._response.T)
-            moved *= self._scale
-            constraint[first:, :count] = moved[:, :count]
-            np.subtract(clearance.lower, moved[:, -1], out=lower[size + first : size + rows])
-        self._room.used, before = size + rows, self._room.used
-        if before > size + rows:
-            lower[size + rows : before] = -UNBOUNDED
-        answer = daqp.ask(
-            hessian,
-            gradient,
-            constraint,
-            lower[: size + rows],
-            upper[: size + rows],
-            self._room.sense[: size + rows],
-        )
-        self._answer[:] = answer.x
-        return answer
-
-    def move(self, answer: DenseAnswer, near: int, torsion: Array, accuracy: Accuracy) -> Move:
-        """Return where an answer of :meth:`ask` leads; its QP had `near` clearance rows, at most ``NEAR``.
+    def move(self, clearance: ClearanceRows, torsion: Array) -> Move:
+        """Solve the QP at the state loaded last, and return where its answer leads.
 
         The solution's ``nodes`` and ``vertices`` are left empty. `torsion` (T,) is the curve's before the step, rad.
 
         Raises
         ------
-        AnswerError
-            The answer's residuals are too large.
+        InfeasibleStepError, SolverError
+            As :meth:`solve`.
         """
-        multipliers, count = answer.multipliers, len(answer.multipliers)
-        self._multipliers[:count] = multipliers
-        self._multipliers[count:] = 0.0
-        self._settle(1.0)
-        out = self._settled.outputs
-        error, before, after, progress, moved, primal, dual = out[5].tolist()
-        refuse_large(primal, dual, answer.name)
-        solution = self._solution(answer, near, _NOWHERE, _NOWHERE)
+        near, work = self._workspace.take(clearance), self._workspace
+        code = _check(work.call("move", TOLERANCE))
+        data = work.data
+        if code == _Code.INACCURATE:
+            refuse_large(data.primal, data.dual, f"daqp (exit flag {data.flag})")
+        solution, is_settled = self._solution(work.x, near, _NOWHERE, _NOWHERE), code == _Code.DONE
+        points = work.points if is_settled else work.started_points
+        q, vertices = work.started.reshape(work.shape).copy(), points.reshape(-1, 3).copy()
         torsion = torsion + solution.torsion if len(torsion) else torsion
-        q, vertices = out[6].reshape(self._shape).copy(), out[4].reshape(-1, 3).copy()
-        closed = self._closed(error, before, after, accuracy)
-        return Move(solution, q, vertices, torsion, progress, moved, closed)
-
-    def settle(
-        self, q: Array, vertices: Array, lower: Array, upper: Array, goal: TipGoal, accuracy: Accuracy
-    ) -> Closed | None:
-        """Return configuration `q` with quantities closed, actuators in their boxes (n_a,) and the tip at `goal`.
-
-        With hard tracking, stations are held on the curve of control vertices `vertices` (V, 3), m. None if the
-        iteration does not converge.
-        """
-        inputs = self._settled.inputs
-        inputs[0][:] = q.reshape(-1)
-        inputs[1][:] = lower
-        inputs[2][:] = upper
-        inputs[3][:] = goal.position
-        inputs[4][:] = goal.rotation.T.reshape(-1)
-        inputs[14][:] = vertices.reshape(-1)
-        self._settle(0.0)
-        error, before, after = self._settled.outputs[5][:3].tolist()
-        return self._closed(error, before, after, accuracy)
-
-    def _settle(self, follows: float) -> None:
-        """Settle the configuration after the answer, or with `follows` = 0 the one that was loaded."""
-        if not self.layout.hard_tracking:
-            response = self._response[: self._actuators]
-            np.dot(response, response.T, out=self._gram)
-        self._follows[0] = follows
-        self._settled()
-
-    def _closed(self, error: float, before: float, after: float, accuracy: Accuracy) -> Closed | None:
-        """Return the settled configuration; None if a quantity or the tip is not exact enough, m and rad."""
-        if not (error <= accuracy.member and before <= accuracy.start and after <= accuracy.tip):
-            return None
-        q, quantities, position, rotation = self._settled.outputs[:4]
-        return Closed(
-            q.reshape(self._shape).copy(),
-            quantities.copy(),
-            error,
-            position.copy(),
-            rotation.reshape(3, 3).T.copy(),
+        return Move(
+            solution, q, vertices, torsion, data.reached, data.furthest, work.closed() if is_settled else None
         )
 
-    def _reserve(self, rows: int) -> None:
-        """Make room for `rows` bounds, those of the unknowns first, and for the constraints behind these."""
-        size, equal = self._size, self._size + self._equal
-        self._room.constraint = np.zeros((rows - size, size))
-        self._room.lower, self._room.upper = np.full(rows, -UNBOUNDED), np.full(rows, UNBOUNDED)
-        self._room.sense = np.zeros(rows, dtype=np.int32)
-        self._room.row_start = self._width * np.arange(rows - size)[:, None, None]
-        self._room.sense[size:equal] = EQUALITY
-        if self._legs:
-            # The first leg is the first of the curve's free coordinates.
-            self._room.constraint[self._equal, self._actuators] = 1.0
-        tip_rows = self._room.constraint[: self._tip].reshape(-1)
-        bounds = (values[: size + self._tip] for values in (self._room.lower, self._room.upper))
-        for result, array in enumerate((tip_rows, *bounds), start=1):
-            array[:] = self._rows.outputs[result]
-            self._rows.bind_output(result, array)
-        checked = equal + self._legs + NEAR
-        self._room.used = checked
-        for argument, array in (
-            (9, self._room.constraint[: checked - size]),
-            (10, self._room.lower),
-            (11, self._room.upper),
-        ):
-            self._settled.bind_input(argument, array.reshape(-1)[: self._settled.inputs[argument].size])
+    def settle(
+        self, q: Array, curve: CurvePoint, lower: Array, upper: Array, goal: TipGoal
+    ) -> Settled | None:
+        """Return the configuration near `q`, quantities closed and the tip at `goal`, and the curve near `curve`.
 
-    def _assemble(self) -> tuple[Array, Array]:
-        """Return Hessian and gradient of the objective."""
-        count, stack = self._actuators, self._stack
-        hessian, gradient, linear = self._hessian, self._gradient, self._linear
-        np.dot(stack * self._elastic if self._hard else stack, stack.T, out=hessian)
-        np.add(hessian[-1], linear, out=gradient)
-        gradient[-1] = linear[-1]
-        if self.layout.vertex_goals:
-            gradient[count] += self._goal_pull[1] @ self._normal
-            gradient[count + 1 : self._torsion] += self._goal_pull[2:].reshape(-1)
-        if self._normal.tobytes() != self._constant_normal:
-            self._constant[:-1, :-1] = self._constant_hessian()
-            self._constant_normal = self._normal.tobytes()
-        hessian[-1] = 0.0
-        hessian[:, -1] = 0.0
-        self._constant[-1, -1] = self._curvature[0]
-        hessian += self._constant
-        return hessian, gradient
+        Actuators are in their boxes (n_a,). None if the iteration does not converge.
+        """
+        work, inputs = self._workspace, self._workspace.condense.inputs
+        work.q[:], work.points[:] = q.reshape(-1), curve.vertices.reshape(-1)
+        inputs[4][:], inputs[5][:] = lower, upper
+        inputs[8][:], inputs[9][:] = goal.position, goal.rotation.T.reshape(-1)
+        work.gone[0] = 0.0
+        if work.call("settle") != _Code.DONE:
+            return None
+        return Settled(work.closed(), CurvePoint(work.points.reshape(-1, 3).copy(), curve.torsion))
 
-    def _constant_hessian(self) -> Array:
-        """Return the part of the Hessian that changes only when the base turns."""
-        layout, weights = self.layout, self.layout.weights
-        basis = free_basis(self._normal, 3 * layout.vertices + layout.torsion)
-        of_curve = basis.T @ layout.curve_hessian @ basis
-        of_actuators = (weights.actuator_rate + weights.stroke_centring) * np.eye(self._actuators)
-        return np.asarray(block_diag(of_actuators, of_curve))
+    def gain(self) -> Gain | None:
+        """See ``CondensedSolver.gain_of``; for the QP solved last."""
+        work, count = self._workspace, self._workspace.actuators
+        free = np.ones(work.size, dtype=bool)
+        free[:count] = ~held(work.x[:count], work.lower[:count], work.upper[:count])
+        free[-1] = False
+        gain = settling_gain(work.hessian, work.constraint[: work.equal], free)
+        return None if gain is None else Gain(gain, lambda x: self._whole(x, 0, moves=False))
 
-    def _spread_rows(self, clearance: ClearanceRows) -> Array:
-        """Return the clearance rows (R, 3 (N - N_c)) over the free nodes' displacements."""
-        near, width = len(clearance), self._width
-        flat = self._place[clearance.nodes][:, :, None] + _AXES
-        flat += self._room.row_start[:near]
-        # Entries at one place are added up: a row may name a node twice.
-        spread = np.bincount(flat.reshape(-1), clearance.coefficients.reshape(-1), near * width)
-        return np.asarray(spread.reshape(near, width)[:, :-3], dtype=float)
+    def _whole(self, x: Array, near: int, *, moves: bool = True) -> StepSolution:
+        """Return the solution of the unknowns `x`, without what residuals alone move unless it `moves`."""
+        work, layout, constant = self._workspace, self.layout, float(moves)
+        count, nodes = work.actuators, np.zeros((len(layout.arm.node_names), 3))
+        moved = x[:count] @ work.response[:count] + constant * work.response[-1]
+        nodes[layout.arm.free] = moved.reshape(-1, 3) / np.sqrt(layout.weights.node_rate)
+        vertices = constant * work.offset
+        if layout.vertices:
+            vertices[1] += work.normal * x[count]
+            vertices[2:] += x[count + 1 : work.torsion].reshape(-1, 3)
+        return self._solution(x, near, nodes, vertices)
+
+    def _solution(self, x: Array, near: int, nodes: Array, vertices: Array) -> StepSolution:
+        work, x = self._workspace, x.copy()
+        count, first = work.actuators, work.size + work.first_near
+        return StepSolution(
+            nodes=nodes,
+            actuators=x[:count],
+            vertices=vertices,
+            progress=float(x[-1]),
+            actuator_multipliers=work.multipliers[:count].copy(),
+            clearance_multipliers=-work.multipliers[first : first + near],
+            iterations=work.data.iterations,
+            torsion=x[work.torsion : -1],
+        )
+
+
+def _check(code: int) -> int:
+    """Return the code that a function returned; raise if there is no answer."""
+    if code == _Code.INFEASIBLE:
+        raise InfeasibleStepError("the hard rows of the step contradict one another")
+    if code == _Code.NO_VALUE:
+        raise EvaluationError("the rows of the step have no value at its configuration")
+    return code
+
+
+class _Workspace:
+    """The arrays of the C, and the kernels that it calls."""
+
+    hessian: Array
+    constraint: Array
+    lower: Array
+    upper: Array
+    multipliers: Array
+
+    def __init__(self, layout: Layout, compiled: bool) -> None:
+        arm, equal = layout.arm, len(layout.tip_rows) + len(layout.hard)
+        self._layout, self._source = layout, building(SOURCE)
+        self.condense = row_function(layout).kernel(compiled=compiled)
+        self.missing = missing_function(layout).kernel(compiled=compiled)
+        self.close = closing_function(layout).kernel(compiled=compiled)
+        self.actuators, self.equal = len(arm.actuators), equal
+        self.size, self.first_near = self.actuators + layout.free_curve + 1, equal + len(layout.legs)
+        self.torsion, self.shape = self.size - 1 - layout.torsion, arm.home_configuration.shape
+        self._is_ready: bool | None = None
+        self._accuracy: Accuracy | None = None
+        self._goals: object = None
+
+    @property
+    def is_ready(self) -> bool:
+        """See :class:`FusedSolver`."""
+        if self._is_ready is None:
+            if not self._source.ask():
+                for kernel in (self.condense, self.missing, self.close):
+                    kernel.prepare()
+                return False
+            self._is_ready = self._source.library is not None
+            if self._is_ready:
+                self._start()
+        return self._is_ready
+
+    @property
+    def data(self) -> Any:
+        """The structure of the C."""
+        return self._program.data
+
+    def call(self, name: str, *arguments: float) -> int:
+        """Call a function of the C, and return its code."""
+        return self._program.call(name, *arguments)
+
+    def use(self, goals: dict[str, Array]) -> None:
+        """Let the next QPs have these goals of control vertices."""
+        if goals is not self._goals:
+            self._program.set(**goals)
+            self._goals = goals
+
+    def aim(self, accuracy: Accuracy) -> None:
+        """Settle to that `accuracy` from now on."""
+        if accuracy is not self._accuracy:
+            home, self._accuracy = self._layout.arm.home_configuration, accuracy
+            self._program.set(
+                member=accuracy.member,
+                tip=accuracy.tip,
+                start=accuracy.start,
+                enough_length=enough_length(home, accuracy.member),
+                nearly=_NEARLY,
+                enough_tip=enough_tip_error(home, accuracy.tip),
+            )
+
+    def take(self, clearance: ClearanceRows) -> int:
+        """Give the rows of clearance to the QP, and return their number."""
+        near, slots = clearance.nodes.shape
+        if near > self._room or slots > self._slots:
+            self._reserve(max(2 * near, self._room), max(slots, self._slots))
+        data = self.data
+        data.near = near
+        if near:
+            data.slots = slots
+            self._near_nodes[: near * slots] = clearance.nodes.reshape(-1)
+            self._near_rows[: 3 * near * slots] = clearance.coefficients.reshape(-1)
+            self._near_lower[:near] = clearance.lower
+        return int(near)
+
+    def closed(self) -> Closed:
+        """Return the settled configuration."""
+        (_, quantities, error), (_, position, rotation) = self.close.outputs, self.missing.outputs
+        q, turned = self.q.reshape(self.shape).copy(), rotation.reshape(3, 3).T.copy()
+        return Closed(q, quantities.copy(), float(error[0]), position.copy(), turned)
+
+    def _start(self) -> None:
+        """Allocate the arrays, and tell the C where they are."""
+        layout, condense, missing, close = self._layout, self.condense, self.missing, self.close
+        # The two have the same arguments up to the constants, but for q, the control vertices and `motion`.
+        own, common = (0, 3, 6), 12 + len(CurveRows._fields) * (layout.general is not None)
+        for argument in set(range(common)) - set(own):
+            missing.bind_input(argument, condense.inputs[argument])
+        for argument, shared in enumerate((missing.inputs[0], condense.inputs[4], condense.inputs[5])):
+            close.bind_input(argument, shared)
+        self.q, self.points, self.gone = missing.inputs[0], missing.inputs[3], missing.inputs[common]
+        self.started, self.started_points = self.q.copy(), self.points.copy()
+        size, equal, nodes, rows = self.size, self.equal, layout.node_columns, layout.least_squares
+        self.hessian, self.x = np.zeros((size, size)), np.zeros(size)
+        out = condense.outputs
+        self.response, self.offset, self.normal = (
+            out[0].reshape(size, rows)[:, :nodes],
+            out[6].reshape(-1, 3),
+            out[7],
+        )
+        place, by_nodes = _places(layout)
+        work = nodes + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
+        self._program = Program(SOURCE, "Fused")
+        self._program.set(
+            unknowns=size,
+            actuators=self.actuators,
+            nodes=nodes,
+            squares=rows,
+            tips=len(layout.tip_rows),
+            hard=len(layout.hard),
+            legs=len(layout.legs),
+            vertices=layout.vertices,
+            torsion=layout.torsion,
+            coordinates=self.q.size,
+            by_nodes=int(by_nodes),
+            scale=1.0 / float(np.sqrt(layout.weights.node_rate)),
+            actuator_weight=layout.weights.actuator_rate + layout.weights.stroke_centring,
+            at_bound=AT_BOUND,
+            left=LEFT,
+            worst_condition=WORST_CONDITION,
+            settling_steps=SETTLING_STEPS,
+            closing_steps=MOST_STEPS,
+            too_far=TOO_FAR,
+            feasibility=FEASIBILITY,
+            **_daqp(),
+            stack=out[0],
+            linear=out[4],
+            curvature=out[5],
+            offset=out[6],
+            normal=out[7],
+            leg_rows=out[8],
+            leg_lower=out[9],
+            hard_at=(nodes + layout.hard).astype(np.int32),
+            place=place,
+            node_column=layout.node_column.astype(np.int32),
+            hessian=self.hessian,
+            gradient=np.zeros(size),
+            x=self.x,
+            q=self.q,
+            points=self.points,
+            gone=self.gone,
+            progress=condense.inputs[7],
+            velocity=condense.inputs[10],
+            spin=condense.inputs[11],
+            closer=close.outputs[0],
+            error=close.outputs[2],
+            missed=missing.outputs[0],
+            torsions=np.zeros(layout.torsion),
+            started=self.started,
+            started_points=self.started_points,
+            work=np.zeros(work),
+            close=close,
+            missing=missing,
+        )
+        self._reserve(_ROOM, _SLOTS)
+
+    def _reserve(self, near: int, slots: int) -> None:
+        """Make room for `near` rows of clearance over `slots` nodes each."""
+        size, tips = self.size, len(self._layout.tip_rows)
+        self._room, self._slots, rows = near, slots, self.first_near + near
+        self.constraint, self.multipliers = np.zeros((rows, size)), np.zeros(size + rows)
+        self._near_nodes = np.zeros(near * slots, dtype=np.int64)
+        self._near_rows, self._near_lower = np.zeros(3 * near * slots), np.zeros(near)
+        self.lower, self.upper = np.full(size + rows, -UNBOUNDED), np.full(size + rows, UNBOUNDED)
+        sense = np.zeros(size + rows, dtype=np.int32)
+        sense[size : size + self.equal] = EQUALITY
+        # The rows of the tip, and the bounds up to theirs, are written in place.
+        of_tip = (self.constraint[:tips].reshape(-1), self.lower[: size + tips], self.upper[: size + tips])
+        for result, array in enumerate(of_tip, start=1):
+            self.condense.bind_output(result, array)
+        self._program.set(
+            near_nodes=self._near_nodes,
+            near_rows=self._near_rows,
+            near_lower=self._near_lower,
+            constraint=self.constraint,
+            lower=self.lower,
+            upper=self.upper,
+            sense=sense,
+            multipliers=self.multipliers,
+            condense=self.condense,
+        )
+
+
+def _places(layout: Layout) -> tuple[NDArray[np.int32], bool]:
+    """Return where in q the coordinates of a motion are, and whether these are displacements of nodes."""
+    arm = layout.arm
+    symbols, strokes = arm.symbols(Constants()), ca.MX.sym("strokes", len(arm.actuators))
+    q, nodes = ca.MX.sym("q", *symbols.shape), ca.MX.sym("nodes", layout.node_columns)
+    moved = symbols.coordinates(nodes, strokes)
+    by_nodes = moved.name() == nodes.name()
+    places = ca.jacobian(symbols.along(q, moved), nodes if by_nodes else strokes).sparsity()
+    assert places.colind() == list(range(moved.numel() + 1))
+    return np.array(places.row(), dtype=np.int32), by_nodes

@@ -20,7 +20,7 @@ def row_function(layout: Layout) -> Bound:
     Arguments are ``StepGraph.inputs``. Results: R (3 (N - N_c) + (3 + R) K + S, n_a + q + 1), whose Gram matrix holds
     the Hessian and, in its last column, the gradient of the least-squares terms; tip rows (n_a + q + 1, n_e); lower and
     upper bounds (n_a + q + 1 + n_e) of the unknowns and tip rows; gradient of the other terms (n_a + q + 1); curvature
-    of the progress; offsets (3, V) of the control vertices; base normal (3).
+    of the progress; offsets (3, V) of the control vertices; base normal (3); rows (q, G) and bounds (G) of the legs.
     """
     constants, arm, weights = Constants(), layout.arm, layout.weights
     graph = StepGraph(layout, arm.symbols(constants), constants)
@@ -61,8 +61,24 @@ def row_function(layout: Layout) -> Bound:
             graph.curvature,
             graph.offset,
             graph.normal,
+            _leg_rows(graph),
+            graph.leg_lower,
         ],
     )
+
+
+def _leg_rows(graph: StepGraph) -> ca.MX:
+    """Return (q, G) the rows of the legs over the free coordinates of the curve."""
+    layout, axes = graph.layout, graph.leg_axes
+    rows = ca.MX.zeros(layout.free_curve, len(layout.legs))
+    for k, (start, _) in enumerate(layout.legs.tolist()):
+        if start == 0:
+            # The first leg is the first of these coordinates.
+            rows[0, k] = 1.0
+            continue
+        first = 3 * start - 5
+        rows[first : first + 6, k] = ca.vertcat(-axes[:, k], axes[:, k])
+    return rows
 
 
 def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX]) -> list[ca.MX]:

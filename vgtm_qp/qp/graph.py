@@ -44,6 +44,8 @@ class StepGraph:
         Of the stations at `q`, and at `at`.
     base_axes, normal, offset : (3, 2), (3,), (3, V)
         Axes and normal of the curve's base, and the displacements that bring the curve back to it.
+    leg_axes, leg_lower : (3, G), (G,)
+        Of the legs of ``Layout.legs``, see ``rows.curve.legs``.
     """
 
     def __init__(self, layout: Layout, symbols: ArmSymbols, constants: Constants) -> None:
@@ -107,7 +109,7 @@ class StepGraph:
     def _curve(self) -> None:
         layout, stations = self.layout, self.layout.arm.stations
         self.base_axes, self.normal = ca.MX.zeros(3, 2), ca.MX.zeros(3)
-        self.offset = ca.MX.zeros(3, 0)
+        self.offset, self.leg_axes, self.leg_lower = ca.MX.zeros(3, 0), ca.MX.zeros(3, 0), ca.MX.zeros(0)
         if not layout.vertices:
             return
         home = layout.arm.home
@@ -121,6 +123,10 @@ class StepGraph:
         centre = based[:, start[0].tolist()] @ ca.DM(stations.weights[0])
         self.base_axes, self.normal = rotation[:, :2], rotation[:, 2]
         self.offset = curve_rows.base_offset(centre, rotation, self.vertices)
+        if len(layout.legs):
+            (least,) = self.weights(layout.least_leg)
+            both = len(layout.legs) > 1
+            self.leg_axes, self.leg_lower = curve_rows.legs(self.vertices, self.normal, least, both=both)
         if layout.general is None:
             self._tables = (
                 self.table("curve_weights", layout.curve_weights),

@@ -19,6 +19,9 @@ from vgtm_qp.rows.tip import axes as tip_axes
 _ENDS_AT_TIP = 3
 """Fewest control vertices with which a curve can begin at the base, along its normal, and end anywhere."""
 
+_LEAST_LEG = 0.1
+"""Least length of a leg with a given direction, as a share of a leg of the straight polygon at home."""
+
 _GOAL_REACH = 0.01
 """Greatest share of the arm's length by which a control vertex is drawn towards its goal in one step."""
 
@@ -190,6 +193,11 @@ class Layout:
         last = self.vertices - 1
         legs = [(0, 1), (last - 1, last)][: int(last > 0) + self.ends_along_tip]
         return np.array(legs, dtype=np.int64).reshape(-1, 2)
+
+    @property
+    def least_leg(self) -> float:
+        """Least length of such a leg, m: a share of a leg of the straight polygon at home."""
+        return _LEAST_LEG * self.arm.height / max(self.vertices - 1, 1)
 
     def record(self) -> dict[str, Any] | None:
         """Return the curve and its stations as JSON data for verification; None without a curve.

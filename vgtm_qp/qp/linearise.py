@@ -92,9 +92,23 @@ class Linearisation:
         asked.load(kernel)
         kernel()
         count, tips, turns = len(layout.tracked), len(layout.tip_rows), layout.turns
-        _, strokes, error, rate, tip, curvature, offset, axes, gap, turn, face, curve, *motion = (
-            output.copy() for output in kernel.outputs
-        )
+        (
+            _,
+            strokes,
+            error,
+            rate,
+            tip,
+            curvature,
+            offset,
+            axes,
+            legs,
+            least,
+            gap,
+            turn,
+            face,
+            curve,
+            *motion,
+        ) = (output.copy() for output in kernel.outputs)
         weights, moves = layout.weights, asked.motion
         home = layout.arm.home_quantities[layout.arm.actuators]
         vertices = asked.vertices
@@ -132,7 +146,7 @@ class Linearisation:
             base_axes=base_axes,
             base_rhs=base_rhs,
             clearance=clearance,
-            legs=Legs.at(layout, vertices, np.cross(base_axes[0], base_axes[1])),
+            legs=Legs(legs.reshape(-1, 3), least),
             spacing_rhs=spacing if moves else 0.0 * spacing,
             curve=asked.curve,
         )
@@ -142,7 +156,8 @@ def linear_function(layout: Layout) -> Bound:
     """Return the function that linearises a step of `layout`.
 
     Arguments are ``StepGraph.inputs``. Results: quantities (M,), strokes (n_a,); tip error, rate (n_e,) and J_u
-    (n_e, 3K); curvature of the progress; offsets (3, V) and base axes (3, 2) of the curve; and, one block a tracked
+    (n_e, 3K); curvature of the progress; offsets (3, V) and base axes (3, 2) of the curve; axes (3, G) and bounds (G)
+    of its legs; and, one block a tracked
     station, gaps (3, K), turns (R, K), their rows over the stations' nodes (R, 9 K) and over the curve
     (``StationSymbols.curve``); last, the values of ``Arm.motion_rows``.
     """
@@ -165,6 +180,8 @@ def linear_function(layout: Layout) -> Bound:
         graph.curvature,
         graph.offset,
         graph.base_axes,
+        graph.leg_axes,
+        graph.leg_lower,
         *(ca.horzcat(*block) for block in blocks),
         *symbols.motion(graph.q, graph.at, graph.moved),
     ]

@@ -13,7 +13,6 @@ from vgtm_qp.arm.arm import MotionRows
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.shape import CurveRows
-from vgtm_qp.rows.curve import legs
 
 
 @dataclass
@@ -65,10 +64,6 @@ class ClearanceRows:
         )
 
 
-_LEAST_LEG = 0.1
-"""Least length of a leg with a given direction, as a share of a leg of the straight polygon at home."""
-
-
 class Legs(NamedTuple):
     """The legs of the control polygon that must not reverse: axes . (displacement of their ends) >= lower, in m.
 
@@ -80,15 +75,6 @@ class Legs(NamedTuple):
 
     axes: Array
     lower: Array
-
-    @classmethod
-    def at(cls, layout: Layout, vertices: Array, normal: Array) -> Legs:
-        """Return those of control vertices (V, 3), m, of a curve whose base has the `normal` (3,)."""
-        if not len(layout.legs):
-            return cls(np.zeros((0, 3)), np.zeros(0))
-        axes, lengths = legs(vertices, normal, both=len(layout.legs) > 1)
-        least = _LEAST_LEG * layout.arm.height / (layout.vertices - 1)
-        return cls(axes, np.minimum(least - lengths, 0.0))
 
     def over_vertices(self, layout: Layout) -> Array:
         """Return (G, 3 V) the rows over the control vertices."""

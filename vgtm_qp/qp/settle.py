@@ -1,22 +1,33 @@
-"""The small correction after a step's QP: the tip returns to its path without another QP.
+"""The small correction after a step's QP: its equalities hold exactly without another QP.
 
-The QP was linearised at the predicted middle of the step, so that the remaining tip error is of third order. Newton
-iterations with a constant Jacobian remove it: the least motion of the nodes, in the QP's metric, that moves the tip by
-the error while actuators at a bound stay there. Clearance rows can be left out: their margin exceeds the motion.
+The QP was linearised at the predicted middle of the step, so that what tip and stations lack then is of third order.
+Newton iterations with a constant Jacobian remove it: the least change, in the QP's metric, that makes good what is
+missing while actuators at a bound stay there. Clearance rows can be left out: their margin exceeds the motion.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv, dposv
 
+from vgtm_qp.arm.symbols import Bound, Constants, rotated
 from vgtm_qp.arrays import Array
+from vgtm_qp.qp.answer import StepSolution
+from vgtm_qp.qp.graph import StationSymbols, StepGraph
+from vgtm_qp.qp.layout import Layout
 
 WORST_CONDITION = 1e8
 SETTLING_STEPS = 6
-SETTLED = 1e-11
-"""Tip error below which settling stops, m or rad."""
+MOST_STEPS = 12
+"""Greatest number of Newton steps to exact quantities."""
+
+TOO_FAR = 1e-2
+"""Error of a quantity after a QP above which Newton's iteration is not tried."""
 
 LEFT = 1e-8
 """Remaining path of the tip, m or rad, that counts as zero."""
@@ -25,39 +36,108 @@ AT_BOUND = 1e-6
 """Distance from a bound below which an actuator counts as held there, m."""
 
 
+_SETTLED = 1e-3
+"""Ratio of what is missing to the tolerance below which settling stops."""
+
+_ROUNDING = float(np.finfo(float).eps)
+
+
+def enough_length(q: Array, tolerance: float) -> float:
+    """Return the error of a quantity at which the iteration stops.
+
+    It is far below `tolerance`, because division by a short step's duration makes errors of rates and accelerations of
+    it. For very long arms the rounding of node positions is the limit.
+    """
+    return max(1e-3 * tolerance, 8.0 * _ROUNDING * float(np.abs(q).max()))
+
+
+def enough_tip_error(q: Array, tolerance: float) -> float:
+    """Return the tip error, m or rad, at which settling stops; see :func:`enough_length`."""
+    return max(_SETTLED * tolerance, 1e3 * _ROUNDING * float(np.abs(q).max()))
+
+
 def held(displacement: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
     """Return which actuators (n_a,) a QP left at a bound, by their position: multipliers may vanish there."""
     return np.asarray((displacement < lower + AT_BOUND) | (displacement > upper - AT_BOUND))
 
 
-def settling_gain(
-    response: Array, tip: Array, free: NDArray[np.bool_], node_rate: float, actuator_rate: float
-) -> Array | None:
-    """Return the actuator displacements (n_a, n_e) per unit of tip error; None where too few actuators are free.
+def settling_gain(hessian: Array, rows: Array, free: NDArray[np.bool_]) -> Array | None:
+    """Return (n, m) the least changes of the unknowns that change the values of the `rows` by one each.
+
+    None if the `free` unknowns determine no such changes.
 
     Parameters
     ----------
-    response : (3 (N - N_c), n_a)
-        Node displacements per actuator displacement.
-    tip : (n_e, n_a)
-        The tip's rows.
-    free : (n_a,)
-        Actuators that may move.
-    node_rate, actuator_rate : float
-        The QP's weights on node and actuator displacements.
+    hessian : (n, n)
+        Of the QP, whose metric says what is least.
+    rows : (m, n)
+        Equalities: those of the tip, and of stations that are kept on the curve.
+    free : (n,)
+        Unknowns that may change.
     """
-    if np.count_nonzero(free) < len(tip):
+    if np.count_nonzero(free) < len(rows):
         return None
-    moving, rows = response[:, free], tip[:, free]
-    hessian = node_rate * (moving.T @ moving)
-    hessian.flat[:: len(hessian) + 1] += actuator_rate
-    _, answer, failed = dposv(hessian, rows.T)
+    moving = rows[:, free]
+    _, answer, failed = dposv(hessian[np.ix_(free, free)], moving.T)
     if failed:
         return None
-    normal = rows @ answer
-    _, _, shares, failed = dgesv(normal, np.eye(len(tip)))
+    normal = moving @ answer
+    _, _, shares, failed = dgesv(normal, np.eye(len(rows)))
     if failed or not np.abs(shares).max() * np.abs(normal).max() < WORST_CONDITION:
         return None
-    gain = np.zeros((len(free), len(tip)))
+    gain = np.zeros((len(free), len(rows)))
     gain[free] = answer @ shares
     return gain
+
+
+class Gain(NamedTuple):
+    """The result (n, m) of :func:`settling_gain`, and the `solution` that changes (n,) of the unknowns are."""
+
+    per_missing: Array
+    solution: Callable[[Array], StepSolution]
+
+    def updated(self, change: Array, less: Array) -> Gain:
+        """Return Broyden's update after a `change` (n,) that made good `less` (m,) of what was missing."""
+        gain = self.per_missing
+        along = change @ gain
+        scale = along @ less
+        if scale == 0.0:
+            return self
+        return self._replace(per_missing=gain + np.outer(change - gain @ less, along / scale))
+
+
+def missing_function(layout: Layout) -> Bound:
+    """Return the function of what the equalities of a step lack at a configuration and a curve.
+
+    Arguments: those of ``StepGraph.inputs`` before the constants, with ``motion`` zero, and the progress that the goal
+    has made since, straight. Results: the changes (n_e + H) that the values of the tip's rows and of the hard rows of
+    stations need, m and rad; position (3) and rotation (3, 3) of the tip.
+    """
+    constants = Constants()
+    graph = StepGraph(layout, layout.arm.symbols(constants), constants)
+    missing = [graph.tip_error]
+    if layout.vertices:
+        station = StationSymbols(layout)
+        function = ca.Function("off", station.inputs, [station.gap, ca.densify(station.turn)])
+        gaps, turns = zip(*(function(*graph.station(k)) for k in range(len(layout.tracked))), strict=True)
+        missing.append(-ca.vertcat(*gaps, *turns)[layout.hard.tolist()])
+    results = [ca.vertcat(*missing), graph.tip_position, graph.tip_rotation]
+    gone, inputs = ca.MX.sym("gone"), graph.inputs
+    goal = [graph.goal + gone * graph.velocity, rotated(gone * graph.spin) @ graph.turned]
+    results = ca.graph_substitute(results, [graph.goal, graph.turned], goal)
+    arguments = inputs[: len(inputs) - len(constants.symbols)]
+    return constants.bound("missing", [*arguments, gone], results)
+
+
+def closing_function(layout: Layout) -> Bound:
+    """Return the function (q, lower, upper) -> q after one Newton step, and quantities (M) and their error at q.
+
+    Fixed quantities go to their values, actuators into their boxes (n_a); see ``ArmSymbols.closed``.
+    """
+    constants, arm = Constants(), layout.arm
+    symbols = arm.symbols(constants)
+    q, count = ca.MX.sym("q", *symbols.shape), len(arm.actuators)
+    lower, upper = ca.MX.sym("lower", count), ca.MX.sym("upper", count)
+    quantities = symbols.quantities(q)
+    results = [symbols.closed(q, lower, upper), quantities, symbols.error(quantities, lower, upper)]
+    return constants.bound("close", [q, lower, upper], results)

@@ -93,6 +93,20 @@ class CurveShape:
         turn[:, 2, 2] = 1.0
         return turn
 
+    def at(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
+        """Return positions and frames alone, with zeros for all else; see :meth:`rows`."""
+        curve = Curve(self.family, vertices, torsion, base_frame)
+        s = curve.arc_parameter(self.nodes) if self.by_arc_length else self.nodes
+        count, size = len(s), curve.coordinates
+        if self.tracks_roll:
+            frame = curve.frame(s) @ self._home_roll
+        else:
+            frame = np.zeros((count, 3, 3))
+            frame[:, :, 2] = curve.tangent(s)
+        nothing = np.zeros((count, 3, size))
+        spacing = np.zeros(self.spacings), np.zeros((self.spacings, size))
+        return CurveRows(curve.position(s), nothing, frame, nothing, *spacing)
+
     def rows(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
         """Return the rows at control vertices (V, 3), torsion (T,), with the frame (3, 3) of the base face.
 

@@ -31,11 +31,12 @@ class StepSolver(Protocol):
 
     Attributes
     ----------
-    knows_gain : bool
-        Whether :meth:`gain` may return an array.
+    settles : str
+        How its answers are settled: by all "equalities", by the "curve" that stations follow, or by the "strokes" that
+        :meth:`gain` changes.
     """
 
-    knows_gain: bool
+    settles: str
 
     def solve(self, numbers: StepNumbers) -> StepSolution:
         """Return the solution; raise ``InfeasibleStepError`` or ``SolverError`` instead of a wrong one."""
@@ -85,7 +86,7 @@ def make_solver(name: str, layout: Layout) -> StepSolver:
 class FullSolver:
     """Builds the full QP, has it solved, and checks the residuals whatever the solver's status."""
 
-    knows_gain = False
+    settles = "equalities"
 
     def __init__(self, layout: Layout, name: str, answer: _Answer) -> None:
         self.builder = FullBuilder(layout)

@@ -24,18 +24,19 @@ def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
     return offset
 
 
-def legs(vertices: Array, normal: Array, *, both: bool) -> tuple[Array, Array]:
-    """Return axes (G, 3) and lengths (G,), m, along them, of the first leg of the control polygon, and of the last.
+def legs(vertices: Any, normal: Any, least: Any, *, both: bool) -> tuple[Any, Any]:
+    """Return axes (3, G) of the first leg of the control polygon (3, V), and of the last, and bounds (G,).
 
-    The axis of the first is the base's `normal` (3,), that of the last its own direction. A leg must not shrink to zero
-    length: it would reverse, and the curve with it.
+    A leg must not shrink to zero length: it would reverse, and the curve with it. So the displacement of its end less
+    that of its start, along its axis, is at least the bound, m: the leg then keeps the `least` length, or what it has.
+    The axis of the first leg is the base's `normal` (3,), that of the last its own direction.
     """
-    axes, lengths = [normal], [float((vertices[1] - vertices[0]) @ normal)]
+    axes, lengths = [normal], [ca.dot(vertices[:, 1] - vertices[:, 0], normal)]
     if both:
-        last = vertices[-1] - vertices[-2]
-        lengths.append(float(np.linalg.norm(last)))
-        axes.append(last / max(lengths[1], _TINY))
-    return np.array(axes), np.array(lengths)
+        last = vertices[:, -1] - vertices[:, -2]
+        lengths.append(ca.norm_2(last))
+        axes.append(last / ca.fmax(lengths[1], _TINY))
+    return ca.horzcat(*axes), ca.fmin(least - ca.vertcat(*lengths), 0.0)
 
 
 def free_basis(normal: Array, size: int) -> Array:

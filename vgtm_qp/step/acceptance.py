@@ -124,7 +124,7 @@ class TrackingError:
         layout, arm, shape = self._layout, self._layout.arm, self._layout.general
         points, frames = layout.curve_weights @ vertices, None
         if shape is not None and (layout.hard_turns or shape.by_arc_length):
-            rows = shape.rows(vertices, torsion, base_frame(arm, base))
+            rows = shape.at(vertices, torsion, base_frame(arm, base))
             points, frames = rows.position, rows.frame
         worst = float(np.abs(arm.stations.centres(arm.nodes(q))[layout.tracked] - points).max())
         return max(worst, self._greatest_turn(q, vertices, frames)) if layout.hard_turns else worst

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vgtm_qp.step.actuation import Actuation, Box
-from vgtm_qp.step.attempt import Attempt
+from vgtm_qp.step.attempt import Attempt, Tracking
 from vgtm_qp.step.braking import ANY_RANK, Brakes, Braking
 from vgtm_qp.step.setup import TOO_LONG
 from vgtm_qp.step.shaping import Shaping
@@ -29,6 +29,10 @@ _BEYOND = 60.0
 
 _INSTANT = 1e-9
 
+_LEAST_HELD = 0.25
+"""Least share of a piece of path for which stations stay on the curve, where they may leave it."""
+
+_HELD_BACK = "stations on the curve hold the arm back"
 _OFF_PATH = "the arm could brake after it only off its path"
 
 
@@ -79,25 +83,35 @@ class Advancer:
 
         With a limit on the displacement of nodes, pieces longer than that limit are not tried.
         """
-        values, box, limit = self._actuation.values(state), (target.lower, target.upper), self._step_limit
+        box, limit = (target.lower, target.upper), self._step_limit
         is_slow, first = self._tip_mode == "scaled", 1.0
         if is_slow and limit < np.inf:
             first = min(1.0, limit / max(self._asked(target), _INSTANT))
-        whole = first == 1.0
-        yield self._try(state, target, dt) if whole else self._try_piece(state, target, dt, first, box)
-        share, trust = first, min(_TRUST, _LONGER * limit) / first
-        while share > first * smallest and is_slow:
-            share /= 2
-            near, far = values - share * trust, values + share * trust
-            lower, upper = (
-                np.minimum(np.maximum(box[0], near), box[1]),
-                np.maximum(np.minimum(box[1], far), box[0]),
-            )
-            yield self._try_piece(state, target, dt, share, (lower, upper))
+        tracking = Tracking.EITHER
+        if is_slow and self._attempt.gives_way and self._actuation.starts_at_once:
+            # Stations leave the curve only if they do not stay on it on shorter pieces either. An arm that cannot stop
+            # at once must not be led into a corner in that way.
+            yield from self._pieces(state, target, dt, first, max(smallest, _LEAST_HELD), Tracking.HARD)
+            tracking = Tracking.ELASTIC
+        yield from self._pieces(state, target, dt, first, smallest if is_slow else first, tracking)
         if not self._actuation.starts_at_once:
             slow = self._actuation.creeping(state, box, dt)
             if slow is not None:
                 yield self._try(state, replace(target, lower=slow[0], upper=slow[1]), dt)
+
+    def _pieces(
+        self, state: State, target: Target, dt: float, first: float, smallest: float, tracking: Tracking
+    ) -> Iterator[Advance]:
+        """Yield the attempts at the `first` share of a piece, and at halves of that down to its `smallest` share."""
+        values, box = self._actuation.values(state), (target.lower, target.upper)
+        share, trust = first, min(_TRUST, _LONGER * self._step_limit) / first
+        yield self._try_piece(state, target, dt, first, box, tracking)
+        while share > first * smallest:
+            share /= 2
+            near, far = values - share * trust, values + share * trust
+            lower = np.minimum(np.maximum(box[0], near), box[1])
+            upper = np.maximum(np.minimum(box[1], far), box[0])
+            yield self._try_piece(state, target, dt, share, (lower, upper), tracking)
 
     def _asked(self, target: Target) -> float:
         """Return the displacement of the tip that a target asks for, m."""
@@ -105,16 +119,31 @@ class Advancer:
         asked = path.at(target.end).position - path.at(target.start).position
         return float(np.linalg.norm(asked[axes]))
 
-    def _try_piece(self, state: State, target: Target, dt: float, share: float, box: Box) -> Advance:
+    def _try_piece(
+        self, state: State, target: Target, dt: float, share: float, box: Box, tracking: Tracking
+    ) -> Advance:
         """Return a step towards a `share` of a target with the limits `box`."""
+        if share == 1.0:
+            return self._try(state, target, dt, tracking=tracking)
         end = target.start + share * (target.end - target.start)
-        return self._try(state, replace(target, end=end, lower=box[0], upper=box[1]), dt, share)
+        piece = replace(target, end=end, lower=box[0], upper=box[1])
+        return self._try(state, piece, dt, share, tracking=tracking)
 
-    def _try(self, state: State, target: Target, dt: float, share: float = 1.0) -> Advance:
+    def _try(
+        self,
+        state: State,
+        target: Target,
+        dt: float,
+        share: float = 1.0,
+        *,
+        tracking: Tracking = Tracking.EITHER,
+    ) -> Advance:
         """Return a step towards a target that is a `share` of the one that progress refers to."""
-        step = self._attempt.run(state, target, share)
+        step = self._attempt.run(state, target, share, tracking=tracking)
         if not step.moved:
             return Advance(step, None)
+        if tracking is Tracking.HARD and step.progress * share < _LEAST_HELD:
+            return Advance(_blocked(step, state, _HELD_BACK), None)
         if step.progress < WHOLE and self._tip_mode != "scaled":
             # The tip must stay on time: a part of the path is not enough.
             return Advance(_blocked(step, state, "the tip cannot stay on time"), None)

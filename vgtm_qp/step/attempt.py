@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import Enum
 from time import perf_counter
 
 import numpy as np
@@ -45,6 +46,14 @@ _FURTHER = 1e-6
 _ROUNDING = float(np.finfo(float).eps)
 
 
+class Tracking(Enum):
+    """Whether stations stay on the curve in an attempt, may leave it, or leave it only if the arm then gets further."""
+
+    HARD = "hard"
+    ELASTIC = "elastic"
+    EITHER = "either"
+
+
 class Phases:
     """Seconds spent in each phase of a step, by name."""
 
@@ -84,18 +93,33 @@ class Attempt:
         self._setup = setup
         self._tracking = TrackingError(layout, setup.kinematics) if layout.hard_tracking else None
 
-    def run(self, state: State, target: Target, share: float = 1.0, *, progress: float = 0.0) -> Step:
+    @property
+    def gives_way(self) -> bool:
+        """Whether stations may leave the curve where they block the arm."""
+        return self._setup.elastic is not None
+
+    def run(
+        self,
+        state: State,
+        target: Target,
+        share: float = 1.0,
+        *,
+        progress: float = 0.0,
+        tracking: Tracking = Tracking.EITHER,
+    ) -> Step:
         """Return the step from `state` along the target's piece of path, with its progress on that piece.
 
         The motion of the step before, times `share`, predicts the motion of this one. `progress` is the part of the
-        piece that is covered at the start. If hard tracking holds the arm back, elastic tracking is tried too, if the
-        setup allows it, and used if the arm gets further.
+        piece that is covered at the start.
         """
         self.phases.start()
-        step = self._separated(state, target, share, progress, self._setup.engine, self._tracking)
-        if self._setup.elastic is None or (step.moved and step.progress >= WHOLE):
+        elastic, piece = self._setup.elastic, (state, target, share, progress)
+        if elastic is not None and tracking is Tracking.ELASTIC:
+            return self._separated(*piece, elastic(), None)
+        step = self._separated(*piece, self._setup.engine, self._tracking)
+        if elastic is None or tracking is Tracking.HARD or (step.moved and step.progress >= WHOLE):
             return step
-        other = self._separated(state, target, share, progress, self._setup.elastic(), None)
+        other = self._separated(*piece, elastic(), None)
         return other if not step.moved or other.progress > step.progress + _FURTHER else step
 
     def _separated(

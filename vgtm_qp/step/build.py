@@ -23,6 +23,7 @@ from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.bays import BaySolver
+from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
 from vgtm_qp.qp.shape import CurveShape
@@ -43,8 +44,10 @@ _CONDENSED_ALL_THE_SAME = (
 )
 
 
-def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
+def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False) -> Setup:
     """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
+
+    A `plain` arm does not step in one call of C: its answers are the same.
 
     Raises
     ------
@@ -69,9 +72,10 @@ def build_arm(problem: Problem, *, compiled: bool = True) -> Setup:
         "influence": clearance.influence,
         "by_fcl": clearance.distance == "fcl",
     }
-    engine = make_engine(solver, home.layout, kinematics, task, tracking, compiled=compiled)
+    how = {"compiled": compiled, "plain": plain}
+    engine = make_engine(solver, home.layout, kinematics, task, tracking, **how)
     gives_way = home.layout.hard_tracking and problem.method.gives_way
-    elastic = elastic_engine(solver, home.layout, kinematics, task) if gives_way else None
+    elastic = elastic_engine(solver, home.layout, kinematics, task, plain=plain) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     return Setup(
         arm=arm,
@@ -237,8 +241,11 @@ def make_engine(
     tracking: str = "coupled",
     *,
     compiled: bool = True,
+    plain: bool = False,
 ) -> Engine:
     """Return the engine that solves the steps of an arm with the QP solver of that name, or by its bays.
+
+    `compiled` and `plain` are as for :func:`build_arm`.
 
     Raises
     ------
@@ -251,22 +258,22 @@ def make_engine(
     is_short, is_default = len(layout.arm.actuators) < STAGED_ACTUATORS, solver == DEFAULT_SOLVER
     if layout.elastic_tip and is_default and not is_short:
         warnings.warn(_CONDENSED_ALL_THE_SAME, stacklevel=2)
-    is_quick = is_default and compiled and not layout.elastic_tip
+    is_quick = is_default and not plain and not layout.elastic_tip
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
-        return FusedEngine(layout)
-    along = chain_solver(layout) if is_quick and prefers_staged(layout) else None
+        return FusedEngine(layout, kinematics, task, FusedSolver(layout, compiled=compiled))
+    along = chain_solver(layout) if is_quick and compiled and prefers_staged(layout) else None
     if along is not None and ChainEngine.serves(along):
         return ChainEngine(along, kinematics, task)
     return GeneralEngine(layout, kinematics, task, along or make_solver(solver, layout), compiled=compiled)
 
 
 def elastic_engine(
-    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask
+    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask, *, plain: bool = False
 ) -> Callable[[], Engine]:
     """Return a function that gives the engine of the same layout with elastic tracking, built on its first call."""
     elastic = replace(layout, hard_tracking=False, hard_turns=False)
     # It is seldom needed: not compiled, it is built faster.
-    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False))
+    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False, plain=plain))
 
 
 def check_solver(problem: Problem) -> None:

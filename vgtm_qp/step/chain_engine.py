@@ -13,16 +13,16 @@ from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.symbols import Bound, Constants, Frames
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
+from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Settled, StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import PeriodValues
 from vgtm_qp.qp.long.solver import ChainSolver
 from vgtm_qp.qp.numbers import Legs, RowNumbers, beyond
-from vgtm_qp.qp.settle import held
-from vgtm_qp.rows.curve import base_offset
+from vgtm_qp.qp.settle import enough_length, enough_tip_error, held
+from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
-from vgtm_qp.step.closing import Closing, Correct, converge, enough_length
-from vgtm_qp.step.engine import Engine, enough_tip_error
+from vgtm_qp.step.closing import Closing, Correct, converge
+from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.state import frozen
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
@@ -48,7 +48,6 @@ class ChainEngine(Engine):
         self._aims = arm.home_quantities.copy()
         self._strokes = arm.home_quantities[arm.actuators]
         self._answer = (self._strokes, self._strokes, self._strokes)
-        self._vertices: Array = np.zeros((self.layout.vertices, 3))
         self._curve_weights = self.layout.curve_weights[chain.stations.reshape(-1)]
         self._any_closing = Closing(self.layout, kinematics)
 
@@ -74,7 +73,7 @@ class ChainEngine(Engine):
             ends.inputs[2][:] = (X[start] if moved is None else X[start] + moved[start]).reshape(-1)
             ends.inputs[3][:] = vertices.reshape(-1)
         ends()
-        rotation, spin, offset, normal = ends.outputs
+        rotation, spin, offset, normal, legs, least = ends.outputs
         if layout.vertices:
             self._data.hold_base(offset.reshape(-1, 3), normal)
         pull = layout.vertex_gradient(vertices, target.vertex_goals) if motion else np.zeros_like(vertices)
@@ -98,15 +97,16 @@ class ChainEngine(Engine):
             progress_gradient=progress_gradient(curvature, progress),
             progress_curvature=curvature,
             clearance=rows,
-            legs=Legs.at(layout, vertices, normal),
+            legs=Legs(legs.reshape(-1, 3).copy(), least.copy()),
         )
         solution = self._solver.solve_filled(numbers)
         self._answer = solution.actuators, numbers.lower, numbers.upper
         self._strokes = length + solution.actuators
-        self._vertices = vertices + solution.vertices
         return solution
 
-    def settle(self, X: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
+    def settle(
+        self, X: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
+    ) -> Settled | None:
         """See ``engine.Engine``: each step corrects the lengths, and the remaining tip error by the actuators.
 
         The actuated lengths are those of the QP's answer plus a correction that brings the tip to its goal. With faces
@@ -116,14 +116,14 @@ class ChainEngine(Engine):
         enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)
         closing.start(X)
         first: Array = X.take(self._nodes, axis=0)
-        wanted = self._aim(self._strokes, *bounds)
+        wanted = self._aim(self._strokes, curve.vertices, *bounds)
         gain: Array | None = None
-        steers = solver.knows_gain
+        steers = by_strokes = solver.settles == "strokes"
 
         def measure(own: Array) -> tuple[float, Correct | None]:
             nonlocal wanted, gain, steers
             is_off = steers
-            if solver.knows_gain and own is not first:
+            if by_strokes and own is not first:
                 error = self._task.error(*self._tip_of(own, turned=self._task.turns is not None), goal)
                 off = float(np.abs(error).max())
                 if off > accuracy.start:
@@ -133,7 +133,7 @@ class ChainEngine(Engine):
                     steers = gain is not None
                 if is_off := gain is not None and off > enough_tip:
                     wanted = wanted + gain @ error
-                    self._aim(wanted, *bounds)
+                    self._aim(wanted, curve.vertices, *bounds)
             closer, worst = closing.step(own)
             return worst, closer.copy if is_off or not worst <= enough else None
 
@@ -141,14 +141,14 @@ class ChainEngine(Engine):
         closed = self._closed(X, own, worst)
         strokes = closed.quantities[self.layout.arm.actuators]
         if not (
-            solver.knows_gain
-            or (worst <= accuracy.member and np.abs(beyond(strokes, *bounds)).max() <= enough)
+            by_strokes or (worst <= accuracy.member and np.abs(beyond(strokes, *bounds)).max() <= enough)
         ):
             closed = self._any_closing.close(closed.q, *bounds, accuracy.member)
         off = float(np.abs(self._task.error(closed.tip_position, closed.tip_rotation, goal)).max())
-        return closed if off <= accuracy.tip and closed.error <= accuracy.member else None
+        is_there = off <= accuracy.tip and closed.error <= accuracy.member
+        return Settled(closed, curve) if is_there else None
 
-    def _aim(self, strokes: Array, lower: Array, upper: Array) -> Array:
+    def _aim(self, strokes: Array, vertices: Array, lower: Array, upper: Array) -> Array:
         """Set the targets: `strokes` (n_a,), m, within bounds, home lengths of the others, curve nodes of held faces.
 
         Return the strokes within bounds.
@@ -157,7 +157,7 @@ class ChainEngine(Engine):
         aimed = self._aims[self.layout.arm.actuators] = np.minimum(np.maximum(strokes, lower), upper)
         self._aims.take(self._members, out=lengths.reshape(-1), mode="clip")
         for faces in points:
-            np.matmul(self._curve_weights, self._vertices, out=faces.reshape(-1, 3))
+            np.matmul(self._curve_weights, vertices, out=faces.reshape(-1, 3))
         return aimed
 
     def _closed(self, X: Array, own: Array, worst: float) -> Closed:
@@ -182,7 +182,8 @@ def _end_kernel(layout: Layout) -> Kernel:
 
     Arguments: the tip's nodes X, Y (3, K), where residuals and where Jacobians are evaluated; the nodes of the first
     station (3, 3) when the base has moved; control vertices (3, V). Results: rotation of the tip at X, its spin
-    (3, 3K) at Y; offset (3, V) and normal (3,) of the curve at the base, see ``ChainData``.
+    (3, 3K) at Y; offset (3, V) and normal (3,) of the curve at the base, see ``ChainData``; axes (3, G) and bounds
+    (G) of the curve's legs.
     """
     arm, tip, constants, vertices = layout.arm, layout.arm.end_effector, Constants(), layout.vertices
     X, Y = (ca.MX.sym(name, 3, len(tip.nodes)) for name in "XY")
@@ -196,7 +197,11 @@ def _end_kernel(layout: Layout) -> Kernel:
     if vertices:
         home, weights = arm.home[arm.stations.nodes[:1]], ca.DM(arm.stations.weights[0])
         turned, _ = Frames(home, arm.stations.frames[:1], np.arange(3), constants, "base").at(base)
-        offset, normal = base_offset(base @ weights, turned, points), turned[:, 2]
-    results = [ca.densify(result) for result in (rotation, spin, offset, normal)]
+        offset, normal = curve_rows.base_offset(base @ weights, turned, points), turned[:, 2]
+    axes, lower = ca.MX.zeros(3, 0), ca.MX.zeros(0)
+    if len(layout.legs):
+        least = constants.add("least_leg", np.array([layout.least_leg]))
+        axes, lower = curve_rows.legs(points, normal, least, both=len(layout.legs) > 1)
+    results = [ca.densify(result) for result in (rotation, spin, offset, normal, axes, lower)]
     function = ca.Function("ends", [X, Y, base, points, *constants.symbols], results)
     return Bound(function, constants.values).kernel()

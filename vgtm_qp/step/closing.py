@@ -13,29 +13,13 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.answer import Closed
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.lengths import LengthSolver
-
-MOST_STEPS = 12
-
-_TOO_FAR = 1e-2
-"""Error of a quantity after a QP above which Newton's iteration is not tried."""
-
-_ROUNDING = float(np.finfo(float).eps)
-
-
-def enough_length(q: Array, tolerance: float) -> float:
-    """Return the error of a quantity at which the iteration stops.
-
-    It is far below `tolerance`, because division by a short step's duration makes errors of rates and accelerations of
-    it. For very long arms the rounding of node positions is the limit.
-    """
-    return max(1e-3 * tolerance, 8.0 * _ROUNDING * float(np.abs(q).max()))
-
+from vgtm_qp.qp.settle import MOST_STEPS, TOO_FAR, enough_length
 
 Correct = Callable[[], Array]
 
 
 def converge(
-    q: Array, measure: Callable[[Array], tuple[float, Correct | None]], too_far: float = _TOO_FAR
+    q: Array, measure: Callable[[Array], tuple[float, Correct | None]], too_far: float = TOO_FAR
 ) -> tuple[Array, float]:
     """Return the configuration to which Newton's method leads, and its error, infinite in a singular pose.
 
@@ -73,7 +57,7 @@ class Closing:
         return LengthSolver(self._arm.bays, np.flatnonzero(self._fixed), held)
 
     def close(
-        self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float = _TOO_FAR
+        self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float = TOO_FAR
     ) -> Closed:
         """Return the configuration near `q` whose actuators keep their values, or go to the nearest one allowed.
 

@@ -8,33 +8,29 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import EvaluationError, SolverError
-from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
+from vgtm_qp.compiled import Kernel
+from vgtm_qp.errors import EvaluationError
+from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
+from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.fused import FusedSolver
-from vgtm_qp.qp.fused_settle import NEAR
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
-from vgtm_qp.qp.numbers import StepNumbers
+from vgtm_qp.qp.numbers import StepNumbers, norm
 from vgtm_qp.qp.residual import FailedStepError, InfeasibleStepError
-from vgtm_qp.qp.settle import LEFT, SETTLING_STEPS, held, settling_gain
+from vgtm_qp.qp.settle import LEFT, MOST_STEPS, SETTLING_STEPS, Gain, enough_tip_error, held, missing_function
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.rows.tip import TipGoal
-from vgtm_qp.step.closing import MOST_STEPS, Closing
+from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.target import QPInput, Target
-from vgtm_qp.step.task import TipTask, over_all_nodes, tip_response
-
-_SETTLED = 1e-3
-"""Ratio of tip error to tolerance below which settling stops."""
-
-_ROUNDING = float(np.finfo(float).eps)
+from vgtm_qp.step.task import TipTask
 
 _ON_PATH = 1e-6
 """Slack, m or rad, that counts as zero: solvers leave so much."""
@@ -91,10 +87,11 @@ class Engine(ABC):
                 # Interior-point solvers stop just short of the end; the arm would need one more step.
                 progress = 1.0
         furthest = float(np.abs(solution.nodes).max())
-        closed = None
+        curve, closed = CurvePoint(asked.vertices, asked.torsion).after(solution), None
         if furthest < np.inf:
-            closed = self.settle(q, target, target.goal(progress), accuracy)
-        curve = asked.vertices + solution.vertices, asked.torsion + solution.torsion
+            settled = self.settle(q, curve, target, target.goal(progress), accuracy)
+            if settled is not None:
+                closed, curve = settled
         return Move(solution, q, *curve, progress, furthest, closed)
 
     def _least(self, asked: QPInput) -> StepSolution:
@@ -113,17 +110,68 @@ class Engine(ABC):
         """Return the QP's answer; raise ``SolverError`` instead of a wrong one."""
 
     @abstractmethod
-    def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
-        """Return the configuration near `q`, quantities closed and the tip at `goal`; None if it takes another QP."""
+    def settle(
+        self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
+    ) -> Settled | None:
+        """Return the configuration near `q`, quantities closed and the tip at `goal`, and the curve near `curve`.
+
+        None if it takes another QP.
+        """
 
     def drawn(self, layout: Layout) -> Engine | None:  # noqa: ARG002
         """Return the engine for a layout that differs only in its vertex goals; None if one must be built."""
         return None
 
 
-def enough_tip_error(q: Array, tolerance: float) -> float:
-    """Return the tip error, m or rad, at which settling stops; see ``closing.enough_length``."""
-    return max(_SETTLED * tolerance, 1e3 * _ROUNDING * float(np.abs(q).max()))
+class Equalities:
+    """Settles configurations and their curves by all equalities of a step."""
+
+    def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
+        self._layout, self._closing = layout, Closing(layout, kinematics)
+
+    @cached_property
+    def _missing(self) -> Kernel:
+        return missing_function(self._layout).kernel(compiled=False)
+
+    def settle(
+        self,
+        q: Array,
+        curve: CurvePoint,
+        asked: QPInput,
+        goal: TipGoal,
+        accuracy: Accuracy,
+        first_gain: Callable[[], Gain | None],
+    ) -> Settled | None:
+        """Return the configuration near `q` and the curve that satisfy all equalities, by Newton steps.
+
+        Their Jacobian is at first that of the QP, which was `asked`, and their metric that of its objective.
+        """
+        arm, target = self._layout.arm, asked.target
+        gain, x, before = None, np.zeros(0), np.zeros(0)
+        for step in range(SETTLING_STEPS + 1):
+            closed = self._closing.close(q, target.lower, target.upper, accuracy.member)
+            missing = self._missing_at(closed.q, curve, asked, goal)
+            off = norm(missing)
+            if not (closed.error <= accuracy.member and off <= accuracy.start):
+                return None
+            if step == SETTLING_STEPS or off <= enough_tip_error(closed.q, accuracy.tip):
+                break
+            gain = first_gain() if gain is None else gain.updated(x, before - missing)
+            if gain is None:
+                break
+            x, before = gain.per_missing @ missing, missing
+            change = gain.solution(x)
+            q, curve = arm.advanced(closed.q, change.nodes, change.actuators), curve.after(change)
+        return Settled(closed, curve) if off <= accuracy.tip else None
+
+    def _missing_at(self, q: Array, curve: CurvePoint, asked: QPInput, goal: TipGoal) -> Array:
+        """Return what the equalities lack, see ``missing_function``."""
+        here = asked._replace(
+            q=q, at=q, vertices=curve.vertices, torsion=curve.torsion, goal=goal, motion=False
+        )
+        here.linear(self._layout, rows=False).load(self._missing)
+        self._missing()
+        return self._missing.outputs[0].copy()
 
 
 class GeneralEngine(Engine):
@@ -141,137 +189,168 @@ class GeneralEngine(Engine):
         super().__init__(layout)
         self._linearisation = Linearisation(layout, compiled=compiled)
         self._solver, self._task = solver, task
-        self._closing = Closing(layout, kinematics)
+        self._closing, self.equalities = Closing(layout, kinematics), Equalities(layout, kinematics)
         # With hard tracking, stations and fixed quantities may determine the configuration.
         is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
         tracked = layout.tracked.tolist()
         self._on_curve = is_plain and layout.arm.symbols(Constants()).held(tracked) is not None
-        self._last: tuple[StepNumbers, StepSolution] | None = None
-        self._vertices: Array = np.zeros((0, 3))
+        self._last: tuple[QPInput, StepNumbers, StepSolution] | None = None
         self._strokes: Array = np.zeros(0)
+
+    @cached_property
+    def _condensed(self) -> CondensedSolver:
+        return CondensedSolver(self.layout)
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
         numbers = self._linearisation.numbers(asked.linear(self.layout), asked.rows)
         solution = self._solver.solve(numbers)
         self._strokes = self._linearisation.quantities[self.layout.arm.actuators] + solution.actuators
-        self._last = numbers, solution
-        self._vertices = asked.vertices + solution.vertices
+        self._last = asked, numbers, solution
         return solution
 
-    def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
+    def settle(
+        self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
+    ) -> Settled | None:
         """See :class:`Engine`; an elastic tip with a slack is not moved."""
         assert self._last is not None
-        slack = self._last[1].tip_slack
-        closed = self._settled(q, target, goal, accuracy) if slack <= _ON_PATH else None
-        if closed is not None or slack <= accuracy.tip:
-            return closed
+        slack = self._last[2].tip_slack
+        settled = None
+        if slack <= _ON_PATH:
+            ways = {
+                "equalities": self._by_equalities,
+                "curve": self._on_its_curve,
+                "strokes": self._by_strokes,
+            }
+            settled = ways[self._solver.settles](q, curve, target, goal, accuracy)
+        if settled is not None or slack <= accuracy.tip:
+            return settled
         closed = self._closing.close(q, target.lower, target.upper, accuracy.member)
-        return closed if closed.error <= accuracy.member else None
+        return Settled(closed, curve) if closed.error <= accuracy.member else None
 
-    def _settled(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
-        """Return the configuration near `q` with the tip at `goal`, by Newton steps with a constant Jacobian.
+    def _by_equalities(
+        self,
+        q: Array,
+        curve: CurvePoint,
+        _: Target,
+        goal: TipGoal,
+        accuracy: Accuracy,
+    ) -> Settled | None:
+        assert self._last is not None
+        asked, numbers, solution = self._last
+        at_bound = held(solution.actuators, numbers.lower, numbers.upper)
+        gain = partial(self._condensed.gain_of, numbers, at_bound)
+        return self.equalities.settle(q, curve, asked, goal, accuracy, gain)
 
-        If the solver has a gain, actuators start from its answer and correct the tip by the gain. Otherwise they follow
-        the least motion of the nodes that moves the tip.
-        """
-        arm, bounds = self.layout.arm, (target.lower, target.upper)
+    def _on_its_curve(
+        self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
+    ) -> Settled | None:
+        """Return the configuration near `q` whose stations are on the curve, if these determine the nodes."""
+        bounds = target.lower, target.upper
+        closed = None
         if self._on_curve:
-            points = self.layout.curve_weights @ self._vertices
-            on_curve = self._closing.close_on_curve(q, points, *bounds, accuracy.member)
-            if on_curve is not None and on_curve.error <= accuracy.member:
-                error = self._task.error(on_curve.tip_position, on_curve.tip_rotation, goal)
-                return on_curve if float(np.abs(error).max()) <= accuracy.tip else None
-        by_strokes, gain, box = self._solver.knows_gain, None, bounds
-        most = MOST_STEPS if by_strokes else SETTLING_STEPS
+            points = self.layout.curve_weights @ curve.vertices
+            closed = self._closing.close_on_curve(q, points, *bounds, accuracy.member)
+        if closed is None or not closed.error <= accuracy.member:
+            closed = self._closing.close(q, *bounds, accuracy.member)
+        is_there = self._off(closed, goal) <= accuracy.tip and closed.error <= accuracy.member
+        return Settled(closed, curve) if is_there else None
+
+    def _by_strokes(
+        self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
+    ) -> Settled | None:
+        """Return the configuration near `q` with the tip at `goal`: actuators correct the QP's answer."""
+        bounds, gain = (target.lower, target.upper), None
         strokes = np.clip(self._strokes, *bounds)
-        for step in range(most + 1):
-            if by_strokes:
-                box = (np.clip(strokes, *bounds),) * 2
-            closed = self._closing.close(q, *box, accuracy.member)
+        for step in range(MOST_STEPS + 1):
+            closed = self._closing.close(q, *(np.clip(strokes, *bounds),) * 2, accuracy.member)
             error = self._task.error(closed.tip_position, closed.tip_rotation, goal)
             off = float(np.abs(error).max())
             if not (closed.error <= accuracy.member and off <= accuracy.start):
                 return None
-            if step == most or off <= enough_tip_error(closed.q, accuracy.tip):
+            if step == MOST_STEPS or off <= enough_tip_error(closed.q, accuracy.tip):
                 break
             gain = self._gain() if gain is None else gain
             if gain is None:
                 break
-            nodes, per_error = gain
-            strokes, q = strokes + per_error @ error, closed.q
-            if nodes is not None:
-                q = arm.advanced(q, nodes @ error, per_error @ error)
-        return closed if off <= accuracy.tip else None
+            strokes, q = strokes + gain @ error, closed.q
+        return Settled(closed, curve) if off <= accuracy.tip else None
 
-    def _gain(self) -> tuple[Array | None, Array] | None:
-        """Return displacements per tip error after the last QP; None if another QP has to settle the tip.
-
-        Those of the nodes (N, 3, n_e), None if only the solver's gain is known, and those of the actuators (n_a, n_e).
-        """
+    def _gain(self) -> Array | None:
+        """Return the actuators' changes (n_a, n_e) per tip error after the last QP; None if they cannot settle it."""
         assert self._last is not None
-        layout, arm, weights, (numbers, solution) = (
-            self.layout,
-            self.layout.arm,
-            self.layout.weights,
-            self._last,
-        )
-        at_bound = held(solution.actuators, numbers.lower, numbers.upper)
-        if self._solver.knows_gain:
-            gain = self._solver.gain(at_bound)
-            return None if gain is None else (None, gain)
-        if layout.hard_tracking:
-            return None
-        try:
-            response, _ = numbers.motion.response()
-        except SolverError:
-            return None
-        every = over_all_nodes(arm, response)
-        tip = tip_response(arm, numbers.tip_jacobian, every)
-        stiffness = weights.actuator_rate + weights.stroke_centring
-        gain = settling_gain(response, tip, ~at_bound, weights.node_rate, stiffness)
-        return None if gain is None else (every @ gain, gain)
+        _, numbers, solution = self._last
+        return self._solver.gain(held(solution.actuators, numbers.lower, numbers.upper))
+
+    def _off(self, closed: Closed, goal: TipGoal) -> float:
+        """Return the greatest tip error, m or rad."""
+        return float(np.abs(self._task.error(closed.tip_position, closed.tip_rotation, goal)).max())
 
 
 class FusedEngine(Engine):
-    """One compiled call from configuration to QP, for arms whose coordinates can be eliminated one after another."""
+    """One compiled call, for arms whose coordinates can be eliminated one after another.
 
-    def __init__(self, layout: Layout, solver: FusedSolver | None = None) -> None:
+    Until it is compiled, and where no compiler works, an interpreted engine gives the same answers.
+    """
+
+    def __init__(self, layout: Layout, kinematics: Kinematics, task: TipTask, solver: FusedSolver) -> None:
         super().__init__(layout)
-        self._solver = FusedSolver(layout) if solver is None else solver
-        self._vertices = np.zeros((layout.vertices, 3))
+        self._kinematics, self._task = kinematics, task
+        self._solver = solver
+        self._last: QPInput | None = None
+
+    @cached_property
+    def _plain(self) -> GeneralEngine:
+        solver = CondensedSolver(self.layout)
+        return GeneralEngine(self.layout, self._kinematics, self._task, solver, compiled=False)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the compiled call is there."""
+        return self._solver.is_ready
 
     def drawn(self, layout: Layout) -> FusedEngine:
         """See :class:`Engine`."""
-        return FusedEngine(layout, self._solver.drawn(layout))
+        return FusedEngine(layout, self._kinematics, self._task, self._solver.drawn(layout))
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
-        """See :class:`Engine`; one compiled call after the QP settles its answer, if it applies.
+        """See :class:`Engine`; one compiled call also settles the answer, if it applies.
 
-        It does not apply if the path turns within the step, the base moves, or too many rows are near.
+        It does not apply if the path turns within the step, the base moves, or the curve's rows are computed in Python.
         """
-        near, target = len(asked.rows.lower), asked.target
-        if near > NEAR or target.base is not None or not target.path.is_straight(target.start, target.end):
+        target, solver = asked.target, self._solver
+        if not solver.is_ready:
+            return self._plain.move(asked, accuracy, spent)
+        solver.aim(accuracy)
+        is_straight = target.base is None and target.path.is_straight(target.start, target.end)
+        if not is_straight or self.layout.general is not None:
             return super().move(asked, accuracy, spent)
         try:
-            self._solver.load(asked.linear(self.layout))
-            answer = self._solver.ask(asked.rows)
-            spent("qp")
-            return self._solver.move(answer, near, asked.torsion, accuracy)
-        except (InfeasibleStepError, EvaluationError):
-            # The general way may find an answer without the margin, or settle this one by more steps.
+            solver.load(asked.linear(self.layout))
+            return solver.move(asked.rows, asked.torsion)
+        except InfeasibleStepError:
+            # The general way may find an answer without the margin.
             return super().move(asked, accuracy, spent)
+        except EvaluationError:
+            return self._plain.move(asked, accuracy, spent)
         except FailedStepError as error:
             error.build = lambda: self.qp(asked)
             raise
+        finally:
+            spent("qp")
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
         self._solver.load(asked.linear(self.layout))
-        solution = self._solver.solve(asked.rows)
-        self._vertices = asked.vertices + solution.vertices
-        return solution
+        self._last = asked
+        return self._solver.solve(asked.rows)
 
-    def settle(self, q: Array, target: Target, goal: TipGoal, accuracy: Accuracy) -> Closed | None:
+    def settle(
+        self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
+    ) -> Settled | None:
         """See :class:`Engine`."""
-        return self._solver.settle(q, self._vertices, target.lower, target.upper, goal, accuracy)
+        if self.layout.general is None:
+            self._solver.aim(accuracy)
+            return self._solver.settle(q, curve, target.lower, target.upper, goal)
+        assert self._last is not None
+        return self._plain.equalities.settle(q, curve, self._last, goal, accuracy, self._solver.gain)

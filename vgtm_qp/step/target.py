@@ -66,11 +66,12 @@ class QPInput(NamedTuple):
     rows: ClearanceRows
     motion: bool
 
-    def linear(self, layout: Layout) -> StepInput:
-        """Return this input in the terms of a QP of `layout`."""
+    def linear(self, layout: Layout, *, rows: bool = True) -> StepInput:
+        """Return this input in the terms of a QP of `layout`; without `rows`, those of a general curve are zeros."""
         arm, target, shape, curve = layout.arm, self.target, layout.general, None
         if shape is not None:
-            curve = shape.rows(self.vertices, self.torsion, base_frame(arm, target.base))
+            at = self.vertices, self.torsion, base_frame(arm, target.base)
+            curve = shape.rows(*at) if rows else shape.at(*at)
         nodes = arm.nodes(self.q)
         return StepInput(
             q=self.q,

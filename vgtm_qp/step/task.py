@@ -14,7 +14,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError
 from vgtm_qp.rotation import rotation_from_vector, turn_between
-from vgtm_qp.rows.tip import TipGoal, axes, error, row_names, tip_function
+from vgtm_qp.rows.tip import TipGoal, axes, row_names, tip_function
 from vgtm_qp.step.path import Path
 
 _UNCHANGED = "the state of the arm is unchanged"
@@ -72,8 +72,6 @@ class TipTask:
 
     def error(self, position: Array, rotation: Array, goal: TipGoal) -> Array:
         """Return the error (n_e,) alone, m or rad, as every step of settling needs it."""
-        if self.turns is None:
-            return np.asarray(error(self.row_names, position, rotation, goal.position, goal.rotation))
         return self.residual(position, rotation, goal)[0]
 
     def rows(self, X: Array, kinematics: Kinematics, goal: TipGoal) -> TipRows:

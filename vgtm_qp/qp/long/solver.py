@@ -34,7 +34,7 @@ class ChainSolver(ABC):
         The numbers of the QP except those of ``RowNumbers``.
     """
 
-    knows_gain = False
+    settles = "curve"
 
     def __init__(self, elimination: Elimination, size: int, *, is_reversed: bool) -> None:
         chain = self.chain = elimination.chain

@@ -23,7 +23,7 @@ from vgtm_qp.qp.settle import WORST_CONDITION
 class StagedSolver(ChainSolver):
     """Eliminates the free motions of the bays; for layouts without hard tracking."""
 
-    knows_gain = True
+    settles = "strokes"
 
     def __init__(self, chain: Chain) -> None:
         elimination = self._elimination = Elimination(chain)

@@ -1,0 +1,142 @@
+"""Our own C: sources that lie beside their Python, compiled once, called with structures of numbers and addresses.
+
+A source declares one structure, whose fields :func:`structure` reads from it, so that the C is their only definition.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from vgtm_qp.compiled import Building, Kernel, cache_directory, compiler
+from vgtm_qp.errors import EvaluationError
+
+_STRUCT = re.compile(r"typedef struct \{((?:(?!typedef).)*?)\} (\w+);", re.DOTALL)
+_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
+_FUNCTION_POINTER = re.compile(r"\(\*(\w+)\)")
+
+INCLUDES = Path(ca.__file__).parent / "include"
+"""Headers of the libraries in CasADi's wheel, DAQP's among them."""
+
+
+class CompiledKernel(ctypes.Structure):
+    """A function of CasADi as C calls it, its arguments, results and workspaces."""
+
+    _fields_ = [(name, ctypes.c_void_p) for name in ("eval", "arg", "res", "iw", "w")]
+
+
+_TYPES: dict[str, Any] = {"int": ctypes.c_int, "double": ctypes.c_double, "Kernel": CompiledKernel}
+
+
+@cache
+def structure(source: Path, name: str) -> type[ctypes.Structure]:
+    """Return the structure of that `name` in a C source as a class of ctypes; its pointers are addresses."""
+    body = next(match[1] for match in _STRUCT.finditer(source.read_text()) if match[2] == name)
+    fields: list[tuple[str, Any]] = []
+    for declaration in _COMMENT.sub("", body).split(";"):
+        words = declaration.replace("const ", "").split(None, 1)
+        if len(words) < 2:
+            continue
+        pointer = _FUNCTION_POINTER.search(declaration)
+        if pointer:
+            fields.append((pointer[1], ctypes.c_void_p))
+            continue
+        for field in words[1].split(","):
+            is_pointer = "*" in field
+            fields.append((field.strip(" *\n"), ctypes.c_void_p if is_pointer else _TYPES[words[0]]))
+    return type(name, (ctypes.Structure,), {"_fields_": fields})
+
+
+def building(source: Path) -> Building:
+    """Begin to compile a C source, once in a process for each compiler."""
+    return _building(source, compiler(), cache_directory())
+
+
+@cache
+def _building(source: Path, *_: object) -> Building:
+    return Building(source.stem, source.read_text(), (f"-I{INCLUDES}",))
+
+
+class Program:
+    """Functions of a C source that share one structure, and what its pointers point to.
+
+    Raises
+    ------
+    OSError
+        The source could not be compiled.
+    """
+
+    def __init__(self, source: Path, name: str) -> None:
+        library = building(source).library
+        if library is None:
+            raise OSError(f"{source.name} could not be compiled")
+        self._library = ctypes.CDLL(str(library))
+        self.data = structure(source, name)()
+        self._at = ctypes.addressof(self.data)
+        self._kept: dict[str, Any] = {}
+        self._interpreted: dict[str, Kernel] = {}
+
+    def set(self, **values: Any) -> None:
+        """Set fields: numbers, kernels, and C-contiguous arrays, which are kept, for pointers."""
+        for name, value in values.items():
+            if isinstance(value, Kernel):
+                is_interpreted = not value.is_done or not value.is_compiled
+                found, self._kept[name] = _interpreted(value) if is_interpreted else _compiled(value)
+                setattr(self.data, name, found)
+                if is_interpreted and not value.is_done:
+                    self._interpreted[name] = value
+                else:
+                    self._interpreted.pop(name, None)
+            elif isinstance(value, np.ndarray):
+                assert value.flags.c_contiguous
+                setattr(self.data, name, value.ctypes.data)
+                self._kept[name] = value
+            else:
+                setattr(self.data, name, value)
+
+    def call(self, name: str, *arguments: float) -> int:
+        """Call the C function of that name with the structure and numbers; kernels compiled meanwhile are used."""
+        if self._interpreted:
+            self.set(**{key: kernel for key, kernel in self._interpreted.items() if kernel.is_done})
+        code: int = self._library[name](ctypes.c_void_p(self._at), *map(ctypes.c_double, arguments))
+        return code
+
+
+_EVALUATION = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
+
+
+def _interpreted(kernel: Kernel) -> tuple[CompiledKernel, list[Any]]:
+    """Return a kernel that C calls back, and what must live as long as that."""
+
+    def evaluate(*_: object) -> int:
+        try:
+            kernel()
+        except EvaluationError:
+            return 1
+        return 0
+
+    arg = np.array([array.ctypes.data for array in kernel.inputs], dtype=np.uintp)
+    function = _EVALUATION(evaluate)
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    return CompiledKernel(address, arg.ctypes.data, 0, 0, 0), [function, arg]
+
+
+def _compiled(kernel: Kernel) -> tuple[CompiledKernel, list[Any]]:
+    """Return a compiled kernel as C calls it, and the arrays that must live as long as that."""
+    library = ctypes.CDLL(str(kernel.library))
+    sizes = [ctypes.c_longlong() for _ in range(4)]
+    library[f"{kernel.name}_work"](*map(ctypes.byref, sizes))
+    arguments, results, integers, numbers = (size.value for size in sizes)
+    arg, res = np.zeros(arguments, dtype=np.uintp), np.zeros(results, dtype=np.uintp)
+    arg[: len(kernel.inputs)] = [array.ctypes.data for array in kernel.inputs]
+    res[: len(kernel.outputs)] = [array.ctypes.data for array in kernel.outputs]
+    iw, w = np.zeros(integers, dtype=np.int64), np.zeros(numbers)
+    address = ctypes.cast(library[kernel.name], ctypes.c_void_p).value
+    kept = [arg, res, iw, w, *kernel.inputs, *kernel.outputs]
+    return CompiledKernel(address, *(array.ctypes.data for array in (arg, res, iw, w))), kept

@@ -1,0 +1,381 @@
+/* The step of a short arm in one call: condense, solve, check, settle.
+
+   Every formula of the arm and its curve is a function that CasADi generates; here are the loops and the dense algebra
+   between them. A Fused belongs to one resolver: nothing is static, so that threads with a resolver each are safe.
+   Matrices are row by row. */
+
+#include <math.h>
+#include <string.h>
+
+#include <daqp/api.h>
+
+#define EXPORT __attribute__((visibility("default")))
+
+typedef long long Index;
+
+typedef struct {
+    int (*eval)(const double **, double **, Index *, double *, int);
+    const double **arg;
+    double **res;
+    Index *iw;
+    double *w;
+} Kernel;
+
+enum { DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED };
+
+typedef struct {
+    /* Numbers of: unknowns n; actuators n_a; columns of the free nodes; least-squares rows L; rows of the tip, of
+       stations, of legs, of clearance; control vertices, torsion coordinates; coordinates of q. */
+    int unknowns, actuators, nodes, squares, tips, hard, legs, near, vertices, torsion, coordinates;
+    /* Whether q moves with the nodes; a row of clearance names this many nodes. */
+    int by_nodes, slots;
+    /* Root of the node rate's weight, inverted; weight of the actuators' changes. */
+    double scale, actuator_weight;
+    /* Distance from a bound that counts as held; path left that counts as none; worst condition of a gain. */
+    double at_bound, left, worst_condition;
+    int settling_steps, closing_steps;
+    double too_far;
+
+    /* (StepGraph.inputs) -> results of row_function; (q, lower, upper) -> (closer q, quantities, error);
+       (StepGraph.inputs, gone) -> results of missing_function. */
+    Kernel condense, close, missing;
+    void (*quadprog)(DAQPResult *, DAQPProblem *, DAQPSettings *);
+    void (*defaults)(DAQPSettings *);
+    double feasibility;
+
+    const double *stack, *linear, *curvature, *offset, *normal, *leg_rows, *leg_lower;
+    const int *hard_at;            /* (H) columns of the stack */
+    const double *curve_hessian;   /* (D, D) */
+    const double *goal_pull, *goal_weight;     /* (V, 3), (V) of the control vertices' goals */
+    const int *place;              /* where each coordinate of the motion is in q */
+
+    const Index *near_nodes;       /* (R, slots) */
+    const double *near_rows;       /* (R, slots, 3) */
+    const double *near_lower;      /* (R) */
+    const int *node_column;        /* (N), -1 for nodes of the base */
+
+    double *hessian, *gradient;                /* (n, n), (n) */
+    double *constraint, *lower, *upper;        /* (rows, n), (n + rows) */
+    int *sense;
+    double *x, *multipliers;                   /* (n), (n + rows) */
+
+    double *q, *points;                        /* what close and missing read: q, and (V, 3) */
+    double *gone;                              /* (1) */
+    const double *progress, *velocity, *spin;  /* (1), (3), (3) */
+    const double *closer, *values, *error, *missed;
+    double *torsions;                          /* (T) changes */
+    double *started, *started_points;          /* q and the curve before they were settled */
+
+    /* Tolerances; errors of quantities that count as closed, as nearly closed; errors of equalities that are enough. */
+    double member, tip, start, enough_length, nearly, enough_tip;
+
+    double primal, dual, reached, furthest, off;
+    int flag, iterations;
+    double *work;
+} Fused;
+
+static int call(const Kernel *kernel)
+{
+    return kernel->eval(kernel->arg, kernel->res, kernel->iw, kernel->w, 0);
+}
+
+static double dot(const double *a, const double *b, int count)
+{
+    double sum = 0.0;
+    for (int k = 0; k < count; k++) sum += a[k] * b[k];
+    return sum;
+}
+
+static double norm(const double *a, int count)
+{
+    return sqrt(dot(a, a, count));
+}
+
+/* Hessian and gradient of the objective: the Gram matrix of the stack, whose last row is its constant, and the parts
+   of the curve and the actuators. Equalities have no weight. */
+static void objective(Fused *f)
+{
+    int n = f->unknowns, count = f->actuators, rows = f->squares, last = n - 1, curve = last - count;
+    double *free_rows = f->work, *H = f->hessian, *g = f->gradient;
+    memcpy(free_rows, f->stack, sizeof(double) * n * rows);
+    for (int k = 0; k < f->hard; k++)
+        for (int i = 0; i < n; i++) free_rows[i * rows + f->hard_at[k]] = 0.0;
+    for (int i = 0; i < n; i++) {
+        int to = i < last ? i + 1 : last;
+        for (int j = 0; j < to; j++) {
+            double sum = dot(free_rows + i * rows, free_rows + j * rows, rows);
+            if (i < last) H[i * n + j] = H[j * n + i] = sum;
+            else g[j] = sum + f->linear[j];
+        }
+    }
+    g[last] = f->linear[last];
+    for (int k = 0; k < n; k++) H[last * n + k] = H[k * n + last] = 0.0;
+    H[last * n + last] = f->curvature[0];
+    for (int k = 0; k < count; k++) H[k * n + k] += f->actuator_weight;
+    if (!curve) return;
+    int size = 5 + curve;
+    for (int i = 0; i < curve; i++)
+        for (int j = 0; j < curve; j++) {
+            /* The first free coordinate moves the second control vertex along the normal. */
+            double sum = 0.0;
+            for (int a = 0; a < (i ? 1 : 3); a++)
+                for (int b = 0; b < (j ? 1 : 3); b++)
+                    sum += (i ? 1.0 : f->normal[a]) * (j ? 1.0 : f->normal[b])
+                        * f->curve_hessian[(i ? 5 + i : 3 + a) * size + (j ? 5 + j : 3 + b)];
+            H[(count + i) * n + count + j] += sum;
+        }
+    for (int k = 3; k < 3 * f->vertices; k++) {
+        double pull = f->goal_pull[k] + f->goal_weight[k / 3] * f->offset[k];
+        if (k < 6) g[count] += pull * f->normal[k - 3];
+        else g[count + k - 5] += pull;
+    }
+}
+
+/* Rows after those of the tip, which the function wrote in place: stations, legs, clearances. */
+static void constrain(Fused *f)
+{
+    int n = f->unknowns, count = f->actuators, last = n - 1;
+    double *row = f->constraint + f->tips * n;
+    double *lower = f->lower + n + f->tips, *upper = f->upper + n + f->tips;
+    for (int k = 0; k < f->hard; k++, row += n, lower++, upper++) {
+        for (int i = 0; i < last; i++) row[i] = f->stack[i * f->squares + f->hard_at[k]];
+        row[last] = 0.0;
+        *lower = *upper = -f->stack[last * f->squares + f->hard_at[k]];
+    }
+    for (int k = 0; k < f->legs; k++, row += n, lower++) {
+        memset(row, 0, sizeof(double) * n);
+        memcpy(row + count, f->leg_rows + k * (last - count), sizeof(double) * (last - count));
+        *lower = f->leg_lower[k];
+    }
+    for (int k = 0; k < f->near; k++, row += n, lower++) {
+        const Index *nodes = f->near_nodes + k * f->slots;
+        const double *parts = f->near_rows + 3 * k * f->slots;
+        double known = 0.0;
+        memset(row, 0, sizeof(double) * n);
+        for (int s = 0; s < f->slots; s++) {
+            int column = f->node_column[nodes[s]];
+            const double *part = parts + 3 * s;
+            if (column < 0 || (part[0] == 0.0 && part[1] == 0.0 && part[2] == 0.0)) continue;
+            for (int i = 0; i < count; i++)
+                row[i] += f->scale * dot(part, f->stack + i * f->squares + column, 3);
+            known += f->scale * dot(part, f->stack + last * f->squares + column, 3);
+        }
+        *lower = f->near_lower[k] - known;
+    }
+}
+
+/* Norm of what the answer is beyond its bounds, and of the stationarity, relative to the forces. */
+static void residuals(Fused *f, int rows)
+{
+    int n = f->unknowns;
+    double beyond = 0.0, off = 0.0, *force = f->work;
+    const double *y = f->multipliers;
+    for (int k = 0; k < n; k++) force[k] = dot(f->hessian + k * n, f->x, n) + f->gradient[k] + y[k];
+    for (int k = 0; k < n + rows; k++) {
+        const double *row = f->constraint + (k - n) * n;
+        double value = k < n ? f->x[k] : dot(row, f->x, n);
+        double out = fmax(value - f->upper[k], f->lower[k] - value);
+        /* A comparison with NaN fails. */
+        if (!(out <= 0.0)) beyond += out * out;
+        if (k >= n && y[k] != 0.0)
+            for (int i = 0; i < n; i++) force[i] += y[k] * row[i];
+    }
+    for (int k = 0; k < n; k++) off += force[k] * force[k];
+    f->primal = sqrt(beyond);
+    f->dual = sqrt(off) / (1.0 + norm(f->gradient, n) + norm(y, n + rows));
+}
+
+/* Condense the QP at the state that was loaded, and solve it. */
+EXPORT int solve(Fused *f)
+{
+    int rows = f->tips + f->hard + f->legs + f->near;
+    if (call(&f->condense)) return NO_VALUE;
+    objective(f);
+    constrain(f);
+    DAQPProblem problem = {f->unknowns, f->unknowns + rows, f->unknowns, f->hessian, f->gradient,
+                           f->constraint, f->upper, f->lower, f->sense};
+    DAQPSettings settings;
+    DAQPResult result;
+    memset(&result, 0, sizeof(result));
+    f->defaults(&settings);
+    settings.primal_tol = f->feasibility;
+    settings.eps_prox = 0.0;
+    result.x = f->x;
+    result.lam = f->multipliers;
+    f->quadprog(&result, &problem, &settings);
+    f->flag = result.exitflag;
+    f->iterations = result.iter;
+    if (result.exitflag == EXIT_INFEASIBLE) return INFEASIBLE;
+    residuals(f, rows);
+    return DONE;
+}
+
+/* Move q and the curve by the changes x of the unknowns; `whole` adds what residuals alone move. */
+static void advance(Fused *f, const double *x, int whole)
+{
+    int count = f->actuators, last = f->unknowns - 1;
+    f->furthest = 0.0;
+    if (f->by_nodes) {
+        double *moved = f->work;
+        memset(moved, 0, sizeof(double) * f->nodes);
+        if (whole) memcpy(moved, f->stack + last * f->squares, sizeof(double) * f->nodes);
+        for (int i = 0; i < count; i++)
+            for (int k = 0; k < f->nodes; k++) moved[k] += x[i] * f->stack[i * f->squares + k];
+        for (int k = 0; k < f->nodes; k++) {
+            f->q[f->place[k]] += f->scale * moved[k];
+            if (!(fabs(f->scale * moved[k]) <= f->furthest)) f->furthest = fabs(f->scale * moved[k]);
+        }
+    } else {
+        for (int i = 0; i < count; i++) f->q[f->place[i]] += x[i];
+        for (int k = 0; k < f->nodes; k++) {
+            double moved = whole ? f->stack[last * f->squares + k] : 0.0;
+            for (int i = 0; i < count; i++) moved += x[i] * f->stack[i * f->squares + k];
+            if (!(fabs(f->scale * moved) <= f->furthest)) f->furthest = fabs(f->scale * moved);
+        }
+    }
+    if (!f->vertices) return;
+    const double *free = x + count;
+    if (whole)
+        for (int k = 0; k < 3 * f->vertices; k++) f->points[k] += f->offset[k];
+    for (int k = 0; k < 3; k++) f->points[3 + k] += f->normal[k] * free[0];
+    for (int k = 0; k < 3 * (f->vertices - 2); k++) f->points[6 + k] += free[1 + k];
+    for (int k = 0; k < f->torsion; k++) f->torsions[k] += free[1 + 3 * (f->vertices - 2) + k];
+}
+
+/* In place, the Cholesky factor of A (n, n) below its diagonal; 0 if A is not positive definite. */
+static int factorise(double *A, int n)
+{
+    for (int j = 0; j < n; j++) {
+        double pivot = A[j * n + j] - dot(A + j * n, A + j * n, j);
+        if (!(pivot > 0.0)) return 0;
+        pivot = sqrt(pivot);
+        A[j * n + j] = pivot;
+        for (int i = j + 1; i < n; i++) A[i * n + j] = (A[i * n + j] - dot(A + i * n, A + j * n, j)) / pivot;
+    }
+    return 1;
+}
+
+/* The gain of settling_gain in factors: L of the Hessian of the free unknowns, half = rows L^-T, and the factor of
+   half half^T. */
+typedef struct {
+    int free, *of;
+    double *factor, *half, *normal;
+} Gain;
+
+static int gain_of(Fused *f, Gain *g, double *work)
+{
+    int n = f->unknowns, m = f->tips + f->hard, last = n - 1, free = 0;
+    g->factor = work;
+    g->half = work + n * n;
+    g->normal = g->half + m * n;
+    g->of = (int *)(g->normal + m * m);
+    for (int k = 0; k < last; k++)
+        if (k >= f->actuators || (f->x[k] > f->lower[k] + f->at_bound && f->x[k] < f->upper[k] - f->at_bound))
+            g->of[free++] = k;
+    g->free = free;
+    if (free < m) return 0;
+    for (int i = 0; i < free; i++)
+        for (int j = 0; j <= i; j++) g->factor[i * free + j] = f->hessian[g->of[i] * n + g->of[j]];
+    if (!factorise(g->factor, free)) return 0;
+    for (int k = 0; k < m; k++) {
+        double *half = g->half + k * free;
+        for (int i = 0; i < free; i++)
+            half[i] = (f->constraint[k * n + g->of[i]] - dot(g->factor + i * free, half, i)) / g->factor[i * free + i];
+    }
+    for (int i = 0; i < m; i++)
+        for (int j = 0; j <= i; j++) g->normal[i * m + j] = dot(g->half + i * free, g->half + j * free, free);
+    if (!factorise(g->normal, m)) return 0;
+    double least = INFINITY, greatest = 0.0;
+    for (int i = 0; i < m; i++) {
+        least = fmin(least, g->normal[i * m + i]);
+        greatest = fmax(greatest, g->normal[i * m + i]);
+    }
+    return greatest * greatest < f->worst_condition * least * least;
+}
+
+/* The least changes (n) of the unknowns that make good what is missing (m). */
+static void change_by(const Fused *f, const Gain *g, const double *missing, double *change, double *work)
+{
+    int n = f->unknowns, m = f->tips + f->hard, free = g->free;
+    double *shares = work, *part = work + m;
+    for (int i = 0; i < m; i++)
+        shares[i] = (missing[i] - dot(g->normal + i * m, shares, i)) / g->normal[i * m + i];
+    memset(part, 0, sizeof(double) * free);
+    for (int i = m - 1; i >= 0; i--) {
+        shares[i] /= g->normal[i * m + i];
+        for (int j = 0; j < i; j++) shares[j] -= g->normal[i * m + j] * shares[i];
+        for (int k = 0; k < free; k++) part[k] += shares[i] * g->half[i * free + k];
+    }
+    memset(change, 0, sizeof(double) * n);
+    for (int i = free - 1; i >= 0; i--) {
+        part[i] /= g->factor[i * free + i];
+        for (int j = 0; j < i; j++) part[j] -= g->factor[i * free + j] * part[i];
+        change[g->of[i]] = part[i];
+    }
+}
+
+/* Settle q and the curve: quantities exact, equalities satisfied. Each step closes the quantities too. Steps (n) after
+   the first have Broyden's updates of the gain, in the form that needs the steps alone. */
+EXPORT int settle(Fused *f)
+{
+    int n = f->unknowns, m = f->tips + f->hard, steps = 0, counted = 0;
+    double *step = f->work + f->nodes + n * f->squares, *work = step + (f->settling_steps + 1) * n;
+    double furthest = f->furthest;
+    Gain gain;
+    for (;;) {
+        if (call(&f->close)) return UNSETTLED;
+        double error = *f->error;
+        if (!(error < f->too_far)) return UNSETTLED;
+        if (error > f->nearly) {
+            /* What is missing now is not yet what the equalities lack. */
+            if (counted++ == f->closing_steps) return UNSETTLED;
+            memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
+            continue;
+        }
+        if (call(&f->missing)) return UNSETTLED;
+        f->off = norm(f->missed, m);
+        if (!(f->off <= f->start)) return UNSETTLED;
+        int is_off = f->off > f->enough_tip && steps < f->settling_steps;
+        if (is_off && !steps && !gain_of(f, &gain, work)) is_off = 0;
+        int is_open = error > f->enough_length && counted < f->closing_steps;
+        if (!is_off && !is_open) break;
+        if (is_open || is_off) memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
+        counted += !is_off;
+        if (!is_off) continue;
+        double *next = step + steps * n;
+        change_by(f, &gain, f->missed, next, work + n * n + m * (n + m) + n);
+        for (int k = 0; k < steps; k++) {
+            const double *before = step + k * n;
+            double share = dot(before, next, n) / dot(before, before, n);
+            if (k < steps - 1)
+                for (int i = 0; i < n; i++) next[i] += share * before[n + i];
+            else if (share < 1.0)
+                for (int i = 0; i < n; i++) next[i] /= 1.0 - share;
+        }
+        steps++;
+        advance(f, next, 0);
+    }
+    f->furthest = furthest;
+    return *f->error <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
+}
+
+/* Solve, follow the answer from q, and settle. */
+EXPORT int move(Fused *f, double tolerance)
+{
+    int code = solve(f);
+    if (code) return code;
+    if (!(f->primal <= tolerance && f->dual <= tolerance)) return INACCURATE;
+    double before = *f->progress, reached = fmin(fmax(before + f->x[f->unknowns - 1], 0.0), 1.0), fastest = 0.0;
+    for (int k = 0; k < 3; k++) fastest = fmax(fastest, fmax(fabs(f->velocity[k]), fabs(f->spin[k])));
+    /* The arm would need one more step for what interior-point solvers leave. */
+    if ((1.0 - reached) * fastest <= f->left) reached = 1.0;
+    f->reached = reached;
+    *f->gone = reached - before;
+    memcpy(f->q, f->condense.arg[0], sizeof(double) * f->coordinates);
+    memcpy(f->points, f->condense.arg[3], sizeof(double) * 3 * f->vertices);
+    memset(f->torsions, 0, sizeof(double) * f->torsion);
+    advance(f, f->x, 1);
+    memcpy(f->started, f->q, sizeof(double) * f->coordinates);
+    memcpy(f->started_points, f->points, sizeof(double) * 3 * f->vertices);
+    return settle(f);
+}
