@@ -36,7 +36,7 @@ typedef struct {
     int settling_steps, closing_steps;
     double too_far;
 
-    /* (StepGraph.inputs) -> results of row_function; (q, lower, upper) -> (closer q, quantities, error);
+    /* (StepGraph.inputs) -> results of row_function; (q, lower, upper) -> (closer q, quantities, errors);
        (StepGraph.inputs, gone) -> results of missing_function. */
     Kernel condense, close, missing;
     void (*quadprog)(DAQPResult *, DAQPProblem *, DAQPSettings *);
@@ -62,12 +62,12 @@ typedef struct {
     double *q, *points;                        /* what close and missing read: q, and (V, 3) */
     double *gone;                              /* (1) */
     const double *progress, *velocity, *spin;  /* (1), (3), (3) */
-    const double *closer, *values, *error, *missed;
+    const double *closer, *errors, *missed;
     double *torsions;                          /* (T) changes */
     double *started, *started_points;          /* q and the curve before they were settled */
 
-    /* Tolerances; errors of quantities that count as closed, as nearly closed; errors of equalities that are enough. */
-    double member, tip, start, enough_length, nearly, enough_tip;
+    /* Tolerances of quantities and equalities, greatest error at the start, and errors at which the iterations end. */
+    double member, tip, start, enough_length, enough_tip;
 
     double primal, dual, reached, furthest, off;
     int flag, iterations;
@@ -314,8 +314,8 @@ static void change_by(const Fused *f, const Gain *g, const double *missing, doub
     }
 }
 
-/* Settle q and the curve: quantities exact, equalities satisfied. Each step closes the quantities too. Steps (n) after
-   the first have Broyden's updates of the gain, in the form that needs the steps alone. */
+/* Settle q and the curve: quantities exact, equalities satisfied. Steps (n) after the first have Broyden's updates of
+   the gain, in the form that needs the steps alone. */
 EXPORT int settle(Fused *f)
 {
     int n = f->unknowns, m = f->tips + f->hard, steps = 0, counted = 0;
@@ -324,24 +324,19 @@ EXPORT int settle(Fused *f)
     Gain gain;
     for (;;) {
         if (call(&f->close)) return UNSETTLED;
-        double error = *f->error;
-        if (!(error < f->too_far)) return UNSETTLED;
-        if (error > f->nearly) {
-            /* What is missing now is not yet what the equalities lack. */
-            if (counted++ == f->closing_steps) return UNSETTLED;
+        /* The norm is NaN where one of the errors is. */
+        double error = f->errors[0];
+        if (!(error < f->too_far && f->errors[1] < INFINITY)) return UNSETTLED;
+        if (error > f->enough_length && counted++ < f->closing_steps) {
             memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
             continue;
         }
         if (call(&f->missing)) return UNSETTLED;
         f->off = norm(f->missed, m);
         if (!(f->off <= f->start)) return UNSETTLED;
-        int is_off = f->off > f->enough_tip && steps < f->settling_steps;
-        if (is_off && !steps && !gain_of(f, &gain, work)) is_off = 0;
-        int is_open = error > f->enough_length && counted < f->closing_steps;
-        if (!is_off && !is_open) break;
-        if (is_open || is_off) memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
-        counted += !is_off;
-        if (!is_off) continue;
+        if (f->off <= f->enough_tip || steps == f->settling_steps) break;
+        if (!steps && !gain_of(f, &gain, work)) break;
+        counted = 0;
         double *next = step + steps * n;
         change_by(f, &gain, f->missed, next, work + n * n + m * (n + m) + n);
         for (int k = 0; k < steps; k++) {
@@ -356,7 +351,7 @@ EXPORT int settle(Fused *f)
         advance(f, next, 0);
     }
     f->furthest = furthest;
-    return *f->error <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
+    return f->errors[0] <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
 }
 
 /* Solve, follow the answer from q, and settle. */

@@ -46,9 +46,6 @@ from vgtm_qp.rows.tip import TipGoal
 
 SOURCE = Path(__file__).with_name("fused.c")
 _NOWHERE: Array = np.zeros((0, 3))
-_NEARLY = 1e-9
-"""Error of quantities, m or rad, below which settling corrects them together with tip and stations."""
-
 _ROOM, _SLOTS = 24, 4
 """Rows of clearance for which there is room at first, and nodes of each."""
 
@@ -268,7 +265,6 @@ class _Workspace:
                 tip=accuracy.tip,
                 start=accuracy.start,
                 enough_length=enough_length(home, accuracy.member),
-                nearly=_NEARLY,
                 enough_tip=enough_tip_error(home, accuracy.tip),
             )
 
@@ -288,9 +284,9 @@ class _Workspace:
 
     def closed(self) -> Closed:
         """Return the settled configuration."""
-        (_, quantities, error), (_, position, rotation) = self.close.outputs, self.missing.outputs
+        (_, quantities, errors), (_, position, rotation) = self.close.outputs, self.missing.outputs
         q, turned = self.q.reshape(self.shape).copy(), rotation.reshape(3, 3).T.copy()
-        return Closed(q, quantities.copy(), float(error[0]), position.copy(), turned)
+        return Closed(q, quantities.copy(), float(errors[0]), position.copy(), turned)
 
     def _start(self) -> None:
         """Allocate the arrays, and tell the C where they are."""
@@ -356,7 +352,7 @@ class _Workspace:
             velocity=condense.inputs[10],
             spin=condense.inputs[11],
             closer=close.outputs[0],
-            error=close.outputs[2],
+            errors=close.outputs[2],
             missed=missing.outputs[0],
             torsions=np.zeros(layout.torsion),
             started=self.started,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgesv, dposv
+from scipy.linalg import cho_solve, solve_triangular
 
 from vgtm_qp.arm.symbols import Bound, Constants, rotated
 from vgtm_qp.arrays import Array
@@ -77,16 +77,18 @@ def settling_gain(hessian: Array, rows: Array, free: NDArray[np.bool_]) -> Array
     """
     if np.count_nonzero(free) < len(rows):
         return None
-    moving = rows[:, free]
-    _, answer, failed = dposv(hessian[np.ix_(free, free)], moving.T)
-    if failed:
+    try:
+        factor = np.linalg.cholesky(hessian[np.ix_(free, free)])
+        half = solve_triangular(factor, rows[:, free].T, lower=True)
+        normal = np.linalg.cholesky(half.T @ half)
+    except (np.linalg.LinAlgError, ValueError):
         return None
-    normal = moving @ answer
-    _, _, shares, failed = dgesv(normal, np.eye(len(rows)))
-    if failed or not np.abs(shares).max() * np.abs(normal).max() < WORST_CONDITION:
+    pivots = normal.diagonal()
+    if not pivots.max() ** 2 < WORST_CONDITION * pivots.min() ** 2:
         return None
     gain = np.zeros((len(free), len(rows)))
-    gain[free] = answer @ shares
+    shares = cho_solve((normal, True), np.eye(len(rows)))
+    gain[free] = solve_triangular(factor, half @ shares, lower=True, trans=1)
     return gain
 
 
@@ -130,14 +132,17 @@ def missing_function(layout: Layout) -> Bound:
 
 
 def closing_function(layout: Layout) -> Bound:
-    """Return the function (q, lower, upper) -> q after one Newton step, and quantities (M) and their error at q.
+    """Return the function (q, lower, upper) -> q after one Newton step; quantities (M) and their errors at q.
 
-    Fixed quantities go to their values, actuators into their boxes (n_a); see ``ArmSymbols.closed``.
+    Fixed quantities go to their values, actuators into their boxes (n_a); see ``ArmSymbols.closed``. The errors are the
+    greatest one, which skips NaN, and their norm, which keeps it.
     """
     constants, arm = Constants(), layout.arm
     symbols = arm.symbols(constants)
     q, count = ca.MX.sym("q", *symbols.shape), len(arm.actuators)
     lower, upper = ca.MX.sym("lower", count), ca.MX.sym("upper", count)
     quantities = symbols.quantities(q)
-    results = [symbols.closed(q, lower, upper), quantities, symbols.error(quantities, lower, upper)]
+    off = quantities - symbols.aims(quantities, lower, upper)
+    errors = ca.vertcat(ca.norm_inf(off), ca.norm_2(off))
+    results = [symbols.closed(q, lower, upper), quantities, errors]
     return constants.bound("close", [q, lower, upper], results)
