@@ -16,8 +16,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import vgtm_qp as vq
 from vgtm_qp.builder import source_of
 from vgtm_qp.compiled import Kernel, compiler, finish_compiling, stop_compilers
+from vgtm_qp.maneuver.plan import make_plan
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -332,3 +334,162 @@ def test_an_interrupt_ends_a_compiler_that_hangs_with_its_children(tmp_path, com
         process.communicate(timeout=300.0)
     assert process.returncode in (130, -signal.SIGINT)
     _wait(lambda: not _is_running(child))
+
+
+def _waits(folder: Path) -> Path:
+    """Return a compiler that notes each run in ``runs``, and compiles only once there is a file ``go``."""
+    wrapper = folder / "waits"
+    wrapper.write_text(
+        f'#!/bin/sh\necho run >> "{folder / "runs"}"\n'
+        f'while [ ! -e "{folder / "go"}" ]; do sleep 0.05; done\nexec {compiler()} "$@"\n'
+    )
+    wrapper.chmod(0o755)
+    return wrapper
+
+
+@needs_compiler
+def test_no_call_waits_and_a_kernel_changes_over_when_its_library_is_there(tmp_path, monkeypatch):
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("VGTM_CACHE", str(cache))
+    monkeypatch.setenv("VGTM_CC", str(_waits(tmp_path)))
+    kernel, rng = Kernel(_long("changing", 1.5)), np.random.default_rng(0)
+    source, result = np.zeros(120), np.zeros(120)
+    kernel.bind_input(0, source)
+    kernel.bind_output(0, result)
+    values = rng.normal(size=(20, 120))
+    before = []
+    for row in values:
+        source[:] = row
+        kernel()
+        before.append(result.copy())
+    _wait((tmp_path / "runs").exists)
+    kernel()
+    # The compiler runs until it may go on: no call can have waited for it.
+    assert not kernel.is_compiled
+    (tmp_path / "go").touch()
+    _wait(lambda: bool(list(cache.glob("changing-*.so"))))
+    for row, wanted in zip(values, before, strict=True):
+        source[:] = row
+        kernel()
+        np.testing.assert_allclose(result, wanted, rtol=1e-14, atol=1e-14)
+    assert kernel.is_compiled
+    assert kernel.outputs[0] is result
+
+
+@needs_compiler
+def test_what_is_seldom_called_is_not_compiled(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("VGTM_CC", str(_waits(tmp_path)))
+    kernel = Kernel(_square())
+    for _ in range(7):
+        assert _value(kernel) == 9.0
+    assert not (tmp_path / "cache").exists()
+    assert _value(kernel) == 9.0
+    _wait((tmp_path / "runs").exists)
+    stop_compilers()
+    assert _value(kernel) == 9.0
+
+
+OFTEN = """
+import casadi as ca
+from vgtm_qp.compiled import Kernel
+x = ca.SX.sym("x")
+kernel = Kernel(ca.Function("square", [x], [x * x]))
+for _ in range(20):
+    kernel()
+import pathlib, time
+while not pathlib.Path({runs!r}).exists():
+    time.sleep(0.01)
+print(kernel.is_compiled)
+"""
+
+
+@needs_compiler
+def test_the_end_of_a_process_does_not_wait_and_its_kernels_are_compiled_for_the_next(tmp_path):
+    cache, settings = tmp_path / "cache", {"VGTM_CC": str(_waits(tmp_path))}
+    found = _run(OFTEN.format(runs=str(tmp_path / "runs")), cache, **settings)
+    # The compiler still runs, and is not gone.
+    assert (found.returncode, found.stdout) == (0, "False\n"), found.stderr
+    assert not list(cache.glob("*.so"))
+    (tmp_path / "go").touch()
+    _wait(lambda: bool(list(cache.glob("*.so"))) and not list(cache.glob("*.new")))
+    count = len((tmp_path / "runs").read_text().split())
+    assert _run(LOADED, cache, **settings).stdout == "True 9.0\n"
+    assert len((tmp_path / "runs").read_text().split()) == count
+
+
+@needs_compiler
+def test_two_processes_make_one_library_once(tmp_path):
+    environment = {**os.environ, "VGTM_CACHE": str(tmp_path / "cache"), "VGTM_CC": str(_waits(tmp_path))}
+    both = [
+        subprocess.Popen([sys.executable, "-c", LOADED], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    _wait((tmp_path / "runs").exists)
+    (tmp_path / "go").touch()
+    assert [process.communicate(timeout=300.0)[0] for process in both] == ["True 9.0\n"] * 2
+    # One run for the object, one for the library.
+    assert len((tmp_path / "runs").read_text().split()) == 2
+
+
+@needs_compiler
+def test_what_a_killed_process_left_in_the_cache_is_taken_over(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    assert Kernel(_square()).compile()
+    (library,) = tmp_path.glob("*.so")
+    library.unlink()
+    for name in (f"{library.name}.new", f"{library.with_suffix('.o').name}.new"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "made").write_bytes(b"half")
+        os.utime(tmp_path / name, (0.0, 0.0))
+    assert Kernel(_square()).compile()
+    assert not list(tmp_path.glob("*.new"))
+
+
+@needs_compiler
+def test_a_builder_that_is_killed_leaves_interpreted_kernels(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("VGTM_CC", str(_waits(tmp_path)))
+    stop_compilers()
+    kernel = Kernel(_square())
+    for _ in range(10):
+        kernel()
+    _wait((tmp_path / "runs").exists)
+    builder = kernel._compiling._builder
+    builder._process.kill()
+    builder.ended.wait(300.0)
+    assert _value(kernel) == 9.0
+    assert kernel.is_done
+    assert not kernel.is_compiled
+    (tmp_path / "go").touch()
+
+
+@needs_compiler
+def test_a_step_is_the_same_while_kernels_are_interpreted_and_once_they_are_compiled(tmp_path, monkeypatch):
+    """The same maneuver with kernels that change over on the way, and with none that can."""
+    problem = vq.Problem(
+        truss={"module": "octahedral", "bays": 3},
+        curve={"control_vertices": 4},
+        maneuver={"steps": 24, "waypoint": [{"time": 6.0, "position": [0.4, 0.1, 2.2]}]},
+        obstacle=[{"name": "ball", "shape": "sphere", "center": [0.9, 0.0, 1.4], "radius": 0.3}],
+        clearance={"safe": 0.05},
+    )
+    monkeypatch.setenv("VGTM_CC", "none")
+    interpreted = vq.Resolver(problem)
+    monkeypatch.delenv("VGTM_CC")
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    changing = vq.Resolver(problem)
+    plan = make_plan(problem, *changing.tip())
+    value, ready = plan.path.start, []
+    for count, mark in enumerate(plan.marks.tolist()):
+        if count == 12:
+            finish_compiling()
+        changing.state = interpreted.state
+        steps = [one.follow(plan.path, value, mark) for one in (interpreted, changing)]
+        assert all(step.moved for step in steps)
+        np.testing.assert_allclose(steps[1].state.nodes, steps[0].state.nodes, rtol=0.0, atol=1e-10)
+        value += steps[0].progress * (mark - value)
+        ready.append(changing.setup.engine.is_ready)
+    # It changed over on the way.
+    assert not ready[0]
+    assert ready[-1]
