@@ -1,23 +1,72 @@
-"""Settings of all tests."""
+"""Settings of all tests: how many processes run them, and what they draw at random."""
 
+import os
 import secrets
+import signal
+import zlib
 
+# Each process of the tests has a core of its own. NumPy reads this when it is first imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
 import pytest
-from hypothesis import settings
+from hypothesis import is_hypothesis_test, settings
 
-# Every run looks at new cases, in CI too; what was found once stays as an explicit example beside its test. The seed
-# of a run is told in its first lines, and `pytest --hypothesis-seed=...` draws the same cases again.
-settings.register_profile("fresh", derandomize=False, print_blob=True)
-settings.load_profile("fresh")
+# A shell starts what it runs in the background deaf to interrupts, and the programs that tests start would inherit
+# that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+settings.register_profile("property", derandomize=False, print_blob=True)
+settings.load_profile("property")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that repeats the random cases of a run."""
+    parser.addoption(
+        "--seed", type=int, metavar="N", help="Draw the random cases of seed N, which an earlier run has told"
+    )
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_configure(config: pytest.Config) -> None:
-    """Choose the seed of all property tests, before hypothesis asks for one; workers are given that of the run."""
-    if config.getoption("hypothesis_seed") is None:
-        config.option.hypothesis_seed = str(secrets.randbits(32))
+    """Choose the seed of the run, unless it is given, before hypothesis asks for it; workers are given the run's."""
+    option = config.option
+    if option.seed is None:
+        option.seed = secrets.randbits(32)
+    if option.hypothesis_seed is None:
+        option.hypothesis_seed = str(option.seed)
 
 
 def pytest_report_header(config: pytest.Config) -> str:
-    """Tell the seed."""
-    return f"property tests: --hypothesis-seed={config.getoption('hypothesis_seed')}"
+    """Tell the seed: what a run finds is found again with it."""
+    return f"random cases: --seed={config.option.seed} draws them again"
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Tell the seed once more beside what failed; a quiet run has no header."""
+    if terminalreporter.stats.get("failed") or terminalreporter.stats.get("error"):
+        terminalreporter.write_line(pytest_report_header(config))
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Use all cores; for files and tests that are named, and for what is printed by ``-s``, this process alone."""
+    named = config.args_source is pytest.Config.ArgsSource.ARGS and all(".py" in each for each in config.args)
+    if named or config.option.capture == "no":
+        return 0
+    cores = os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS", "")
+    return int(cores) if cores.isdigit() else len(os.sched_getaffinity(0))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that draw new cases in each run, for ``-m property``."""
+    for item in items:
+        if isinstance(item, pytest.Function) and (is_hypothesis_test(item.obj) or "rng" in item.fixturenames):
+            item.add_marker("property")
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Return random numbers that are new in each run and in each test."""
+    return np.random.default_rng([request.config.option.seed, zlib.crc32(request.node.nodeid.encode())])

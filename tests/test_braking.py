@@ -11,6 +11,9 @@ from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.step.path import Path
 
 CRATE = {"name": "crate", "shape": "box", "center": [0.9, 0.3, 1.8], "size": [0.5, 0.5, 0.5]}
+KNOWN = [0, 1, None]
+"""Seeds of goals that make the arm brake; of those that are drawn anew only what must hold of all is asserted."""
+
 WALL = {"name": "wall", "shape": "box", "center": [1.0, 0.0, 2.0], "size": [0.3, 6.0, 6.0]}
 
 
@@ -48,26 +51,27 @@ def test_limited_accelerations_stretch_a_maneuver_round_a_corner(acceleration, l
 
 def test_a_maneuver_that_is_blocked_ends_where_the_arm_may_rest():
     goal = [{"time": 6.0, "position": [1.2, 0.0, 2.0]}]
-    maneuver = vq.solve(problem(0.1, **{"obstacle": [WALL], "maneuver.waypoint": goal}))
+    maneuver = vq.solve(problem(0.1, **{"obstacle": [WALL], "maneuver.waypoint": goal, "maneuver.steps": 20}))
     assert maneuver.status == "blocked"
     assert maneuver.certificate.ok, maneuver.certificate.failures()
     rate = np.diff(maneuver.member_lengths[-2:], axis=0)[0] / np.diff(maneuver.time[-2:])
     assert np.abs(rate[maneuver.member_actuated]).max() <= 0.1 * np.diff(maneuver.time[-2:]) + 1e-9
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("known", KNOWN)
 @pytest.mark.parametrize("obstacles", [[], [CRATE]])
-def test_random_goals_in_a_control_loop_never_trap_a_moving_arm(seed, obstacles):
+def test_random_goals_in_a_control_loop_never_trap_a_moving_arm(known, obstacles, rng):
     resolver = vq.Resolver(problem(0.1, obstacle=obstacles))
-    truss, random = truss_of(resolver.setup.arm), np.random.default_rng(seed)
+    rng = rng if known is None else np.random.default_rng(known)
+    truss = truss_of(resolver.setup.arm)
     steps, goal = [], np.zeros(3)
     for k in range(40):
         if k % 8 == 0:
-            goal = np.array([0.0, 0.0, 2.0]) + random.uniform([-0.9, -0.9, -0.5], [0.9, 0.9, 0.5])
+            goal = np.array([0.0, 0.0, 2.0]) + rng.uniform([-0.9, -0.9, -0.5], [0.9, 0.9, 0.5])
         before = resolver.state
         step = resolver.step(position=goal, dt=0.2)
         if step.status is vq.StepStatus.BLOCKED:
-            assert may_rest(truss, steps[-1], before)
+            assert not steps or may_rest(truss, steps[-1], before)
             continue
         steps.append(before)
         change = np.abs(step.state.rates - before.rates)[truss.actuators]
@@ -75,8 +79,9 @@ def test_random_goals_in_a_control_loop_never_trap_a_moving_arm(seed, obstacles)
         assert np.all(change <= (truss.acceleration[truss.actuators] + 1e-9) * interval)
         if obstacles:
             assert resolver.setup.monitor.least(step.state.nodes, among="obstacles")[0] >= 0.05 - 1e-9
-    assert len(steps) >= 30
-    assert max(np.abs(state.rates).max() for state in steps) > 0.03
+    if known is not None:
+        assert len(steps) >= 30
+        assert max(np.abs(state.rates).max() for state in steps) > 0.03
 
 
 def keeps_accelerations(truss, before, after, slack=1e-9):
@@ -110,12 +115,11 @@ ELASTIC = {"method.tracking_mode": "elastic"}
 """What brakes the arm is known of this tracking; stations on the curve take it other ways."""
 
 
-def random_goals(seed, count=40, base=None):
+def random_goals(rng, count=40, base=None):
     """Yield goals, as functions of the resolver, that jump every eight steps; they go with a base that moves."""
-    random = np.random.default_rng(seed)
     for k in range(count):
         if k % 8 == 0:
-            goal = np.array([0.0, 0.0, 2.0]) + random.uniform([-0.9, -0.9, -0.5], [0.9, 0.9, 0.5])
+            goal = np.array([0.0, 0.0, 2.0]) + rng.uniform([-0.9, -0.9, -0.5], [0.9, 0.9, 0.5])
         yield (
             lambda resolver, goal=goal: (
                 goal
@@ -125,22 +129,24 @@ def random_goals(seed, count=40, base=None):
         )
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("known", KNOWN)
 @pytest.mark.parametrize("obstacles", [[], [CRATE]])
-def test_an_elastic_tip_leaves_its_goal_to_brake_and_never_traps_a_moving_arm(seed, obstacles):
+def test_an_elastic_tip_leaves_its_goal_to_brake_and_never_traps_a_moving_arm(known, obstacles, rng):
     resolver = vq.Resolver(problem(0.1, obstacle=obstacles, **{"end_effector.mode": "elastic", **ELASTIC}))
-    steps = drive(resolver, random_goals(seed))
-    assert max(np.abs(step.state.rates).max() for step in steps) > 0.1
-    assert any(step.braked and step.left_path for step in steps)
+    steps = drive(resolver, random_goals(rng if known is None else np.random.default_rng(known)))
+    if known is not None:
+        assert max(np.abs(step.state.rates).max() for step in steps) > 0.1
+        assert any(step.braked and step.left_path for step in steps)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_hard_tip_that_is_turned_round_brakes_along_its_path(seed):
+@pytest.mark.parametrize("known", KNOWN)
+def test_a_hard_tip_that_is_turned_round_brakes_along_its_path(known, rng):
     resolver = vq.Resolver(problem(0.1, **{"end_effector.mode": "hard"}))
-    random, speed, steps = np.random.default_rng(seed), np.zeros(3), []
+    rng = rng if known is None else np.random.default_rng(known)
+    speed, steps = np.zeros(3), []
     for k in range(60):
         if k % 12 == 0:
-            wanted = random.uniform(-0.08, 0.08, 3)
+            wanted = rng.uniform(-0.08, 0.08, 3)
         speed = speed + np.clip(wanted - speed, -0.006, 0.006)
         if k % 20 == 19:
             speed = -speed
@@ -149,9 +155,10 @@ def test_a_hard_tip_that_is_turned_round_brakes_along_its_path(seed):
             truss = truss_of(resolver.setup.arm)
             speed = truss.tip_weights @ resolver.state.motion[truss.tip] / 0.2
     braked = [step for step in steps if step.braked]
-    assert braked
     assert not any(step.left_path for step in braked)
-    assert sum(step.status is vq.StepStatus.REACHED for step in steps) > 40
+    if known is not None:
+        assert braked
+        assert sum(step.status is vq.StepStatus.REACHED for step in steps) > 40
 
 
 SLOW = {"time": 10.0, "position": [0.1, 0.0, 0.05], "rotation_vector": [0.0, 0.02, 0.02]}
@@ -161,12 +168,15 @@ IN_THE_WAY = {**CRATE, "center": [0.92, 0.3, 1.8]}
 
 @pytest.mark.parametrize("mode", ["scaled", "elastic"])
 @pytest.mark.parametrize(("base", "obstacles"), [(SLOW, [CRATE]), (SIDEWAYS, [IN_THE_WAY])])
-def test_a_moving_base_never_traps_a_moving_arm(mode, base, obstacles):
+@pytest.mark.parametrize("known", [1, None])
+def test_a_moving_base_never_traps_a_moving_arm(mode, base, obstacles, known, rng):
     changes = {"truss.base_motion": [base], "end_effector.mode": mode}
-    steps = drive(vq.Resolver(problem(0.1, obstacle=obstacles, **changes)), random_goals(1, 60, base))
-    assert sum(step.braked for step in steps) > 3
+    goals = random_goals(rng if known is None else np.random.default_rng(known), 60, base)
+    steps = drive(vq.Resolver(problem(0.1, obstacle=obstacles, **changes)), goals)
     assert mode == "elastic" or not any(step.left_path for step in steps)
-    assert max(np.abs(step.state.rates).max() for step in steps) > 0.1
+    if known is not None:
+        assert sum(step.braked for step in steps) > 3
+        assert max(np.abs(step.state.rates).max() for step in steps) > 0.1
 
 
 @pytest.mark.parametrize("mode", ["scaled", "elastic"])

@@ -59,9 +59,8 @@ def engines(name, *, vertices=5, hard=False, track=None):
     [(name, vertices, False) for name in MODULES for vertices in (5, 0)]
     + [(name, 7, True) for name in SQUARE],
 )
-def test_both_engines_give_one_answer(name, vertices, hard, base):
+def test_both_engines_give_one_answer(name, vertices, hard, base, rng):
     layout, kinematics, plain, chain = engines(name, vertices=vertices, hard=hard)
-    rng = np.random.default_rng(5)
     X, Y, points, target, rows = make_step(layout, kinematics, rng, base=base)
     target = replace(target, lower=target.lower - 1.0, upper=target.upper + 1.0) if hard else target
     for motion, progress in ((True, 0.0), (False, 0.7), (True, 0.0)):
@@ -86,12 +85,12 @@ def test_both_engines_give_one_answer(name, vertices, hard, base):
     [(name, vertices, False) for name in MODULES for vertices in (5, 0)]
     + [(name, 7, True) for name in SQUARE],
 )
-def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
+def test_both_engines_settle_in_one_place(name, vertices, hard, tight, rng):
     """From the end of a motion; `tight` actuators end at a bound, or beyond it, and are brought back."""
     layout, kinematics, plain, chain = engines(name, vertices=vertices, hard=hard)
     arm, tip = layout.arm, layout.arm.end_effector
     points = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, arm.height]
-    _, _, _, target, rows = make_step(layout, kinematics, np.random.default_rng(5))
+    _, _, _, target, rows = make_step(layout, kinematics, rng)
     kinematics.evaluate(arm.home)
     home = kinematics.quantities[arm.actuators]
     reach = 0.004 if tight else 0.5
@@ -135,14 +134,13 @@ def test_both_engines_settle_in_one_place(name, vertices, hard, tight):
 
 @pytest.mark.parametrize("name", ["octahedral", "hexapod", "tetrahedral-23"])
 @pytest.mark.parametrize("reverse", [False, True])
-def test_the_rows_of_a_period_are_derivatives(name, reverse):
+def test_the_rows_of_a_period_are_derivatives(name, reverse, rng):
     """Lengths, gaps and angles against central differences of themselves, the Jacobians being taken at X too."""
     layout, kinematics, *_ = engines(name)
     chain, arm = find_chain(layout), layout.arm
     elimination = Elimination(chain)
     data = ChainData(chain, elimination.inputs.sizes, is_reversed=reverse)
     values = PeriodValues(chain, data)
-    rng = np.random.default_rng(3)
     X, _, points, _, _ = make_step(layout, kinematics, rng)
     moved = rng.normal(size=X.shape)
     moved[arm.base] = 0.0

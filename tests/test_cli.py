@@ -55,6 +55,7 @@ def run(capsys: pytest.CaptureFixture[str], *tokens: str) -> tuple[int, str, str
     return code, captured.out, captured.err
 
 
+@pytest.mark.smoke
 def test_solve_writes_a_verified_result_and_prints_a_table(capsys, folder):
     code, out, err = run(capsys, "solve", "free.toml")
     assert (code, err) == (0, WARNING)
@@ -120,6 +121,7 @@ def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
     assert run(capsys, "verify", summary["result"])[0] == 3
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     ("tokens", "words"),
     [
@@ -210,6 +212,7 @@ def test_mistakes_that_only_the_arm_shows_have_their_place_too(
     assert err == f"{mistake['file']}: {key}: found {value}; expected {mistake['expected']}\n"
 
 
+@pytest.mark.smoke
 def test_check_describes_the_truss(capsys):
     code, out, _ = run(capsys, "check", "free.toml")
     assert code == 0
@@ -248,6 +251,7 @@ def test_a_maneuver_outside_its_tolerances_gives_4(capsys):
     assert not document["verified"]
 
 
+@pytest.mark.smoke
 def test_list_and_schema_and_doctor(capsys):
     bundled = vq.bundled_problems()
     assert [entry["name"] for entry in json.loads(run(capsys, "list", "--json")[1])["problems"]] == list(

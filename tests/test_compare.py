@@ -29,6 +29,7 @@ def report() -> vq.Report:
     return vq.compare(problem, methods=METHODS)
 
 
+@pytest.mark.smoke
 def test_each_method_is_held_against_the_same_verification(report: vq.Report) -> None:
     assert [row.method for row in report.rows] == METHODS
     qp = report.row("qp")
@@ -96,6 +97,7 @@ def test_a_method_that_an_arm_cannot_have_is_refused_in_its_row() -> None:
     report.figure()
 
 
+@pytest.mark.smoke
 def test_every_preset_is_a_valid_method() -> None:
     problem = vq.load_problem("five_bay_free")
     for name in PRESETS:

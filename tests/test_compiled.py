@@ -117,14 +117,14 @@ def test_what_two_kernels_share_is_compiled_once(tmp_path, monkeypatch):
 
 
 @needs_compiler
-def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, monkeypatch):
+def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, monkeypatch, rng):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     a, b = ca.MX.sym("a", 4, 4), ca.MX.sym("b", 4, 4)
     product = a
     for k in range(300):
         product = 0.25 * product @ b + ca.fmin(a + k, b)
     function = ca.Function("product", [a, b], [product])
-    kernel, rng = Kernel(function), np.random.default_rng(0)
+    kernel = Kernel(function)
     assert len(source_of(function)) > 100_000
     assert kernel.compile()
     for array in kernel.inputs:
@@ -137,6 +137,7 @@ def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, mon
     np.testing.assert_allclose(kernel.outputs[0].reshape(4, 4).T, wanted, rtol=1e-12)
 
 
+@pytest.mark.smoke
 def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     kernel = Kernel(_square())
@@ -148,6 +149,7 @@ def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, mo
     assert kernel.outputs[0] is result
 
 
+@pytest.mark.smoke
 @needs_compiler
 def test_finishing_leaves_nothing_to_wait_for(tmp_path, monkeypatch):
     cache = tmp_path / "cache"
@@ -348,11 +350,11 @@ def _waits(folder: Path) -> Path:
 
 
 @needs_compiler
-def test_no_call_waits_and_a_kernel_changes_over_when_its_library_is_there(tmp_path, monkeypatch):
+def test_no_call_waits_and_a_kernel_changes_over_when_its_library_is_there(tmp_path, monkeypatch, rng):
     cache = tmp_path / "cache"
     monkeypatch.setenv("VGTM_CACHE", str(cache))
     monkeypatch.setenv("VGTM_CC", str(_waits(tmp_path)))
-    kernel, rng = Kernel(_long("changing", 1.5)), np.random.default_rng(0)
+    kernel = Kernel(_long("changing", 1.5))
     source, result = np.zeros(120), np.zeros(120)
     kernel.bind_input(0, source)
     kernel.bind_output(0, result)

@@ -23,8 +23,7 @@ FAMILIES = [
 NODES = np.array([0.0, 0.21, 0.5, 0.83, 1.0])
 
 
-def bent_curve(family, seed=0, torsion=2, bend=0.25):
-    rng = np.random.default_rng(seed)
+def bent_curve(family, rng, torsion=2, bend=0.25):
     vertices = 4.0 * family.abscissae[:, None] * np.array([0.0, 0.0, 1.0])
     vertices = vertices + bend * rng.normal(size=vertices.shape)
     return Curve(family, vertices, rng.normal(size=torsion))
@@ -51,9 +50,10 @@ def angular_velocity_rows(curve, nodes, h=1e-5):
     return np.stack(columns, axis=-1)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
-def test_jacobians_agree_with_differences(family):
-    curve = bent_curve(family)
+def test_jacobians_agree_with_differences(family, rng):
+    curve = bent_curve(family, rng)
     np.testing.assert_allclose(
         curve.position_jacobian(NODES), differences(lambda c: c.position(NODES), curve), atol=1e-9
     )
@@ -63,8 +63,8 @@ def test_jacobians_agree_with_differences(family):
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
-def test_orientation_jacobian_agrees_with_differences(family):
-    curve = bent_curve(family, seed=1)
+def test_orientation_jacobian_agrees_with_differences(family, rng):
+    curve = bent_curve(family, rng)
     assert curve.tangent(0.0)[2] < 0.999
     rows = curve.orientation_jacobian(NODES)
     np.testing.assert_allclose(rows, angular_velocity_rows(curve, NODES), atol=3e-6)
@@ -74,9 +74,9 @@ def test_orientation_jacobian_agrees_with_differences(family):
     np.testing.assert_allclose(turn[0], 0.0, atol=1e-14)
 
 
-def test_orientation_rows_on_a_turned_base():
+def test_orientation_rows_on_a_turned_base(rng):
     base = Rotation.from_rotvec([0.4, -0.3, 0.9]).as_matrix()
-    free = bent_curve(bezier(5), seed=4)
+    free = bent_curve(bezier(5), rng)
     curve = Curve(free.family, free.control_vertices @ base.T, free.torsion, base)
     np.testing.assert_allclose(curve.frame(NODES), base @ free.frame(NODES), atol=1e-12)
     np.testing.assert_allclose(
@@ -84,10 +84,11 @@ def test_orientation_rows_on_a_turned_base():
     )
 
 
+@pytest.mark.smoke
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(FAMILIES), st.integers(0, 10**6), st.floats(0.01, 0.99))
 def test_frames_are_rotations_with_the_tangent_as_third_axis(family, seed, s):
-    curve = bent_curve(family, seed)
+    curve = bent_curve(family, np.random.default_rng(seed))
     nodes = np.array([0.0, s, 1.0])
     frames = curve.frame(nodes)
     np.testing.assert_allclose(
@@ -98,8 +99,8 @@ def test_frames_are_rotations_with_the_tangent_as_third_axis(family, seed, s):
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
-def test_frame_rate_agrees_with_differences(family):
-    curve = bent_curve(family, seed=2)
+def test_frame_rate_agrees_with_differences(family, rng):
+    curve = bent_curve(family, rng)
     inner = np.array([0.13, 0.47, 0.91])
     h = 1e-5
     turn = curve.frame(inner + h) @ np.swapaxes(curve.frame(inner - h), -1, -2)
@@ -108,8 +109,8 @@ def test_frame_rate_agrees_with_differences(family):
     )
 
 
-def test_frame_does_not_turn_about_the_tangent_without_torsion():
-    curve = bent_curve(bezier(6), seed=3, torsion=0)
+def test_frame_does_not_turn_about_the_tangent_without_torsion(rng):
+    curve = bent_curve(bezier(6), rng, torsion=0)
     s = np.linspace(0.0, 1.0, 400)
     np.testing.assert_allclose(np.sum(curve.frame_rate(s) * curve.tangent(s), axis=1), 0.0, atol=1e-12)
     # A closed form: along a plane curve the frame turns about the plane's normal and keeps that normal.
@@ -118,8 +119,8 @@ def test_frame_does_not_turn_about_the_tangent_without_torsion():
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
-def test_frame_is_the_solution_of_its_differential_equation(family):
-    curve = bent_curve(family, seed=8, bend=0.15)
+def test_frame_is_the_solution_of_its_differential_equation(family, rng):
+    curve = bent_curve(family, rng, bend=0.15)
 
     def transport(s, flat):
         x, y, z = curve.frame_rate(min(s, 1.0))
@@ -133,11 +134,11 @@ def test_frame_is_the_solution_of_its_differential_equation(family):
             .y[:, -1]
             .reshape(3, 3)
         )
-    np.testing.assert_allclose(curve.frame(1.0), frame, atol=1e-6)
+    np.testing.assert_allclose(curve.frame(1.0), frame, atol=1e-5)
 
 
-def test_frame_of_a_single_parameter_is_that_of_many():
-    curve = bent_curve(b_spline(7, 3), seed=5)
+def test_frame_of_a_single_parameter_is_that_of_many(rng):
+    curve = bent_curve(b_spline(7, 3), rng)
     many = curve.frame(np.linspace(0.0, 1.0, 41))
     np.testing.assert_allclose(curve.frame(0.525), many[21], atol=1e-14)
     assert curve.frame(np.full((2, 3), 0.5)).shape == (2, 3, 3, 3)
@@ -173,19 +174,19 @@ def test_length_of_a_parabola():
     st.sampled_from(FAMILIES), st.integers(0, 10**6), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=5)
 )
 def test_arc_parameters_are_at_their_fractions(family, seed, fractions):
-    curve = bent_curve(family, seed)
+    curve = bent_curve(family, np.random.default_rng(seed))
     s = curve.arc_parameter(fractions)
     np.testing.assert_allclose(curve.length(s), np.array(fractions) * curve.length(), atol=1e-9)
 
 
-def test_arc_parameters_of_the_ends_are_exact():
-    curve = bent_curve(bezier(6))
+def test_arc_parameters_of_the_ends_are_exact(rng):
+    curve = bent_curve(bezier(6), rng)
     np.testing.assert_array_equal(curve.arc_parameter([0.0, 1.0]), [0.0, 1.0])
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
-def test_arc_nodes_move_along_the_curve_by_the_term_the_paper_omits(family):
-    curve = bent_curve(family, seed=6)
+def test_arc_nodes_move_along_the_curve_by_the_term_the_paper_omits(family, rng):
+    curve = bent_curve(family, rng)
     fractions = np.array([0.0, 0.31, 0.64, 1.0])
     s = curve.arc_parameter(fractions)
     rates = curve.arc_node_rates(s)
@@ -198,9 +199,9 @@ def test_arc_nodes_move_along_the_curve_by_the_term_the_paper_omits(family):
 
 
 @pytest.mark.parametrize("fraction", [-0.1, 1.1, float("nan")])
-def test_fractions_outside_are_refused(fraction):
+def test_fractions_outside_are_refused(fraction, rng):
     with pytest.raises(CurveError, match="0 to 1"):
-        bent_curve(bezier(4)).arc_parameter(fraction)
+        bent_curve(bezier(4), rng).arc_parameter(fraction)
 
 
 def test_arc_parameters_around_a_cusp_and_a_sudden_stop():

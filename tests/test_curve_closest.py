@@ -76,6 +76,7 @@ def test_all_closest_points_to_a_box(family, seed, turned):
     assert_all_minima(curve, closest, lambda r: box_distance(r, center, size, rotation))
 
 
+@pytest.mark.smoke
 def test_straight_curve_beside_and_through_a_box():
     curve = straight_curve(bezier(6), [0, 0, 0], [0, 0, 4])
     beside = closest_to_box(curve, [1.15, 0, 2.2], 0.9)
@@ -94,8 +95,7 @@ def test_straight_curve_beside_and_through_a_box():
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
 @pytest.mark.parametrize("s", [0.0, 0.5, 0.37, 1.0])
-def test_point_on_the_curve_is_found_at_distance_zero(family, s):
-    rng = np.random.default_rng(7)
+def test_point_on_the_curve_is_found_at_distance_zero(family, s, rng):
     curve = Curve(family, rng.normal(size=(family.control_vertices, 3)))
     closest = closest_to_point(curve, curve.position(s))
     np.testing.assert_allclose(closest.distance[0], 0.0, atol=1e-12)

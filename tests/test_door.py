@@ -97,9 +97,9 @@ def evaluated(arm, q):
     return kinematics
 
 
-def bent(arm, seed=0, size=0.05):
+def bent(arm, rng, size=0.05):
     """A configuration off home to which the actuators have led."""
-    rng, q = np.random.default_rng(seed), arm.home_configuration
+    q = arm.home_configuration
     for _ in range(3):
         strokes = size * rng.normal(size=len(arm.actuators)) / 3
         q = arm.advanced(q, moved_by(arm, q, strokes), strokes)
@@ -124,7 +124,8 @@ def derivative(arm, q, strokes, function):
 @settings(deadline=None, max_examples=5)
 @given(seed=st.integers(0, 1000))
 def check_motion(arm, seed):
-    q, rng = bent(arm, seed), np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
+    q = bent(arm, rng)
     strokes = rng.normal(size=len(arm.actuators))
     change, nodes = derivative(arm, q, strokes, arm.nodes)
     np.testing.assert_allclose(change, nodes, atol=1e-7)
@@ -135,6 +136,8 @@ def check_motion(arm, seed):
     np.testing.assert_allclose(evaluated(arm, q).quantities, arm.measured(q), atol=1e-12)
 
 
+@pytest.mark.smoke
+@pytest.mark.property
 def test_nodes_and_quantities_move_with_the_actuators(arm):
     check_motion(arm)
 
@@ -142,11 +145,12 @@ def test_nodes_and_quantities_move_with_the_actuators(arm):
 TRACKS = [("position",), ("position", "orientation"), ("x", "z", "pointing")]
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("track", TRACKS, ids="+".join)
-def test_rows_of_tip_and_stations_are_the_derivatives_of_their_residuals(arm, track):
+def test_rows_of_tip_and_stations_are_the_derivatives_of_their_residuals(arm, track, rng):
     layout, _ = make_layout(arm, track, vertices=5)
     linearisation = Linearisation(layout, compiled=False)
-    q, rng = bent(arm, 3), np.random.default_rng(5)
+    q = bent(arm, rng)
     kinematics, tip, count = evaluated(arm, q), arm.end_effector, len(arm.actuators)
     goal = TipGoal(
         tip.position(arm.nodes(q)), kinematics.tip_rotation.copy(), rng.normal(size=3), np.zeros(3)
@@ -175,8 +179,8 @@ def test_rows_of_tip_and_stations_are_the_derivatives_of_their_residuals(arm, tr
         np.testing.assert_allclose(here.tip_rate[:3], goal.velocity, atol=1e-12)
 
 
-def test_rows_of_clearances_are_the_derivatives_of_the_distances(arm):
-    q, rng = bent(arm, 7), np.random.default_rng(2)
+def test_rows_of_clearances_are_the_derivatives_of_the_distances(arm, rng):
+    q = bent(arm, rng)
     points = arm.points(q)
     beside = points[arm.bodies.points[len(arm.bodies) // 2]].mean(axis=0) + np.array([0.31, 0.17, 0.05])
     monitor = Clearance(arm.bodies, [sphere("ball", beside, 0.1)], safe=0.05, influence=1.0)
@@ -211,7 +215,7 @@ def test_rows_of_clearances_are_the_derivatives_of_the_distances(arm):
 @given(seed=st.integers(0, 10_000), size=st.floats(0.001, 0.5))
 def check_deviation(arm, seed, size):
     rng = np.random.default_rng(seed)
-    start = bent(arm, seed, 0.2)
+    start = bent(arm, rng, 0.2)
     end = start + size * rng.normal(size=start.shape) / len(start)
     bound = arm.deviation(start, end)
     first, last = arm.points(start), arm.points(end)
@@ -222,6 +226,7 @@ def check_deviation(arm, seed, size):
     assert np.abs(arm.nodes(end) - arm.nodes(start)).max() <= arm.travel(end - start) + 1e-12
 
 
+@pytest.mark.property
 @pytest.mark.parametrize("name", ["offset joints", *SERIAL])
 def test_points_leave_their_chords_by_no_more_than_is_said(name):
     arm = make_arm(problem_of(name))
@@ -230,10 +235,10 @@ def test_points_leave_their_chords_by_no_more_than_is_said(name):
 
 
 @pytest.mark.parametrize("name", ["octahedral", "hexapod"])
-def test_points_of_pin_joints_stay_on_their_chords(name):
+def test_points_of_pin_joints_stay_on_their_chords(name, rng):
     arm = make_arm(problem_of(name))
     assert not arm.leaves_chords
-    start, end = bent(arm, 1), bent(arm, 2)
+    start, end = bent(arm, rng), bent(arm, rng)
     half = arm.points(0.5 * (start + end))
     np.testing.assert_allclose(half, 0.5 * (arm.points(start) + arm.points(end)), atol=1e-14)
 
@@ -366,8 +371,8 @@ def test_the_base_that_verification_places_turns_on_too():
 
 
 @pytest.mark.parametrize("serial", list(SERIAL))
-def test_a_chain_is_where_the_product_of_its_joints_says(serial):
-    arm, rng = make_arm(problem_of(serial)), np.random.default_rng(1)
+def test_a_chain_is_where_the_product_of_its_joints_says(serial, rng):
+    arm = make_arm(problem_of(serial))
     joints = SERIAL[serial]["joint"]
     for _ in range(5):
         q = np.concatenate([rng.uniform(-1.0, 1.0, len(joints)), rng.normal(size=6)])
@@ -420,10 +425,10 @@ def test_certificates_hold_and_files_come_back_as_they_went(name, maneuvers, tmp
     )
 
 
-def test_a_certificate_finds_states_that_were_bent(name, maneuvers):
+def test_a_certificate_finds_states_that_were_bent(name, maneuvers, rng):
     from dataclasses import replace
 
-    maneuver, rng = maneuvers[name], np.random.default_rng(3)
+    maneuver = maneuvers[name]
     key = "joints" if name in SERIAL else "nodes"
     bent_states = getattr(maneuver, key).copy()
     bent_states[-1] += 1e-4 * rng.normal(size=bent_states[-1].shape)
@@ -462,12 +467,12 @@ def test_the_record_of_a_serial_arm_is_held_against_its_problem(maneuvers):
         replace(maneuver, joints=maneuver.joints[:, 1:], joint_names=maneuver.joint_names[1:])
 
 
-def test_a_recorded_chain_bends_no_more_than_its_bound():
+def test_a_recorded_chain_bends_no_more_than_its_bound(rng):
     from vgtm_qp.result.chain import RecordedChain
 
     for serial in SERIAL:
         arm = make_arm(problem_of(serial))
-        chain, rng = RecordedChain(arm.record()), np.random.default_rng(4)
+        chain = RecordedChain(arm.record())
         for size in (0.01, 0.3):
             before = arm.home_configuration + 0.2 * rng.normal(size=arm.home_configuration.shape)
             after = before + size * rng.normal(size=before.shape)

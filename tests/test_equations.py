@@ -73,16 +73,19 @@ def table() -> dict[int, set[str]]:
     return found
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("number", EQUATIONS)
 def test_an_equation_heads_one_function(number: int) -> None:
     functions = headed().get(number, set())
     assert len(functions) == (number not in UNUSED), functions
 
 
+@pytest.mark.smoke
 def test_no_docstring_names_an_equation_that_the_paper_does_not_have() -> None:
     assert set(headed()) <= set(EQUATIONS)
 
 
+@pytest.mark.smoke
 def test_the_table_of_equations_has_them_all_and_names_what_they_head() -> None:
     rows = table()
     assert set(rows) == set(EQUATIONS) - UNUSED
@@ -90,6 +93,7 @@ def test_the_table_of_equations_has_them_all_and_names_what_they_head() -> None:
         assert functions <= rows[number], (number, functions - rows[number])
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     ("line", "wanted"),
     [

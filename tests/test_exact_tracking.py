@@ -36,6 +36,7 @@ def gaps(resolver):
     return np.linalg.norm(stations - layout.curve_weights @ state.control_vertices, axis=1)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     ("module", "bays", "track"),

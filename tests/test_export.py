@@ -61,6 +61,7 @@ def test_the_command_line_names_the_formats_that_there_are():
     assert set(FormatName.__args__) == set(FORMATS)
 
 
+@pytest.mark.smoke
 def test_csv_holds_lengths_and_rates_to_the_last_digit(maneuver: vq.Maneuver, tmp_path: Path):
     with export_maneuver(maneuver, tmp_path / "t.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
@@ -92,6 +93,7 @@ def test_rates_through_the_states_are_exact_for_a_parabola():
     assert np.allclose(through[1:-1, 1], 0.1 + 0.1 * time[1:-1], atol=1e-12)
 
 
+@pytest.mark.smoke
 def test_a_ros_trajectory_holds_the_lengths(maneuver: vq.Maneuver, tmp_path: Path):
     message = yaml.safe_load(export_maneuver(maneuver, tmp_path / "t.yaml").read_text())
     assert message["joint_names"] == list(maneuver.actuator_names)
@@ -247,6 +249,7 @@ def test_a_missing_extra_is_named_with_the_pip_line(
         replay(still)
 
 
+@pytest.mark.smoke
 def test_wrong_formats_and_places_are_named(maneuver: vq.Maneuver, tmp_path: Path):
     with pytest.raises(vq.ExportError, match="choices: html, gif"):
         export_maneuver(maneuver, tmp_path / "x.csv", to="cvs")

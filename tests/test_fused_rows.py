@@ -107,8 +107,8 @@ def test_other_modules_with_other_curves(name, curve):
     compare(curved(TRUSSES[name](joint_offset=0.05), ("position", "pointing"), curve))
 
 
-def test_every_weight_counts_where_it_should():
-    rng, names = np.random.default_rng(1), Weights.model_fields
+def test_every_weight_counts_where_it_should(rng):
+    names = Weights.model_fields
     weights = Weights(**dict(zip(names, rng.uniform(0.2, 3.0, len(names)).tolist(), strict=True)))
     layout = curved(TRUSSES["hexapod"](), ("position", "orientation"), "everything")
     compare(replace(layout, weights=weights))

@@ -81,6 +81,7 @@ cases = st.sampled_from(sorted(FORMULAS)).flatmap(
 )
 
 
+@pytest.mark.smoke
 @settings(max_examples=500, deadline=None)
 @given(cases)
 def test_distance_is_exact_and_never_over_estimated(case):
@@ -259,9 +260,9 @@ def test_a_pair_that_is_followed_has_its_contacts_and_a_bound_whatever_normal_it
         np.testing.assert_allclose(row[1:3] @ after[:2] - other, row[5:8] * one["distance"], atol=1e-9)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("count", [1, 16, 17, 65, 300, 1500])
-def test_batches_of_any_size_equal_single_rows(count):
-    rng = np.random.default_rng(count)
+def test_batches_of_any_size_equal_single_rows(count, rng):
     ends, others = rng.normal(size=(count, 6)), rng.normal(size=(count, 6))
     pairs = np.column_stack([ends, others, np.zeros(count)])
     rows = BATCH["segment"](pairs)
@@ -271,10 +272,10 @@ def test_batches_of_any_size_equal_single_rows(count):
         np.testing.assert_allclose(rows[k], BATCH["segment"](pairs[k : k + 1])[0], rtol=1e-14, atol=1e-13)
 
 
-def test_a_batch_gives_the_same_answers_once_it_is_compiled():
+def test_a_batch_gives_the_same_answers_once_it_is_compiled(rng):
     pair = ca.SX.sym("pair", 13)
     batch = Batch(ca.Function("distance_again", [pair], [distance_function("segment")(pair)]))
-    pairs = np.random.default_rng(0).normal(size=(130, 13))
+    pairs = rng.normal(size=(130, 13))
     sizes = (3, 8, 9, 130)
     expected = [batch(pairs[:size]) for size in sizes]
     finish_compiling()

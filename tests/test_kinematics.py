@@ -65,8 +65,9 @@ def test_at_home_everything_is_as_the_truss_says(truss, kinematics):
     np.testing.assert_allclose(arm.measured(truss.home), truss.home_lengths, atol=1e-14)
 
 
-def test_lengths_are_those_between_member_ends_and_gradients_their_derivatives(truss, kinematics):
-    X = random_pose(truss, np.random.default_rng(1))
+@pytest.mark.smoke
+def test_lengths_are_those_between_member_ends_and_gradients_their_derivatives(truss, kinematics, rng):
+    X = random_pose(truss, rng)
     kinematics.evaluate(X)
     np.testing.assert_allclose(kinematics.quantities, lengths_of(truss, X), atol=1e-14)
     np.testing.assert_allclose(TrussArm(truss).measured(X), lengths_of(truss, X), atol=1e-14)
@@ -80,8 +81,7 @@ def test_lengths_are_those_between_member_ends_and_gradients_their_derivatives(t
     np.testing.assert_allclose(gradient, central_differences(lambda Y: lengths_of(truss, Y), X), atol=2e-9)
 
 
-def test_length_jacobian_has_the_free_nodes_columns_and_the_base_the_rest(truss, kinematics):
-    rng = np.random.default_rng(2)
+def test_length_jacobian_has_the_free_nodes_columns_and_the_base_the_rest(truss, kinematics, rng):
     X = random_pose(truss, rng)
     layout, _ = make_layout(truss)
     kinematics.evaluate(X)
@@ -109,8 +109,8 @@ def test_stages_order_the_length_jacobian_block_lower_triangular(truss):
     assert np.all(truss.stage[nodes].max(axis=1) <= truss.stage[truss.members].max(axis=1))
 
 
-def test_face_spins_are_the_angular_velocity_rows_of_the_face_frames(truss, kinematics):
-    X = random_pose(truss, np.random.default_rng(3))
+def test_face_spins_are_the_angular_velocity_rows_of_the_face_frames(truss, kinematics, rng):
+    X = random_pose(truss, rng)
 
     def rotations(Y):
         kinematics.evaluate(Y)
@@ -128,8 +128,9 @@ def test_face_spins_are_the_angular_velocity_rows_of_the_face_frames(truss, kine
         np.testing.assert_allclose(rows, wanted[face], atol=5e-9)
 
 
-def test_tip_spin_is_the_angular_velocity_rows_of_the_tip_frame(truss, kinematics):
-    X = random_pose(truss, np.random.default_rng(4))
+@pytest.mark.smoke
+def test_tip_spin_is_the_angular_velocity_rows_of_the_tip_frame(truss, kinematics, rng):
+    X = random_pose(truss, rng)
 
     def rotation(Y):
         kinematics.evaluate(Y)
@@ -141,9 +142,9 @@ def test_tip_spin_is_the_angular_velocity_rows_of_the_tip_frame(truss, kinematic
     np.testing.assert_allclose(scattered(kinematics.tip_spin, truss.tip, truss.node_count), wanted, atol=5e-9)
 
 
-def test_everything_is_as_the_equations_say_to_rounding(truss, kinematics):
+def test_everything_is_as_the_equations_say_to_rounding(truss, kinematics, rng):
     """Differences are good to 1e-9; complex steps of the plain equations to the last digits."""
-    X = random_pose(truss, np.random.default_rng(8))
+    X = random_pose(truss, rng)
     kinematics.evaluate(X)
     np.testing.assert_allclose(kinematics.quantities, oracle.lengths(truss, X), atol=1e-14)
     rows = np.stack(
@@ -162,8 +163,8 @@ def test_everything_is_as_the_equations_say_to_rounding(truss, kinematics):
     np.testing.assert_allclose(stations.centres(X), oracle.face_centres(truss, X), atol=1e-14)
 
 
-def test_the_rows_of_the_motion_are_the_length_jacobian_beside_the_actuators(truss, kinematics):
-    arm, X = TrussArm(truss), random_pose(truss, np.random.default_rng(9), 0.02)
+def test_the_rows_of_the_motion_are_the_length_jacobian_beside_the_actuators(truss, kinematics, rng):
+    arm, X = TrussArm(truss), random_pose(truss, rng, 0.02)
     kinematics.evaluate(X)
     rows, pattern = kinematics.motion(), arm.motion_pattern
     found = np.zeros((truss.member_count, 3 * len(arm.free) + len(arm.actuators)))
@@ -171,15 +172,14 @@ def test_the_rows_of_the_motion_are_the_length_jacobian_beside_the_actuators(tru
     wanted, _ = oracle.motion(truss, X, X, X)
     np.testing.assert_allclose(found, wanted, atol=1e-13)
     assert [label.kind == "actuated member" for label in pattern.labels] == arm.actuated.tolist()
-    rhs = np.random.default_rng(10).normal(size=truss.member_count)
+    rhs = rng.normal(size=truss.member_count)
     response, rest = arm.motion_rows(kinematics.gradient.copy(), rhs).response()
     moved = np.vstack([response, np.eye(len(arm.actuators))])
     np.testing.assert_allclose(wanted @ moved, 0.0, atol=1e-11)
     np.testing.assert_allclose(wanted[:, : len(rest)] @ rest, rhs, atol=1e-10)
 
 
-def test_a_rigid_motion_keeps_lengths_and_turns_frames_with_it(truss, kinematics):
-    rng = np.random.default_rng(5)
+def test_a_rigid_motion_keeps_lengths_and_turns_frames_with_it(truss, kinematics, rng):
     X = random_pose(truss, rng)
     turn, shift = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3)
     kinematics.evaluate(X)
@@ -200,9 +200,8 @@ def test_a_rigid_motion_keeps_lengths_and_turns_frames_with_it(truss, kinematics
         np.testing.assert_allclose(kinematics.tip_rotation, turn @ tip_rotation, atol=1e-12)
 
 
-def test_a_face_frame_prefers_no_node():
+def test_a_face_frame_prefers_no_node(rng):
     """The frame of a scaled, sheared and moved triangle is the same whichever of its nodes is named first."""
-    rng = np.random.default_rng(6)
     truss = TRUSSES["octahedral"]()
     X = random_pose(truss, rng, 0.2)
     frames = []
@@ -216,11 +215,11 @@ def test_a_face_frame_prefers_no_node():
 
 
 @pytest.mark.parametrize("offset", OFFSETS)
-def test_the_compiled_kernel_is_the_interpreted_one(offset):
+def test_the_compiled_kernel_is_the_interpreted_one(offset, rng):
     truss = TRUSSES["octahedral"](joint_offset=offset)
     arm = TrussArm(truss)
     compiled, interpreted = arm.kinematics(), arm.kinematics(compiled=False)
-    X = random_pose(truss, np.random.default_rng(7))
+    X = random_pose(truss, rng)
     for kinematics in (compiled, interpreted):
         kinematics.evaluate(X)
     for name in ("quantities", "gradient", "station_rotation", "station_spin", "tip_rotation", "tip_spin"):

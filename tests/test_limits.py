@@ -18,6 +18,7 @@ def one(*values):
     return (np.array([value], dtype=float) for value in values)
 
 
+@pytest.mark.smoke
 @settings(max_examples=300, deadline=None)
 @given(distance=st.floats(0.0, 5.0), acceleration=positive, dt=st.sampled_from([1e-3, 0.01, 0.2, 1.0, 3.0]))
 def test_braking_speed_is_the_greatest_from_which_steps_stop_in_time(distance, acceleration, dt):
@@ -30,11 +31,13 @@ def test_braking_speed_is_the_greatest_from_which_steps_stop_in_time(distance, a
     assert braking_distance(speed + 1e-6) > distance
 
 
+@pytest.mark.smoke
 def test_without_an_acceleration_limit_any_speed_brakes():
     assert braking_speed(np.array([0.0, 1.0]), np.array([np.inf, np.inf]), 0.1).tolist() == [np.inf, np.inf]
     assert braking_speed(np.array([-1.0]), np.array([2.0]), 0.1).tolist() == [0.0]
 
 
+@pytest.mark.smoke
 @settings(max_examples=300, deadline=None)
 @given(
     start=share,
@@ -61,6 +64,7 @@ def test_lengths_that_stay_in_their_boxes_keep_every_limit(
         length, speed = after, change
 
 
+@pytest.mark.smoke
 @settings(max_examples=300, deadline=None)
 @given(
     length=st.floats(0.0, 4.0),
@@ -85,6 +89,7 @@ def test_a_start_outside_any_limit_has_a_box_that_leads_back(
     assert abs(upper[0] - length) <= rate * dt + 1e-12
 
 
+@pytest.mark.smoke
 def test_an_actuator_outside_its_stroke_comes_back_by_its_own_limits():
     stroke = np.array([[0.6, 1.5]])
     length, speed = np.array([1.7]), np.array([0.0])
@@ -99,8 +104,8 @@ def test_an_actuator_outside_its_stroke_comes_back_by_its_own_limits():
     assert length[0] == pytest.approx(0.6, abs=1e-9)
 
 
-def test_each_actuator_has_its_own_box():
-    rng = np.random.default_rng(0)
+@pytest.mark.smoke
+def test_each_actuator_has_its_own_box(rng):
     count = 20
     stroke = np.sort(rng.uniform(0.5, 2.0, (count, 2)), axis=1)
     length = stroke[:, 0] + rng.uniform(size=count) * np.diff(stroke, axis=1)[:, 0]

@@ -111,6 +111,7 @@ def test_slow_actuators_take_more_steps_and_more_time():
     np.testing.assert_allclose(slow.tip_position[-1], fast.tip_position[-1], atol=1e-6)
 
 
+@pytest.mark.smoke
 def test_waypoints_are_all_passed():
     data = arm_problem((0.35, 0.0, 1.35), steps=12, time=3.0).to_dict()
     data["maneuver"]["waypoint"].append({"time": 6.0, "position": [0.0, 0.3, 1.4]})
@@ -155,6 +156,7 @@ def test_progress_is_told_and_an_interrupt_keeps_what_was_solved():
     np.testing.assert_array_equal(partial.nodes, whole.nodes[:4])
 
 
+@pytest.mark.smoke
 def test_without_verification_there_is_no_certificate():
     maneuver = solve(arm_problem((0.2, 0.0, 1.45), steps=3), verify=False)
     assert maneuver.certificate is None

@@ -51,6 +51,7 @@ def offsets(rng, has):
     return 0.1 * rng.normal(size=(len(MEMBERS), 2, 3)) if has else None
 
 
+@pytest.mark.smoke
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 100_000))
 def test_ends_in_symbols_are_those_in_arrays_and_their_jacobians_the_derivatives(seed):
@@ -71,6 +72,7 @@ def test_ends_in_symbols_are_those_in_arrays_and_their_jacobians_the_derivatives
         np.testing.assert_allclose(np.array(jacobian), change.reshape(3, 9), atol=1e-8)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("has_offsets", [False, True])
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 100_000))
@@ -85,6 +87,7 @@ def test_lengths_and_the_whole_jacobian_are_those_of_the_ends(has_offsets, seed)
     np.testing.assert_array_equal(scatter.sparse(gradient).toarray(), scatter.dense(gradient))
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("has_offsets", [False, True])
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 100_000))

@@ -160,6 +160,7 @@ def test_pointing_is_tracked_by_three_octahedral_bays_together() -> None:
     np.testing.assert_allclose(states[0], states[1], atol=1e-9)
 
 
+@pytest.mark.smoke
 def test_the_curve_keeps_its_base_and_its_null_space_vector_does_not_move_the_tip() -> None:
     ends = []
     for terms in ([], ["curve_rate", "spacing", "smoothness"]):
@@ -302,11 +303,10 @@ def test_dense_and_sparse_algebra_hold_the_same_actuators(correct: bool) -> None
     np.testing.assert_allclose(*ways, atol=1e-9)
 
 
-def test_the_potential_gradient_is_that_of_the_potential() -> None:
+def test_the_potential_gradient_is_that_of_the_potential(rng) -> None:
     problem = vq.load_problem("five_bay_two_cubes").replace({"method.solver": "piqp"})
     setup = build_arm(problem)
-    random = np.random.default_rng(0)
-    X = setup.arm.home + random.normal(scale=0.02, size=setup.arm.home.shape)
+    X = setup.arm.home + rng.normal(scale=0.02, size=setup.arm.home.shape)
 
     def potential(nodes: np.ndarray) -> float:
         distance = setup.monitor.near(nodes, 0.0, setup.influence).distance
@@ -316,7 +316,7 @@ def test_the_potential_gradient_is_that_of_the_potential() -> None:
     assert np.abs(gradient).max() > 0.1
     assert np.linalg.eigvalsh(blocks).min() > -1e-9
     for _ in range(5):
-        direction = random.normal(size=X.shape)
+        direction = rng.normal(size=X.shape)
         h = 1e-6
         slope = (potential(X + h * direction) - potential(X - h * direction)) / (2 * h)
         assert slope == pytest.approx(float(np.sum(gradient * direction)), rel=1e-4, abs=1e-4)

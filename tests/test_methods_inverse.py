@@ -25,6 +25,7 @@ def random_metric(random: np.random.Generator, size: int) -> np.ndarray:
     return root @ root.T + 0.1 * np.eye(size)
 
 
+@pytest.mark.smoke
 @settings(max_examples=30, deadline=None)
 @given(SEEDS, st.integers(1, 6), st.integers(1, 6))
 def test_moore_penrose_meets_its_four_conditions_at_any_rank(seed: int, rows: int, rank: int) -> None:
@@ -40,6 +41,7 @@ def test_moore_penrose_meets_its_four_conditions_at_any_rank(seed: int, rows: in
     np.testing.assert_allclose(P @ J, (P @ J).T, atol=1e-11 * scale)
 
 
+@pytest.mark.smoke
 @settings(max_examples=20, deadline=None)
 @given(SEEDS)
 def test_weighted_inverse_is_the_least_weighted_norm(seed: int) -> None:
@@ -52,28 +54,31 @@ def test_weighted_inverse_is_the_least_weighted_norm(seed: int) -> None:
     np.testing.assert_allclose(free @ (W @ d), 0.0, atol=1e-8 * np.abs(W @ d).max())
 
 
-def test_damped_inverse_solves_the_damped_least_squares_problem() -> None:
-    random = np.random.default_rng(3)
-    J, W, x, damping = random.normal(size=(4, 9)), random_metric(random, 9), random.normal(size=4), 0.3
+@pytest.mark.smoke
+def test_damped_inverse_solves_the_damped_least_squares_problem(rng) -> None:
+    J, W, x, damping = rng.normal(size=(4, 9)), random_metric(rng, 9), rng.normal(size=4), 0.3
     d = weighted(J, W, damping=damping).matrix @ x
     expected = np.linalg.solve(J.T @ J / damping**2 + W, J.T @ x / damping**2)
     np.testing.assert_allclose(d, expected, atol=1e-10)
 
 
-def test_truncated_inverse_drops_the_small_singular_values() -> None:
-    u, v = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0], np.eye(3, 5)
+@pytest.mark.smoke
+def test_truncated_inverse_drops_the_small_singular_values(rng) -> None:
+    u, v = np.linalg.qr(rng.normal(size=(3, 3)))[0], np.eye(3, 5)
     J = u @ np.diag([1.0, 0.1, 1e-4]) @ v
     inverse = moore_penrose(J, truncation=1e-3)
     assert inverse.rank == 2
     assert np.linalg.norm(inverse.matrix, 2) == pytest.approx(10.0)
 
 
+@pytest.mark.smoke
 def test_dependent_rows_are_refused_by_the_weighted_inverse() -> None:
     J = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0]])
     with pytest.raises(SolverError, match="dependent"):
         weighted(J, np.eye(3))
 
 
+@pytest.mark.smoke
 @settings(max_examples=20, deadline=None)
 @given(SEEDS)
 def test_the_null_space_vector_gives_the_constrained_minimiser(seed: int) -> None:
@@ -89,6 +94,7 @@ def test_the_null_space_vector_gives_the_constrained_minimiser(seed: int) -> Non
     np.testing.assert_allclose(d, expected, atol=1e-8)
 
 
+@pytest.mark.smoke
 @settings(max_examples=20, deadline=None)
 @given(SEEDS, st.integers(2, 40))
 def test_banded_system_solves_what_a_dense_one_does(seed: int, size: int) -> None:
@@ -105,6 +111,7 @@ def test_banded_system_solves_what_a_dense_one_does(seed: int, size: int) -> Non
     )
 
 
+@pytest.mark.smoke
 def test_a_singular_banded_system_is_refused() -> None:
     system = BandedSystem(np.array([0, 1, 1]), np.array([0, 1, 0]))
     with pytest.raises(SolverError, match="singular"):

@@ -18,9 +18,9 @@ from vgtm_qp.study.scenes import random_scene
 
 
 @pytest.mark.parametrize("name", TRUSSES)
-def test_ends_and_their_jacobians_are_those_of_the_formulas(name):
+def test_ends_and_their_jacobians_are_those_of_the_formulas(name, rng):
     truss = TRUSSES[name](joint_offset=0.1)
-    X = random_pose(truss, np.random.default_rng(1))
+    X = random_pose(truss, rng)
     kinematics = EndKinematics(truss.members, truss.joints, compiled=False)
     kinematics.evaluate(X)
     np.testing.assert_allclose(kinematics.ends, truss.member_ends(X), atol=1e-14)
@@ -46,9 +46,8 @@ def separation_of(setup):
     return Separation(replace(setup, margin=0.0))
 
 
-def test_clearance_rows_are_the_derivatives_of_the_distances():
+def test_clearance_rows_are_the_derivatives_of_the_distances(rng):
     """Distances by their definition at moved nodes, against the rows: the joints' rotation is part of both."""
-    rng = np.random.default_rng(2)
     setup = build_arm(beside_a_cube())
     truss, monitor = truss_of(setup.arm), setup.monitor
     X = truss.home + 0.02 * rng.normal(size=truss.home.shape)
@@ -73,20 +72,19 @@ def test_clearance_rows_are_the_derivatives_of_the_distances():
         assert change[k] == pytest.approx(wanted, abs=1e-5), names[k]
 
 
-def test_rows_of_different_widths_join():
+def test_rows_of_different_widths_join(rng):
     narrow = ClearanceRows(np.array([[0, 1, 2, 3]]), np.ones((1, 4, 3)), np.zeros(1))
     wide = ClearanceRows(np.arange(12)[None], 2.0 * np.ones((1, 12, 3)), np.ones(1))
+    moved = rng.normal(size=(12, 3))
     for first, second in ((narrow, wide), (wide, narrow)):
         joined = first.joined(second)
-        moved = np.random.default_rng(0).normal(size=(12, 3))
         value = np.einsum("rsc,rsc->r", joined.coefficients, moved[joined.nodes])
         alone = [np.einsum("rsc,rsc->r", r.coefficients, moved[r.nodes])[0] for r in (first, second)]
         np.testing.assert_allclose(value, alone)
         assert list(joined.lower) == [first.lower[0], second.lower[0]]
 
 
-def test_a_proof_of_the_way_holds_at_every_instant_of_it():
-    rng = np.random.default_rng(4)
+def test_a_proof_of_the_way_holds_at_every_instant_of_it(rng):
     setup = build_arm(beside_a_cube())
     separation, truss, monitor = separation_of(setup), truss_of(setup.arm), setup.monitor
     certified = 0

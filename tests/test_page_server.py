@@ -48,6 +48,7 @@ def _version() -> str:
     return str(viser.__version__)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LocalHost", "127.0.0.2", "[::1]"])
 def test_the_page_opens_a_web_socket_to_its_own_server(port: int, name: str):
     assert status(port, f"{name}:{port}", None, upgrade=False) == 200
@@ -103,6 +104,7 @@ def test_a_page_for_others_says_so():
         view(vq.load_problem("five_bay_free"), host="0.0.0.0", port=-1)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("wanted", ["99999999", "-1", "65536"])
 def test_a_port_that_cannot_be_is_refused_at_once(wanted: str, capsys: pytest.CaptureFixture[str]):
     assert main(["view", "five_bay_free", f"--port={wanted}"]) == 2

@@ -21,6 +21,7 @@ def maneuver() -> vq.Maneuver:
     )
 
 
+@pytest.mark.smoke
 def test_clearance_is_drawn_in_millimetres_above_what_is_forbidden(maneuver: vq.Maneuver):
     (axes,) = maneuver.plot_clearance().axes
     lines = {line.get_label(): line for line in axes.lines}
@@ -33,6 +34,7 @@ def test_clearance_is_drawn_in_millimetres_above_what_is_forbidden(maneuver: vq.
     )
 
 
+@pytest.mark.smoke
 def test_strokes_are_drawn_between_their_limits(maneuver: vq.Maneuver):
     (axes,) = maneuver.plot_strokes().axes
     lines = {line.get_label(): line for line in axes.lines}
@@ -43,6 +45,7 @@ def test_strokes_are_drawn_between_their_limits(maneuver: vq.Maneuver):
     assert len(axes.patches) == 2
 
 
+@pytest.mark.smoke
 def test_tip_error_and_step_time_are_those_of_the_result(maneuver: vq.Maneuver):
     (axes,) = maneuver.plot_tip_error().axes
     assert axes.get_yscale() == "log"
@@ -55,6 +58,7 @@ def test_tip_error_and_step_time_are_those_of_the_result(maneuver: vq.Maneuver):
     assert np.allclose(tops, 1000.0 * maneuver.step_time[1:])
 
 
+@pytest.mark.smoke
 def test_plots_share_a_figure_where_axes_are_given(maneuver: vq.Maneuver):
     figure = Figure()
     grid = figure.subplots(2, 2)
@@ -65,6 +69,7 @@ def test_plots_share_a_figure_where_axes_are_given(maneuver: vq.Maneuver):
         assert "(" in axes.get_ylabel()
 
 
+@pytest.mark.smoke
 def test_a_home_pose_alone_can_be_plotted(maneuver: vq.Maneuver):
     nodes = maneuver.nodes[:1]
     alone = maneuver_of(nodes, np.array([0.0]), tripod())
@@ -72,6 +77,7 @@ def test_a_home_pose_alone_can_be_plotted(maneuver: vq.Maneuver):
         assert isinstance(plot(), Figure)
 
 
+@pytest.mark.smoke
 def test_colours_go_from_blue_to_red_and_fixed_members_are_grey(maneuver: vq.Maneuver):
     short, long = stroke_colours(np.array([0.0, 1.0]))
     assert short[2] > 2 * short[0]
@@ -86,6 +92,7 @@ def test_colours_go_from_blue_to_red_and_fixed_members_are_grey(maneuver: vq.Man
     assert np.isnan(share[1:5]).all()
 
 
+@pytest.mark.smoke
 def test_states_between_states_are_on_straight_lines(maneuver: vq.Maneuver):
     middle = resampled(maneuver.time, maneuver.nodes, np.array([0.25, 1.0]))
     assert np.allclose(middle[0], (maneuver.nodes[0] + maneuver.nodes[1]) / 2)
@@ -93,6 +100,7 @@ def test_states_between_states_are_on_straight_lines(maneuver: vq.Maneuver):
     assert resampled(maneuver.time, maneuver.control_vertices, np.array([0.25])).shape == (1, 0, 3)
 
 
+@pytest.mark.smoke
 def test_the_camera_sees_the_whole_maneuver(maneuver: vq.Maneuver):
     camera = camera_for(drawing_of_maneuver(maneuver), maneuver.nodes, maneuver.tip_position)
     ahead = camera.target - camera.position

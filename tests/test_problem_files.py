@@ -37,6 +37,7 @@ def test_the_schema_file_is_up_to_date() -> None:
     assert written == json.dumps(problem_schema(), indent=2) + "\n", "write it again: vgtm schema"
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("file", sorted(PROBLEMS.glob("*.toml")), ids=lambda file: file.stem)
 def test_each_problem_file_fits_the_schema_and_the_models(file: Path) -> None:
     text = file.read_text()
@@ -52,6 +53,7 @@ def test_each_problem_file_fits_the_schema_and_the_models(file: Path) -> None:
     assert Problem.from_dict(json.loads(json.dumps(data)), source=file) == problem
 
 
+@pytest.mark.smoke
 def test_the_bundled_problems_are_those_of_the_folder() -> None:
     assert {"five_bay_two_cubes", "five_bay_two_cubes_pointing", "ten_bay_round_a_cube"} <= set(
         bundled_problems()

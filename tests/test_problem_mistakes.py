@@ -312,6 +312,7 @@ def test_each_mistake_has_place_value_and_expectation(
     assert "<" not in message
 
 
+@pytest.mark.smoke
 def test_all_mistakes_of_a_file_come_at_once(tmp_path: Path) -> None:
     file = tmp_path / "wrong.toml"
     text = VALID.replace("bays = 5", "bays = 0").replace("size = 0.9", "size = 0").replace("safe", "saef")
@@ -351,6 +352,7 @@ def test_files_that_are_no_problem_at_all(tmp_path: Path, content: bytes, key: s
     assert raised.value.source == str(file)
 
 
+@pytest.mark.smoke
 def test_a_missing_file_names_the_nearest_and_the_bundled_ones(tmp_path: Path) -> None:
     (tmp_path / "reach.toml").write_text(VALID)
     with pytest.raises(ProblemError, match=r'"five_bay_two_cubes".*did you mean "reach.toml"') as raised:

@@ -51,6 +51,7 @@ def saved(tmp_path: Path) -> Path:
     return good_maneuver().save(tmp_path / "out" / "result.npz")
 
 
+@pytest.mark.smoke
 def test_round_trip_keeps_every_bit(saved: Path) -> None:
     original, loaded = good_maneuver(), load_result(saved)
     assert original.arrays.keys() == loaded.arrays.keys()
@@ -155,6 +156,7 @@ def test_a_flipped_byte_is_refused_or_changes_nothing(data: st.DataObject) -> No
             np.testing.assert_array_equal(array, loaded.arrays[name])
 
 
+@pytest.mark.smoke
 def test_altered_array_is_refused(saved: Path) -> None:
     nodes = raw(saved)["nodes"]
     nodes[3, 4, 0] += 1e-6
@@ -169,6 +171,7 @@ def test_swapped_rows_of_one_array_are_refused(saved: Path) -> None:
         load_result(swapped)
 
 
+@pytest.mark.smoke
 def test_altered_manifest_is_refused(saved: Path) -> None:
     with pytest.raises(ResultError, match="digest"):
         load_result(rewrite(saved, sign=False, manifest={"reached": 0.5}))

@@ -111,8 +111,7 @@ def near_home(setup, rng):
 
 
 @pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL, ids=str)
-def test_the_rows_of_a_general_curve_are_those_of_the_equations(module, bays, curve, method):
-    rng = np.random.default_rng(0)
+def test_the_rows_of_a_general_curve_are_those_of_the_equations(module, bays, curve, method, rng):
     setup = built(module, bays, curve, method)
     layout, count = setup.layout, len(setup.arm.actuators)
     linearisation = Linearisation(layout, compiled=False)
@@ -140,8 +139,7 @@ def test_the_rows_of_a_general_curve_are_those_of_the_equations(module, bays, cu
 
 
 @pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL, ids=str)
-def test_rows_of_gaps_and_turns_are_the_derivatives_of_their_residuals(module, bays, curve, method):
-    rng = np.random.default_rng(3)
+def test_rows_of_gaps_and_turns_are_the_derivatives_of_their_residuals(module, bays, curve, method, rng):
     setup = built(module, bays, curve, method)
     layout, arm, h = setup.layout, setup.arm, 1e-6
     linearisation = Linearisation(layout, compiled=False)
@@ -176,11 +174,11 @@ def test_rows_of_gaps_and_turns_are_the_derivatives_of_their_residuals(module, b
 
 @pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL[:5], ids=str)
 def test_the_rows_of_a_curve_are_the_derivatives_of_its_nodes_frames_and_spacings(
-    module, bays, curve, method
+    module, bays, curve, method, rng
 ):
     setup = built(module, bays, curve, method)
     shape, arm = setup.layout.shape, setup.arm
-    _, _, vertices, torsion = near_home(setup, np.random.default_rng(1))
+    _, _, vertices, torsion = near_home(setup, rng)
     base = arm.stations.frames[0]
     # The frame is carried along from the base face: it stays where the curve leaves that along its normal.
     vertices[1] = vertices[0] + [0.0, 0.0, 0.4]
@@ -202,9 +200,9 @@ def test_the_rows_of_a_curve_are_the_derivatives_of_its_nodes_frames_and_spacing
 
 
 @pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL[3:5], ids=str)
-def test_tracking_errors_are_the_greatest_gap_or_turn(module, bays, curve, method):
+def test_tracking_errors_are_the_greatest_gap_or_turn(module, bays, curve, method, rng):
     setup = built(module, bays, curve, method)
-    layout, rng = setup.layout, np.random.default_rng(2)
+    layout = setup.layout
     X, _, vertices, torsion = near_home(setup, rng)
     rows = layout.shape.rows(vertices, torsion, setup.arm.stations.frames[0])
     for each in (layout, replace(layout, hard_turns=False), replace(layout, hard_tracking=True, shape=None)):

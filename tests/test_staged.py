@@ -147,9 +147,9 @@ def assert_same(found, wanted):
         np.testing.assert_allclose(one, other, atol=1e-9 * (1 + np.abs(other).max(initial=0.0)), err_msg=name)
 
 
-def assert_same_answers(case, solver, count, seed=0, **options):
+def assert_same_answers(case, solver, count, rng, **options):
     """Compare over random QPs; return how many strokes and clearances were active in all, and how many had none."""
-    dense, rng = CondensedSolver(case.layout), np.random.default_rng(seed)
+    dense = CondensedSolver(case.layout)
     strokes = clearances = infeasible = 0
     for k in range(count):
         numbers = random_numbers(case, rng, motion=k % 3 < 2, **options)
@@ -165,10 +165,10 @@ def assert_same_answers(case, solver, count, seed=0, **options):
 
 @pytest.mark.parametrize("vertices", [5, 0])
 @pytest.mark.parametrize("name", MODULES)
-def test_elastic_answers_are_those_of_the_condensed_qp(name, vertices):
+def test_elastic_answers_are_those_of_the_condensed_qp(name, vertices, rng):
     case = Case(MODULES[name](), vertices=vertices)
     solver = StagedSolver(find_chain(case.layout))
-    strokes, clearances, infeasible = assert_same_answers(case, solver, 9)
+    strokes, clearances, infeasible = assert_same_answers(case, solver, 9, rng)
     assert strokes > 20
     assert clearances > 5
     assert infeasible < 5
@@ -183,56 +183,57 @@ def test_elastic_answers_are_those_of_the_condensed_qp(name, vertices):
     ],
 )
 @pytest.mark.parametrize("base", [False, True])
-def test_tip_directions_and_a_moving_base(name, options, base):
+def test_tip_directions_and_a_moving_base(name, options, base, rng):
     case = Case(MODULES[name](), **options)
     solver = StagedSolver(find_chain(case.layout))
-    found = assert_same_answers(case, solver, 6, base=base, push=0.03, box=0.06)
+    found = assert_same_answers(case, solver, 6, rng, base=base, push=0.03, box=0.06)
     assert found[0] + found[1] > 0
     assert found[2] < 6
 
 
-def test_offset_joints():
+def test_offset_joints(rng):
     case = Case(modules.octahedral(4, joint_offset=0.05))
     solver = StagedSolver(find_chain(case.layout))
-    assert sum(assert_same_answers(case, solver, 5)) > 5
+    assert sum(assert_same_answers(case, solver, 5, rng)) > 5
 
 
-def test_other_weights():
+def test_other_weights(rng):
     weights = Weights(node_rate=0.0, actuator_rate=1.0, stroke_centring=0.0, tracking=3.0, tangent=0.7)
     case = Case(MODULES["octahedral"](), weights=weights)
-    assert sum(assert_same_answers(case, StagedSolver(find_chain(case.layout)), 5)) > 5
+    assert sum(assert_same_answers(case, StagedSolver(find_chain(case.layout)), 5, rng)) > 5
 
 
-def test_locked_actuators_are_rows_of_their_own():
+def test_locked_actuators_are_rows_of_their_own(rng):
     truss = lock_members(MODULES["octahedral"](), ["B2-1", "B4-3"])
     case = Case(truss)
     chain = find_chain(case.layout)
     assert [truss.member_names[k] for k in chain.locked] == ["B2-1", "B4-3"]
-    assert sum(assert_same_answers(case, StagedSolver(chain), 6)) > 5
+    assert sum(assert_same_answers(case, StagedSolver(chain), 6, rng)) > 5
 
 
 @pytest.mark.parametrize("track", [("position",), ("position", "pointing")])
 @pytest.mark.parametrize("name", SQUARE)
-def test_hard_tracking_follows_the_curve(name, track):
+def test_hard_tracking_follows_the_curve(name, track, rng):
     case = Case(MODULES[name](), track, vertices=7, hard_tracking=True)
     chain = find_chain(case.layout)
     assert chain.is_square
     options = {"off": 0.005, "push": 0.02, "box": 0.3}
-    _, clearances, infeasible = assert_same_answers(case, TrackedSolver(chain), 8, **options)
+    _, clearances, infeasible = assert_same_answers(case, TrackedSolver(chain), 8, rng, **options)
     assert clearances > 0
     assert infeasible < 4
-    strokes, *_ = assert_same_answers(case, TrackedSolver(chain), 8, **{**options, "box": 0.06}, near=0)
+    strokes, *_ = assert_same_answers(case, TrackedSolver(chain), 8, rng, **{**options, "box": 0.06}, near=0)
     assert strokes > 0
 
 
-def test_a_long_arm_with_many_rows_at_once():
+def test_a_long_arm_with_many_rows_at_once(rng):
     case = Case(modules.octahedral(24), vertices=6)
     solver = StagedSolver(find_chain(case.layout))
-    strokes, clearances, _ = assert_same_answers(case, solver, 3, near=40, push=0.5, box=0.02)
+    strokes, clearances, _ = assert_same_answers(case, solver, 3, rng, near=40, push=0.5, box=0.02)
     assert strokes > 60
     assert clearances > 5
 
 
+@pytest.mark.smoke
 @given(st.integers(0, 10**6), st.floats(0.005, 0.3), st.floats(0.0, 0.05), st.booleans())
 @settings(max_examples=25, deadline=None)
 def test_any_qp_of_one_arm(shared, seed, box, slack, motion):
@@ -251,25 +252,24 @@ def shared():
     return case, solver, CondensedSolver(case.layout)
 
 
-def test_compiled_and_interpreted_recursions_agree(shared, monkeypatch):
+def test_compiled_and_interpreted_recursions_agree(shared, monkeypatch, rng):
     monkeypatch.delenv("VGTM_CC")
     case, interpreted, _ = shared
     compiled = StagedSolver(find_chain(case.layout))
-    numbers = random_numbers(case, np.random.default_rng(4))
+    numbers = random_numbers(case, rng)
     assert_same(compiled.solve(numbers), interpreted.solve(numbers))
 
 
-def test_what_was_active_before_does_not_change_the_answer(shared):
+def test_what_was_active_before_does_not_change_the_answer(shared, rng):
     case, solver, dense = shared
-    rng = np.random.default_rng(8)
     several = [random_numbers(case, rng, near=9) for _ in range(3)]
     for numbers in several + several[::-1]:
         assert_same(outcome(solver, numbers), outcome(dense, numbers))
 
 
-def test_rows_that_contradict_one_another_are_infeasible(shared):
+def test_rows_that_contradict_one_another_are_infeasible(shared, rng):
     case, solver, _ = shared
-    numbers = random_numbers(case, np.random.default_rng(2), near=1)
+    numbers = random_numbers(case, rng, near=1)
     rows = numbers.clearance
     opposed = ClearanceRows(
         np.repeat(rows.nodes, 2, axis=0),
@@ -287,10 +287,10 @@ def test_rows_that_contradict_one_another_are_infeasible(shared):
 
 
 @pytest.mark.parametrize("hard", [False, True])
-def test_a_singular_bay_is_an_error(hard):
+def test_a_singular_bay_is_an_error(hard, rng):
     case = Case(MODULES["octahedral"](), vertices=7, hard_tracking=hard)
     solver = chain_solver(case.layout)
-    numbers = random_numbers(case, np.random.default_rng(2), off=0.001, push=0.01, box=0.3)
+    numbers = random_numbers(case, rng, off=0.001, push=0.01, box=0.3)
     gradient, fixed = numbers.motion.gradient.copy(), case.truss.fixed
     gradient[fixed[8]] = gradient[fixed[9]] = 0.0
     with pytest.raises(SolverError):
@@ -298,19 +298,19 @@ def test_a_singular_bay_is_an_error(hard):
     assert solver.solve(numbers).progress > 0.9
 
 
-def test_an_objective_without_terms_is_an_error():
+def test_an_objective_without_terms_is_an_error(rng):
     weights = Weights(node_rate=0.0, actuator_rate=0.0, stroke_centring=0.0, tracking=0.0, tangent=0.0)
     case = Case(MODULES["octahedral"](), vertices=0, weights=weights)
-    numbers = random_numbers(case, np.random.default_rng(2))
+    numbers = random_numbers(case, rng)
     with pytest.raises(SolverError, match="singular"):
         StagedSolver(find_chain(case.layout)).solve(numbers)
 
 
 @pytest.mark.parametrize("hard", [False, True])
-def test_a_wrong_answer_is_refused(hard, monkeypatch):
+def test_a_wrong_answer_is_refused(hard, monkeypatch, rng):
     case = Case(MODULES["octahedral"](), vertices=7, hard_tracking=hard)
     solver = chain_solver(case.layout)
-    numbers = random_numbers(case, np.random.default_rng(2), off=0.001, push=0.01, box=0.3)
+    numbers = random_numbers(case, rng, off=0.001, push=0.01, box=0.3)
     solver.solve(numbers)
     right = working_set.dual_solution
     monkeypatch.setattr(working_set, "dual_solution", lambda *a: (right(*a)[0] * (1 + 1e-4), 1))
@@ -325,11 +325,11 @@ def test_a_wrong_answer_is_refused(hard, monkeypatch):
 
 @pytest.mark.parametrize("joint_offset", [0.0, 0.04])
 @pytest.mark.parametrize("name", MODULES)
-def test_the_periods_hold_the_whole_length_jacobian(name, joint_offset):
+def test_the_periods_hold_the_whole_length_jacobian(name, joint_offset, rng):
     case = Case(MODULES[name](joint_offset=joint_offset))
     chain = find_chain(case.layout)
     layout = case.layout
-    numbers = random_numbers(case, np.random.default_rng(0))
+    numbers = random_numbers(case, rng)
     data = StagedSolver(chain).data
     data.fill(numbers)
     values = data.part["jacobian"][::-1]
@@ -404,12 +404,12 @@ def test_memory_is_linear_in_the_bays():
 @pytest.mark.parametrize("joint_offset", [0.0, 0.02])
 @pytest.mark.parametrize("is_wide", [False, True])
 @pytest.mark.parametrize("name", [*MODULES, "graph"])
-def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, monkeypatch):
+def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, monkeypatch, rng):
     if is_wide:
         monkeypatch.setattr(lengths_module, "_WIDEST", 0)
     truss = mast() if name == "graph" else MODULES[name](joint_offset=joint_offset)
     case = Case(truss, vertices=0)
-    rng, kinematics = np.random.default_rng(1), case.kinematics
+    kinematics = case.kinematics
     kinematics.evaluate(random_pose(truss, rng, 0.02))
     error = rng.normal(size=truss.member_count)
     solver = LengthSolver(case.layout.arm.bays)
@@ -422,9 +422,9 @@ def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, m
             solver.solve(broken, error)
 
 
-def test_a_configuration_that_does_not_close_is_measured_where_it_is():
+def test_a_configuration_that_does_not_close_is_measured_where_it_is(rng):
     case = Case(MODULES["octahedral"](), vertices=0)
-    closing, rng, open_ = Closing(case.layout, case.kinematics), np.random.default_rng(4), 0
+    closing, open_ = Closing(case.layout, case.kinematics), 0
     truss, arm = case.truss, case.layout.arm
     for _ in range(10):
         wanted = rng.uniform(0.6, 1.5, len(truss.actuators))
@@ -439,10 +439,10 @@ def test_a_configuration_that_does_not_close_is_measured_where_it_is():
     assert open_
 
 
-def test_the_gain_is_the_least_motion_of_the_tip():
+def test_the_gain_is_the_least_motion_of_the_tip(rng):
     case = Case(MODULES["octahedral"](), vertices=0)
     layout, truss, weights = case.layout, case.truss, case.layout.weights
-    solver, rng = StagedSolver(find_chain(case.layout)), np.random.default_rng(3)
+    solver = StagedSolver(find_chain(case.layout))
     assert solver.gain(np.zeros(len(truss.actuators), dtype=bool)) is None
     stopped = 0
     for _ in range(4):

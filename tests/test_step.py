@@ -37,8 +37,7 @@ def lengths_at(truss, X):
 class Scene:
     """A truss at a random pose beside a random curve, and a path through the tip's pose there."""
 
-    def __init__(self, name, track, joint_offset=0.0, seed=0, base=False):
-        rng = np.random.default_rng(seed)
+    def __init__(self, name, track, rng, joint_offset=0.0, base=False):
         self.truss = truss = TRUSSES[name](joint_offset=joint_offset)
         self.layout, self.task = make_layout(truss, track)
         self.arm = self.layout.arm
@@ -101,6 +100,7 @@ class Scene:
         return [lengths, error, start, axes0 @ (vertices[1] - vertices[0]), gap, tilt]
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("joint_offset", [0.0, 0.1])
 @pytest.mark.parametrize(
     ("name", "track"),
@@ -108,14 +108,13 @@ class Scene:
     + [("hexapod", ("position", "orientation")), ("octahedral", ("x", "z")), ("octahedral", ("orientation",))]
     + [("graph", ("position",)), ("graph", ("y",))],
 )
-def test_rows_of_the_full_qp_linearise_what_they_say(name, track, joint_offset):
+def test_rows_of_the_full_qp_linearise_what_they_say(name, track, joint_offset, rng):
     """The rows at a random displacement against the change of the residuals themselves."""
-    scene = Scene(name, track, joint_offset)
+    scene = Scene(name, track, rng, joint_offset)
     numbers = scene.numbers()
     builder = FullBuilder(scene.layout)
     qp = builder.build(numbers)
     truss, tracked = scene.truss, len(scene.layout.tracked)
-    rng = np.random.default_rng(1)
     node_step = np.where(truss.base[:, None], 0.0, rng.normal(size=scene.X.shape))
     vertex_step, progress_step = rng.normal(size=scene.vertices.shape), 0.5
 
@@ -153,9 +152,9 @@ def test_rows_of_the_full_qp_linearise_what_they_say(name, track, joint_offset):
 
 
 @pytest.mark.parametrize("name", ["octahedral", "tetrahedral-23", "hexapod"])
-def test_right_hand_sides_are_the_residuals(name):
+def test_right_hand_sides_are_the_residuals(name, rng):
     """At the configuration itself: a step to no displacement leaves each residual as it is."""
-    scene = Scene(name, ("position", "pointing"))
+    scene = Scene(name, ("position", "pointing"), rng)
     numbers = scene.numbers()
     scene.kinematics.evaluate(scene.X)
     axes0 = scene.kinematics.station_rotation[0][:, :2].T.copy()
@@ -188,8 +187,8 @@ def test_right_hand_sides_are_the_residuals(name):
     assert np.linalg.norm(polygon) > 0.1
 
 
-def test_a_correction_asks_for_the_constraints_alone():
-    scene = Scene("octahedral", ("position",))
+def test_a_correction_asks_for_the_constraints_alone(rng):
+    scene = Scene("octahedral", ("position",), rng)
     motion, correction = scene.numbers(), scene.numbers(motion=False)
     for name in ("actuator_gradient", "vertex_gradient", "position_rhs", "tangent_rhs"):
         assert np.any(getattr(motion, name))
@@ -203,8 +202,8 @@ def test_a_correction_asks_for_the_constraints_alone():
         np.testing.assert_allclose(getattr(correction, name), getattr(motion, name), atol=1e-13)
 
 
-def test_a_moving_base_takes_its_members_and_the_curve_with_it():
-    scene = Scene("octahedral", ("position",), base=True)
+def test_a_moving_base_takes_its_members_and_the_curve_with_it(rng):
+    scene = Scene("octahedral", ("position",), rng, base=True)
     numbers = scene.numbers()
     truss, pose = scene.truss, scene.target.base
     base = truss.home @ pose.rotation.T + pose.position
@@ -240,12 +239,12 @@ def pair_distance(monitor, member, other, is_self, X):
     return float(np.min(pairs.distance[chosen]))
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("fraction", [1.0, 0.35])
 @pytest.mark.parametrize("name", ["octahedral", "tetrahedral-123"])
-def test_clearance_rows_are_the_derivatives_of_the_exact_distances(name, fraction):
+def test_clearance_rows_are_the_derivatives_of_the_exact_distances(name, fraction, rng):
     """Rows found at a `fraction` of the way from a state, against displacements of the end of that way."""
     truss = TRUSSES[name](member_radius=0.02)
-    rng = np.random.default_rng(5)
     state, end = random_pose(truss, rng, 0.03), random_pose(truss, rng, 0.03)
     monitor = Clearance(TrussArm(truss).bodies, obstacles(), safe=0.05, influence=0.6)
     safe, self_safe = 0.07, 0.03
@@ -349,6 +348,7 @@ WRONG_GOALS = [
 ]
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("goal", WRONG_GOALS, ids=str)
 def test_a_goal_that_is_no_goal_is_refused_and_nothing_moves(crate_problem, goal):
     resolver = Resolver(crate_problem)
@@ -476,11 +476,10 @@ def test_accepted_steps_keep_every_limit_by_recomputation(crate_problem, dt):
 
 @pytest.mark.parametrize("solver", ["daqp", "piqp"])
 @pytest.mark.parametrize("dt", [0.2, 0.02, 0.002])
-def test_random_goals_keep_rate_and_acceleration_at_any_duration(solver, dt):
+def test_random_goals_keep_rate_and_acceleration_at_any_duration(solver, dt, rng):
     """An error in a length counts the more in a rate and an acceleration the shorter the step is."""
     problem = arm_problem(bays=3, truss={"rate": 0.3, "acceleration": 0.6}, method={"solver": solver})
     resolver = Resolver(problem)
-    rng = np.random.default_rng(0)
     moved = 0
     for _ in range(15):
         before = resolver.state
@@ -491,10 +490,9 @@ def test_random_goals_keep_rate_and_acceleration_at_any_duration(solver, dt):
     assert moved >= 5
 
 
-def test_durations_may_differ_from_step_to_step(crate_problem):
+def test_durations_may_differ_from_step_to_step(crate_problem, rng):
     resolver = Resolver(crate_problem)
     start = resolver.tip()[0]
-    rng = np.random.default_rng(3)
     for k in range(20):
         dt = float(rng.choice([0.1, 0.2, 0.35]))
         before, target = resolver.state, start + np.array([0.02 * k, 0.005 * k, -0.004 * k])

@@ -26,9 +26,8 @@ def problem(**changes):
     return found.replace(changes) if changes else found
 
 
-def boxes(seed):
+def boxes(random):
     """Return two or three boxes beside the arm of which some stand in its way."""
-    random = np.random.default_rng(seed)
     found = []
     for k in range(int(random.integers(2, 4))):
         center = [random.uniform(0.95, 1.2), random.uniform(-0.8, 0.8), random.uniform(1.0, 2.3)]
@@ -36,9 +35,9 @@ def boxes(seed):
     return found
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_without_the_named_obstacles_or_limits_a_blocked_arm_gets_further(seed):
-    obstacles = boxes(seed)
+@pytest.mark.parametrize("_", range(10))
+def test_without_the_named_obstacles_or_limits_a_blocked_arm_gets_further(_, rng):
+    obstacles = boxes(rng)
     blocked = vq.solve(problem(obstacle=obstacles))
     assert blocked.certificate.ok, blocked.certificate.failures()
     stop = blocked.manifest["stop"]
@@ -56,7 +55,10 @@ def test_without_the_named_obstacles_or_limits_a_blocked_arm_gets_further(seed):
 
 
 def test_some_of_the_random_scenes_are_blocked_by_obstacles():
-    kinds = [vq.solve(problem(obstacle=boxes(seed)), verify=False).manifest["stop"] for seed in range(6)]
+    kinds = [
+        vq.solve(problem(obstacle=boxes(np.random.default_rng(seed))), verify=False).manifest["stop"]
+        for seed in range(6)
+    ]
     assert any(stop and stop["kind"] == "obstacle" for stop in kinds)
 
 
@@ -70,6 +72,7 @@ def test_the_wall_is_named_and_the_set_is_small():
     json.dumps(maneuver.manifest, allow_nan=False)
 
 
+@pytest.mark.smoke
 def test_a_stretched_arm_is_out_of_reach_of_what_lies_further():
     waypoint = [{"time": 4.0, "position": [0.0, 0.0, 2.62]}]
     maneuver = vq.solve(problem(**{"maneuver.waypoint": waypoint, "truss.stroke": [0.9, 1.2]}))
@@ -126,6 +129,7 @@ def dead_end(kind=StopKind.OBSTACLE, vertices=6, away=(-2.0, 0.0, -1.0)):
     return DeadEnd(Stop(kind, away=away), curve, 2.5, np.array([0.0, 1.0, 0.0]))
 
 
+@pytest.mark.smoke
 def test_a_bulge_is_drawn_across_the_arm_to_four_sides_and_keeps_base_and_tip():
     end = dead_end()
     drawn = [bulge(end, quarter) - end.control_vertices for quarter in range(4)]
@@ -146,6 +150,7 @@ def test_an_arm_that_no_obstacle_pushes_aside_is_bulged_the_way_its_path_goes_on
     np.testing.assert_allclose(moved[:, [0, 2]], 0.0, atol=1e-12)
 
 
+@pytest.mark.smoke
 def test_the_ways_out_are_those_that_a_problem_has():
     patient = problem(**{"method.retries": True})
     first, *names = [name for name, _ in retries(patient, dead_end(vertices=4))]

@@ -106,6 +106,7 @@ def test_the_short_form_of_each_study_is_whole(name: str, tmp_path: Path) -> Non
     assert "Measured on:" in text
 
 
+@pytest.mark.smoke
 def test_an_unknown_study_is_named_with_the_choices(tmp_path: Path) -> None:
     with pytest.raises(GoalError, match='did you mean "figure8"'):
         run_study("figure_8", tmp_path)
@@ -122,6 +123,7 @@ def test_a_clutter_scene_is_the_same_each_time_and_clear_at_home() -> None:
     assert setup.monitor.least(setup.arm.home, 0.0, among="obstacles")[0] > 0.08
 
 
+@pytest.mark.smoke
 def test_wilson_intervals_and_exponents() -> None:
     low, high = wilson_interval(8, 10)
     assert (low, high) == pytest.approx((0.4902, 0.9433), abs=1e-4)

@@ -34,6 +34,7 @@ def again(maneuver: Maneuver, nodes: Any) -> Maneuver:
     return found_clearances(replace(other, tip_target_position=maneuver.tip_target_position))
 
 
+@pytest.mark.smoke
 def test_good_maneuver_passes() -> None:
     certificate = verify(good_maneuver())
     assert certificate.ok, str(certificate)
@@ -46,6 +47,7 @@ def test_verify_file(tmp_path: Path) -> None:
     assert verify_file(good_maneuver().save(tmp_path / "r.npz")).ok
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("node", [3, 4])
 def test_moved_node_is_found(node: int) -> None:
     maneuver = good_maneuver()
@@ -75,6 +77,7 @@ def test_stroke_is_held_to_a_nanometre(beyond: float, found: set[str]) -> None:
     assert broken(driven(lengths, duration=10.0)) == found
 
 
+@pytest.mark.smoke
 def test_rate_is_held() -> None:
     lengths = np.tile(LENGTHS, (11, 1))
     lengths[:, 5] += 0.1 * np.linspace(0.0, 1.0, 11)
@@ -121,6 +124,7 @@ def test_targets_must_lie_on_the_path_and_end_there() -> None:
     assert any("end of the path" in line for line in certificate.contradictions)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     "name", ["member_lengths", "tip_position", "tip_rotation", "clearance", "self_clearance"]
 )
@@ -135,6 +139,7 @@ def test_changed_array_is_found(name: str) -> None:
 CUBE = {"name": "cube", "shape": "box", "center": [2.0, 0.0, 1.0], "size": 0.4}
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     "shape",
     [
@@ -274,11 +279,10 @@ def test_singular_values_against_finite_differences() -> None:
     assert values[2] == pytest.approx(np.linalg.svd(G, compute_uv=False)[0], rel=1e-7)
 
 
-def test_sparse_and_dense_singular_values_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sparse_and_dense_singular_values_agree(monkeypatch: pytest.MonkeyPatch, rng) -> None:
     from vgtm_qp.verify import arm as module
 
     truss = octahedral(6)
-    rng = np.random.default_rng(3)
     nodes = truss.home + 0.02 * rng.normal(size=truss.home.shape)
     maneuver = maneuver_of(nodes[None], np.zeros(1), truss, status="blocked", reached=0.0)
     arm = RecordedArm(maneuver.manifest["arm"], truss.members)
@@ -287,15 +291,13 @@ def test_sparse_and_dense_singular_values_agree(monkeypatch: pytest.MonkeyPatch)
     assert arm.singular_values(nodes) == pytest.approx(dense, rel=1e-5)
 
 
-def offset_joints() -> Joints:
+def offset_joints(rng: np.random.Generator) -> Joints:
     triangle = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [3, 1, 2], [4, 1, 3]])
-    rng = np.random.default_rng(1)
     return Joints(triangle, 0.03 * rng.normal(size=(6, 2, 3)))
 
 
-def test_offset_joints_place_ends_and_bound_their_paths() -> None:
-    truss = tripod(offset_joints())
-    rng = np.random.default_rng(2)
+def test_offset_joints_place_ends_and_bound_their_paths(rng) -> None:
+    truss = tripod(offset_joints(rng))
     maneuver = maneuver_of(truss.home[None], np.zeros(1), truss, status="blocked", reached=0.0)
     arm = RecordedArm(maneuver.manifest["arm"], truss.members)
     np.testing.assert_allclose(arm.length, truss.home_lengths, atol=1e-14)
@@ -324,10 +326,11 @@ def encounters(truss: Any, nodes: Any, obstacles: list[dict[str, Any]]) -> tuple
 
 
 @pytest.mark.parametrize("joints", [False, True])
-@pytest.mark.parametrize("seed", range(3))
-def test_bound_between_states_is_below_every_instant_and_close(seed: int, joints: bool) -> None:
-    rng = np.random.default_rng(seed)
-    truss = tripod(offset_joints() if joints else None)
+@pytest.mark.parametrize("_", range(3))
+def test_bound_between_states_is_below_every_instant_and_close(
+    _: int, joints: bool, rng: np.random.Generator
+) -> None:
+    truss = tripod(offset_joints(rng) if joints else None)
     nodes = truss.home + rng.normal(scale=0.15, size=(2, 5, 3))
     center = nodes[0, 4] + rng.normal(scale=0.4, size=3)
     turn = rng.normal(size=3).tolist()
@@ -366,9 +369,8 @@ def frozen(pair: Any, nodes: Any, share: float) -> float:
     return float(pair.separation(points, index)[0].min())
 
 
-def test_culling_changes_nothing() -> None:
+def test_culling_changes_nothing(rng) -> None:
     truss = octahedral(4)
-    rng = np.random.default_rng(5)
     nodes = truss.home + rng.normal(scale=0.05, size=(3, *truss.home.shape))
     boxes = [
         {"name": f"b{k}", "shape": "box", "center": rng.normal(scale=2.0, size=3).tolist(), "size": 0.3}

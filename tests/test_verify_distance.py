@@ -49,6 +49,7 @@ def to_segment(points: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.linalg.norm(points - start - share[:, None] * along, axis=1))
 
 
+@pytest.mark.smoke
 @many
 @given(point, point, st.tuples(size, size, size).map(np.array))
 @example(np.array([0.0, 0.5, -0.75]), np.array([0.0, 2.0, -0.75]), np.full(3, 0.25))
@@ -61,11 +62,13 @@ def test_segment_box(start: Array, end: Array, half: Array) -> None:
     assert found[0] == pytest.approx(least_along(outside, start, end), abs=1e-9)
 
 
+@pytest.mark.smoke
 def test_segment_box_where_another_library_is_wrong() -> None:
     found, _ = segment_box(np.array([[0.0, 0.5, -0.75]]), np.array([[0.0, 2.0, -0.75]]), np.full(3, 0.25))
     assert found[0] == pytest.approx(np.hypot(0.25, 0.5), abs=1e-15)
 
 
+@pytest.mark.smoke
 @many
 @given(point, point, size)
 def test_segment_ball(start: Array, end: Array, radius: float) -> None:
@@ -74,6 +77,7 @@ def test_segment_ball(start: Array, end: Array, radius: float) -> None:
     assert found[0] == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.smoke
 @many
 @given(point, point, size, size)
 def test_segment_cylinder(start: Array, end: Array, radius: float, half: float) -> None:
@@ -86,6 +90,7 @@ def test_segment_cylinder(start: Array, end: Array, radius: float, half: float) 
     assert found[0] == pytest.approx(least_along(outside, start, end), abs=1e-9)
 
 
+@pytest.mark.smoke
 @many
 @given(point, point, point, point)
 def test_segment_segment(a: Array, b: Array, c: Array, d: Array) -> None:
@@ -96,6 +101,7 @@ def test_segment_segment(a: Array, b: Array, c: Array, d: Array) -> None:
     assert swapped[0] == pytest.approx(found[0], abs=1e-12)
 
 
+@pytest.mark.smoke
 @many
 @given(point, point, point, point, point)
 def test_segment_triangle(a: Array, b: Array, u: Array, v: Array, w: Array) -> None:
@@ -135,6 +141,7 @@ def make(kind: str, turn: Array) -> Body:
     return Body(*placed, mesh(triangle, closed=False))
 
 
+@pytest.mark.smoke
 @many
 @given(bodies, point, point, point)
 def test_plane_across_the_normal_separates_by_the_whole_distance(
@@ -150,6 +157,7 @@ def test_plane_across_the_normal_separates_by_the_whole_distance(
     assert apart == pytest.approx(distance[0], abs=1e-7)
 
 
+@pytest.mark.smoke
 @many
 @given(bodies, point, point)
 def test_support_and_corners_hold_the_body(kind: str, turn: Array, normal: Array) -> None:
@@ -160,6 +168,7 @@ def test_support_and_corners_hold_the_body(kind: str, turn: Array, normal: Array
     assert support >= -1e-12 or kind == "mesh"
 
 
+@pytest.mark.smoke
 def test_winding_number_tells_inside_from_outside() -> None:
     import trimesh
 
@@ -170,6 +179,7 @@ def test_winding_number_tells_inside_from_outside() -> None:
     assert ring.encloses(points).tolist() == [True, False, True, False]
 
 
+@pytest.mark.smoke
 @many
 @given(point)
 def test_rotation_matrix(vector: Array) -> None:

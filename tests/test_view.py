@@ -53,6 +53,7 @@ def session(problem: vq.Problem) -> Session:
     return Session(problem)
 
 
+@pytest.mark.smoke
 def test_the_tip_goes_where_it_is_wanted_and_rests_there(session: Session):
     goal = session.tip + np.array([0.2, 0.1, -0.1])
     session.want_tip(goal)
@@ -78,6 +79,7 @@ def test_no_state_on_the_way_breaks_a_limit(session: Session):
         before = lengths
 
 
+@pytest.mark.smoke
 def test_a_way_through_an_obstacle_is_refused_and_the_obstacle_named():
     session = Session(vq.load_problem("five_bay_blocked_by_wall"))
     session.want_tip(np.array([2.0, 0.0, 3.0]))
