@@ -279,8 +279,9 @@ def elastic_engine(
 ) -> Callable[[], Engine]:
     """Return a function that gives the engine of the same layout with elastic tracking, built on its first call."""
     elastic = replace(layout, hard_tracking=False, hard_turns=False)
-    # It is seldom needed: not compiled, it is built faster.
-    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False, plain=plain))
+    # That of a long arm is built faster if it is not compiled, and seldom needed.
+    is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
+    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=is_short, plain=plain))
 
 
 def check_solver(problem: Problem) -> None:

@@ -180,5 +180,4 @@ class QPResolver(Resolver, serves="qp"):
 
     def again(self, problem: Problem) -> QPResolver:
         """See :class:`Resolver`."""
-        # A kernel takes longer to compile than a maneuver to solve without it.
-        return QPResolver(build_arm(problem, compiled=False))
+        return QPResolver(build_arm(problem))
