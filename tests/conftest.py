@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import is_hypothesis_test, settings
 
-# A shell starts what it runs in the background deaf to interrupts, and the programs that tests start would inherit that.
+# A shell starts what it runs in the background deaf to interrupts, and programs that tests start would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arm.arm import Kinematics, Pose
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.qp.answer import StepSolution
-from vgtm_qp.qp.full import StepQP
+from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
@@ -126,25 +126,45 @@ def numbers_at(
     return Linearisation(setup.layout, compiled=False).numbers(at.linear(setup.layout), rows)
 
 
+class WholeSolver:
+    """Solves the whole QP of a step, not condensed, by PIQP behind qpsolvers: the oracle of all other forms."""
+
+    settles = "equalities"
+
+    def __init__(self, layout: Layout) -> None:
+        self.builder = FullBuilder(layout)
+
+    def solve(self, numbers: StepNumbers) -> StepSolution:
+        qp = self.builder.build(numbers)
+        z, y = solved(qp)
+        return self.builder.solution(z, y, -(qp.P @ z + qp.q + qp.A.T @ y), 0)
+
+    def gain(self, held: NDArray[np.bool_]) -> Array | None:
+        return None
+
+
 def solved(qp: StepQP) -> tuple[Array, Array]:
-    """Answer and equalities' multipliers, by row, of a whole QP, by PIQP behind qpsolvers; zero for other rows."""
+    """Answer and multipliers of the rows of a whole QP, by PIQP behind qpsolvers."""
     equal = qp.row_lower == qp.row_upper
     sides = qp.A[~equal]
-    G = scipy.sparse.vstack([sides, -sides]).tocsc()
+    G = scipy.sparse.vstack([sides, -sides]).tocsr()
     h = np.concatenate([qp.row_upper[~equal], -qp.row_lower[~equal]])
     kept = np.isfinite(h)
     problem = qpsolvers.Problem(
         scipy.sparse.csc_matrix(qp.P),
         qp.q,
-        scipy.sparse.csc_matrix(G.tocsr()[kept]),
+        scipy.sparse.csc_matrix(G[kept]),
         h[kept],
         scipy.sparse.csc_matrix(qp.A[equal]),
         qp.row_lower[equal],
         qp.column_lower,
         qp.column_upper,
     )
-    found = qpsolvers.solve_problem(problem, solver="piqp", eps_abs=1e-10, eps_rel=1e-10)
+    gap = {"eps_duality_gap_abs": 1e-13, "eps_duality_gap_rel": 1e-13}
+    found = qpsolvers.solve_problem(problem, solver="piqp", eps_abs=1e-10, eps_rel=1e-12, **gap)
     assert found.found
-    multipliers = np.zeros(len(equal))
-    multipliers[equal] = found.y
+    multipliers, of_sides = np.zeros(len(equal)), np.zeros(len(h))
+    of_sides[kept] = found.z
+    above, below = np.split(of_sides, 2)
+    multipliers[equal], multipliers[~equal] = found.y, above - below
     return np.asarray(found.x), multipliers

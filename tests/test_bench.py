@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import jsonschema
@@ -16,22 +17,24 @@ import pytest
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName, contestants, measure, report, scenes
+from vgtm_qp.bench.chart import plot_phases
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.bench.measure import Pairs, Spent, breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.tables import render
+from vgtm_qp.bench.tour import Goal, Tour, make_goals
 from vgtm_qp.cli import main
-from vgtm_qp.maneuver.plan import Plan, make_plan
+from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import check_problem, find_warnings
-from vgtm_qp.step.path import Path as TipPath
 from vgtm_qp.step.state import State
+from vgtm_qp.view.figure import save_figure
 
 SPENT = {"type": "number", "minimum": 0}
 TIMING = {
     "type": "object",
-    "required": ["median", "p95", "p99", "cpu", "steps"],
+    "required": ["median", "p95", "p99", "max", "cpu", "cpu_p95", "cpu_p99", "cpu_max", "steps"],
     "additionalProperties": SPENT,
 }
 FRESH = {
@@ -41,7 +44,19 @@ FRESH = {
 }
 SCENE = {
     "type": "object",
-    "required": ["name", "kind", "bays", "tracking", "covered", "stopped_by", "qps", "members", "obstacles"],
+    "required": [
+        "name",
+        "kind",
+        "bays",
+        "tracking",
+        "distance",
+        "covered",
+        "stopped_by",
+        "qps",
+        "members",
+        "actuators",
+        "obstacles",
+    ],
     "properties": {
         "step": TIMING,
         "breakdown": {
@@ -83,46 +98,106 @@ def free() -> vq.Problem:
     return scenes.make_scenes(("free",), trackings=("elastic",))[0].problem
 
 
-def resolver_and_plan(problem: vq.Problem) -> tuple[vq.Resolver, Plan]:
+def resolver_and_goals(problem: vq.Problem) -> tuple[vq.Resolver, list[Goal]]:
     resolver = vq.Resolver(problem)
-    return resolver, make_plan(problem, *resolver.tip())
+    return resolver, make_goals(problem, resolver)
+
+
+def walk_to(resolver: vq.Resolver, goals: list[Goal], count: int) -> None:
+    for goal in goals[1 : count + 1]:
+        assert resolver.step(position=goal.pose.position, pointing=goal.pointing).status == "reached"
 
 
 @pytest.mark.smoke
 def test_percentiles_are_of_the_clock_and_of_the_processor_apart() -> None:
-    found = timing([Spent(k, 200.0 - k) for k in range(1, 101)])
-    assert (found["median"], found["cpu"], found["steps"]) == (50.5, 149.5, 100)
-    assert found["median"] < found["p95"] < found["p99"] < 100.0
+    found = timing([Spent(k, 201.0 - k) for k in range(1, 102)])
+    assert (found["median"], found["cpu"], found["steps"]) == (51.0, 150.0, 101)
+    assert (found["p95"], found["p99"], found["max"]) == (96.0, 100.0, 101.0)
+    assert (found["cpu_p95"], found["cpu_p99"], found["cpu_max"]) == (195.0, 199.0, 200.0)
+
+
+def step_of(status: vq.StepStatus, progress: float) -> Any:
+    """What a tour reads of a step."""
+    return SimpleNamespace(status=status, progress=progress, blocked_by=("wall",))
+
+
+def test_a_tour_goes_there_and_back_and_asks_again_for_what_was_not_reached() -> None:
+    tour = Tour([goal_at(float(k)) for k in range(4)])
+    asked = []
+    for _ in range(2 * tour.round_trip):
+        asked.append(float(tour.goal.pose.position[0]))
+        tour.advance(step_of(vq.StepStatus.REACHED, 1.0))
+    assert asked == [1.0, 2.0, 3.0, 2.0, 1.0, 0.0] * 2
+    slow = Tour([goal_at(float(k)) for k in range(4)])
+    for progress, covered in ((0.5, 0.5 / 3.0), (0.5, 0.75 / 3.0)):
+        slow.advance(step_of(vq.StepStatus.SLOWED, progress))
+        assert slow.goal.pose.position[0] == 1.0
+        assert slow.covered == pytest.approx(covered)
+    slow.advance(step_of(vq.StepStatus.REACHED, 1.0))
+    assert slow.goal.pose.position[0] == 2.0
+    slow.advance(step_of(vq.StepStatus.BLOCKED, 0.0))
+    assert slow.stuck == "wall"
+    slow.restart()
+    assert (slow.stuck, slow.goal.pose.position[0], slow.covered) == ("", 1.0, pytest.approx(1.0 / 3.0))
+
+
+def test_a_tour_that_makes_no_progress_is_stuck() -> None:
+    tour = Tour([goal_at(0.0), goal_at(1.0)])
+    for _ in range(9):
+        tour.advance(step_of(vq.StepStatus.SLOWED, 1e-4))
+    assert tour.stuck == ""
+    tour.advance(step_of(vq.StepStatus.SLOWED, 1e-4))
+    assert tour.stuck == "wall"
+
+
+def goal_at(x: float) -> Goal:
+    zero = np.zeros(3)
+    return Goal(TipGoal(np.array([x, 0.0, 0.0]), np.eye(3), zero, zero), None)
+
+
+def test_goals_are_those_of_the_maneuver_as_a_control_loop_asks_for_them() -> None:
+    (scene,) = scenes.make_scenes(("pointing",), trackings=("elastic",))
+    resolver, goals = resolver_and_goals(scene.problem)
+    position, rotation = resolver.tip()
+    assert len(goals) == scene.problem.maneuver.steps + 1
+    assert goals[0].pose.position == pytest.approx(position)
+    assert goals[0].pointing == pytest.approx(rotation[:, 2])
+    assert goals[-1].pose.position == pytest.approx([1.6, 0.0, 3.3])
+    assert goals[-1].pointing == pytest.approx([0.0, 0.0, 1.0])
+    walk_to(resolver, goals, 3)
+    assert resolver.tip()[0] == pytest.approx(goals[3].pose.position, abs=1e-7)
 
 
 @pytest.mark.smoke
 def test_phases_sum_to_the_total_and_an_interrupted_step_does_not_decide() -> None:
-    seconds = [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1000.0]
-    found = breakdown(seconds, {"qp": [0.5] * 7 + [999.0], "distance": [0.25] * 8})
+    spent = [Spent(1.0, 1.0)] * 10 + [Spent(1000.0, 1.0)] * 30
+    found = breakdown(spent, {"qp": [0.5] * 10 + [999.0] * 30, "distance": [0.25] * 40})
     assert found["total"] == 1.0
     assert found["phases"] == {"qp": 0.5, "distance": 0.25, "other": 0.25}
-    assert breakdown([3.0], {"qp": [1.0]})["phases"] == {"qp": 1.0, "other": 2.0}
+    assert breakdown([Spent(3.0, 3.0)], {"qp": [1.0]})["phases"] == {"qp": 1.0, "other": 2.0}
+    rare = breakdown([Spent(1.0, 1.0)] * 19 + [Spent(9.0, 9.0)], {"qp": [0.5] * 20})
+    assert rare == {"total": 1.0, "phases": {"qp": 0.5, "other": 0.5}}
 
 
 def test_a_run_alone_covers_the_maneuver_and_its_phases_are_parts_of_its_steps(free: vq.Problem) -> None:
-    resolver, plan = resolver_and_plan(free)
-    steps = run_alone(resolver, plan, seconds=60.0, steps=len(plan.marks) + 3)
+    resolver, goals = resolver_and_goals(free)
+    steps = run_alone(resolver, goals, seconds=60.0, steps=len(goals) + 3)
     assert steps.covered == pytest.approx(1.0)
     assert steps.stopped_by == ""
-    assert len(steps.spent) == len(steps.qps) == len(plan.marks) + 3
+    assert len(steps.spent) == len(steps.qps) == len(goals) + 3
     assert min(steps.qps) >= 1
     assert set(steps.phases) == set(resolver.phases)
     within = np.sum(list(steps.phases.values()), axis=0)
     wall = np.array([spent.wall for spent in steps.spent])
     assert np.all(within > 0.0)
     assert np.all(within <= wall + 1e-9)
-    found = breakdown(wall, steps.phases)
+    found = breakdown(steps.spent, steps.phases)
     assert sum(found["phases"].values()) == pytest.approx(found["total"], rel=1e-12)
 
 
 def test_a_blocked_arm_is_reported_and_does_not_run_for_ever() -> None:
-    resolver, plan = resolver_and_plan(vq.load_problem("five_bay_blocked_by_wall"))
-    steps = run_alone(resolver, plan, seconds=60.0, steps=100)
+    resolver, goals = resolver_and_goals(vq.load_problem("five_bay_blocked_by_wall"))
+    steps = run_alone(resolver, goals, seconds=60.0, steps=60)
     assert 0.0 < steps.covered < 1.0
     assert steps.stopped_by
 
@@ -133,14 +208,14 @@ class Watched:
     def __init__(self, log: list[str], seconds: float, clock: Clock) -> None:
         self.log, self.clock, self.seconds = log, clock, seconds
         self.states: list[State] = []
-        self.goals: list[float] = []
+        self.goals: list[Goal] = []
 
     def place(self, state: State) -> None:
         self.states.append(state)
 
-    def step(self, path: TipPath, start: float, end: float, dt: float) -> bool:
+    def step(self, goal: Goal) -> bool:
         self.log.append("theirs")
-        self.goals.append(end)
+        self.goals.append(goal)
         self.clock.pass_by(self.seconds)
         return True
 
@@ -162,27 +237,28 @@ class Clock:
 def test_runs_in_turn_take_the_same_steps_from_the_same_states_and_drift_cancels(
     free: vq.Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    resolver, plan = resolver_and_plan(free)
+    resolver, goals = resolver_and_goals(free)
     log: list[str] = []
     clock = Clock()
-    ours: list[tuple[State, float]] = []
-    follow = resolver.follow
+    ours: list[tuple[State, list[float]]] = []
+    take = resolver.step
 
-    def watched(path: TipPath, start: float, end: float, *, dt: float | None = None) -> vq.Step:
+    def watched(*, position: Any, pointing: Any) -> vq.Step:
         log.append("ours")
-        ours.append((resolver.state, end))
+        ours.append((resolver.state, position.tolist()))
         clock.pass_by(2.0)
-        return follow(path, start, end, dt=dt)
+        return take(position=position, pointing=pointing)
 
-    monkeypatch.setattr(resolver, "follow", watched)
+    monkeypatch.setattr(resolver, "step", watched)
     monkeypatch.setattr(measure, "perf_counter", clock)
-    monkeypatch.setattr(measure, "process_time", clock)
+    monkeypatch.setattr(measure, "thread_time", clock)
     baseline = Watched(log, 6.0, clock)
-    pairs = run_in_turn(resolver, baseline, plan, seconds=1e9, steps=60)
-    assert len(pairs.theirs) == len(pairs.ours) == 60
-    assert baseline.goals[1:] == [goal for _, goal in ours]
+    pairs = run_in_turn(resolver, baseline, goals, seconds=1e9, steps=60)
+    assert (len(pairs.theirs), len(pairs.ours)) == (60, 70)
+    del ours[60:]
+    assert [goal.pose.position.tolist() for goal in baseline.goals[1:]] == [position for _, position in ours]
     assert all(theirs is own for theirs, (own, _) in zip(baseline.states[1:], ours, strict=True))
-    assert log[1:9] == ["theirs", "ours", "ours", "theirs"] * 2
+    assert log[1:] == (["ours"] * 10 + ["theirs"] * 10) * 6 + ["ours"] * 10
     assert clock.slowness > 3.0
     assert pairs.ratio == pytest.approx(3.0, rel=0.02)
 
@@ -192,24 +268,23 @@ def test_a_ratio_is_of_the_processor_and_steps_without_answer_are_counted_apart(
     assert pairs.ratio == 2.0
 
     class Failing(Watched):
-        def step(self, path: TipPath, start: float, end: float, dt: float) -> bool:
+        def step(self, goal: Goal) -> bool:
             raise vq.SolverError("no answer")
 
-    resolver, plan = resolver_and_plan(free)
-    found = run_in_turn(resolver, Failing([], 0.0, Clock()), plan, seconds=60.0, steps=4)
-    assert (found.failed, found.theirs, found.ours) == (4, [], [])
+    resolver, goals = resolver_and_goals(free)
+    found = run_in_turn(resolver, Failing([], 0.0, Clock()), goals, seconds=60.0, steps=4)
+    assert (found.failed, found.theirs) == (4, [])
 
 
 @pytest.fixture(scope="module")
-def midway() -> tuple[vq.Problem, State, State, Plan]:
-    """The two-cube problem, a state half way, the one after it, and the plan."""
+def midway() -> tuple[vq.Problem, State, State, list[Goal]]:
+    """The two-cube problem, a state half way, the one after it, and the goals of these two."""
     problem = scenes.make_scenes(("cubes",), (5,), ("elastic",))[0].problem
-    resolver, plan = resolver_and_plan(problem)
-    for start, end in zip([0.0, *plan.marks[:24]], plan.marks[:25], strict=True):
-        resolver.follow(plan.path, float(start), float(end))
+    resolver, goals = resolver_and_goals(problem)
+    walk_to(resolver, goals, 25)
     before = resolver.state
-    resolver.follow(plan.path, float(plan.marks[24]), float(plan.marks[25]))
-    return problem, before, resolver.state, plan
+    walk_to(resolver, goals[25:], 1)
+    return problem, before, resolver.state, goals[25:27]
 
 
 def tip_and_lengths(problem: vq.Problem, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -219,34 +294,32 @@ def tip_and_lengths(problem: vq.Problem, X: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def test_the_bare_pseudoinverse_moves_the_tip_to_first_order(midway: tuple[Any, ...]) -> None:
-    problem, before, _, plan = midway
+    problem, before, _, (here, goal) = midway
     errors = []
-    here = float(plan.marks[24])
     for share in (1.0, 0.5):
         step = BarePseudoinverse(problem)
         step.place(before)
-        goal = here + share * float(plan.marks[25] - plan.marks[24])
-        assert step.step(plan.path, here, goal, 0.2)
+        wanted = here.pose.position + share * (goal.pose.position - here.pose.position)
+        assert step.step(Goal(goal.pose._replace(position=wanted), None))
         tip, lengths = tip_and_lengths(problem, step.reached)
         fixed = ~build_arm(problem).arm.actuated
         errors.append(np.abs(lengths - before.quantities)[fixed].max())
-        assert np.abs(tip - plan.path.at(goal).position).max() < 1e-12
+        assert np.abs(tip - wanted).max() < 1e-12
     assert 3.0 < errors[0] / errors[1] < 5.0
 
 
 def test_the_nonlinear_program_is_solved_within_its_limits_and_not_worse_than_the_qp(
     midway: tuple[Any, ...],
 ) -> None:
-    problem, before, after, plan = midway
+    problem, before, after, (_, goal) = midway
     step = NonlinearStep(problem)
     step.place(before)
-    here, goal = float(plan.marks[24]), float(plan.marks[25])
-    assert step.step(plan.path, here, goal, goal - here)
+    assert step.step(goal)
     tip, lengths = tip_and_lengths(problem, step.reached)
     setup = build_arm(problem)
     fixed, low, high = ~setup.arm.actuated, *setup.arm.stroke.T
     assert np.abs(lengths - before.quantities)[fixed].max() < 1e-9
-    assert np.abs(tip - plan.path.at(goal).position).max() < 1e-9
+    assert np.abs(tip - goal.pose.position).max() < 1e-9
     assert np.all((lengths > low - 1e-9) & (lengths < high + 1e-9))
     assert setup.monitor.least(step.reached, after.time, among="obstacles")[0] > setup.safe - 1e-3
 
@@ -263,14 +336,14 @@ def test_the_nonlinear_program_is_solved_within_its_limits_and_not_worse_than_th
 @pytest.mark.parametrize("name", ["eq28-sparse", "curve", "osqp", "piqp"])
 def test_the_package_s_own_baselines_step_from_where_they_are_placed(name: Any) -> None:
     scene = scenes.make_scenes(("free",), trackings=("hard",))[0]
-    resolver, plan = resolver_and_plan(scene.problem)
+    resolver, goals = resolver_and_goals(scene.problem)
     baseline = make_baseline(name, scene.problem, scene.bays)
     assert isinstance(baseline, contestants.ResolverStep)
-    resolver.follow(plan.path, 0.0, float(plan.marks[0]))
+    walk_to(resolver, goals, 1)
     before = resolver.state
-    resolver.follow(plan.path, float(plan.marks[0]), float(plan.marks[1]))
+    walk_to(resolver, goals[1:], 1)
     baseline.place(before)
-    assert baseline.step(plan.path, float(plan.marks[0]), float(plan.marks[1]), 0.2)
+    assert baseline.step(goals[2])
     moved = baseline.resolver.state
     assert moved.time == pytest.approx(resolver.state.time)
     assert baseline.resolver.tip()[0] == pytest.approx(resolver.tip()[0], abs=2e-3)
@@ -285,16 +358,21 @@ def test_a_baseline_is_not_tried_on_longer_arms_than_it_says(free: vq.Problem) -
 
 @pytest.mark.smoke
 def test_scenes_have_names_of_their_own_and_the_bays_that_were_asked_for() -> None:
-    found = scenes.make_scenes(("cubes", "pointing", "free"), (5, 12, 12), ("exact", "hard"))
+    found = scenes.make_scenes(("cubes", "serial", "free"), (5, 12, 12), ("exact", "hard"))
     assert [scene.name for scene in found] == [
-        "cubes-5", "cubes-5-hard", "cubes-12", "cubes-12-hard", "pointing-5-elastic", "free-5", "free-5-hard",
+        "cubes-5", "cubes-5-hard", "cubes-12", "cubes-12-hard", "serial-7", "free-5", "free-5-hard",
     ]  # fmt: skip
     assert [scene.problem.truss.bays for scene in found if scene.kind == "cubes"] == [5, 5, 12, 12]
     assert [scene.problem.method.tracking_mode for scene in found[:2]] == ["exact", "hard"]
+    both = scenes.make_scenes(("cubes",), (5,), None, ("fcl", "exact"))
+    assert [scene.name for scene in both] == ["cubes-5", "cubes-5-exact-distance"]
+    assert [scene.problem.clearance.distance for scene in both] == ["fcl", "exact"]
+    usual = {scene.name for scene in scenes.make_scenes()}
+    assert {"free-5", "cubes-5", "cubes-5-exact-distance", "pointing-5-elastic", "cubes-1000-hard"} <= usual
 
 
 @pytest.mark.parametrize(
-    ("kind", "bays"), [("cubes", 10), ("cubes", 30), ("clutter", 50), ("tetrahedral", 14)]
+    ("kind", "bays"), [("cubes", 10), ("cubes", 30), ("clutter", 50), ("tetrahedral", 14), ("serial", 7)]
 )
 def test_scenes_begin_clear_and_can_be_reached(kind: Any, bays: int) -> None:
     scene = scenes.make_scenes((kind,), (bays,), ("elastic",))[0]
@@ -302,16 +380,15 @@ def test_scenes_begin_clear_and_can_be_reached(kind: Any, bays: int) -> None:
     assert scene.bays == bays
     assert check_problem(scene.problem, setup) == []
     assert find_warnings(scene.problem, setup) == []
-    assert len(scene.problem.obstacle) == {"cubes": 2, "clutter": 100, "tetrahedral": 0}[kind]
+    assert len(scene.problem.obstacle) == {"cubes": 2, "clutter": 100, "serial": 1}.get(kind, 0)
 
 
 def test_every_step_of_a_longer_arm_has_a_cube_within_influence() -> None:
     scene = scenes.make_scenes(("cubes",), (10,), ("elastic",))[0]
-    resolver, plan = resolver_and_plan(scene.problem)
-    tip, value = resolver.tip()[0], 0.0
-    for mark in plan.marks:
-        assert resolver.follow(plan.path, value, float(mark)).status == "reached"
-        value = float(mark)
+    resolver, goals = resolver_and_goals(scene.problem)
+    tip = resolver.tip()[0]
+    for goal in goals[1:]:
+        assert resolver.step(position=goal.pose.position).status == "reached"
         least = resolver.setup.monitor.least(resolver.state.nodes, resolver.state.time, among="obstacles")[0]
         assert resolver.setup.safe - 1e-9 <= least < resolver.setup.influence
         assert np.linalg.norm(resolver.tip()[0] - tip) > 0.02
@@ -354,12 +431,14 @@ def test_threads_are_held_before_numpy_is_loaded() -> None:
 
 
 def scene_document(bays: int, cpu: float, ratio: float | None = None, kind: str = "cubes") -> dict[str, Any]:
-    step = {"median": 2 * cpu, "p95": 3 * cpu, "p99": 4 * cpu, "cpu": cpu, "steps": 10}
+    step = {"median": 2 * cpu, "p95": 3 * cpu, "p99": 4 * cpu, "max": 5 * cpu, "steps": 10}
+    step |= {"cpu": cpu, "cpu_p95": cpu, "cpu_p99": 2 * cpu, "cpu_max": 3 * cpu}
     theirs = None if ratio is None else step | {"cpu": ratio * cpu}
     baseline = {"step": theirs, "ours": cpu, "ratio": ratio, "failed": 0, "skipped": ""}
     fresh = {"imports": 1.0, "setup": cpu, "first_step": 1.0, "peak_memory": 100, "imported_memory": 50}
     return {
-        "name": f"{kind}-{bays}-elastic", "kind": kind, "bays": bays, "tracking": "elastic", "step": step,
+        "name": f"{kind}-{bays}-elastic", "kind": kind, "bays": bays, "tracking": "elastic", "distance": "fcl",
+        "step": step,
         "warm": fresh, "baselines": {"eq28-sparse": baseline},
     }  # fmt: skip
 
@@ -400,6 +479,7 @@ def test_the_command_offers_what_there_is() -> None:
 def printed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("bench") / "old.json"
     tokens = ["bench", "--scene", "free", "--tracking", "elastic", "--steps", "12", "--seconds", "20"]
+    tokens += ["--figure", str(file.with_suffix(".png"))]
     with pytest.MonkeyPatch.context() as patch, file.open("w") as stream:
         patch.setattr(sys, "stdout", stream)
         assert main([*tokens, "--baselines", "eq28", "ipopt", "--json"]) == 0
@@ -411,6 +491,7 @@ def test_json_is_one_document_of_the_schema(printed: Path) -> None:
     jsonschema.validate(document, DOCUMENT)
     (scene,) = document["scenes"]
     assert (scene["name"], scene["step"]["steps"], scene["cold"]) == ("free-5-elastic", 12, None)
+    assert printed.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert sum(scene["breakdown"]["phases"].values()) == pytest.approx(scene["breakdown"]["total"])
     assert list(scene["baselines"]) == ["eq28", "ipopt"]
     for found in scene["baselines"].values():
@@ -425,14 +506,52 @@ def test_a_table_shows_every_number_and_the_comparison(
     assert main([*tokens, "--compare", str(printed)]) == 0
     out, err = capsys.readouterr()
     assert "free-5" in err
-    header, *_ = (line for line in out.splitlines() if line.startswith("| one step"))
-    for word in ("median", "p95", "p99", "CPU", "distance", "qp", "correction", "other", "set-up", "memory"):
-        assert word in header
+    first, second, third = (
+        next(line for line in out.splitlines() if line.startswith(f"| {head}"))
+        for head in ("clock", "mean by phase", "fresh process")
+    )
+    assert all(word in first for word in ("median", "95 %", "99 %", "100 %", "CPU median", "CPU 100 %"))
+    assert all(word in second for word in ("distance", "qp", "correction", "acceptance", "other", "covered"))
+    assert all(word in third for word in ("set-up", "memory"))
     assert "| new / old" in out
     document = json.loads(printed.read_text())
     text = render(document)
     assert "eq. (28), dense pseudoinverse alone" in text
-    assert text.count("| free-5") == 2
+    assert text.count("| free-5") == 4
+
+
+def test_a_baseline_that_was_not_measured_has_no_column_and_its_reason_stands_below(printed: Path) -> None:
+    document = json.loads(printed.read_text())
+    document["baselines"]["mink"] = "another package"
+    missing = {"step": None, "ours": None, "ratio": None, "failed": 0, "skipped": "mink is not installed"}
+    document["scenes"][0]["baselines"]["mink"] = missing
+    text = render(document)
+    head = next(line for line in text.splitlines() if line.startswith("| CPU, and ratio"))
+    assert "ipopt" in head
+    assert "mink" not in head
+    assert "mink: another package (not measured: mink is not installed)" in text
+
+
+def test_what_stopped_an_arm_does_not_widen_the_table(printed: Path) -> None:
+    document = json.loads(printed.read_text())
+    document["scenes"][0]["stopped_by"] = "one, two, three, four, five"
+    assert "one, two and 3 more |" in render(document)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+def test_the_chart_has_a_bar_of_phases_for_each_scene(printed: Path, tmp_path: Path, suffix: str) -> None:
+    document = json.loads(printed.read_text())
+    (scene,) = document["scenes"]
+    phases = scene["breakdown"]["phases"]
+    long = {**scene, "name": "cubes-50", "bays": 50}
+    figure = plot_phases({**document, "scenes": [scene, long]})
+    assert [axes.get_yticklabels()[0].get_text() for axes in figure.axes] == ["free-5-elastic", "cubes-50"]
+    for axes in figure.axes:
+        scale = 1e3 if axes.get_xlabel().endswith("ms") else 1e6
+        widths = [bar.get_width() / scale for bar in axes.patches]
+        assert sorted(widths) == pytest.approx(sorted(phases.values()), abs=1e-12)
+        assert axes.get_xlim()[1] / scale > scene["breakdown"]["total"]
+    assert save_figure(figure, tmp_path / f"bars{suffix}").stat().st_size > 5000
 
 
 @pytest.mark.parametrize(
@@ -444,6 +563,8 @@ def test_a_table_shows_every_number_and_the_comparison(
         (["--bays", "20", "0"], ["--bays", "5"]),
         (["--steps", "0"], ["--steps"]),
         (["--seconds", "0"], ["--seconds"]),
+        (["--distance", "guessed"], ["guessed", "fcl"]),
+        (["--figure", "bars.txt"], ["--figure", ".svg"]),
         (["--compare", "none.json"], ["none.json: cannot be read: no such file or directory"]),
     ],
 )

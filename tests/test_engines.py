@@ -8,7 +8,7 @@ import numpy as np
 import oracle
 import pytest
 from arms import TRUSSES, make_layout
-from steps import SHAPES, assert_same_answer, make_step, pressing, shaped
+from steps import SHAPES, WholeSolver, assert_same_answer, make_step, pressing, shaped
 
 from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.curve.families import make_family
@@ -55,8 +55,8 @@ def fused_engine(layout, kinematics, task):
     return engine
 
 
-def general(layout, kinematics, task, solver="daqp"):
-    return GeneralEngine(layout, kinematics, task, make_solver(solver, layout))
+def general(layout, kinematics, task):
+    return GeneralEngine(layout, kinematics, task, make_solver("daqp", layout))
 
 
 @pytest.mark.parametrize("base", [False, True])
@@ -114,12 +114,12 @@ def test_both_engines_give_one_answer_on_every_curve(name, shape, family, rng):
     goals[2], goals[4] = vertices[2] + [0.3, 0.0, 0.0], vertices[4] + [0.0, 0.002, 0.0]
     torsion = 0.1 * rng.normal(size=layout.torsion)
     target = replace(target, vertex_goals=goals)
-    full = general(layout, kinematics, task, "piqp")
+    whole = GeneralEngine(layout, kinematics, task, WholeSolver(layout))
     for motion, progress in ((True, 0.0), (False, 0.7)):
         goal = target.path.at(progress)
         asked = QPInput(X, Y if motion else X, vertices, torsion, target, goal, progress, rows, motion)
         pressed = asked._replace(rows=pressing(rows, plain.solve(asked)))
-        found, wanted, other = (engine.solve(pressed) for engine in (fused, plain, full))
+        found, wanted, other = (engine.solve(pressed) for engine in (fused, plain, whole))
         assert_same_answer(found, wanted)
         np.testing.assert_allclose(found.torsion, wanted.torsion, atol=1e-10)
         assert_same_answer(other, wanted, 3e-6)

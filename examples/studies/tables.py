@@ -35,7 +35,7 @@ OPTIONS = {"robustness": "--scenes 300 --seed 1991", "tracking": "--scenes 120 -
 """Of the studies that take any."""
 COMMANDS = {
     **{name: f"vgtm study {name} {OPTIONS.get(name, '')}".strip() for name in STUDIES},
-    "bench": "vgtm bench --scene free cubes pointing clutter tetrahedral --bays 5 20 50 200 1000 --seconds 0.7",
+    "bench": "vgtm bench --seconds 0.7",
 }
 SHORT = {
     **{name: f"vgtm study {name} --short" for name in STUDIES},

@@ -2,6 +2,7 @@
 
 from typing import Literal
 
-SceneKind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral"]
+SceneKind = Literal["free", "cubes", "pointing", "clutter", "tetrahedral", "serial"]
 TrackingName = Literal["exact", "elastic", "hard"]
-BaselineName = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp"]
+DistanceName = Literal["fcl", "exact"]
+BaselineName = Literal["eq28", "eq28-sparse", "curve", "ipopt", "osqp", "piqp", "mink", "pink"]

@@ -12,12 +12,13 @@ import numpy as np
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.ipopt import NonlinearStep
+from vgtm_qp.bench.peers import MinkStep, PinkStep
+from vgtm_qp.bench.tour import Goal
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods import Resolver, with_method
 from vgtm_qp.methods.conventional import DenseSolution
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
-from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import StepStatus
 
@@ -29,8 +30,8 @@ class Contestant(Protocol):
         """Stand in `state`; not measured."""
         ...
 
-    def step(self, path: Path, start: float, end: float, dt: float) -> bool:
-        """Move along `path` from its value `start` to `end` in `dt` seconds; False where that failed."""
+    def step(self, goal: Goal) -> bool:
+        """Move towards a goal in the duration of the problem's steps; False where that failed."""
         ...
 
 
@@ -54,11 +55,11 @@ class BarePseudoinverse:
         """See :class:`Contestant`."""
         self._nodes = state.nodes
 
-    def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
+    def step(self, goal: Goal) -> bool:
         """See :class:`Contestant`."""
         setup, truss = self._setup, truss_of(self._setup.arm)
         setup.kinematics.evaluate(self._nodes)
-        tip = setup.task.rows(self._nodes, setup.kinematics, path.at(end))
+        tip = setup.task.rows(self._nodes, setup.kinematics, goal.pose)
         J, _ = self._solution.jacobians(setup.kinematics.gradient, tip.jacobian)
         x = np.concatenate([tip.error, np.zeros(len(truss.fixed))])
         X = np.array(self._nodes)
@@ -82,9 +83,10 @@ class ResolverStep:
             state = replace(state, control_vertices=resolver.state.control_vertices)
         resolver.state = state
 
-    def step(self, path: Path, start: float, end: float, dt: float) -> bool:
+    def step(self, goal: Goal) -> bool:
         """See :class:`Contestant`."""
-        return self.resolver.follow(path, start, end, dt=dt).status is StepStatus.REACHED
+        step = self.resolver.step(position=goal.pose.position, pointing=goal.pointing)
+        return step.status is StepStatus.REACHED
 
 
 BASELINES: dict[BaselineName, Baseline] = {
@@ -102,6 +104,8 @@ BASELINES: dict[BaselineName, Baseline] = {
     "ipopt": Baseline("one nonlinear program a step, IPOPT", 20, NonlinearStep),
     "osqp": Baseline("the same QPs, sparse, OSQP", 200, partial(ResolverStep, solver="osqp")),
     "piqp": Baseline("the same QPs, sparse, PIQP", 200, partial(ResolverStep, solver="piqp")),
+    "mink": Baseline("the same tip, limits and distances as a QP on MuJoCo, mink", 1000, MinkStep),
+    "pink": Baseline("the same tip, limits and distances as a QP on Pinocchio, pink", 1000, PinkStep),
 }
 
 

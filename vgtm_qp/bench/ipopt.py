@@ -13,11 +13,11 @@ import numpy as np
 
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
+from vgtm_qp.bench.tour import Goal
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.clearance import clearance_rows
 from vgtm_qp.rows.limits import actuator_box
-from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State
 
 _PAIRS = 24
@@ -78,23 +78,23 @@ class NonlinearStep:
         """See :class:`~vgtm_qp.bench.contestants.Contestant`."""
         self._state = state
 
-    def step(self, path: Path, start: float, end: float, dt: float) -> bool:  # noqa: ARG002
+    def step(self, goal: Goal) -> bool:
         """See :class:`~vgtm_qp.bench.contestants.Contestant`; False where IPOPT fails."""
         setup, state = self._setup, self._state
         truss, actuators = truss_of(setup.arm), setup.arm.actuators
-        here, goal = state.nodes[truss.free].reshape(-1), path.at(end)
+        here, pose = state.nodes[truss.free].reshape(-1), goal.pose
         lower, upper = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
         limits = truss.stroke[actuators], truss.rate[actuators], truss.acceleration[actuators]
         lower[actuators], upper[actuators] = actuator_box(
-            state.quantities[actuators], state.rates[actuators], *limits, dt, state.duration or None
+            state.quantities[actuators], state.rates[actuators], *limits, setup.dt, state.duration or None
         )
         floors = self._clearances(state)
         zero = np.zeros(self._ends)
-        across = goal.rotation[:, :2].T
+        across = pose.rotation[:, :2].T
         moved = state.motion[truss.free].reshape(-1)
         answer = self._solver(
             x0=here + moved,
-            p=np.concatenate([here, goal.position, across.T.reshape(-1), self._rows.T.reshape(-1)]),
+            p=np.concatenate([here, pose.position, across.T.reshape(-1), self._rows.T.reshape(-1)]),
             lbg=np.concatenate([lower, zero, floors]),
             ubg=np.concatenate([upper, zero, np.full(_PAIRS, np.inf)]),
             lam_x0=self._multipliers[0],

@@ -1,61 +1,78 @@
-"""Timing: one resolver by itself over whole maneuvers, then in turn with a baseline, step by step.
+"""Timing: one resolver by itself over whole maneuvers, then in turn with a baseline, by blocks of steps.
 
-In turn, both take each step from the state that the resolver had reached, and which of them is first alternates:
-a machine that slows down slows both, and the ratio of their medians holds. The content of the processor's caches
-differs: after a large baseline the smaller contestant may take half as long again. Ratios are those of CPU time,
-because longer steps are interrupted more often. Garbage is collected as usual.
+A step is ``Resolver.step(position=...)``, with ``pointing`` where a direction is tracked, as a control loop calls it:
+to the next mark of the maneuver, there and back, from the state that the last one left; an arm that is stuck goes on
+from home. All is warm: the kernels are compiled, and nothing is done for the first time.
+
+In turn, both take the same steps from the states that the resolver reached: it takes ten, then the baseline those ten,
+and at the end it takes ten more. A machine that slows down slows both, and the ratio of their medians holds. Steps of
+one block are as warm as in a control loop: right after a large baseline a step may take twice as long, because the
+processor's caches are filled with other things. Ratios are those of the thread's CPU time, because longer steps are
+interrupted more often. Garbage is collected as usual.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from time import perf_counter, process_time
+from time import perf_counter, thread_time
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vgtm_qp.bench.contestants import Contestant
+from vgtm_qp.bench.tour import Goal, Tour
+from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.errors import VgtmError
-from vgtm_qp.maneuver.plan import Plan
 from vgtm_qp.methods import Resolver
 from vgtm_qp.step.state import State
-from vgtm_qp.step.step import Step, StepStatus
+from vgtm_qp.step.step import Step
 
 _Answer = TypeVar("_Answer")
 
+_BY_CLOCK = ("median", "p95", "p99", "max")
+_BY_CPU = ("cpu", "cpu_p95", "cpu_p99", "cpu_max")
 _LEAST_STEPS = 10
-_WARM_UP = 5
-_STALLED_PROGRESS, _STALLED_STEPS = 1e-3, 10
+_BLOCK = 10
+"""Steps of one contestant before the other has its turn."""
+_INTERRUPTED = 1.05
+"""Ratio of a step's time by the clock to its CPU time, from which on it counts as interrupted."""
 _OVERRUN = 5.0
 """A run ends after this many times its duration, however few steps it had."""
 
 
 class Spent(NamedTuple):
-    """Wall-clock and CPU time of a step, s."""
+    """Wall-clock time, and CPU time of the thread, of a step, s."""
 
     wall: float
     cpu: float
 
 
 def timing(spent: Sequence[Spent]) -> dict[str, float]:
-    """Return seconds of one or more steps: ``median``, ``p95`` and ``p99`` by the clock, median ``cpu``; ``steps``."""
-    wall, cpu = np.array(spent, dtype=float).T
-    median, p95, p99 = (float(value) for value in np.percentile(wall, (50, 95, 99)))
-    return {"median": median, "p95": p95, "p99": p99, "cpu": float(np.median(cpu)), "steps": len(wall)}
+    """Return seconds of one or more steps, and their number ``steps``.
 
-
-def breakdown(seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> dict[str, Any]:
-    """Return where the time of steps (S,) goes: mean seconds in each of the ``phases``, which sum to the ``total``.
-
-    The mean is that of the middle half of the steps in the order of their time, so that one which the system
-    interrupted does not decide. Phase ``other`` is what the resolver does outside its phases.
+    ``median``, ``p95``, ``p99`` and ``max`` are by the clock; ``cpu``, ``cpu_p95``, ``cpu_p99`` and ``cpu_max`` the
+    same of the thread's CPU time.
     """
-    times = np.asarray(seconds, dtype=float)
-    count = len(times)
-    middle = np.argsort(times, kind="stable")[count // 4 : max(count - count // 4, count // 4 + 1)]
-    total = float(times[middle].mean())
+    found: dict[str, float] = {}
+    for names, times in zip((_BY_CLOCK, _BY_CPU), np.array(spent, dtype=float).T, strict=True):
+        found |= zip(names, np.percentile(times, (50, 95, 99, 100)).tolist(), strict=True)
+    return found | {"steps": len(spent)}
+
+
+def breakdown(spent: Sequence[Spent], phases: Mapping[str, ArrayLike]) -> dict[str, Any]:
+    """Return where the time of S steps goes: mean seconds in each of the ``phases`` (S,), which sum to the ``total``.
+
+    Of the steps that the system did not interrupt, by clock and CPU time, the mean is that of the middle half in the
+    order of their time. Phase ``other`` is what the resolver does outside its phases.
+    """
+    wall, cpu = np.array(spent, dtype=float).T
+    delay = wall / np.maximum(cpu, 1e-9)
+    kept = np.argsort(delay, kind="stable")[: max(int(np.sum(delay < _INTERRUPTED)), _LEAST_STEPS)]
+    kept, count = kept[np.argsort(wall[kept], kind="stable")], len(kept)
+    middle = kept[count // 4 : max(count - count // 4, count // 4 + 1)]
+    total = float(wall[middle].mean())
     means = {name: float(np.asarray(values, dtype=float)[middle].mean()) for name, values in phases.items()}
     return {"total": total, "phases": means | {"other": total - sum(means.values())}}
 
@@ -64,8 +81,8 @@ def breakdown(seconds: ArrayLike, phases: Mapping[str, ArrayLike]) -> dict[str, 
 class Steps:
     """Steps that the resolver took by itself: seconds of each in every phase, its QPs, and rows by FCL and exact ones.
 
-    ``covered`` is the greatest share of the maneuver that one pass covered, 0 to 1; ``stopped_by`` what blocked the
-    arm, empty if nothing did.
+    ``covered`` is the greatest share of the maneuver that the arm covered, 0 to 1; ``stopped_by`` what stopped it
+    first, empty if nothing did.
     """
 
     spent: list[Spent] = field(default_factory=list)
@@ -79,7 +96,7 @@ class Steps:
 
 @dataclass
 class Pairs:
-    """Times of a baseline and of the resolver, of the same steps; `failed` counts steps without an answer."""
+    """Times of a baseline and of the resolver; `failed` counts steps that are left out: the baseline has no answer."""
 
     theirs: list[Spent] = field(default_factory=list)
     ours: list[Spent] = field(default_factory=list)
@@ -87,57 +104,41 @@ class Pairs:
 
     @property
     def ratio(self) -> float:
-        """Median CPU time of the baseline over that of the resolver, of the same steps."""
+        """Median CPU time of the baseline over that of the resolver."""
         return timing(self.theirs)["cpu"] / timing(self.ours)["cpu"]
 
-
-class _Place(NamedTuple):
-    """Where a step begins: the state, its piece of the path, and its duration, s."""
-
-    state: State
-    start: float
-    end: float
-    dt: float
+    def add(self, baseline: Contestant, block: list[tuple[State, Goal, Spent]]) -> None:
+        """Let the baseline take steps that the resolver took, from the states where they began."""
+        for state, goal, ours in block:
+            theirs, answered = _take(baseline, state, goal)
+            if answered:
+                self.theirs.append(theirs)
+                self.ours.append(ours)
+            else:
+                self.failed += 1
 
 
 class _Walk:
-    """A resolver that repeats a plan from home, by the steps that a maneuver takes."""
+    """A resolver on a tour from home."""
 
-    def __init__(self, resolver: Resolver, plan: Plan) -> None:
-        self._resolver, self._plan = resolver, plan
+    def __init__(self, resolver: Resolver, goals: list[Goal]) -> None:
+        self._resolver, self.tour = resolver, Tour(goals)
         self.restart()
 
     def restart(self) -> None:
         """Go home."""
         self._resolver.state = self._resolver.setup.home_state()
-        self._value, self._stalled, self.stuck = self._plan.path.start, 0, ""
-
-    @property
-    def covered(self) -> float:
-        """The part of the path behind the arm, 0 to 1."""
-        path = self._plan.path
-        return (self._value - path.start) / (path.end - path.start)
-
-    @property
-    def place(self) -> _Place:
-        """Where the next step begins."""
-        return _Place(self._resolver.state, self._value, *self._plan.next_mark(self._value))
+        self.tour.restart()
 
     def step(self) -> tuple[Spent, Step]:
         """Take a step; return what it took, and the step."""
-        _, start, end, dt = self.place
-        spent, step = _timed(lambda: self._resolver.follow(self._plan.path, start, end, dt=dt))
-        self._stalled = self._stalled + 1 if step.progress < _STALLED_PROGRESS else 0
-        if step.status is StepStatus.BLOCKED or self._stalled == _STALLED_STEPS:
-            self.stuck = ", ".join(step.blocked_by) or "nothing that has a name"
-        elif step.status is StepStatus.SLOWED:
-            self._value += step.progress * (end - start)
-        else:
-            self._value = end
+        take, goal = self._resolver.step, self.tour.goal
+        spent, step = _timed(lambda: take(position=goal.pose.position, pointing=goal.pointing))
+        self.tour.advance(step)
         return spent, step
 
     def repeat(self, seconds: float, steps: int) -> Iterator[int]:
-        """Count steps to take, from home again where the plan ends, until there are so many or `seconds` have passed.
+        """Count steps to take until there are so many or `seconds` have passed; an arm that is stuck goes home.
 
         A few are counted at least, unless they are too slow; an arm that is stuck at home takes no other.
         """
@@ -147,18 +148,18 @@ class _Walk:
             if count and perf_counter() - started >= limit:
                 return
             yield count
-            if self.stuck and self.covered == 0.0:
+            if self.tour.stuck and self.tour.covered == 0.0:
                 return
-            if self.stuck or self._value >= self._plan.marks[-1]:
+            if self.tour.stuck:
                 self.restart()
 
 
-def run_alone(resolver: Resolver, plan: Plan, *, seconds: float, steps: int) -> Steps:
-    """Return up to `steps` steps of whole maneuvers, as many as `seconds` suffice for, after a warm-up."""
-    walk, found = _Walk(resolver, plan), Steps()
-    for _ in walk.repeat(seconds, _WARM_UP):
+def run_alone(resolver: Resolver, goals: list[Goal], *, seconds: float, steps: int) -> Steps:
+    """Return up to `steps` steps, as many as `seconds` suffice for, after one tour there and back as a warm-up."""
+    walk, found = _Walk(resolver, goals), Steps()
+    for _ in walk.repeat(seconds, min(steps, walk.tour.round_trip)):
         walk.step()
-    walk.restart()
+    finish_compiling()
     before = dict(resolver.phases)
     for _ in walk.repeat(seconds, steps):
         spent, step = walk.step()
@@ -170,38 +171,38 @@ def run_alone(resolver: Resolver, plan: Plan, *, seconds: float, steps: int) -> 
         for name, total in now.items():
             found.phases.setdefault(name, []).append(total - before[name])
         before = now
-        found.covered = max(found.covered, walk.covered)
-        found.stopped_by = found.stopped_by or walk.stuck
+        found.stopped_by = found.stopped_by or walk.tour.stuck
+    found.covered = walk.tour.covered
     return found
 
 
-def run_in_turn(resolver: Resolver, baseline: Contestant, plan: Plan, *, seconds: float, steps: int) -> Pairs:
-    """Return the times of a baseline and of the resolver over the same steps, in alternation."""
-    walk, found = _Walk(resolver, plan), Pairs()
-    _take(baseline, walk.place, plan)
+def run_in_turn(
+    resolver: Resolver, baseline: Contestant, goals: list[Goal], *, seconds: float, steps: int
+) -> Pairs:
+    """Return the times of a baseline and of the resolver over the same steps, by blocks in turn; the last is ours."""
+    walk, found = _Walk(resolver, goals), Pairs()
+    _take(baseline, resolver.state, walk.tour.goal)
+    finish_compiling()
+    block: list[tuple[State, Goal, Spent]] = []
     for count in walk.repeat(seconds, steps):
-        place = walk.place
-        if count % 2:
-            ours, _ = walk.step()
-            theirs, answered = _take(baseline, place, plan)
-        else:
-            theirs, answered = _take(baseline, place, plan)
-            ours, _ = walk.step()
-        if answered:
-            found.theirs.append(theirs)
-            found.ours.append(ours)
-        else:
-            found.failed += 1
+        state, goal = resolver.state, walk.tour.goal
+        ours, _ = walk.step()
+        block.append((state, goal, ours))
+        if len(block) == _BLOCK or count == steps - 1:
+            found.add(baseline, block)
+            block = []
+    found.add(baseline, block)
+    found.ours += [walk.step()[0] for _ in walk.repeat(seconds, min(steps, _BLOCK))]
     return found
 
 
-def _take(contestant: Contestant, place: _Place, plan: Plan) -> tuple[Spent, bool]:
-    """Let a baseline take the step at `place`; return what it took and whether it found an answer."""
-    contestant.place(place.state)
+def _take(contestant: Contestant, state: State, goal: Goal) -> tuple[Spent, bool]:
+    """Let a baseline take a step from a state; return what it took and whether it found an answer."""
+    contestant.place(state)
 
     def answers() -> bool:
         try:
-            return contestant.step(plan.path, place.start, place.end, place.dt)
+            return contestant.step(goal)
         except (VgtmError, np.linalg.LinAlgError):
             return False
 
@@ -209,6 +210,6 @@ def _take(contestant: Contestant, place: _Place, plan: Plan) -> tuple[Spent, boo
 
 
 def _timed(take: Callable[[], _Answer]) -> tuple[Spent, _Answer]:
-    wall, cpu = perf_counter(), process_time()
+    wall, cpu = perf_counter(), thread_time()
     answer = take()
-    return Spent(perf_counter() - wall, process_time() - cpu), answer
+    return Spent(perf_counter() - wall, thread_time() - cpu), answer

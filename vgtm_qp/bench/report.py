@@ -10,21 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName
 from vgtm_qp.bench.contestants import BASELINES, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.measure import breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.scenes import BenchScene
+from vgtm_qp.bench.tour import Goal, make_goals
 from vgtm_qp.comparison.tables import exponent
 from vgtm_qp.errors import ResultError, VgtmError
 from vgtm_qp.machine import commit, machine_record, versions
-from vgtm_qp.maneuver.plan import Plan, make_plan
 from vgtm_qp.methods import Resolver
 
 _PACKAGES = ("vgtm-qp", "numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl")
+_PEERS = ("mink", "mujoco", "pin-pink", "pin")
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""In version 1 a step was ``Resolver.follow``, and CPU time that of the process."""
+_ALONE = 30.0
 LEAST_BAYS = 50
 """Growth with the bays is fitted from here on: below, what every step costs hides it."""
 
@@ -34,33 +36,35 @@ def measure_scene(
 ) -> dict[str, Any]:
     """Measure one scene: alone, in turn with each of the baselines, and in fresh processes; seconds and bytes.
 
-    Keys of what is returned: ``name``, ``kind``, ``bays`` and ``tracking`` of the scene; the numbers of ``members``,
-    ``actuators`` and ``obstacles``; ``covered``, the share of the maneuver that the measured steps covered, 0 to 1;
-    ``stopped_by``, what blocked the arm, empty where nothing did; ``step`` and ``breakdown``, see `measure.py`;
-    ``qps``, QPs a step; ``fcl_rows`` and ``exact_rows``, clearance rows a step by FCL and by closed forms; ``warm`` and
-    ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
+    Keys of what is returned: ``name``, ``kind``, ``bays``, ``tracking`` and ``distance`` of the scene; the numbers of
+    ``members`` (bodies of any arm), ``actuators`` and ``obstacles``; ``covered``, the share of the maneuver that the
+    arm covered, 0 to 1; ``stopped_by``, what stopped it, empty where nothing did; ``step`` and ``breakdown``, see
+    `measure.py`; ``qps``, QPs a step; ``fcl_rows`` and ``exact_rows``, clearance rows a step by FCL and by closed
+    forms; ``warm`` and ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
     ``baselines``, what `_against` returns, by name.
 
-    Each run, alone and in turn with each baseline, ends after so many `steps` or when so many `seconds` have passed.
+    Each run ends after so many `steps`. Those in turn with a baseline end when so many `seconds` have passed, the one
+    alone when 30 times as many have.
     """
     problem = scene.problem
     resolver = Resolver(problem)
-    plan = make_plan(problem, *resolver.tip())
-    alone = run_alone(resolver, plan, seconds=seconds, steps=steps)
-    baselines = {name: _against(scene, name, resolver, plan, seconds=seconds, steps=steps) for name in names}
-    data, truss = problem.to_dict(), truss_of(resolver.setup.arm)
+    goals = make_goals(problem, resolver)
+    alone = run_alone(resolver, goals, seconds=_ALONE * seconds, steps=steps)
+    baselines = {name: _against(scene, name, resolver, goals, seconds=seconds, steps=steps) for name in names}
+    data, arm = problem.to_dict(), resolver.setup.arm
     return {
         "name": scene.name,
         "kind": scene.kind,
         "bays": scene.bays,
         "tracking": scene.tracking,
-        "members": truss.member_count,
-        "actuators": len(truss.actuators),
+        "distance": scene.distance,
+        "members": len(arm.bodies),
+        "actuators": len(arm.actuators),
         "obstacles": len(problem.obstacle),
         "covered": alone.covered,
         "stopped_by": alone.stopped_by,
         "step": timing(alone.spent),
-        "breakdown": breakdown([spent.wall for spent in alone.spent], alone.phases),
+        "breakdown": breakdown(alone.spent, alone.phases),
         "qps": float(np.mean(alone.qps)),
         "fcl_rows": float(np.mean(alone.fcl_rows)),
         "exact_rows": float(np.mean(alone.exact_rows)),
@@ -71,7 +75,13 @@ def measure_scene(
 
 
 def _against(
-    scene: BenchScene, name: BaselineName, resolver: Resolver, plan: Plan, *, seconds: float, steps: int
+    scene: BenchScene,
+    name: BaselineName,
+    resolver: Resolver,
+    goals: list[Goal],
+    *,
+    seconds: float,
+    steps: int,
 ) -> dict[str, Any]:
     """Return a baseline's ``step``, see `timing`, and its ``ratio`` to ``ours``, median CPU times of the same steps, s.
 
@@ -83,7 +93,7 @@ def _against(
         baseline = make_baseline(name, scene.problem, scene.bays)
     except VgtmError as error:
         return missing | {"skipped": str(error).splitlines()[0]}
-    pairs = run_in_turn(resolver, baseline, plan, seconds=seconds, steps=steps)
+    pairs = run_in_turn(resolver, baseline, goals, seconds=seconds, steps=steps)
     if not pairs.theirs:
         return missing | {"failed": pairs.failed, "skipped": "found no answer to any step"}
     step, ours = timing(pairs.theirs), timing(pairs.ours)["cpu"]
@@ -109,7 +119,7 @@ def measure(
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),
         "machine": machine_record(),
-        "versions": versions(_PACKAGES),
+        "versions": versions(_PACKAGES + _PEERS),
         "settings": {"seconds": seconds, "steps": steps, "cold": cold, "one_blas_thread": pinned},
         "baselines": {name: BASELINES[name].title for name in names},
         "start": measure_start(),
@@ -124,13 +134,13 @@ def measure(
 
 
 def growth(scenes: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the exponent of the bays in the CPU time of a step between two cubes, by method and tracking.
+    """Return the exponent of the bays in the CPU time of a step between two cubes, by method and tracking, with FCL.
 
     Fitted by least squares of the logarithms over arms of 50 bays and more, where there are two at least.
     """
     points: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for scene in scenes:
-        if scene["kind"] != "cubes" or scene["bays"] < LEAST_BAYS:
+        if scene["kind"] != "cubes" or scene["bays"] < LEAST_BAYS or scene["distance"] != "fcl":
             continue
         medians = {"qp": scene["step"]["cpu"]}
         medians |= {name: found["step"]["cpu"] for name, found in scene["baselines"].items() if found["step"]}

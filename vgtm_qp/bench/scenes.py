@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import product
 from typing import Any, NamedTuple, get_args
 
-from vgtm_qp.bench import SceneKind, TrackingName
+from vgtm_qp.bench import DistanceName, SceneKind, TrackingName
 from vgtm_qp.problem import Problem, load_problem
 
 KINDS: tuple[SceneKind, ...] = get_args(SceneKind)
-TRACKINGS: tuple[TrackingName, ...] = ("exact", "elastic")
-BAYS = (5, 10, 20, 50, 100, 200, 500, 1000)
+BAYS = (5, 20, 50, 200, 1000)
 CLUTTERED_BAYS = 50
 CLUTTER = 100
 
@@ -30,42 +30,128 @@ _SHIFT, _SINK = 1.6, 0.78
 _EDGE = 0.9
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
+Variant = tuple[TrackingName, DistanceName]
+VARIANTS: dict[SceneKind, tuple[Variant, ...]] = {
+    "free": (("exact", "fcl"),),
+    "cubes": (("exact", "fcl"), ("elastic", "fcl")),
+    "pointing": (("elastic", "fcl"), ("elastic", "exact")),
+    "clutter": (("exact", "fcl"),),
+    "tetrahedral": (("exact", "fcl"),),
+    "serial": (("exact", "fcl"), ("exact", "exact")),
+}
+"""Modes of tracking, and what gives the distances, that each kind is measured with if nothing else is asked for.
+
+Between the cubes a direction of the tip needs elastic tracking all the way: an arm that keeps to its curve while it can
+is blocked half way.
+"""
+MORE_BETWEEN_CUBES: dict[int, tuple[Variant, ...]] = {
+    5: (("hard", "fcl"), ("exact", "exact")),
+    1000: (("hard", "fcl"),),
+}
+"""Further variants of ``cubes`` by the number of bays."""
+
+_WITHOUT_CURVE = ("tetrahedral", "serial")
+_JOINTS = 7
+_JOINT_AXES = ((0, 0, 1), (0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1))
+_JOINT_HEIGHTS = (0.36, 0.0, 0.0, 0.42, 0.0, 0.4, 0.0)
+"""Shoulder, elbow and wrist of a KUKA LBR iiwa 14, m above the joint before; limits, deg, and speeds, deg/s, too."""
+_JOINT_LIMITS = (170, 120, 170, 120, 170, 120, 175)
+_JOINT_SPEEDS = (85, 85, 100, 75, 130, 135, 135)
+_JOINT_HOME = (0.0, 0.4, 0.0, -1.4, 0.0, 0.6, 0.0)
+
 
 class BenchScene(NamedTuple):
-    """A problem to be measured; `tracking` is its mode, "none" where there is no curve."""
+    """A problem to be measured.
+
+    `tracking` is its mode, "none" without a curve; `bays` are the joints of a serial arm.
+    """
 
     name: str
     kind: SceneKind
     bays: int
     tracking: str
+    distance: DistanceName
     problem: Problem
 
 
 def make_scenes(
     kinds: Iterable[SceneKind] = KINDS,
     bays: Sequence[int] = BAYS,
-    trackings: Sequence[TrackingName] = TRACKINGS,
+    trackings: Sequence[TrackingName] | None = None,
+    distances: Sequence[DistanceName] | None = None,
 ) -> list[BenchScene]:
     """Return the scenes of these kinds; `bays` are those of the arms between two cubes.
 
-    A direction of the tip cannot be held with hard tracking, so that ``pointing`` is elastic alone.
+    Without `trackings` and `distances` each has its `VARIANTS`; otherwise each mode with each kind of distance, by
+    default exact tracking and FCL.
     """
     scenes = []
     for kind in dict.fromkeys(kinds):
-        if kind == "tetrahedral":
-            scenes.append(BenchScene("tetrahedral", kind, 14, "none", load_problem(_BUNDLED[kind])))
-            continue
-        counts = bays if kind == "cubes" else [CLUTTERED_BAYS if kind == "clutter" else _BUNDLED_BAYS]
-        for count in dict.fromkeys(counts):
+        for count in dict.fromkeys(bays if kind == "cubes" else [_count(kind)]):
+            variants: Iterable[Variant] = VARIANTS[kind]
+            if kind == "cubes":
+                variants = (*variants, *MORE_BETWEEN_CUBES.get(count, ()))
+            if trackings or distances:
+                variants = product(trackings or ("exact",), distances or ("fcl",))
+            if kind in _WITHOUT_CURVE:
+                variants = (("exact", distance) for _, distance in variants)
             problem = _problem(kind, count)
-            for tracking in ("elastic",) if kind == "pointing" else dict.fromkeys(trackings):
-                name = f"{kind}-{count}" + ("" if tracking == "exact" else f"-{tracking}")
-                changed = problem.replace({"method.tracking_mode": tracking})
-                scenes.append(BenchScene(name, kind, count, tracking, changed))
+            scenes += [_scene(problem, kind, count, *variant) for variant in dict.fromkeys(variants)]
     return scenes
 
 
+def _scene(
+    problem: Problem, kind: SceneKind, bays: int, tracking: TrackingName, distance: DistanceName
+) -> BenchScene:
+    changes: dict[str, Any] = {"clearance.distance": distance}
+    words = [kind, str(bays)]
+    if kind not in _WITHOUT_CURVE:
+        changes["method.tracking_mode"] = tracking
+        words += [tracking] if tracking != "exact" else []
+    words += ["exact-distance"] if distance == "exact" else []
+    mode = "none" if kind in _WITHOUT_CURVE else tracking
+    return BenchScene("-".join(words), kind, bays, mode, distance, problem.replace(changes))
+
+
+def _count(kind: SceneKind) -> int:
+    """Return the number of bays, or of joints, of a kind whose number is fixed."""
+    fixed: dict[SceneKind, int] = {"clutter": CLUTTERED_BAYS, "tetrahedral": 14, "serial": _JOINTS}
+    return fixed.get(kind, _BUNDLED_BAYS)
+
+
+def _serial() -> Problem:
+    """Return an arm of seven joints, as mink and pink are made for, whose elbow moves out of the way of a cube."""
+    numbers = zip(_JOINT_AXES, _JOINT_HEIGHTS, _JOINT_LIMITS, _JOINT_SPEEDS, _JOINT_HOME, strict=True)
+    joints = [
+        {
+            "name": f"joint {k}",
+            "axis": axis,
+            "position": [0.0, 0.0, height],
+            "limits": [-math.radians(limit), math.radians(limit)],
+            "rate": math.radians(speed),
+            "home": home,
+        }
+        for k, (axis, height, limit, speed, home) in enumerate(numbers, start=1)
+    ]
+    return Problem.from_dict(
+        {
+            "schema_version": 1,
+            "name": "arm of seven joints beside a cube",
+            "arm": {"joint": joints, "tip": [0.0, 0.0, 0.2], "link_radius": 0.06},
+            "end_effector": {"track": ["position"]},
+            "maneuver": {"steps": 50, "waypoint": [{"time": 5.0, "position": [0.3, 0.5, 0.6]}]},
+            "obstacle": [{"name": "cube", "shape": "box", "center": [0.35, 0.36, 0.88], "size": 0.25}],
+            "clearance": {"safe": 0.03, "influence": 0.3},
+            "method": {"tracking": "none"},
+        }
+    )
+
+
 def _problem(kind: SceneKind, bays: int) -> Problem:
+    if kind == "serial":
+        return _serial()
+    if kind == "tetrahedral":
+        return load_problem(_BUNDLED[kind])
     problem = load_problem(_BUNDLED[kind])
     if bays != _BUNDLED_BAYS:
         problem = _scaled(problem, bays)

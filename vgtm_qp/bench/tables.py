@@ -27,60 +27,101 @@ def _parts(document: dict[str, Any]) -> Iterator[str]:
         f"CPU to start: python {start['python']:.3f} s, import vgtm_qp {start['import']:.3f} s, "
         f"vgtm --help {start['help']:.3f} s"
     )
+    yield (
+        "One step is Resolver.step(position=...) to the next mark of the maneuver, there and back, after one such tour."
+    )
     yield _steps(document["scenes"])
+    yield _phases(document["scenes"])
     if document["baselines"]:
         yield _baselines(document)
-        yield "\n".join(f"{name}: {title}" for name, title in document["baselines"].items())
+        yield "\n".join(_legend(document))
+    yield _fresh(document["scenes"])
     if document["growth"]:
         yield _growth(document["growth"])
     if "compared" in document:
         yield _compared(document["compared"])
 
 
-def _steps(scenes: Sequence[dict[str, Any]]) -> str:
-    known = [name for scene in scenes for name in scene["breakdown"]["phases"]]
-    phases = sorted(dict.fromkeys(known), key=lambda name: _PHASES.index(name) if name in _PHASES else -1)
-    timed = ("median", "p95", "p99", "CPU", *phases)
-    heads = ("steps", "QPs", "FCL + exact rows", *timed, "set-up", "cold", "memory", "covered")
+def phase_names(scenes: Iterable[dict[str, Any]]) -> list[str]:
+    """Return the names of all phases of scenes in the order of a step, ``other`` last."""
+    names = dict.fromkeys(name for scene in scenes for name in scene["breakdown"]["phases"])
+    return sorted(names, key=lambda name: _PHASES.index(name) if name in _PHASES else -1)
+
+
+def _steps(scenes: Iterable[dict[str, Any]]) -> str:
+    shares = ("median", "95 %", "99 %", "100 %")
+    heads = ("clock", "steps", *shares, *(f"CPU {share}" for share in shares), "CPU 99 % / median")
+    keys = ("median", "p95", "p99", "max", "cpu", "cpu_p95", "cpu_p99", "cpu_max")
     rows = []
     for scene in scenes:
-        step, cold = scene["step"], scene["cold"]
-        rows.append(
-            (
-                scene["name"],
-                str(step["steps"]),
-                f"{scene['qps']:.2f}",
-                f"{scene.get('fcl_rows', 0.0):.1f} + {scene.get('exact_rows', 0.0):.1f}",
-                *(_time(step[key]) for key in ("median", "p95", "p99", "cpu")),
-                *(_time(scene["breakdown"]["phases"].get(name)) for name in phases),
-                _setup(scene["warm"]),
-                _setup(cold),
-                f"{scene['warm']['peak_memory'] / 1e6:.0f} MB",
-                f"{100 * scene['covered']:.0f} %"
-                + (f", {scene['stopped_by']}" if scene["stopped_by"] else ""),
-            )
+        step = scene["step"]
+        times = (time_text(step[key]) for key in keys)
+        rows.append((scene["name"], str(step["steps"]), *times, f"{step['cpu_p99'] / step['cpu']:.1f}"))
+    return markdown_table(heads, rows, right=True)
+
+
+def _phases(scenes: Sequence[dict[str, Any]]) -> str:
+    names = phase_names(scenes)
+    rows = []
+    for scene in scenes:
+        found, stopped = scene["breakdown"], scene["stopped_by"]
+        parts = (found["phases"].get(name) for name in names)
+        counts = (
+            f"{scene[key]:.{digits}f}" for key, digits in (("qps", 2), ("fcl_rows", 1), ("exact_rows", 1))
         )
-    return markdown_table(("one step", *heads), rows, right=True)
+        covered = f"{100 * scene['covered']:.0f} %" + (f", {_few(stopped)}" if stopped else "")
+        rows.append((scene["name"], time_text(found["total"]), *map(time_text, parts), *counts, covered))
+    heads = ("mean by phase", "total", *names, "QPs", "rows by FCL", "exact rows", "covered")
+    return markdown_table(heads, rows, right=True)
+
+
+def _few(names: str) -> str:
+    """Return names that are separated by commas, the first two of them if there are many."""
+    first = names.split(", ")
+    return names if len(first) < 4 else f"{first[0]}, {first[1]} and {len(first) - 2} more"
 
 
 def _baselines(document: dict[str, Any]) -> str:
-    names = list(document["baselines"])
+    scenes = document["scenes"]
+    names = [
+        name for name in document["baselines"] if any(scene["baselines"][name]["step"] for scene in scenes)
+    ]
     rows = []
-    for scene in document["scenes"]:
+    for scene in scenes:
         cells = [_against(scene["baselines"][name]) for name in names]
-        rows.append((scene["name"], _time(scene["step"]["cpu"]), *cells))
+        rows.append((scene["name"], time_text(scene["step"]["cpu"]), *cells))
     return markdown_table(("CPU, and ratio to ours in turn", "ours", *names), rows, right=True)
 
 
-def _setup(fresh: dict[str, Any] | None) -> str:
-    return f"{_time(fresh['setup'])} (CPU {_time(fresh['setup_cpu'])})" if fresh else "-"
+def _legend(document: dict[str, Any]) -> Iterator[str]:
+    """Yield what each baseline is, and why one of them has no column."""
+    for name, title in document["baselines"].items():
+        found = [scene["baselines"][name] for scene in document["scenes"]]
+        missing = "" if any(entry["step"] for entry in found) else found[-1]["skipped"] if found else ""
+        yield f"{name}: {title}" + (f" (not measured: {missing})" if missing else "")
 
 
 def _against(found: dict[str, Any]) -> str:
     if not found["step"]:
         return "-"
     failed = f", {found['failed']} failed" if found["failed"] else ""
-    return f"{_time(found['step']['cpu'])}, x {found['ratio']:.3g}{failed}"
+    return f"{time_text(found['step']['cpu'])}, x {found['ratio']:.3g}{failed}"
+
+
+def _fresh(scenes: Iterable[dict[str, Any]]) -> str:
+    rows = [
+        (
+            scene["name"],
+            *(_setup(scene[key]) for key in ("warm", "cold")),
+            f"{scene['warm']['peak_memory'] / 1e6:.0f} MB",
+        )
+        for scene in scenes
+    ]
+    return markdown_table(("fresh process", "set-up", "set-up, no cache", "memory"), rows, right=True)
+
+
+def _setup(fresh: dict[str, Any] | None) -> str:
+    return f"{time_text(fresh['setup'])} (CPU {time_text(fresh['setup_cpu'])})" if fresh else "-"
 
 
 def _growth(rows: Iterable[dict[str, Any]]) -> str:
@@ -95,8 +136,8 @@ def _compared(found: dict[str, Any]) -> str:
     rows = [
         (
             row["name"],
-            _time(row["old"]),
-            _time(row["new"]),
+            time_text(row["old"]),
+            time_text(row["new"]),
             f"{row['cpu']:.2f}",
             f"{row['corrected']:.2f} by {row['by']}" if row["by"] else "-",
             *(f"{row[key]:.2f}" for key in ("p99", "setup", "memory")),
@@ -108,7 +149,7 @@ def _compared(found: dict[str, Any]) -> str:
     return markdown_table(heads, rows, right=True)
 
 
-def _time(seconds: float | None) -> str:
+def time_text(seconds: float | None) -> str:
     """Return a time with three digits and its unit."""
     if seconds is None:
         return "-"

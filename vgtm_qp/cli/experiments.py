@@ -9,8 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from vgtm_qp.bench import BaselineName, SceneKind, TrackingName
-from vgtm_qp.cli.output import ExitCode, Json, Output, Switch, answer, bar, document, following, note, say
+from vgtm_qp.bench import BaselineName, DistanceName, SceneKind, TrackingName
+from vgtm_qp.cli.output import (
+    ExitCode,
+    Json,
+    Output,
+    Switch,
+    answer,
+    bar,
+    check_writable,
+    document,
+    following,
+    note,
+    say,
+)
 
 if TYPE_CHECKING:
     from vgtm_qp.step.step import Step
@@ -154,26 +166,40 @@ def bench(
             help="of the arms between two cubes, 5 or more; 5 to 1000 by default",
         ),
     ] = None,
-    tracking: Annotated[list[TrackingName] | None, _several(help="exact and elastic by default")] = None,
+    tracking: Annotated[
+        list[TrackingName] | None,
+        _several(help="method.tracking_mode; by default those that matter for a scene"),
+    ] = None,
+    distance: Annotated[
+        list[DistanceName] | None,
+        _several(help="clearance.distance; by default those that matter for a scene"),
+    ] = None,
     baselines: Annotated[
         list[BaselineName] | None,
         _several(negative="--no-baselines", help="what else takes the steps; all by default"),
     ] = None,
     seconds: Annotated[
-        float, Parameter(validator=Number(gt=0), help="duration of each run of a scene, at most")
+        float,
+        Parameter(
+            validator=Number(gt=0),
+            help="greatest duration of a run in turn with a baseline; alone it is 30 times as long",
+        ),
     ] = 2.0,
-    steps: Annotated[int, Parameter(validator=Number(gte=1), help="steps of each run, at most")] = 1000,
+    steps: Annotated[int, Parameter(validator=Number(gte=1), help="steps of each run, at most")] = 2000,
     cold: Annotated[bool, Switch(help="set up with an empty cache of compiled kernels too")] = False,
     compare: Annotated[
         Path | None, Parameter(help="what --json printed before: give the ratios to it")
+    ] = None,
+    figure: Annotated[
+        Path | None, Parameter(help="bars of the time of a step by phase, as .pdf, .png or .svg")
     ] = None,
     json: Json = False,
 ) -> None:
     """Measure how long a step takes, where that time goes, and what other methods take for the same steps.
 
-    BLAS is held to one thread. Each scene is run by itself, for its median, percentiles and phases, then in
-    turn with each baseline, step by step from the same states, for the ratios. Set-up and memory are those of
-    a fresh process.
+    A step is one call of Resolver.step, as a control loop makes it: to the next mark of the maneuver, there and back,
+    warm. BLAS is held to one thread. Each scene is run by itself, for percentiles and phases, then in turn with each
+    baseline, ten steps each from the same states, for the ratios. Set-up and memory are those of a fresh process.
     """
     from vgtm_qp.machine import pin_threads
 
@@ -181,12 +207,14 @@ def bench(
     from vgtm_qp.bench.contestants import BASELINES
     from vgtm_qp.bench.report import compare as compared
     from vgtm_qp.bench.report import load_document, measure
-    from vgtm_qp.bench.scenes import BAYS, KINDS, TRACKINGS, BenchScene, make_scenes
+    from vgtm_qp.bench.scenes import BAYS, KINDS, BenchScene, make_scenes
     from vgtm_qp.bench.tables import render
 
+    if figure is not None:
+        check_writable(figure, "--figure", (".pdf", ".png", ".svg"))
     older = None if compare is None else load_document(compare)
     kinds = scene or (("cubes",) if bays else KINDS)
-    scenes = make_scenes(kinds, bays or BAYS, tracking or TRACKINGS)
+    scenes = make_scenes(kinds, bays or BAYS, tracking, distance)
     if not pinned:
         note("vgtm bench: BLAS was loaded before its threads could be held to one")
 
@@ -204,4 +232,10 @@ def bench(
     )
     if older is not None:
         found["compared"] = compared(found, older)
+    if figure is not None:
+        from vgtm_qp.bench.chart import plot_phases
+        from vgtm_qp.view.figure import save_figure
+
+        save_figure(plot_phases(found), figure)
+        note(f"written: {figure}")
     answer(found, render(found), as_json=json)

@@ -28,9 +28,8 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
 
     def __init__(self, problem: Problem) -> None:
         method = problem.method
-        # The solver is never called; this one compiles no kernels.
-        coupled = {**method.kept_by("qp", "coupled"), "solver": "piqp"}
-        super().__init__(build_arm(problem.replace({"method": coupled})))
+        coupled = problem.replace({"method": method.kept_by("qp", "coupled")})
+        super().__init__(build_arm(coupled, solves=False))
         setup, mistakes = self.setup, []
         if not setup.layout.vertices:
             text = (

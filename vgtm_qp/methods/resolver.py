@@ -103,9 +103,7 @@ def arm_without_curve(problem: Problem) -> Setup:
     ProblemError, TrussError
         The arm cannot be built.
     """
-    # The solver is never called; this one compiles no kernels.
-    method = {**problem.method.kept_by("qp", "none"), "solver": "piqp"}
-    return build_arm(problem.replace({"method": method}))
+    return build_arm(problem.replace({"method": problem.method.kept_by("qp", "none")}), solves=False)
 
 
 def displacement_to(goal: TipGoal, start: TipGoal) -> TipGoal:

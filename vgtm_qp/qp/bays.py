@@ -33,8 +33,6 @@ class BaySolver(CondensedSolver):
         A bay has more rows than motions, for example because one of its actuators is locked.
     """
 
-    settles = "curve"
-
     def __init__(self, layout: Layout, *, parallel: bool) -> None:
         super().__init__(layout)
         builder = self.builder

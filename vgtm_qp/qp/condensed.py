@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.qp import daqp
 from vgtm_qp.qp.answer import StepSolution
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.dense import EQUALITY, DenseSolver, check
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers
@@ -21,12 +22,12 @@ from vgtm_qp.rows.curve import free_basis
 
 
 class CondensedSolver:
-    """Solves the QP of a step in the unknowns x with DAQP."""
+    """Solves the QP of a step in the unknowns x."""
 
     settles = "equalities"
 
-    def __init__(self, layout: Layout) -> None:
-        self.layout = layout
+    def __init__(self, layout: Layout, solver: DenseSolver = DAQP) -> None:
+        self.layout, self._solver = layout, solver
         self.builder = builder = FullBuilder(layout)
         actuators, slack = builder.column["actuators"], builder.column["slack"]
         # The columns that the condensed QP keeps, before and after the free coordinates of the curve.
@@ -64,11 +65,11 @@ class CondensedSolver:
             bounds.append(np.concatenate([self._own(columns), of_rows]))
         lower, upper = np.maximum(bounds[0], -UNBOUNDED), np.minimum(bounds[1], UNBOUNDED)
         sense = np.zeros(len(lower), dtype=np.int32)
-        sense[size : size + self._equal] = daqp.EQUALITY
+        sense[size : size + self._equal] = EQUALITY
         tips = size + len(bounded)
-        sense[tips : tips + len(builder.tip_rows)] = daqp.EQUALITY
-        answer = daqp.ask(hessian, gradient, constraint, lower, upper, sense)
-        daqp.check(answer, hessian, gradient, constraint, lower, upper)
+        sense[tips : tips + len(builder.tip_rows)] = EQUALITY
+        answer = self._solver.ask(hessian, gradient, constraint, lower, upper, sense)
+        check(answer, hessian, gradient, constraint, lower, upper)
         y, w = np.zeros(len(qp.row_lower)), np.zeros(builder.size)
         y[rows] = answer.multipliers[tips:]
         w[bounded] = answer.multipliers[size:tips]

@@ -55,25 +55,6 @@ class StepQP:
         rows = beyond(self.A @ z, self.row_lower, self.row_upper)
         return norm(np.concatenate([rows, beyond(z, self.column_lower, self.column_upper)]))
 
-    def dual_residual(self, z: Array, row_multipliers: Array, column_multipliers: Array) -> float:
-        """Return |P z + q + A'y + w|, multipliers positive at upper and negative at lower bounds."""
-        return norm(self.P @ z + self.q + self.A.T @ row_multipliers + column_multipliers)
-
-    def complementarity_residual(self, z: Array, row_multipliers: Array, column_multipliers: Array) -> float:
-        """Return the norm of |multiplier| times the slack of its bound, at most 1: complementary slackness.
-
-        A multiplier of the wrong sign has the slack of the other bound; one of a free row has an infinite slack.
-        """
-        pairs = (
-            (row_multipliers, self.A @ z, self.row_lower, self.row_upper),
-            (column_multipliers, z, self.column_lower, self.column_upper),
-        )
-        parts = []
-        for multiplier, x, lower, upper in pairs:
-            slack = np.where(multiplier > 0.0, upper - x, x - lower)
-            parts.append(np.abs(multiplier) * np.clip(slack, 0.0, 1.0))
-        return norm(np.concatenate(parts))
-
     def violated(self, z: Array, tolerance: float = 1e-9) -> list[tuple[str, float]]:
         """Return rows and columns that violate their bounds at `z` by more than `tolerance`, worst first."""
         value = self.A @ z
@@ -141,11 +122,6 @@ class FullBuilder:
     def _turns(self) -> str:
         """Axes of the turns between a station and the curve: tilts about x and y, roll about z."""
         return "xyz"[: self.layout.turns]
-
-    @property
-    def structure(self) -> object:
-        """A token that changes when the sparsity of `A` does."""
-        return self._pattern
 
     def build(self, numbers: StepNumbers) -> StepQP:
         """Return the QP with the values of `numbers`."""

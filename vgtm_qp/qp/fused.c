@@ -21,7 +21,7 @@ typedef struct {
     double *w;
 } Kernel;
 
-enum { DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED };
+enum { DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED, FAILED };
 
 typedef struct {
     /* Numbers of: unknowns n; actuators n_a; columns of the free nodes; least-squares rows L; rows of the tip, of
@@ -41,6 +41,8 @@ typedef struct {
     Kernel condense, close, missing;
     void (*quadprog)(DAQPResult *, DAQPProblem *, DAQPSettings *);
     void (*defaults)(DAQPSettings *);
+    /* In their place another solver, or null: it sets x, multipliers and iterations, and returns a code as above. */
+    int (*other)(void);
     double feasibility;
 
     const double *stack, *linear, *curvature, *offset, *normal, *leg_rows, *leg_lower;
@@ -192,6 +194,11 @@ EXPORT int solve(Fused *f)
     if (call(&f->condense)) return NO_VALUE;
     objective(f);
     constrain(f);
+    if (f->other) {
+        int code = f->other();
+        if (code == DONE) residuals(f, rows);
+        return code;
+    }
     DAQPProblem problem = {f->unknowns, f->unknowns + rows, f->unknowns, f->hessian, f->gradient,
                            f->constraint, f->upper, f->lower, f->sense};
     DAQPSettings settings;

@@ -1,4 +1,4 @@
-"""The fast path of a step: one call of C linearises, condenses, solves by DAQP, checks the answer and settles it.
+"""The fast path of a step: one call of C linearises, condenses, solves, checks the answer and settles it.
 
 It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in a tenth of the time for short arms; see ``fused.c``.
 """
@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import EvaluationError
+from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.native import Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
-from vgtm_qp.qp.daqp import EQUALITY, FEASIBILITY
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.dense import EQUALITY, DenseSolver
 from vgtm_qp.qp.fused_rows import row_function
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
@@ -58,6 +59,7 @@ class _Code(IntEnum):
     INFEASIBLE = 2
     INACCURATE = 3
     UNSETTLED = 4
+    FAILED = 5
 
 
 @cache
@@ -73,11 +75,21 @@ class FusedSolver:
 
     ``settle`` and ``move`` are for curves of constant tables; others have rows that only Python can compute. Solvers
     that differ in their goals of control vertices share one workspace.
+
+    The dense QPs are for `solver`, which C calls back unless it is DAQP.
     """
 
-    def __init__(self, layout: Layout, *, compiled: bool = True, workspace: _Workspace | None = None) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        solver: DenseSolver = DAQP,
+        *,
+        compiled: bool = True,
+        workspace: _Workspace | None = None,
+    ) -> None:
         self.layout = layout
-        self._workspace = _Workspace(layout, compiled) if workspace is None else workspace
+        self._workspace = _Workspace(layout, solver, compiled) if workspace is None else workspace
+        self.solver = self._workspace.solver
         self._pull = np.zeros((layout.vertices, 3))
         weight = np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
         self._goals = {
@@ -117,9 +129,8 @@ class FusedSolver:
             As ``CondensedSolver.solve``.
         """
         near, work = self._workspace.take(clearance), self._workspace
-        _check(work.call("solve"))
-        data = work.data
-        refuse_large(data.primal, data.dual, f"daqp (exit flag {data.flag})")
+        work.check(work.call("solve"))
+        refuse_large(work.data.primal, work.data.dual, work.status)
         return self._whole(work.x, near)
 
     def move(self, clearance: ClearanceRows, torsion: Array) -> Move:
@@ -133,10 +144,9 @@ class FusedSolver:
             As :meth:`solve`.
         """
         near, work = self._workspace.take(clearance), self._workspace
-        code = _check(work.call("move", TOLERANCE))
-        data = work.data
+        code, data = work.check(work.call("move", TOLERANCE)), work.data
         if code == _Code.INACCURATE:
-            refuse_large(data.primal, data.dual, f"daqp (exit flag {data.flag})")
+            refuse_large(data.primal, data.dual, work.status)
         solution, is_settled = self._solution(work.x, near, _NOWHERE, _NOWHERE), code == _Code.DONE
         points = work.points if is_settled else work.started_points
         q, vertices = work.started.reshape(work.shape).copy(), points.reshape(-1, 3).copy()
@@ -197,15 +207,6 @@ class FusedSolver:
         )
 
 
-def _check(code: int) -> int:
-    """Return the code that a function returned; raise if there is no answer."""
-    if code == _Code.INFEASIBLE:
-        raise InfeasibleStepError("the hard rows of the step contradict one another")
-    if code == _Code.NO_VALUE:
-        raise EvaluationError("the rows of the step have no value at its configuration")
-    return code
-
-
 class _Workspace:
     """The arrays of the C, and the kernels that it calls."""
 
@@ -215,8 +216,8 @@ class _Workspace:
     upper: Array
     multipliers: Array
 
-    def __init__(self, layout: Layout, compiled: bool) -> None:
-        arm, equal = layout.arm, len(layout.tip_rows) + len(layout.hard)
+    def __init__(self, layout: Layout, solver: DenseSolver, compiled: bool) -> None:
+        arm, self.solver, equal = layout.arm, solver, len(layout.tip_rows) + len(layout.hard)
         self._layout, self._source = layout, building(SOURCE)
         self.condense = row_function(layout).kernel(compiled=compiled)
         self.missing = missing_function(layout).kernel(compiled=compiled)
@@ -227,6 +228,8 @@ class _Workspace:
         self._is_ready: bool | None = None
         self._accuracy: Accuracy | None = None
         self._goals: object = None
+        self._other_status = ""
+        self._failure: SolverError | None = None
 
     @property
     def is_ready(self) -> bool:
@@ -247,6 +250,38 @@ class _Workspace:
     def call(self, name: str, *arguments: float) -> int:
         """Call a function of the C, and return its code."""
         return self._program.call(name, *arguments)
+
+    @property
+    def status(self) -> str:
+        """Name of the solver, and how it ended."""
+        return self._other_status or f"daqp (exit flag {self.data.flag})"
+
+    def check(self, code: int) -> int:
+        """Return the code that a function returned; raise if there is no answer."""
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+        if code == _Code.INFEASIBLE:
+            raise InfeasibleStepError("the hard rows of the step contradict one another")
+        if code == _Code.NO_VALUE:
+            raise EvaluationError("the rows of the step have no value at its configuration")
+        return code
+
+    def _ask(self) -> int:
+        """Let the solver answer the QP, for C; an error is raised when C has returned."""
+        rows = self.first_near + self.data.near
+        count = self.size + rows
+        bounds = self.lower[:count], self.upper[:count]
+        try:
+            answer = self.solver.ask(
+                self.hessian, self.gradient, self.constraint[:rows], *bounds, self._sense[:count]
+            )
+        except SolverError as error:
+            self._failure = error
+            return _Code.FAILED
+        self.x[:], self.multipliers[:count] = answer.x, answer.multipliers
+        self._other_status, self.data.iterations = answer.status, answer.iterations
+        return _Code.DONE
 
     def use(self, goals: dict[str, Array]) -> None:
         """Let the next QPs have these goals of control vertices."""
@@ -298,7 +333,7 @@ class _Workspace:
         self.q, self.points, self.gone = missing.inputs[0], missing.inputs[3], missing.inputs[common]
         self.started, self.started_points = self.q.copy(), self.points.copy()
         size, equal, nodes, rows = self.size, self.equal, layout.node_columns, layout.least_squares
-        self.hessian, self.x = np.zeros((size, size)), np.zeros(size)
+        self.hessian, self.gradient, self.x = np.zeros((size, size)), np.zeros(size), np.zeros(size)
         out = condense.outputs
         self.response, self.offset, self.normal = (
             out[0].reshape(size, rows)[:, :nodes],
@@ -328,7 +363,7 @@ class _Workspace:
             settling_steps=SETTLING_STEPS,
             closing_steps=MOST_STEPS,
             too_far=TOO_FAR,
-            feasibility=FEASIBILITY,
+            feasibility=DAQP.accuracy,
             **_daqp(),
             stack=out[0],
             linear=out[4],
@@ -341,7 +376,7 @@ class _Workspace:
             place=place,
             node_column=layout.node_column.astype(np.int32),
             hessian=self.hessian,
-            gradient=np.zeros(size),
+            gradient=self.gradient,
             x=self.x,
             q=self.q,
             points=self.points,
@@ -359,6 +394,9 @@ class _Workspace:
             close=close,
             missing=missing,
         )
+        if self.solver is not DAQP:
+            self._callback = ctypes.CFUNCTYPE(ctypes.c_int)(self._ask)
+            self._program.set(other=ctypes.cast(self._callback, ctypes.c_void_p).value)
         self._reserve(_ROOM, _SLOTS)
 
     def _reserve(self, near: int, slots: int) -> None:
@@ -369,8 +407,8 @@ class _Workspace:
         self._near_nodes = np.zeros(near * slots, dtype=np.int64)
         self._near_rows, self._near_lower = np.zeros(3 * near * slots), np.zeros(near)
         self.lower, self.upper = np.full(size + rows, -UNBOUNDED), np.full(size + rows, UNBOUNDED)
-        sense = np.zeros(size + rows, dtype=np.int32)
-        sense[size : size + self.equal] = EQUALITY
+        self._sense = np.zeros(size + rows, dtype=np.int32)
+        self._sense[size : size + self.equal] = EQUALITY
         # The rows of the tip, and the bounds up to theirs, are written in place.
         of_tip = (self.constraint[:tips].reshape(-1), self.lower[: size + tips], self.upper[: size + tips])
         for result, array in enumerate(of_tip, start=1):
@@ -382,7 +420,7 @@ class _Workspace:
             constraint=self.constraint,
             lower=self.lower,
             upper=self.upper,
-            sense=sense,
+            sense=self._sense,
             multipliers=self.multipliers,
             condense=self.condense,
         )

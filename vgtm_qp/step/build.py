@@ -24,11 +24,12 @@ from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.bays import BaySolver
+from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
 from vgtm_qp.qp.shape import CurveShape
-from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, make_solver
+from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, dense_solver, make_solver
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
@@ -45,10 +46,11 @@ _CONDENSED_ALL_THE_SAME = (
 )
 
 
-def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False) -> Setup:
+def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, solves: bool = True) -> Setup:
     """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
 
-    A `plain` arm does not step in one call of C: its answers are the same.
+    A `plain` arm does not step in one call of C: its answers are the same. If the caller never `solves` a QP, the
+    engine is the one that is built fastest.
 
     Raises
     ------
@@ -73,8 +75,11 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False) -
         "influence": clearance.influence,
         "by_fcl": clearance.distance == "fcl",
     }
-    how = {"compiled": compiled, "plain": plain}
-    engine = make_engine(solver, home.layout, kinematics, task, tracking, **how)
+    if solves:
+        how = {"compiled": compiled, "plain": plain}
+        engine = make_engine(solver, home.layout, kinematics, task, tracking, **how)
+    else:
+        engine = GeneralEngine(home.layout, kinematics, task, CondensedSolver(home.layout), compiled=False)
     gives_way = home.layout.hard_tracking and problem.method.gives_way
     elastic = elastic_engine(solver, home.layout, kinematics, task, plain=plain) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
@@ -257,13 +262,15 @@ def make_engine(
     if tracking in ("recursive", "parallel"):
         by_bays = BaySolver(layout, parallel=tracking == "parallel")
         return GeneralEngine(layout, kinematics, task, by_bays, compiled=compiled)
-    is_short, is_default = len(layout.arm.actuators) < STAGED_ACTUATORS, solver == DEFAULT_SOLVER
-    if layout.elastic_tip and is_default and not is_short:
+    is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
+    if layout.elastic_tip and not is_short:
         warnings.warn(_CONDENSED_ALL_THE_SAME, stacklevel=2)
-    is_quick = is_default and not plain and not layout.elastic_tip
+    is_quick = not plain and not layout.elastic_tip
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
-        return FusedEngine(layout, kinematics, task, FusedSolver(layout, compiled=compiled))
-    along = chain_solver(layout) if is_quick and compiled and prefers_staged(layout) else None
+        fused = FusedSolver(layout, dense_solver(solver), compiled=compiled)
+        return FusedEngine(layout, kinematics, task, fused)
+    is_staged = is_quick and compiled and prefers_staged(layout)
+    along = chain_solver(layout, dense_solver(solver)) if is_staged else None
     if along is not None and ChainEngine.serves(along):
         return ChainEngine(along, kinematics, task)
     return GeneralEngine(layout, kinematics, task, along or make_solver(solver, layout), compiled=compiled)

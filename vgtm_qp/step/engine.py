@@ -301,7 +301,7 @@ class FusedEngine(Engine):
 
     @cached_property
     def _plain(self) -> GeneralEngine:
-        solver = CondensedSolver(self.layout)
+        solver = CondensedSolver(self.layout, self._solver.solver)
         return GeneralEngine(self.layout, self._kinematics, self._task, solver, compiled=False)
 
     @property

@@ -28,9 +28,8 @@ def run(problem: str, offset: float) -> Row:
     """Solve with pin joints, then give the strokes to an arm with offset joints; return the error of its tip, m."""
     loaded = load_problem(problem)
     maneuver = solve(loaded, verify=False)
-    setup = build_arm(
-        loaded.replace({"truss.joint_offset": offset, "truss.stroke": None, "method.solver": "piqp"})
-    )
+    offsets = loaded.replace({"truss.joint_offset": offset, "truss.stroke": None})
+    setup = build_arm(offsets, solves=False)
     X = np.array(setup.arm.home)
     errors = []
     for lengths, tip in zip(maneuver.member_lengths, maneuver.tip_position, strict=True):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.dense import DenseSolver
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.staged import StagedSolver
@@ -11,16 +13,19 @@ STAGED_ACTUATORS = 46
 """Least number of actuators with which elimination along the chain is faster than condensing onto the actuators."""
 
 
-def chain_solver(layout: Layout) -> StagedSolver | TrackedSolver | None:
-    """Return the solver along the chain of `layout`; None if it is no chain, or has rows that chains do not serve."""
+def chain_solver(layout: Layout, solver: DenseSolver = DAQP) -> StagedSolver | TrackedSolver | None:
+    """Return what solves along the chain of `layout`; None if it is no chain, or has rows that chains do not serve.
+
+    The dense QPs of the elimination are for `solver`.
+    """
     if layout.general is not None or layout.hard_turns or layout.elastic_tip:
         return None
     chain = find_chain(layout)
     if chain is None:
         return None
     if layout.hard_tracking:
-        return TrackedSolver(chain) if chain.is_square else None
-    return StagedSolver(chain)
+        return TrackedSolver(chain, solver) if chain.is_square else None
+    return StagedSolver(chain, solver)
 
 
 def prefers_staged(layout: Layout) -> bool:

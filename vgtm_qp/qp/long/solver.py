@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.answer import StepSolution
+from vgtm_qp.qp.dense import DenseSolver
 from vgtm_qp.qp.long.chain_data import ChainData
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import ChainClosing
@@ -18,6 +19,9 @@ from vgtm_qp.qp.numbers import RowNumbers, StepNumbers, beyond, norm
 from vgtm_qp.qp.residual import refuse_large, relative
 
 SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
+
+_PRESSES = 1e-9
+"""Least multiplier of a row that the next QP starts with. Interior-point solvers leave some of each row."""
 
 
 class ChainSolver(ABC):
@@ -36,7 +40,10 @@ class ChainSolver(ABC):
 
     settles = "curve"
 
-    def __init__(self, elimination: Elimination, size: int, *, is_reversed: bool) -> None:
+    def __init__(
+        self, elimination: Elimination, size: int, solver: DenseSolver, *, is_reversed: bool
+    ) -> None:
+        self._solver = solver
         chain = self.chain = elimination.chain
         self.layout = chain.layout
         self.data = ChainData(chain, elimination.inputs.sizes, is_reversed=is_reversed)
@@ -85,11 +92,12 @@ class ChainSolver(ABC):
             least = self._least(combined[:-1])
             return table.values(*least, self._free, progress)
 
-        answer = solve_rows(table, self._size + 1, columns, values, self._active)
+        answer = solve_rows(table, self._size + 1, columns, values, self._active, self._solver)
         nodes, vertices = self.displacements(), self.data.vertices(self._free)
         self._check(table, answer, nodes, vertices)
         self._last, (found, multipliers) = (table, answer), answer[:2]
-        self._active = {table.key(k) for k in np.flatnonzero(multipliers).tolist() if k >= table.equal}
+        active = np.flatnonzero(np.abs(multipliers) > _PRESSES)
+        self._active = {table.key(k) for k in active.tolist() if k >= table.equal}
         return StepSolution(
             nodes=nodes,
             actuators=found[table.actuators].copy(),

@@ -12,6 +12,8 @@ from scipy.linalg.lapack import dtrtrs
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.dense import DenseSolver
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.solver import SINGULAR, ChainSolver
@@ -25,12 +27,12 @@ class StagedSolver(ChainSolver):
 
     settles = "strokes"
 
-    def __init__(self, chain: Chain) -> None:
+    def __init__(self, chain: Chain, solver: DenseSolver = DAQP) -> None:
         elimination = self._elimination = Elimination(chain)
         periods, own = chain.periods, chain.nodes.shape[1]
         self._freedom = periods * elimination.freedom
         # The recursion runs from the tip to the base.
-        super().__init__(elimination, self._freedom + elimination.curve, is_reversed=True)
+        super().__init__(elimination, self._freedom + elimination.curve, solver, is_reversed=True)
         data = self.data
         self._factor = Sweep(elimination.factor(), periods, data.head, data.tail, data.table)
         gains = self._factor.outputs[1]

@@ -12,6 +12,8 @@ from scipy.linalg.lapack import dtrtrs
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.dense import DenseSolver
 from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.solver import SINGULAR, ChainSolver
@@ -93,9 +95,9 @@ class Following:
 class TrackedSolver(ChainSolver):
     """Follows the curve, with hard tracking; for chains with `is_square`."""
 
-    def __init__(self, chain: Chain) -> None:
+    def __init__(self, chain: Chain, solver: DenseSolver = DAQP) -> None:
         elimination = Elimination(chain)
-        super().__init__(elimination, elimination.curve, is_reversed=False)
+        super().__init__(elimination, elimination.curve, solver, is_reversed=False)
         self._graphs, data = Following(elimination), self.data
         self._following = Sweep(self._graphs.response(), chain.periods, data.head, data.tail, data.table)
         self._changes = Sweep(elimination.changes(), chain.periods, data.head)

@@ -11,7 +11,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp import daqp
+from vgtm_qp.qp.dense import EQUALITY, DenseSolver
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import EndRows
 from vgtm_qp.qp.numbers import UNBOUNDED, RowNumbers
@@ -24,7 +24,6 @@ _NO_ROW = 1e-11
 _DEPENDENT = 1e-14
 _INDEPENDENT = 1e-4
 """Ratio of the least to the greatest Cholesky pivot above which rows are far from dependent."""
-_VIOLATED = 1e-10
 _REFINEMENTS = 4
 
 
@@ -179,7 +178,12 @@ def _all_active(
 
 
 def dual_solution(
-    gram: Array, values: Array, lower: Array, upper: Array, equal: NDArray[np.bool_]
+    gram: Array,
+    values: Array,
+    lower: Array,
+    upper: Array,
+    equal: NDArray[np.bool_],
+    solver: DenseSolver,
 ) -> tuple[Array, int]:
     """Return the multipliers that bring `values` - `gram` multipliers into the bounds at least cost.
 
@@ -217,10 +221,10 @@ def dual_solution(
         value = bound[kept]
         free = np.abs(value) >= UNBOUNDED
         bounds.append(np.where(free, value, (value - values[kept]) * scale))
-    sense = np.where(equal[kept], daqp.EQUALITY, 0).astype(np.int32)
-    answer = daqp.ask(np.eye(rank), np.zeros(rank), rows, bounds[0], bounds[1], sense)
-    if answer.flag < 1:
-        raise SolverError(f"daqp ended with exit flag {answer.flag}")
+    sense = np.where(equal[kept], EQUALITY, 0).astype(np.int32)
+    answer = solver.ask(np.eye(rank), np.zeros(rank), rows, bounds[0], bounds[1], sense)
+    if not answer.is_solved:
+        raise SolverError(answer.status)
     multipliers[kept] = answer.multipliers * scale
     return multipliers, answer.iterations
 
@@ -253,6 +257,7 @@ def solve_rows(
     find_columns: Callable[[Index], Array],
     find_values: Callable[[Array], Array],
     remembered: set[Key],
+    solver: DenseSolver,
 ) -> Answer:
     """Return the answer of a QP with the rows of `table`; `remembered` are keys of those active before.
 
@@ -282,7 +287,7 @@ def solve_rows(
     values = find_values(np.zeros(size))
     while True:
         violation = np.maximum(table.lower - values, values - table.upper)
-        violated = np.flatnonzero(violation > _VIOLATED)
+        violated = np.flatnonzero(violation > solver.accuracy)
         known = {*rows, *new}
         outside = np.array([k for k in violated.tolist() if k not in known], dtype=np.int64)
         room = BLOCK * max(1, len(outside) // (4 * BLOCK))
@@ -310,6 +315,7 @@ def solve_rows(
             table.lower[index],
             table.upper[index],
             index < table.equal,
+            solver,
         )
         iterations += count
         values = find_values(columns @ multipliers)

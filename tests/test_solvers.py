@@ -1,0 +1,151 @@
+"""Dense solvers by name: their answers are DAQP's, whatever rows come and go, and OSQP keeps its workspace."""
+
+from __future__ import annotations
+
+import numpy as np
+import osqp
+import pytest
+
+import vgtm_qp as vq
+from vgtm_qp.qp import osqp as by_osqp
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.dense import EQUALITY, check, residuals
+from vgtm_qp.qp.numbers import UNBOUNDED
+from vgtm_qp.qp.osqp import Osqp
+from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError
+from vgtm_qp.qp.solvers import available_solvers, dense_solver
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.chain_engine import ChainEngine
+from vgtm_qp.step.engine import FusedEngine
+
+OTHERS = [name for name in available_solvers() if name != "daqp"]
+SIZE, BOUNDED = 9, 6
+
+
+def random_qp(rng, rows, *, bounded=BOUNDED):
+    """A feasible QP: two equalities, then rows with a lower, an upper and both bounds in turn; some are active."""
+    root = rng.normal(size=(SIZE, SIZE))
+    constraint = rng.normal(size=(rows, SIZE))
+    inside = 0.1 * rng.normal(size=SIZE)
+    values = np.concatenate([inside[:bounded], constraint @ inside])
+    lower = values - rng.uniform(0.0, 0.1, len(values))
+    upper = values + rng.uniform(0.0, 0.1, len(values))
+    equal = slice(bounded, bounded + 2)
+    lower[equal] = upper[equal] = values[equal]
+    upper[bounded + 2 :: 3], lower[bounded + 3 :: 3] = UNBOUNDED, -UNBOUNDED
+    sense = np.zeros(len(values), dtype=np.int32)
+    sense[equal] = EQUALITY
+    return root @ root.T + 0.1 * np.eye(SIZE), rng.normal(size=SIZE), constraint, lower, upper, sense
+
+
+@pytest.fixture
+def set_ups(monkeypatch):
+    """Numbers of rows for which OSQP was set up."""
+    found, set_up = [], osqp.OSQP.setup
+
+    def counted(self, P, q, A, *bounds, **settings):
+        found.append(A.shape[0])
+        return set_up(self, P, q, A, *bounds, **settings)
+
+    monkeypatch.setattr(osqp.OSQP, "setup", counted)
+    return found
+
+
+@pytest.mark.parametrize("bounded", [0, BOUNDED, SIZE])
+@pytest.mark.parametrize("name", OTHERS)
+def test_every_solver_has_daqp_s_answer(name, bounded):
+    rng, solver, active = np.random.default_rng(1), dense_solver(name), 0
+    for rows in (5, 2, 11, 4, 3):
+        *qp, sense = random_qp(rng, rows, bounded=bounded)
+        found, wanted = solver.ask(*qp, sense), DAQP.ask(*qp, sense)
+        check(wanted, *qp)
+        np.testing.assert_allclose(found.x, wanted.x, atol=1e-6)
+        np.testing.assert_allclose(found.multipliers, wanted.multipliers, atol=1e-5)
+        active += np.count_nonzero(wanted.multipliers)
+    assert active > 15
+
+
+@pytest.mark.parametrize("name", ["daqp", *OTHERS])
+def test_rows_that_contradict_one_another_are_infeasible(name):
+    *qp, sense = random_qp(np.random.default_rng(2), 4)
+    _, _, constraint, lower, upper = qp
+    constraint[3] = constraint[2]
+    lower[-2:], upper[-2:] = (-UNBOUNDED, 0.1), (0.0, UNBOUNDED)
+    with pytest.raises(InfeasibleStepError):
+        dense_solver(name).ask(*qp, sense)
+
+
+def test_osqp_is_set_up_once_and_grows_by_doubling(set_ups):
+    rng, solver = np.random.default_rng(3), Osqp()
+    for rows in (4, 12, 2, 9, 13, 24, 3, 25, 30):
+        *qp, sense = random_qp(rng, rows)
+        np.testing.assert_allclose(solver.ask(*qp, sense).x, DAQP.ask(*qp, sense).x, atol=1e-7)
+    assert set_ups == [BOUNDED + capacity for capacity in (12, 24, 48)]
+
+
+def test_osqp_starts_from_its_last_answer_also_with_more_rows():
+    solver = Osqp()
+    hessian, gradient, constraint, lower, upper, sense = random_qp(np.random.default_rng(4), 4)
+    cold = solver.ask(hessian, gradient, constraint, lower, upper, sense)
+    again = solver.ask(hessian, gradient + 1e-6, constraint, lower, upper, sense)
+    free, open_ends = np.zeros((9, SIZE)), np.full(9, UNBOUNDED)
+    more = solver.ask(
+        hessian,
+        gradient,
+        np.concatenate([constraint, free]),
+        np.concatenate([lower, -open_ends]),
+        np.concatenate([upper, open_ends]),
+        np.concatenate([sense, np.zeros(9, dtype=np.int32)]),
+    )
+    assert max(again.iterations, more.iterations) < cold.iterations
+    np.testing.assert_allclose(more.x, cold.x, atol=1e-9)
+
+
+def test_osqp_tries_again_where_the_first_answer_is_not_accurate(set_ups, monkeypatch):
+    monkeypatch.setattr(by_osqp, "_FIRST", {**by_osqp._FIRST, "max_iter": 10})
+    monkeypatch.setattr(by_osqp._Workspace.__init__, "__defaults__", (by_osqp._FIRST,))
+    rng, solver = np.random.default_rng(5), Osqp()
+    for _ in range(3):
+        *qp, sense = random_qp(rng, 4)
+        answer = solver.ask(*qp, sense)
+        assert max(residuals(answer, *qp)) <= solver.accuracy
+    assert len(set_ups) > 2
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+@pytest.mark.parametrize("part", range(5))
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_is_not_a_number_is_refused_and_forgotten(name, part, wrong):
+    solver, rng = dense_solver(name), np.random.default_rng(6)
+    *qp, sense = random_qp(rng, 4)
+    spoilt = [array.copy() for array in qp]
+    spoilt[part].flat[0] = wrong
+    with pytest.raises(AnswerError, match="NaN"):
+        solver.ask(*spoilt, sense)
+    np.testing.assert_allclose(solver.ask(*qp, sense).x, DAQP.ask(*qp, sense).x, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["osqp", "piqp"])
+def test_named_solvers_have_the_engines_of_daqp(name):
+    problem = vq.load_problem("five_bay_free").replace({"method.solver": name})
+    assert isinstance(build_arm(problem).engine, FusedEngine)
+    long = problem.replace({"truss.bays": 16, "method.tracking_mode": "elastic"})
+    assert isinstance(build_arm(long).engine, ChainEngine)
+
+
+@pytest.mark.parametrize("mode", ["hard", "elastic"])
+def test_a_long_arm_goes_the_same_way_with_every_solver(mode):
+    problem = vq.load_problem("ten_bay_round_a_cube").replace(
+        {"truss.bays": 20, "method.tracking_mode": mode, "maneuver.steps": 200, "method.retries": False}
+    )
+    wanted: list[np.ndarray] = []
+    for name in available_solvers():
+        resolver = vq.Resolver(problem.replace({"method.solver": name}))
+        tip = resolver.tip()[0]
+        for k in range(1, 5):
+            step = resolver.step(position=tip + k * np.array([0.3, 0.05, -0.1]))
+            assert step.status in ("reached", "slowed")
+        nodes = resolver.state.nodes
+        wanted = wanted or [nodes]
+        np.testing.assert_allclose(nodes, wanted[0], atol=1e-5, err_msg=name)
+        assert np.abs(nodes - resolver.setup.arm.home).max() > 0.1

@@ -1,0 +1,135 @@
+"""Dense QPs of a step: what a solver is asked, what it answers, and the check of its answer.
+
+    minimise  1/2 x' H x + g' x   subject to   lower <= [x; C x] <= upper
+
+The bounds are those of the first unknowns, then those of the rows C. Often, not always, all unknowns have bounds.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.arrays import Array
+from vgtm_qp.qp.numbers import beyond, norm
+from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, refuse_large, relative
+
+EQUALITY = 5
+"""DAQP's mark for a row that is always active."""
+
+
+class DenseAnswer(NamedTuple):
+    """A solver's answer to a dense QP.
+
+    Attributes
+    ----------
+    x : (n,)
+    multipliers : (b + m,)
+        Of bounds, then of rows: positive at an upper, negative at a lower bound.
+    iterations : int
+    status : str
+        Name of the solver, and how it ended.
+    is_solved : bool
+        Whether the solver says that it solved the QP.
+    """
+
+    x: Array
+    multipliers: Array
+    iterations: int
+    status: str
+    is_solved: bool = True
+
+
+class DenseSolver(Protocol):
+    """Solves dense QPs.
+
+    Attributes
+    ----------
+    accuracy : float
+        Violation of a row, m or rad, that its answers may have.
+    """
+
+    accuracy: float
+
+    def ask(
+        self,
+        hessian: Array,
+        gradient: Array,
+        constraint: Array,
+        lower: Array,
+        upper: Array,
+        sense: NDArray[np.int32],
+    ) -> DenseAnswer:
+        """Return the answer, in new arrays.
+
+        Parameters
+        ----------
+        hessian, gradient : (n, n), (n,)
+        constraint : (m, n)
+        lower, upper, sense : (b + m,)
+            Bounds, first of b unknowns; infinite ones are ``numbers.UNBOUNDED``. `sense` is ``EQUALITY`` or 0.
+
+        Raises
+        ------
+        InfeasibleStepError
+            The rows contradict one another.
+        AnswerError
+            The solver failed. Without this error the answer of :class:`vgtm_qp.qp.daqp.Daqp` is not checked yet.
+        """
+        ...
+
+
+def residuals(
+    answer: DenseAnswer, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
+) -> tuple[float, float]:
+    """Return the primal residual of an answer, m or rad, and the dual one, relative to the objective's forces.
+
+    The dual residual is the greater one of |H x + g + multipliers| and of the norm of |multiplier| times the distance
+    from its bound, at most 1. A multiplier of the wrong sign has the distance from the other bound.
+    """
+    x, y = answer.x, answer.multipliers
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        return np.nan, np.nan
+    bounded = len(y) - len(constraint)
+    values = np.concatenate((x[:bounded], constraint @ x))
+    stationarity = hessian @ x
+    stationarity += gradient
+    stationarity[:bounded] += y[:bounded]
+    stationarity += y[bounded:] @ constraint
+    apart = np.where(y > 0.0, upper - values, values - lower)
+    complementarity = norm(np.abs(y) * np.minimum(np.maximum(apart, 0.0), 1.0))
+    dual = relative(max(norm(stationarity), complementarity), gradient, y)
+    return norm(beyond(values, lower, upper)), dual
+
+
+def check(
+    answer: DenseAnswer, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
+) -> None:
+    """Refuse an answer whose residuals are too large; the QP is that of :meth:`DenseSolver.ask`.
+
+    Raises
+    ------
+    AnswerError
+        See :func:`vgtm_qp.qp.residual.refuse_large`.
+    """
+    refuse_large(*residuals(answer, hessian, gradient, constraint, lower, upper), answer.status)
+
+
+def check_question(solver: str, *arrays: Array) -> None:
+    """Refuse a QP that must not be given to a solver by iterations, where NaN would stay; the bounds come last.
+
+    Raises
+    ------
+    AnswerError
+        A number is infinite or NaN.
+    InfeasibleStepError
+        A lower bound is above its upper bound.
+    """
+    if not all(math.isfinite(array.sum()) for array in arrays):
+        raise AnswerError(f"{solver} was not asked: the QP has an infinite number or NaN")
+    lower, upper = arrays[-2:]
+    if (lower > upper).any():
+        raise InfeasibleStepError("a lower bound is above its upper bound")
