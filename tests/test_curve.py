@@ -64,9 +64,11 @@ def test_jacobians_agree_with_differences(family, rng):
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
 def test_orientation_jacobian_agrees_with_differences(family, rng):
-    curve = bent_curve(family, rng)
+    curve = bent_curve(family, rng, bend=0.1)
     rows = curve.orientation_jacobian(NODES)
-    np.testing.assert_allclose(rows, angular_velocity_rows(curve, NODES), atol=3e-5)
+    # Rows are those of the exact frame, differences those of double reflection, which is of fourth order.
+    atol = 1e-5 * (1.0 + np.abs(rows).max())
+    np.testing.assert_allclose(rows, angular_velocity_rows(curve, NODES), atol=atol)
     size = curve.control_vertices.size
     turn = np.einsum("kid,ki->kd", rows[..., size:], curve.tangent(NODES))
     np.testing.assert_allclose(turn[-1], [0.0, 1.0], atol=1e-14)
