@@ -105,9 +105,9 @@ def test_frame_rate_agrees_with_differences(family, rng):
     inner = np.array([0.13, 0.47, 0.91])
     h = 1e-5
     turn = curve.frame(inner + h) @ np.swapaxes(curve.frame(inner - h), -1, -2)
-    np.testing.assert_allclose(
-        curve.frame_rate(inner), Rotation.from_matrix(turn).as_rotvec() / (2 * h), atol=2e-5
-    )
+    rate = curve.frame_rate(inner)
+    atol = 1e-5 * (1.0 + np.abs(rate).max())
+    np.testing.assert_allclose(rate, Rotation.from_matrix(turn).as_rotvec() / (2 * h), atol=atol)
 
 
 def test_frame_does_not_turn_about_the_tangent_without_torsion(rng):
@@ -121,7 +121,7 @@ def test_frame_does_not_turn_about_the_tangent_without_torsion(rng):
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f"{f.name}-{f.degree}")
 def test_frame_is_the_solution_of_its_differential_equation(family, rng):
-    curve = bent_curve(family, rng, bend=0.15)
+    curve = bent_curve(family, rng, bend=0.05)
 
     def transport(s, flat):
         x, y, z = curve.frame_rate(min(s, 1.0))
