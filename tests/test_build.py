@@ -15,8 +15,8 @@ GOAL = [0.1, 0.0, 4.0]
 
 @pytest.fixture
 def resolver():
-    # Without compiled code the engine's answers can be read.
-    resolver = QPResolver(build_arm(vq.load_problem("five_bay_two_cubes"), compiled=False))
+    # The answers of an engine that is not one call of C can be read.
+    resolver = QPResolver(build_arm(vq.load_problem("five_bay_two_cubes"), plain=True))
     assert resolver.step(position=[0.05, 0.0, 4.04]).status == "reached"
     return resolver
 

@@ -16,7 +16,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import vgtm_qp as vq
+from vgtm_qp.builder import source_of
 from vgtm_qp.compiled import Kernel, compiler, finish_compiling, stop_compilers
+from vgtm_qp.maneuver.plan import make_plan
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -35,12 +38,12 @@ def _value(kernel: Kernel) -> float:
 @needs_compiler
 def test_a_library_that_cannot_be_loaded_is_compiled_again(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     (library,) = tmp_path.glob("*.so")
     library.unlink()
     library.write_bytes(b"cut short")
     kernel = Kernel(_square())
-    assert kernel.is_compiled
+    assert kernel.compile()
     assert _value(kernel) == 9.0
 
 
@@ -49,7 +52,7 @@ def test_where_the_cache_is_no_folder_the_virtual_machine_serves(tmp_path, monke
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "file" / "cache"))
     (tmp_path / "file").write_text("in the way")
     kernel = Kernel(_square())
-    assert not kernel.is_compiled
+    assert not kernel.compile()
     assert _value(kernel) == 9.0
 
 
@@ -61,7 +64,7 @@ def test_the_compiler_may_have_flags(tmp_path, monkeypatch, as_given):
     monkeypatch.setenv("VGTM_CC", as_given.format(cc=found))
     assert shlex.split(compiler() or "") == shlex.split(as_given.format(cc=found))
     kernel = Kernel(_square())
-    assert kernel.is_compiled
+    assert kernel.compile()
     assert _value(kernel) == 9.0
 
 
@@ -76,7 +79,7 @@ def test_the_folder_of_the_compiler_may_have_a_space(tmp_path, monkeypatch, as_g
     wrapper.chmod(0o755)
     monkeypatch.setenv("VGTM_CC", as_given.format(cc=wrapper))
     kernel = Kernel(_square())
-    assert kernel.is_compiled
+    assert kernel.compile()
     assert _value(kernel) == 9.0
     assert (tmp_path / "ran").exists()
 
@@ -101,7 +104,7 @@ def _long(name: str, scale: float) -> ca.Function:
 def test_what_two_kernels_share_is_compiled_once(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     kernels = [Kernel(_long(name, scale)) for name, scale in (("one", 1.0), ("other", 2.0))]
-    assert all(kernel.is_compiled for kernel in kernels)
+    assert all(kernel.compile() for kernel in kernels)
     assert len(list(tmp_path.glob("*.so"))) == 2
     assert len(list(tmp_path.glob("*.o"))) == 1
     interpreted = Kernel(_long("one", 1.0), compiled=False)
@@ -122,8 +125,8 @@ def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, mon
         product = 0.25 * product @ b + ca.fmin(a + k, b)
     function = ca.Function("product", [a, b], [product])
     kernel = Kernel(function)
-    assert len(_source(function)) > 100_000
-    assert kernel.is_compiled
+    assert len(source_of(function)) > 100_000
+    assert kernel.compile()
     for array in kernel.inputs:
         array[:] = rng.uniform(-1.0, 1.0, size=16)
     kernel()
@@ -132,12 +135,6 @@ def test_long_texts_are_compiled_for_little_time_and_give_the_same(tmp_path, mon
     for k in range(300):
         wanted = 0.25 * wanted @ second + np.minimum(first + k, second)
     np.testing.assert_allclose(kernel.outputs[0].reshape(4, 4).T, wanted, rtol=1e-12)
-
-
-def _source(function: ca.Function) -> str:
-    generator = ca.CodeGenerator("product.c")
-    generator.add(function)
-    return str(generator.dump())
 
 
 @pytest.mark.smoke
@@ -157,13 +154,16 @@ def test_arrays_bound_before_the_first_call_are_those_that_are_used(tmp_path, mo
 def test_finishing_leaves_nothing_to_wait_for(tmp_path, monkeypatch):
     cache = tmp_path / "cache"
     monkeypatch.setenv("VGTM_CACHE", str(cache))
-    kernel = Kernel(_long("awaited", 3.0))
+    kernel, unused = Kernel(_long("awaited", 3.0)), Kernel(_long("unused", 3.0))
+    kernel()
     finish_compiling()
     assert list(cache.glob("awaited-*.so"))
     # With a file in the place of the cache nothing could be compiled or loaded any more.
     shutil.rmtree(cache)
     cache.write_text("in the way")
+    kernel()
     assert kernel.is_compiled
+    assert not unused.is_compiled
 
 
 @needs_compiler
@@ -173,9 +173,9 @@ def test_a_forked_process_does_not_wait_for_the_compilers_of_its_parent(tmp_path
     kernel = Kernel(_long("forked", 1.5))
     child = os.fork()
     if child == 0:
-        os._exit(0 if kernel.is_compiled else 1)
+        os._exit(0 if kernel.compile() else 1)
     assert os.waitpid(child, 0)[1] == 0
-    assert kernel.is_compiled
+    assert kernel.compile()
 
 
 def _run(code: str, cache: Path, **settings: str) -> subprocess.CompletedProcess[str]:
@@ -193,7 +193,7 @@ x = ca.SX.sym("x")
 kernel = Kernel(ca.Function("square", [x], [x * x]))
 kernel.inputs[0][:] = 3.0
 kernel()
-print(kernel.is_compiled, kernel.outputs[0][0])
+print(kernel.compile(), kernel.outputs[0][0])
 """
 
 
@@ -212,13 +212,13 @@ def test_a_damaged_library_is_made_again_and_never_loaded(tmp_path):
 @needs_compiler
 def test_a_library_without_its_checksum_is_made_again(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     (library,), (digest,) = tmp_path.glob("*.so"), tmp_path.glob("*.so.sha256")
     before = library.stat().st_ino
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     assert library.stat().st_ino == before
     digest.unlink()
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     assert library.stat().st_ino != before
     assert digest.exists()
 
@@ -240,11 +240,11 @@ def test_a_cache_that_others_may_write_is_not_used(tmp_path, mode):
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root gives files away")
 def test_what_others_own_is_not_loaded(tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     (library,) = tmp_path.glob("*.so")
     before = library.stat().st_ino
     os.chown(library, 12345, 12345)
-    assert Kernel(_square()).is_compiled
+    assert Kernel(_square()).compile()
     assert library.stat().st_ino != before
     assert library.stat().st_uid == 0
     os.chown(tmp_path, 12345, 12345)
@@ -258,7 +258,7 @@ def test_files_of_the_cache_that_others_may_write_are_made_again(tmp_path, monke
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
     mask = os.umask(0o000)
     try:
-        assert Kernel(_long("open", 1.0)).is_compiled
+        assert Kernel(_long("open", 1.0)).compile()
     finally:
         os.umask(mask)
     for path in (tmp_path / "cache", *(tmp_path / "cache").iterdir()):
@@ -266,7 +266,7 @@ def test_files_of_the_cache_that_others_may_write_are_made_again(tmp_path, monke
     (library,) = (tmp_path / "cache").glob("*.so")
     before = library.stat().st_ino
     library.chmod(0o666)
-    assert Kernel(_long("open", 1.0)).is_compiled
+    assert Kernel(_long("open", 1.0)).compile()
     assert library.stat().st_ino != before
 
 
@@ -311,10 +311,10 @@ def test_a_compiler_that_hangs_is_ended_with_its_children_and_not_asked_again(tm
     monkeypatch.setenv("VGTM_CC", str(_hanging(tmp_path)))
     try:
         with pytest.warns(UserWarning, match="did not end within 1 s"):
-            assert _value(Kernel(_square())) == 9.0
+            assert not Kernel(_square()).compile()
         _wait(lambda: not _is_running(int((tmp_path / "child").read_text())))
         (tmp_path / "child").unlink()
-        assert not Kernel(_long("after", 2.0)).is_compiled
+        assert not Kernel(_long("after", 2.0)).compile()
         assert not (tmp_path / "child").exists()
     finally:
         stop_compilers()
@@ -336,3 +336,162 @@ def test_an_interrupt_ends_a_compiler_that_hangs_with_its_children(tmp_path, com
         process.communicate(timeout=300.0)
     assert process.returncode in (130, -signal.SIGINT)
     _wait(lambda: not _is_running(child))
+
+
+def _waits(folder: Path) -> Path:
+    """Return a compiler that notes each run in ``runs``, and compiles only once there is a file ``go``."""
+    wrapper = folder / "waits"
+    wrapper.write_text(
+        f'#!/bin/sh\necho run >> "{folder / "runs"}"\n'
+        f'while [ ! -e "{folder / "go"}" ]; do sleep 0.05; done\nexec {compiler()} "$@"\n'
+    )
+    wrapper.chmod(0o755)
+    return wrapper
+
+
+@needs_compiler
+def test_no_call_waits_and_a_kernel_changes_over_when_its_library_is_there(tmp_path, monkeypatch, rng):
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("VGTM_CACHE", str(cache))
+    monkeypatch.setenv("VGTM_CC", str(_waits(tmp_path)))
+    kernel = Kernel(_long("changing", 1.5))
+    source, result = np.zeros(120), np.zeros(120)
+    kernel.bind_input(0, source)
+    kernel.bind_output(0, result)
+    values = rng.normal(size=(20, 120))
+    before = []
+    for row in values:
+        source[:] = row
+        kernel()
+        before.append(result.copy())
+    _wait((tmp_path / "runs").exists)
+    kernel()
+    # The compiler runs until it may go on: no call can have waited for it.
+    assert not kernel.is_compiled
+    (tmp_path / "go").touch()
+    _wait(lambda: bool(list(cache.glob("changing-*.so"))))
+    for row, wanted in zip(values, before, strict=True):
+        source[:] = row
+        kernel()
+        np.testing.assert_allclose(result, wanted, rtol=1e-14, atol=1e-14)
+    assert kernel.is_compiled
+    assert kernel.outputs[0] is result
+
+
+@needs_compiler
+def test_what_is_seldom_called_is_not_compiled(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("VGTM_CC", str(_waits(tmp_path)))
+    kernel = Kernel(_square())
+    for _ in range(7):
+        assert _value(kernel) == 9.0
+    assert not (tmp_path / "cache").exists()
+    assert _value(kernel) == 9.0
+    _wait((tmp_path / "runs").exists)
+    stop_compilers()
+    assert _value(kernel) == 9.0
+
+
+OFTEN = """
+import casadi as ca
+from vgtm_qp.compiled import Kernel
+x = ca.SX.sym("x")
+kernel = Kernel(ca.Function("square", [x], [x * x]))
+for _ in range(20):
+    kernel()
+import pathlib, time
+while not pathlib.Path({runs!r}).exists():
+    time.sleep(0.01)
+print(kernel.is_compiled)
+"""
+
+
+@needs_compiler
+def test_the_end_of_a_process_does_not_wait_and_its_kernels_are_compiled_for_the_next(tmp_path):
+    cache, settings = tmp_path / "cache", {"VGTM_CC": str(_waits(tmp_path))}
+    found = _run(OFTEN.format(runs=str(tmp_path / "runs")), cache, **settings)
+    # The compiler still runs, and is not gone.
+    assert (found.returncode, found.stdout) == (0, "False\n"), found.stderr
+    assert not list(cache.glob("*.so"))
+    (tmp_path / "go").touch()
+    _wait(lambda: bool(list(cache.glob("*.so"))) and not list(cache.glob("*.new")))
+    count = len((tmp_path / "runs").read_text().split())
+    assert _run(LOADED, cache, **settings).stdout == "True 9.0\n"
+    assert len((tmp_path / "runs").read_text().split()) == count
+
+
+@needs_compiler
+def test_two_processes_make_one_library_once(tmp_path):
+    environment = {**os.environ, "VGTM_CACHE": str(tmp_path / "cache"), "VGTM_CC": str(_waits(tmp_path))}
+    both = [
+        subprocess.Popen([sys.executable, "-c", LOADED], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    _wait((tmp_path / "runs").exists)
+    (tmp_path / "go").touch()
+    assert [process.communicate(timeout=300.0)[0] for process in both] == ["True 9.0\n"] * 2
+    # One run for the object, one for the library.
+    assert len((tmp_path / "runs").read_text().split()) == 2
+
+
+@needs_compiler
+def test_what_a_killed_process_left_in_the_cache_is_taken_over(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    assert Kernel(_square()).compile()
+    (library,) = tmp_path.glob("*.so")
+    library.unlink()
+    for name in (f"{library.name}.new", f"{library.with_suffix('.o').name}.new"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "made").write_bytes(b"half")
+        os.utime(tmp_path / name, (0.0, 0.0))
+    assert Kernel(_square()).compile()
+    assert not list(tmp_path.glob("*.new"))
+
+
+@needs_compiler
+def test_a_builder_that_is_killed_leaves_interpreted_kernels(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("VGTM_CC", str(_waits(tmp_path)))
+    stop_compilers()
+    kernel = Kernel(_square())
+    for _ in range(10):
+        kernel()
+    _wait((tmp_path / "runs").exists)
+    builder = kernel._compiling._builder
+    builder._process.kill()
+    builder.ended.wait(300.0)
+    assert _value(kernel) == 9.0
+    assert kernel.is_done
+    assert not kernel.is_compiled
+    (tmp_path / "go").touch()
+
+
+@needs_compiler
+def test_a_step_is_the_same_while_kernels_are_interpreted_and_once_they_are_compiled(tmp_path, monkeypatch):
+    """The same maneuver with kernels that change over on the way, and with none that can."""
+    problem = vq.Problem(
+        truss={"module": "octahedral", "bays": 3},
+        curve={"control_vertices": 4},
+        maneuver={"steps": 24, "waypoint": [{"time": 6.0, "position": [0.4, 0.1, 2.2]}]},
+        obstacle=[{"name": "ball", "shape": "sphere", "center": [0.9, 0.0, 1.4], "radius": 0.3}],
+        clearance={"safe": 0.05},
+    )
+    monkeypatch.setenv("VGTM_CC", "none")
+    interpreted = vq.Resolver(problem)
+    monkeypatch.delenv("VGTM_CC")
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    changing = vq.Resolver(problem)
+    plan = make_plan(problem, *changing.tip())
+    value, ready = plan.path.start, []
+    for count, mark in enumerate(plan.marks.tolist()):
+        if count == 12:
+            finish_compiling()
+        changing.state = interpreted.state
+        steps = [one.follow(plan.path, value, mark) for one in (interpreted, changing)]
+        assert all(step.moved for step in steps)
+        np.testing.assert_allclose(steps[1].state.nodes, steps[0].state.nodes, rtol=0.0, atol=1e-10)
+        value += steps[0].progress * (mark - value)
+        ready.append(changing.setup.engine.is_ready)
+    # It changed over on the way.
+    assert not ready[0]
+    assert ready[-1]

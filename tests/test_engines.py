@@ -49,7 +49,7 @@ def engines(name, *, joint_offset=0.0, track=None, vertices=5, **options):
 
 def fused_engine(layout, kinematics, task):
     """An engine whose C is there, if there is a compiler."""
-    assert building(SOURCE).result() is not None
+    assert building(SOURCE).finish() is not None
     engine = FusedEngine(layout, kinematics, task, FusedSolver(layout))
     assert engine.is_ready
     return engine

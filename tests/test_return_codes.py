@@ -16,7 +16,7 @@ from arms import make_layout
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.kinematics import LengthRows
-from vgtm_qp.compiled import Kernel, compiler, finish_compiling
+from vgtm_qp.compiled import Kernel, compiler
 from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.methods import Resolver
 from vgtm_qp.native import building
@@ -62,9 +62,10 @@ def test_a_function_without_a_value_at_its_first_call_raises():
 def test_a_tip_that_cannot_be_moved_is_not_settled(compiled, tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     layout, _ = make_layout(modules.octahedral(2), vertices=0)
-    assert building(SOURCE).result() is not None
+    assert building(SOURCE).finish() is not None
     solver = FusedSolver(layout, compiled=compiled)
-    finish_compiling()
+    for kernel in (solver._workspace.condense, solver._workspace.missing, solver._workspace.close):
+        assert kernel.compile() == compiled
     assert solver.is_ready
     arm, curve = layout.arm, CurvePoint(np.zeros((0, 3)), np.zeros(0))
     q, lengths = arm.home_configuration, arm.home_quantities[arm.actuators]

@@ -1,15 +1,15 @@
-"""CasADi functions as kernels: compiled to C once per topology, evaluated in place on NumPy arrays.
+"""CasADi functions as kernels: evaluated in place on NumPy arrays, as machine code as soon as that is there.
 
-``Function.buffer()`` costs 0.5-4 us a call where ``F(array)`` costs 23 us. A kernel is compiled when a C compiler
-is there and the library is kept by a hash of its source, so the second process pays only for a `dlopen`. Without a
-compiler the CasADi virtual machine evaluates the same graph, 4 to 10 times slower.
+``Function.buffer()`` costs 0.5-4 us a call where ``F(array)`` costs 23 us. CasADi's virtual machine evaluates a kernel
+until its compiled form is there, which does the same 4 to 10 times faster. A kernel that was called a few times is
+handed to a process of its own, see :mod:`vgtm_qp.builder`, which compiles it. The library is loaded at the start of a
+later call, in the thread that makes this call: nothing waits for a compiler but :func:`finish_compiling` and
+:meth:`Kernel.compile`, and neither does the end of a process. What is not compiled by then is compiled all the same,
+behind other work, so that the next process starts with it.
 
-The first set-up of an arm is mostly compile time. The straight-line functions that a kernel maps or calls are compiled
-separately, once for all kernels that use them, by several processes at a time; a kernel waits for them at its first
-call.
-
-What is loaded from the cache runs as this process does. Folder and files must therefore be the user's, with nobody else
-allowed to write them, and the SHA-256 beside a library must be that of its content.
+Libraries are kept by a hash of their function. What is loaded from the cache runs as this process does: folder and
+files must be the user's, with nobody else allowed to write them, and the SHA-256 beside a library must be that of its
+content.
 
 The return code of a function shows whether it could be evaluated; if not, its outputs keep their old values. Every call
 checks the code, in half a microsecond, so that old outputs never pass as new ones.
@@ -17,22 +17,22 @@ checks the code, in half a microsecond, so that old outputs never pass as new on
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import ctypes
+import gc
 import hashlib
 import os
-import re
+import pickle
+import queue
 import shlex
 import shutil
-import signal
 import stat
 import subprocess
 import sys
-import tempfile
 import threading
-import time
 import warnings
 import weakref
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ from vgtm_qp.errors import EvaluationError
 
 Array = NDArray[np.float64]
 
-_FLAGS = (
+FLAGS = (
     "-O2",
     "-march=native",
     "-fno-math-errno",
@@ -54,36 +54,34 @@ _FLAGS = (
     "-fvisibility=hidden",
     '-DCASADI_SYMBOL_EXPORT=__attribute__((visibility("default")))',
 )
-_QUICK = ("-O1",)
+QUICK = ("-O1",)
 """Flags for long code that calls the straight-line functions: half the compile time, at little cost in speed."""
 
-_OWN = ("-O3", "-fno-signed-zeros", "-fassociative-math")
+OWN = ("-O3", "-fno-signed-zeros", "-fassociative-math")
 """Flags for our own C: sums may be vectorised; NaN and infinity keep their meaning."""
 
-_LONG = 100_000
-"""Length of a source text, in characters, from which compiling lasts seconds."""
+HUNG = 3
+"""Exit code of a builder whose compiler hung."""
 
-_MOST_COMPILERS, _MOST_LINKERS = 4, 64
-"""Processes at a time; most linkers only wait for their objects."""
+_FORM = "1"
+"""Form of the libraries that builders make of a function: another number makes all of them anew."""
+
+_OFTEN = 8
+"""Number of calls from which on a kernel is worth compiling."""
 
 _PATIENCE = 60.0
 """Seconds after which a compiler counts as hung."""
 
-_TICK = 0.2
-"""Seconds after which a compiler is looked after."""
+_LINGER = 1.0
+"""Seconds for which a builder waits for further functions."""
 
-_WORTH_IT = 100
-"""Number of lines below which functions are not compiled separately."""
+_TICK = 0.005
+"""Seconds between two looks for a library, for those who wait."""
 
-_FUNCTION = re.compile(r"^static int (casadi_f\d+)\(.*?^}\n", re.MULTILINE | re.DOTALL)
-_HELPER = re.compile(
-    r"^(?:static |inline )*casadi_real (casadi_\w+)\([^;{]*\{(?:[^\n]*\}\n|.*?^\}\n)",
-    re.MULTILINE | re.DOTALL,
+_BUILDER = (
+    "import sys, pickle; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "from vgtm_qp.builder import main; sys.exit(main())"
 )
-_PRELUDE = """#include <math.h>
-#define casadi_real double
-#define casadi_int long long int
-"""
 
 
 def compiler() -> str | None:
@@ -92,7 +90,11 @@ def compiler() -> str | None:
     It is ``$VGTM_CC``, a program or one with flags, else the first of cc, gcc, clang. ``VGTM_CC=none`` asks for the
     virtual machine.
     """
-    wanted = os.environ.get("VGTM_CC")
+    return _found(os.environ.get("VGTM_CC"), os.environ.get("PATH"))
+
+
+@cache
+def _found(wanted: str | None, _: str | None) -> str | None:
     if wanted in ("", "none"):
         return None
     commands = [["cc"], ["gcc"], ["clang"]] if wanted is None else [[wanted]]
@@ -126,14 +128,15 @@ def distrust(path: Path) -> str:
     return ""
 
 
-def _digest_file(path: Path) -> Path:
+def digest_file(path: Path) -> Path:
+    """Return the file that holds the SHA-256 of a file of the cache."""
     return path.with_name(f"{path.name}.sha256")
 
 
-def _is_sound(path: Path) -> bool:
+def is_sound(path: Path) -> bool:
     """Return whether a file of the cache is there, the user's own, and as it was made."""
     with contextlib.suppress(OSError, ValueError):
-        digest = _digest_file(path)
+        digest = digest_file(path)
         if not distrust(path) and not distrust(digest):
             with path.open("rb") as file:
                 return hashlib.file_digest(file, "sha256").hexdigest() == digest.read_text().strip()
@@ -151,282 +154,277 @@ def _machine() -> str:
 
 
 def _hash(*parts: str) -> str:
-    return hashlib.sha256(
-        "\0".join((*parts, *_FLAGS, *_QUICK, ca.CasadiMeta.version(), _machine())).encode()
-    ).hexdigest()[:32]
+    every = (*parts, *FLAGS, *QUICK, _FORM, ca.CasadiMeta.version(), _machine())
+    return hashlib.sha256("\0".join(every).encode()).hexdigest()[:32]
 
 
-def _split(source: str) -> tuple[str, dict[str, str]]:
-    """Return `source` with its long straight-line functions left out but declared, and those by their new names.
+class _Builder:
+    """A process that compiles, fed by a thread; it ends by itself when it has had nothing to do for a while.
 
-    A function that calls no other, and uses nothing but one-line helpers, has a name made of its text: what is mapped
-    over faces, pairs or bays is one function in however many kernels.
+    Attributes
+    ----------
+    ended : threading.Event
+    is_lost : bool
+        Whether it was stopped, or belongs to the process that this one was forked from.
+    hung : bool
+        Whether its compiler hung.
     """
-    helpers = {match.group(1): match.group(0) for match in _HELPER.finditer(source)}
-    units: dict[str, str] = {}
-    renamed: dict[str, str] = {}
-    for match in _FUNCTION.finditer(source):
-        name, text = match.group(1), match.group(0)
-        used = set(re.findall(r"\bcasadi_\w+", text)) - {name, "casadi_real", "casadi_int"}
-        if text.count("\n") < _WORTH_IT or not used <= helpers.keys():
-            continue
-        body = text[text.index("(") :]
-        before = "".join(
-            re.sub(r"^(?:static |inline )*", "static inline ", helpers[helper]) for helper in sorted(used)
-        )
-        unit = f"vgtm_{_hash(before, body)}"
-        units[unit] = f"{_PRELUDE}{before}int {unit}{body}"
-        renamed[name] = unit
-        source = source.replace(text, f"int {unit}{body[: body.index('{')].rstrip()};\n", 1)
-    for name, unit in renamed.items():
-        source = re.sub(rf"^#define {name} .*\n", "", source, flags=re.MULTILINE)
-        source = re.sub(rf"\b{name}\b", unit, source)
-    return source, units
-
-
-def _with_fast_helpers(source: str) -> str:
-    """Return `source` with all before its first function, matrix products among it, compiled as the rest is not."""
-    head = re.search(r"^/\* \w+:\(", source, flags=re.MULTILINE)
-    if head is None:
-        return source
-    before, after = source[: head.start()], source[head.start() :]
-    return (
-        '#include <math.h>\n#pragma GCC push_options\n#pragma GCC optimize ("O2")\n'
-        f"{before}#pragma GCC pop_options\n{after}"
-    )
-
-
-class _Workers:
-    """The threads in which the compilers of this process run, the objects they make, and the compilers."""
 
     def __init__(self) -> None:
-        self.resolving = threading.RLock()
-        self.linkers = ThreadPoolExecutor(_MOST_LINKERS, "vgtm-linker")
-        self.hung = False
-        self._compilers = ThreadPoolExecutor(min(_MOST_COMPILERS, os.cpu_count() or 1), "vgtm-compiler")
-        self._lock = threading.Lock()
-        self._objects: dict[Path, Future[bool]] = {}
-        self._running: set[subprocess.Popen[bytes]] = set()
-        self._stopped = False
+        self.ended = threading.Event()
+        self.is_lost = self.hung = False
+        self._is_open = True
+        self._process: subprocess.Popen[bytes] | None = None
+        self._jobs: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._jobs.put(list(sys.path))
+        threading.Thread(target=self._serve, daemon=True, name="vgtm-builder").start()
 
-    def compile(self, cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Future[bool]:
-        """Begin to compile `text` into the object `target`, unless that is done or being done."""
-        with self._lock:
-            begun = self._objects.get(target)
-            if begun is None or (begun.done() and not (begun.result() and target.exists())):
-                command = [*shlex.split(cc), *_FLAGS, *flags, "-x", "c", "-c", "-"]
-                self._objects[target] = self._compilers.submit(self.make, target, command, text)
-            return self._objects[target]
+    def take(self, job: dict[str, Any]) -> bool:
+        """Accept a job, in no time; False if the process takes no more."""
+        with _lock:
+            if self._is_open:
+                self._jobs.put(job)
+            return self._is_open
 
-    def link(self, cc: str, objects: dict[Path, Future[bool]], library: Path) -> Path | None:
-        """Return the shared library, made of `objects`; None where it cannot be made."""
-        made = False
-        if all(begun.result() for begun in objects.values()):
-            made = self.make(library, [*shlex.split(cc), "-shared", *map(str, objects), "-lm"])
-            for left in (library.with_suffix(".o"), _digest_file(library.with_suffix(".o"))):
-                with contextlib.suppress(OSError):
-                    left.unlink()
-        # Another process may have made the library meanwhile, and cleared up.
-        return library if made or _is_sound(library) else None
+    def _serve(self) -> None:
+        try:
+            with contextlib.suppress(OSError):
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-c", _BUILDER],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    bufsize=0,
+                    start_new_session=True,
+                )
+                self._feed(self._process)
+                self.hung = self._process.wait() == HUNG
+        finally:
+            with _lock:
+                self._is_open = False
+            self.ended.set()
 
-    def make(self, target: Path, command: list[str], text: str = "") -> bool:
-        """Have a compiler read `text` and write all of `target`, or nothing; return whether it is there."""
-        with contextlib.suppress(OSError):
-            if not _is_sound(target):
-                target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-                with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-                    made = Path(scratch) / target.name
-                    if self._run([*command, "-o", str(made)], text.encode()):
-                        made.chmod(0o644)
-                        digest = _digest_file(made)
-                        digest.write_text(hashlib.sha256(made.read_bytes()).hexdigest())
-                        digest.chmod(0o644)
-                        # A library whose digest is not there yet would be made again by others.
-                        digest.replace(_digest_file(target))
-                        made.replace(target)
-        return _is_sound(target)
+    def _feed(self, process: subprocess.Popen[bytes]) -> None:
+        if self.is_lost:
+            process.terminate()
+        assert process.stdin is not None
+        with contextlib.suppress(OSError), process.stdin as pipe:
+            job: Any = True
+            while job is not None:
+                # The last one is None: the pipe has no end where a forked process has it too.
+                job = self._next()
+                text = memoryview(pickle.dumps(job))
+                while text:
+                    text = text[pipe.write(text) :]
 
-    def _run(self, command: list[str], text: bytes) -> bool:
-        """Run a compiler; return whether it succeeded. One that hangs is ended, and no other is begun."""
-        with self._lock:
-            if self._stopped or self.hung:
-                return False
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                # Its end is seen at once, where a process without a pipe is asked twenty times a second.
-                stderr=subprocess.PIPE,
-                start_new_session=True,
-            )
-            self._running.add(process)
-        end = time.monotonic() + _PATIENCE
-        given: bytes | None = text
-        with process:
-            while True:
-                try:
-                    process.communicate(given, timeout=_TICK)
-                    break
-                except subprocess.TimeoutExpired:
-                    # What it has not read yet goes on being written.
-                    given = None
-                    self.hung = time.monotonic() > end
-                    if self.hung or _is_interrupted():
-                        _end(process)
-                        break
-        with self._lock:
-            self._running.discard(process)
-        return process.returncode == 0
+    def _next(self) -> Any:
+        try:
+            return self._jobs.get(timeout=_LINGER)
+        except queue.Empty:
+            with _lock:
+                self._is_open = not self._jobs.empty()
+            return self._jobs.get() if self._is_open else None
 
     def stop(self) -> None:
-        """End the compilers that run, with all their children, and begin no other."""
-        with self._lock:
-            self._stopped = True
-            running = list(self._running)
-        for pool in (self._compilers, self.linkers):
-            pool.shutdown(wait=False, cancel_futures=True)
-        for process in running:
-            _end(process)
+        """End the process and the compilers that it runs."""
+        self.is_lost, self._is_open = True, False
+        if self._process is not None:
+            self._process.terminate()
+
+    def forget(self) -> None:
+        """Let go of the process in one that was forked."""
+        self.is_lost, self._is_open = True, False
+        if self._process is not None:
+            self._process.returncode = 0
+            if self._process.stdin is not None:
+                self._process.stdin.close()
 
 
-def _is_interrupted() -> bool:
-    """Return whether an interrupt that nobody caught ended the program, which waits for its threads now."""
-    last = getattr(sys, "last_type", None)
-    return last is KeyboardInterrupt and not threading.main_thread().is_alive()
+_lock = threading.RLock()
+_builder: _Builder | None = None
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill what is left of a compiler and its children, which are a session of their own."""
-    if process.poll() is None:
-        with contextlib.suppress(OSError):
-            if hasattr(os, "killpg"):
-                os.killpg(process.pid, signal.SIGKILL)
-            else:
-                process.kill()
-
-
-_workers = _Workers()
-
-
-def _start_anew() -> None:
-    """Begin anew in a forked process, which has none of its parent's threads."""
-    global _workers
-    _workers = _Workers()
+def _hand_over(job: dict[str, Any]) -> _Builder:
+    """Return the builder that takes the job."""
+    global _builder
+    with _lock:
+        while _builder is None or not _builder.take(job):
+            _builder = _Builder()
+        return _builder
 
 
 def stop_compilers() -> None:
     """End all compilers of this process at once, as an interrupt does; kernels that are wanted later begin anew."""
-    global _workers
-    stopped, _workers = _workers, _Workers()
-    stopped.stop()
+    global _builder
+    with _lock:
+        stopped, _builder = _builder, None
+    if stopped is not None:
+        stopped.stop()
+
+
+def _start_anew() -> None:
+    """Begin anew in a forked process, which has none of its parent's threads."""
+    global _lock, _builder
+    _lock, left, _builder = threading.RLock(), _builder, None
+    if left is not None:
+        left.forget()
+
+
+@atexit.register
+def _stop_if_interrupted() -> None:
+    """End the compilers if an interrupt that nobody caught ends the program."""
+    if getattr(sys, "last_type", None) is KeyboardInterrupt:
+        stop_compilers()
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_start_anew)
 
 
-def _begin(function: ca.Function, cc: str) -> Future[Path | None]:
-    """Begin to compile `function`; return what will be its shared library, None where it cannot be compiled."""
-    generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
-    generator.add(function)
-    source = generator.dump()
-    folder = cache_directory()
-    library = folder / f"{function.name()}-{_hash(source, cc)}.so"
-    if _is_sound(library):
-        found: Future[Path | None] = Future()
-        found.set_result(library)
-        return found
-    objects: dict[Path, Future[bool]] = {}
-    rest, units = _split(source)
-    texts = {folder / f"{name}-{_hash(cc)[:8]}.o": text for name, text in units.items()}
-    main, quick = library.with_suffix(".o"), _QUICK if len(rest) > _LONG else ()
-    texts[main] = _with_fast_helpers(rest) if quick else rest
-    # The longest first: nothing waits for it at the end.
-    for path in sorted(texts, key=lambda path: -len(texts[path])):
-        objects[path] = _workers.compile(cc, texts[path], path, quick if path == main else ())
-    return _workers.linkers.submit(_workers.link, cc, objects, library)
-
-
 class Building:
-    """A C source on its way to a shared library; `flags` are the compiler's beside those of every kernel."""
+    """C code on its way to a shared library.
+
+    Attributes
+    ----------
+    library : Path or None
+        The library once it is there.
+    is_settled : bool
+        Whether it is there, or is known never to be.
+    calls : int
+        Number of calls for which it was asked so far in vain.
+    """
 
     def __init__(self, name: str, text: str, flags: tuple[str, ...]) -> None:
-        self._name, self._text, self._flags, self._cc = name, text, flags, compiler()
-        self._library: Future[Path | None] | None = None
-        if self._cc is not None and not _warned_of(cache_directory()):
-            library = cache_directory() / f"{name}-{_hash(text, self._cc, *flags, *_OWN)}.so"
-            objects = {}
-            if not _is_sound(library):
-                target = library.with_suffix(".o")
-                objects[target] = _workers.compile(self._cc, text, target, (*flags, *_OWN))
-            self._library = _workers.linkers.submit(_workers.link, self._cc, objects, library)
+        self._plan(name, text, {"text": text, "flags": (*flags, *OWN)}, *flags, *OWN)
 
-    @property
-    def is_done(self) -> bool:
-        """Whether :meth:`result` does not wait."""
-        return self._library is None or self._library.done()
+    def _plan(self, name: str, code: str, job: dict[str, Any], *more: str) -> None:
+        """Use the library that is in the cache already, or prepare the `job` of making it."""
+        self.library: Path | None = None
+        self.is_settled, self.calls, self._may_fail = False, 0, True
+        self._builder: _Builder | None = None
+        cc, folder = compiler(), cache_directory()
+        if cc is None or cc in _hanging or _warned_of(folder):
+            self.is_settled = True
+            return
+        self._target = folder / f"{name}-{_hash(name, code, cc, *more)}.so"
+        self._job = {**job, "library": str(self._target), "cc": cc, "key": _hash(cc)[:8]}
+        self._load()
+        if not self.is_settled:
+            with _lock:
+                _waiting.add(self)
 
-    def result(self) -> Path | None:
-        """Return the library; None where no compiler works."""
-        return None if self._library is None else self._library.result()
+    def ask(self) -> bool:
+        """Return whether it is settled, without waiting; what is asked for often enough is made."""
+        if not self.is_settled:
+            self.calls += 1
+            if self._builder is not None:
+                self._look()
+            elif self.calls >= _OFTEN:
+                self.begin()
+        return self.is_settled
+
+    def begin(self) -> None:
+        """Begin to make it, unless that was done."""
+        with _lock:
+            if self.is_settled or self._builder is not None:
+                return
+            if self._job["cc"] in _hanging:
+                self.is_settled = True
+                return
+            with contextlib.suppress(OSError):
+                self._target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._builder = _hand_over({**self._job, "patience": _PATIENCE})
+
+    def finish(self) -> Path | None:
+        """Make it now, wait for the end of it, and return `library`."""
+        try:
+            while not self.is_settled:
+                self.begin()
+                self._look()
+                if (builder := self._builder) is not None and not self.is_settled:
+                    builder.ended.wait(_TICK)
+        except KeyboardInterrupt:
+            stop_compilers()
+            raise
+        return self.library
+
+    def _look(self) -> None:
+        """Load the library if it is there by now; settle for none if there will be none."""
+        with _lock:
+            builder = self._builder
+            if self.is_settled or builder is None:
+                return
+            # In this order, for a library may come just before the end.
+            has_ended = builder.ended.is_set()
+            if self._target.exists() and self._load():
+                return
+            if builder.is_lost:
+                self._builder = None
+            elif has_ended:
+                self.is_settled = True
+                if builder.hung:
+                    _hanging.add(self._job["cc"])
+                    _warn(
+                        f"the C compiler {self._job['cc']} did not end within {_PATIENCE:g} s: kernels run uncompiled, "
+                        "4 to 10 times slower; VGTM_CC names another compiler"
+                    )
+
+    def _load(self) -> bool:
+        """Load the library and return True; False if it is not whole.
+
+        The library of a machine with another C library cannot be loaded: it is made once more.
+        """
+        if not is_sound(self._target):
+            return False
+        try:
+            self._accept(self._target)
+            self.library, self.is_settled = self._target, True
+        except (OSError, RuntimeError):
+            with contextlib.suppress(OSError):
+                self._target.unlink(missing_ok=True)
+            self.is_settled, self._may_fail, self._builder = not self._may_fail, False, None
+        return True
+
+    def _accept(self, library: Path) -> None:
+        ctypes.CDLL(str(library))
 
 
-class Compiling:
-    """A function on its way to machine code; several kernels may wait for the same."""
+class Compiling(Building):
+    """A function on its way to machine code; several kernels may wait for the same.
+
+    Attributes
+    ----------
+    given, found : ca.Function
+        The function itself, and its compiled form once that is loaded.
+    """
 
     def __init__(self, function: ca.Function) -> None:
-        self._function, self._cc = function, compiler()
-        self.library: Path | None = None
-        """The shared library, once it is loaded."""
-        self._found: ca.Function | None = None
-        self._begin()
+        self.given = self.found = function
+        text = "" if compiler() is None else function.serialize()
+        self._plan(function.name(), text, {"function": text})
 
-    def _begin(self) -> None:
-        self._begun_by = _workers
-        self._library: Future[Path | None] | None = None
-        if self._cc is not None and not _warned_of(cache_directory()):
-            self._library = _begin(self._function, self._cc)
+    def _accept(self, library: Path) -> None:
+        self.found = ca.external(self.given.name(), str(library))
 
-    @property
-    def is_done(self) -> bool:
-        """Whether :meth:`result` does not wait."""
-        return self._found is not None or self._library is None or self._library.done()
 
-    def result(self) -> ca.Function:
-        """Return the compiled function when it is there, or the one it comes from where no compiler works."""
-        if self._found is None:
-            try:
-                self._found = self._load() or self._function
-            except KeyboardInterrupt:
-                stop_compilers()
-                raise
-        return self._found
+_waiting: weakref.WeakSet[Building] = weakref.WeakSet()
+_hanging: set[str] = set()
+"""Compilers that hung, and are not asked again by this process."""
 
-    def _load(self) -> ca.Function | None:
-        if self._begun_by is not _workers:
-            # The compilers were at work for the process that this one was forked from, or were interrupted.
-            self._begin()
-        for _ in range(2):
-            library = None
-            with contextlib.suppress(CancelledError):
-                library = None if self._library is None else self._library.result()
-            if library is None:
-                break
-            try:
-                found = ca.external(self._function.name(), str(library))
-                self.library = library
-                return found
-            except RuntimeError:
-                # Cut short by a full disk, or from a machine with another C library: compiled once more.
-                with contextlib.suppress(OSError):
-                    library.unlink(missing_ok=True)
-                self._begin()
-        if self._begun_by.hung:
-            _warn(
-                f"the C compiler {self._cc} did not end within {_PATIENCE:g} s: kernels run uncompiled, 4 to 10 times "
-                "slower; VGTM_CC names another compiler"
-            )
-        return None
+
+def finish_compiling() -> bool:
+    """Compile all kernels that this process has called, wait for the end of it, and return whether none failed.
+
+    Each begins to run compiled at its next call.
+    """
+    # What is only kept by a circle of references is not worth waiting for.
+    gc.collect()
+    with _lock:
+        used = [one for one in _waiting if one.calls and not one.is_settled]
+    for one in used:
+        one.begin()
+    every = [one.finish() is not None for one in used]
+    return all(every)
 
 
 @cache
@@ -445,74 +443,87 @@ def _warned_of(folder: Path) -> bool:
     return bool(hindrance)
 
 
-_waiting: weakref.WeakSet[Kernel] = weakref.WeakSet()
-
-
-def finish_compiling() -> None:
-    """Wait until all kernels of this process are compiled, so that none of them has to be waited for later.
-
-    Those that were begun for later go on being compiled.
-    """
-    for kernel in list(_waiting):
-        _ = kernel.is_compiled
-
-
 class Kernel:
     """A CasADi function bound to arrays that live as long as it does: `inputs` and `outputs`.
 
     They are one flat float64 array per argument and result: the nonzeros in CasADi's column-major order. Write the
     inputs in place, call the kernel, read the outputs. One kernel must not be called by two threads at once.
+
+    Parameters
+    ----------
+    function
+    times
+        Number of columns of arguments on which it is evaluated in one call, as by ``function.map(times)``.
+    compiled
+        Whether it may become machine code, or the function's compilation, which kernels may share.
+
+    Attributes
+    ----------
+    name : str
+        Of the function.
+    library : Path or None
+        The shared library once it is machine code.
     """
 
-    def __init__(
-        self, function: ca.Function, *, compiled: bool | Compiling = True, for_later: bool = False
-    ) -> None:
-        self._given, self.name = function, function.name()
+    def __init__(self, function: ca.Function, *, times: int = 1, compiled: bool | Compiling = True) -> None:
+        self._given, self._times, self.name = function, times, function.name()
         self.library: Path | None = None
         self._compiling = Compiling(function) if compiled is True else compiled or None
-        self._found: ca.Function | None = None
-        self._buffer: Any = None
-        self.inputs: list[Array] = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
-        self.outputs: list[Array] = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
-        if self._compiling is None:
-            self._resolve()
-        elif not for_later:
-            _waiting.add(self)
+        self.inputs: list[Array] = [np.zeros(times * function.nnz_in(i)) for i in range(function.n_in())]
+        self.outputs: list[Array] = [np.zeros(times * function.nnz_out(i)) for i in range(function.n_out())]
+        self._use(function if self._compiling is None else self._compiling.found)
+        self._settle()
 
-    def _resolve(self) -> ca.Function:
-        """Return the function that is evaluated, bound to the arrays; waits for the compiler."""
-        with _workers.resolving:
-            if self._found is None:
-                found = self._given if self._compiling is None else self._compiling.result()
-                if self._compiling is not None:
-                    self.library = self._compiling.library
-                self._buffer, self._evaluate = found.buffer()
-                self._code = self._buffer.ret
-                for i, array in enumerate(self.inputs):
-                    self._buffer.set_arg(i, array.reshape(-1).data)
-                for i, array in enumerate(self.outputs):
-                    self._buffer.set_res(i, array.reshape(-1).data)
-                self._found, self._compiling = found, None
-                _waiting.discard(self)
-            return self._found
+    def _use(self, function: ca.Function) -> None:
+        """Evaluate by `function` from now on."""
+        self._function = function
+        self._buffer: Any
+        self._buffer, self._evaluate = function.map(self._times).buffer()
+        self._code = self._buffer.ret
+        for i, array in enumerate(self.inputs):
+            self._buffer.set_arg(i, array.reshape(-1).data)
+        for i, array in enumerate(self.outputs):
+            self._buffer.set_res(i, array.reshape(-1).data)
+
+    def _settle(self) -> None:
+        """Go on with what became of the compilation, if that is settled."""
+        compiling = self._compiling
+        if compiling is not None and compiling.is_settled:
+            self._compiling, self.library = None, compiling.library
+            if compiling.found is not self._function:
+                self._use(compiling.found)
+
+    def prepare(self) -> None:
+        """Count a call: what is called often enough is compiled, and changes over when that is there."""
+        if self._compiling is not None:
+            self._compiling.ask()
+            self._settle()
 
     @property
     def is_done(self) -> bool:
-        """Whether it is compiled, or never will be."""
-        return self._compiling is None or self._compiling.is_done
+        """Whether it is machine code by now, or never will be."""
+        self._settle()
+        return self._compiling is None
 
     @property
     def is_compiled(self) -> bool:
-        """Whether it is machine code; waits for the compiler."""
-        return self._resolve() is not self._given
+        """Whether it is machine code by now."""
+        return self._function is not self._given
+
+    def compile(self) -> bool:
+        """Compile now, wait for the end of it, and return whether it is machine code."""
+        if self._compiling is not None:
+            self._compiling.finish()
+            self._settle()
+        return self.is_compiled
 
     def __call__(self) -> None:
         """Evaluate: read `inputs`, overwrite `outputs`.
 
         EvaluationError, with all outputs NaN, where the function could not be evaluated, at a singular matrix say.
         """
-        if self._found is None:
-            self._resolve()
+        if self._compiling is not None:
+            self.prepare()
         self._evaluate()
         if self._code():
             # Old outputs must not be read as an answer.
@@ -523,14 +534,12 @@ class Kernel:
     def bind_input(self, index: int, array: Array) -> None:
         """Let argument `index` be read from `array` (C-contiguous float64, of its size), which the kernel keeps."""
         self.inputs[index] = _bindable(array, self.inputs[index].size, f"argument {index} takes")
-        if self._buffer is not None:
-            self._buffer.set_arg(index, array.reshape(-1).data)
+        self._buffer.set_arg(index, array.reshape(-1).data)
 
     def bind_output(self, index: int, array: Array) -> None:
         """Let result `index` be written to `array` (C-contiguous float64, of its size), which the kernel keeps."""
         self.outputs[index] = _bindable(array, self.outputs[index].size, f"result {index} gives")
-        if self._buffer is not None:
-            self._buffer.set_res(index, array.reshape(-1).data)
+        self._buffer.set_res(index, array.reshape(-1).data)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Refuse to pickle: a kernel holds addresses; build it in the worker."""

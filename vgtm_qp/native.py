@@ -73,7 +73,7 @@ class Program:
     """
 
     def __init__(self, source: Path, name: str) -> None:
-        library = building(source).result()
+        library = building(source).finish()
         if library is None:
             raise OSError(f"{source.name} could not be compiled")
         self._library = ctypes.CDLL(str(library))

@@ -102,8 +102,8 @@ BASELINES: dict[BaselineName, Baseline] = {
         partial(ResolverStep, method="curve-pseudoinverse"),
     ),
     "ipopt": Baseline("one nonlinear program a step, IPOPT", 20, NonlinearStep),
-    "osqp": Baseline("the same QPs, sparse, OSQP", 200, partial(ResolverStep, solver="osqp")),
-    "piqp": Baseline("the same QPs, sparse, PIQP", 200, partial(ResolverStep, solver="piqp")),
+    "osqp": Baseline("the same QPs, OSQP", 200, partial(ResolverStep, solver="osqp")),
+    "piqp": Baseline("the same QPs, PIQP", 200, partial(ResolverStep, solver="piqp")),
     "mink": Baseline("the same tip, limits and distances as a QP on MuJoCo, mink", 1000, MinkStep),
     "pink": Baseline("the same tip, limits and distances as a QP on Pinocchio, pink", 1000, PinkStep),
 }

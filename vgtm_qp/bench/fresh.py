@@ -1,7 +1,7 @@
-"""What a fresh process takes: start of the command, set-up with a warm or a cold cache of kernels, memory.
+"""What a fresh process takes: start of the command, the way to the first step with a warm or an empty cache, memory.
 
 Run as ``python -m vgtm_qp.bench.fresh`` it is that process: a problem in JSON on stdin, the measures on
-stdout.
+stdout. With a file as its argument it solves the problem and writes the result there.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 import tempfile
 from itertools import pairwise
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, time
 from typing import Any
 
 from vgtm_qp.errors import SolverError
@@ -38,19 +38,40 @@ def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> dict[str, f
     """Return what a fresh process takes to set up a problem in the form of ``Problem.to_dict`` and take a few steps.
 
     Keys: ``imports``, s, of what a resolver needs; ``setup`` and ``setup_cpu``, s from the problem to a resolver that
-    can take its first step, kernels included, by the clock and of the processor, the C compiler's included;
-    ``first_step``, s; ``peak_memory`` and ``imported_memory``, the greatest resident memory after some steps and after
-    the imports alone, bytes. Where it is `cold`, the cache of kernels is an empty one in the place of the user's.
+    can take its first step, by the clock and of the processor; ``first_step``, s; ``to_first_step``, s by the clock
+    from the start of the process to the end of its first accepted step; ``peak_memory`` and ``imported_memory``, the
+    greatest resident memory after some steps and after the imports alone, bytes. Where it is `cold`, the cache of
+    kernels is an empty one in the place of the user's, and ``to_result`` is there: s by the clock from the start of
+    another such process until the whole maneuver is solved, verified and written.
 
     Raises
     ------
     SolverError
         That process failed; the message has the last line that it said.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        environment = _environment() | ({"VGTM_CACHE": folder} if cold else {})
+    found = _run(problem, cold=cold)
+    found["to_first_step"] -= found.pop("began")
+    if cold:
+        began = time()
+        _run(problem, "result.npz", cold=True)
+        found["to_result"] = time() - began
+    return found
+
+
+def _run(problem: dict[str, Any], *result: str, cold: bool) -> dict[str, float]:
+    """Return what a fresh process says; it has nothing to say if it solves the problem into a file `result`."""
+    # The process that compiles for it may outlive it.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        environment = _environment() | ({"VGTM_CACHE": str(Path(folder) / "cache")} if cold else {})
+        began = time()
         done = subprocess.run(
-            [sys.executable, "-P", "-m", "vgtm_qp.bench.fresh"],
+            [
+                sys.executable,
+                "-P",
+                "-m",
+                "vgtm_qp.bench.fresh",
+                *(str(Path(folder) / name) for name in result),
+            ],
             input=json.dumps(problem),
             capture_output=True,
             text=True,
@@ -59,7 +80,15 @@ def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> dict[str, f
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         raise SolverError(f"set-up in a fresh process failed: {lines[-1]}")
-    return dict(json.loads(done.stdout))
+    return {} if result else {"began": began, **json.loads(done.stdout)}
+
+
+def _solve(problem: dict[str, Any], result: str) -> None:
+    """Solve a problem, verify the maneuver and write it, as the command does."""
+    from vgtm_qp.maneuver.solve import solve
+    from vgtm_qp.problem import Problem
+
+    solve(Problem.from_dict(problem)).save(result)
 
 
 def _measured(problem: dict[str, Any]) -> dict[str, float]:
@@ -75,16 +104,18 @@ def _measured(problem: dict[str, Any]) -> dict[str, float]:
     resolver = Resolver(loaded)
     plan = make_plan(loaded, *resolver.tip())
     setup, setup_cpu = perf_counter() - clock, _cpu_seconds() - cpu
-    first_step = 0.0
+    first_step = to_first_step = 0.0
     for start, end in pairwise([plan.path.start, *plan.marks[:_STEPS].tolist()]):
         clock = perf_counter()
-        resolver.follow(plan.path, start, end)
+        step = resolver.follow(plan.path, start, end)
         first_step = first_step or perf_counter() - clock
+        to_first_step = to_first_step or (time() if step.moved else 0.0)
     return {
         "imports": imports,
         "setup": setup,
         "setup_cpu": setup_cpu,
         "first_step": first_step,
+        "to_first_step": to_first_step,
         "peak_memory": _peak_memory(),
         "imported_memory": imported,
     }
@@ -125,4 +156,8 @@ def _environment() -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(_measured(json.load(sys.stdin))))
+    given = json.load(sys.stdin)
+    if len(sys.argv) > 1:
+        _solve(given, sys.argv[1])
+    else:
+        print(json.dumps(_measured(given)))

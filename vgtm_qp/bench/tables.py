@@ -112,16 +112,22 @@ def _fresh(scenes: Iterable[dict[str, Any]]) -> str:
     rows = [
         (
             scene["name"],
-            *(_setup(scene[key]) for key in ("warm", "cold")),
+            f"{time_text(scene['warm']['setup'])} (CPU {time_text(scene['warm']['setup_cpu'])})",
+            time_text(scene["warm"]["to_first_step"]),
+            *(time_text((scene["cold"] or {}).get(key)) for key in ("to_first_step", "to_result")),
             f"{scene['warm']['peak_memory'] / 1e6:.0f} MB",
         )
         for scene in scenes
     ]
-    return markdown_table(("fresh process", "set-up", "set-up, no cache", "memory"), rows, right=True)
-
-
-def _setup(fresh: dict[str, Any] | None) -> str:
-    return f"{time_text(fresh['setup'])} (CPU {time_text(fresh['setup_cpu'])})" if fresh else "-"
+    heads = (
+        "fresh process",
+        "set-up",
+        "to first step",
+        "the same, no cache",
+        "to result, no cache",
+        "memory",
+    )
+    return markdown_table(heads, rows, right=True)
 
 
 def _growth(rows: Iterable[dict[str, Any]]) -> str:

@@ -72,12 +72,13 @@ def main(tokens: Sequence[str] | None = None) -> int:
     try:
         with _plain_warnings():
             code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
+        if code == ExitCode.INTERRUPTED:
+            _stop_compilers()
         return ExitCode.SOLVED if code is None else int(code)
     except (Exception, KeyboardInterrupt) as error:
-        if isinstance(error, KeyboardInterrupt) and (compiled := sys.modules.get("vgtm_qp.compiled")):
-            # The process would wait for them.
-            compiled.stop_compilers()
         code, message = _outcome(error)
+        if code == ExitCode.INTERRUPTED:
+            _stop_compilers()
         mistakes = []
         if isinstance(error, ProblemError):
             mistakes = [{"file": error.source, **asdict(mistake)} for mistake in error.mistakes]
@@ -86,6 +87,12 @@ def main(tokens: Sequence[str] | None = None) -> int:
         if "--json" in given:
             document({"error": message, "mistakes": mistakes})
         return code
+
+
+def _stop_compilers() -> None:
+    """End what compiles behind this process; otherwise it goes on, for the next one."""
+    if compiled := sys.modules.get("vgtm_qp.compiled"):
+        compiled.stop_compilers()
 
 
 def _outcome(error: BaseException) -> tuple[ExitCode, str]:

@@ -9,7 +9,10 @@ from typing import Any
 from vgtm_qp.cli.output import ExitCode, Json, answer, table, why_not_writable
 
 _CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
-_SLOWER = "4 to 10 times slower"
+_SPEED = "five_bay_free"
+"""Problem by whose steps kernels are compared,"""
+_STEPS = 30
+"""and how many of them are timed of each kind."""
 _EXTRAS = {
     "view": ("viser",),
     "export": ("viser", "mcap", "mcap-ros2-support", "imageio-ffmpeg", "pillow", "pyyaml"),
@@ -30,7 +33,9 @@ _EXTRAS = {
 
 
 def doctor(*, json: Json = False) -> int:
-    """Show versions, solvers, the C compiler and its cache, and whether kernels and FCL work.
+    """Show versions, solvers, the C compiler and its cache, whether kernels and FCL work, and how long a step takes.
+
+    Where kernels can be compiled, those of a small arm are, and a step with them is compared with one without.
 
     Exit code 1 if something fails that every maneuver needs.
     """
@@ -55,13 +60,14 @@ def doctor(*, json: Json = False) -> int:
             "hindrance": f"; {hindrance}" if hindrance else "",
         },
         "kernels": _tried(_kernels),
+        "speed": _tried(lambda: _speed(compiler() is not None and not hindrance)),
         "fcl": _tried(_fcl),
         "extras": {
             extra: [name for name, found in versions(names).items() if not found]
             for extra, names in _EXTRAS.items()
         },
     }
-    broken = [name for name in ("solvers", "kernels", "fcl") if not found[name]["ok"]]
+    broken = [name for name in ("solvers", "kernels", "speed", "fcl") if not found[name]["ok"]]
     broken += [name for name in _CORE if not found["versions"][name]]
     found["ok"] = not broken
     verdict = f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order"
@@ -74,9 +80,10 @@ def _report(found: dict[str, Any]) -> str:
     rows = [(name, version or "NOT INSTALLED") for name, version in found["versions"].items()]
     rows += [
         ("QP solvers", found["solvers"]["says"]),
-        ("C compiler", found["compiler"] or f"none found: CasADi interprets the kernels, {_SLOWER}"),
+        ("C compiler", found["compiler"] or "none found: CasADi interprets the kernels"),
         ("kernel cache", f"{cache['folder']}, {cache['kernels']} kernels" + cache["hindrance"]),
         ("kernels", found["kernels"]["says"]),
+        ("one step", found["speed"]["says"]),
         ("FCL", found["fcl"]["says"]),
     ]
     for extra, missing in found["extras"].items():
@@ -107,9 +114,10 @@ def _kernels() -> str:
     from vgtm_qp.machine import environment
 
     x = ca.SX.sym("x", 2)
-    with tempfile.TemporaryDirectory() as folder, environment({"VGTM_CACHE": folder}):
+    scratch = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+    with scratch as folder, environment({"VGTM_CACHE": folder}):
         kernel = Kernel(ca.Function("doctor", [x], [ca.sqrt(ca.dot(x, x))]))
-        compiled = kernel.is_compiled
+        compiled = kernel.compile()
         kernel.inputs[0][:] = 3.0, 4.0
         kernel()
     if abs(float(kernel.outputs[0][0]) - 5.0) > 1e-12:
@@ -117,7 +125,36 @@ def _kernels() -> str:
     if compiled:
         return "compile, load and give the right value"
     reason = "no C compiler" if compiler() is None else "the C compiler fails"
-    return f"interpreted by CasADi, {_SLOWER}: {reason}"
+    return f"interpreted by CasADi: {reason}"
+
+
+def _speed(can_compile: bool) -> str:
+    """Return how long a step of a small arm takes with interpreted kernels, and with compiled ones in turn."""
+    from time import thread_time
+
+    import numpy as np
+
+    from vgtm_qp.compiled import finish_compiling
+    from vgtm_qp.machine import environment
+    from vgtm_qp.methods import Resolver
+    from vgtm_qp.problem import load_problem
+
+    problem = load_problem(_SPEED)
+    with environment({"VGTM_CC": "none"}):
+        interpreted = Resolver(problem)
+    resolver = Resolver(problem)
+    is_compiled = finish_compiling() and can_compile
+    far = interpreted.tip()[0] + np.array([0.3, 0.0, -0.1])
+    times: tuple[list[float], list[float]] = [], []
+    for k in range(_STEPS):
+        for taken, found in zip((interpreted, resolver), times, strict=True):
+            began = thread_time()
+            taken.step(position=(1.0 - k / _STEPS) * taken.tip()[0] + k / _STEPS * far)
+            found.append(thread_time() - began)
+    slow, fast = (1e3 * float(np.median(found)) for found in times)
+    if not is_compiled:
+        return f"{slow:.2g} ms, interpreted, for five bays"
+    return f"{fast:.2g} ms for five bays; {slow:.2g} ms where kernels are interpreted, {slow / fast:.1f} times as long"
 
 
 def _fcl() -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.machine import machine, sentence
 from vgtm_qp.maneuver.maneuver import Maneuver
-from vgtm_qp.maneuver.solve import solve
+from vgtm_qp.maneuver.solve import compile_steps, solve
 from vgtm_qp.methods.presets import DEFAULT_METHODS, check_methods, with_method
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
@@ -125,6 +126,8 @@ def compare(
     found: dict[str, tuple[Row, Maneuver | None]] = {}
     try:
         for name in methods:
+            with suppress(VgtmError):
+                compile_steps(with_method(problem, name))
             found[name] = run_method(problem, name, progress=progress)
             if found[name][0].status == INTERRUPTED:
                 break

@@ -64,7 +64,7 @@ class Clearance:
         self.safe, self.influence = safe, influence
         self.self_influence = min(influence, 2.0 * (safe + float(bodies.radius.max(initial=0.0))))
         self.is_watched = watch and compiler() is not None and can_be_watched(self.scene)
-        self.scene.prepare(watched=self.is_watched)
+        self.scene.prepare()
         self._watching: Watch | None = None
         self._candidates = Candidates(self.scene, influence, self.self_influence)
         self._solids = Solids(self.scene)

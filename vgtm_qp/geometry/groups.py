@@ -33,13 +33,6 @@ _FIRST = 16
 _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
 """From the shifts of both ends of two bodies to that of one middle from the other, and half the turns of both."""
 
-_WATCHED = ((distance_function, (1,)), (sweep_function, (1,)))
-"""Functions evaluated in a watched scene, and for how many pairs at once,"""
-_LISTED = ((distance_function, (1, 64, 1024)), (sweep_function, (1, 64)))
-"""and in any other,"""
-_PROVEN = ((proof_function, (1,)),)
-"""and those for FCL's answers."""
-
 
 class Scene:
     """Bodies of an arm and obstacles, with the functions that evaluate pairs of them.
@@ -66,14 +59,11 @@ class Scene:
         self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if has_self else set()))
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
 
-    def prepare(self, *, watched: bool) -> None:
-        """Begin to compile the functions of steps: of a watched scene, or for few and for many pairs."""
-        for make, counts in (*(_WATCHED if watched else _LISTED), *(_PROVEN if self.fcl else ())):
+    def prepare(self) -> None:
+        """Make the functions of steps, so that no step has to."""
+        for make in (distance_function, sweep_function, *((proof_function,) if self.fcl else ())):
             for shape in self.shapes:
-                for count in counts:
-                    # A watch rarely needs this: only for a motion that it cannot prove itself.
-                    for_later = watched and make is sweep_function
-                    self.batch(make, shape).prepare(count, for_later=for_later)
+                self.batch(make, shape)
 
     def contacts(self, parts: Sequence[Found]) -> Contacts:
         """Return the contacts of all `parts`, one part after the other."""

@@ -55,10 +55,11 @@ def _contact(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
 
 def is_ready(shapes: Iterable[str]) -> bool:
     """Whether scenes of these shapes can be watched: false for ever where nothing can be compiled."""
-    for shape in shapes:
-        _contact(shape, compiler())
     source = building(_SOURCE)
-    return source.is_done and source.result() is not None
+    if not source.ask():
+        for shape in shapes:
+            _contact(shape, compiler())[1].ask()
+    return source.library is not None
 
 
 class _WatchedGroup:

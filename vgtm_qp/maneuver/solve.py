@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.machine import THREADS, environment
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
@@ -77,8 +78,8 @@ def solve_many(
 ) -> Iterator[Maneuver]:
     """Solve problems in separate processes and yield their maneuvers in order.
 
-    Each process solves one problem after another with a resolver of its own and one BLAS thread. Kernels are compiled
-    once for all of them, into the cache that they share.
+    Each process solves one problem after another with a resolver of its own and one BLAS thread. A kernel is compiled
+    once for all of them, into the cache that they share; none of them waits for it.
 
     Parameters
     ----------
@@ -106,6 +107,22 @@ def solve_many(
         finally:
             for task in tasks:
                 task.cancel()
+
+
+def compile_steps(problem: Problem) -> None:
+    """Compile the kernels of a problem's steps and wait for it, so that times are not those of interpreted ones.
+
+    The first step is taken for it by a resolver of its own.
+
+    Raises
+    ------
+    ProblemError, TrussError, SolverError
+        As `solve`.
+    """
+    resolver = Resolver(problem)
+    plan = make_plan(problem, *resolver.tip())
+    resolver.follow(plan.path, plan.path.start, float(plan.marks[0]))
+    finish_compiling()
 
 
 class _Attempt:

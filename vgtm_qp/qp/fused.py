@@ -235,9 +235,11 @@ class _Workspace:
     def is_ready(self) -> bool:
         """See :class:`FusedSolver`."""
         if self._is_ready is None:
-            if not self._source.is_done:
+            if not self._source.ask():
+                for kernel in (self.condense, self.missing, self.close):
+                    kernel.prepare()
                 return False
-            self._is_ready = self._source.result() is not None
+            self._is_ready = self._source.library is not None
             if self._is_ready:
                 self._start()
         return self._is_ready

@@ -14,7 +14,6 @@ from vgtm_qp.arm.arm import Arm, Kinematics
 from vgtm_qp.arm.build import make_arm
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
-from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
 from vgtm_qp.errors import Mistake, nearest
@@ -83,7 +82,6 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
     gives_way = home.layout.hard_tracking and problem.method.gives_way
     elastic = elastic_engine(solver, home.layout, kinematics, task, plain=plain) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
-    finish_compiling()
     return Setup(
         arm=arm,
         kinematics=kinematics,
@@ -281,8 +279,9 @@ def elastic_engine(
 ) -> Callable[[], Engine]:
     """Return a function that gives the engine of the same layout with elastic tracking, built on its first call."""
     elastic = replace(layout, hard_tracking=False, hard_turns=False)
-    # It is seldom needed: not compiled, it is built faster.
-    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=False, plain=plain))
+    # That of a long arm is built faster if it is not compiled, and seldom needed.
+    is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
+    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=is_short, plain=plain))
 
 
 def check_solver(problem: Problem) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.errors import VgtmError
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.step.actuation import Actuation
@@ -51,6 +53,17 @@ class QPResolver(Resolver, serves="qp"):
         self._advancer = Advancer(self._attempt, self._actuation, self._shaping)
         self._state = setup.home_state()
         self._braking: Braking | None = None
+        self._rehearse()
+
+    def _rehearse(self) -> None:
+        """Try a step that stays at home: what steps make when they first need it is there before the first one."""
+        if self.setup.elastic is not None:
+            self.setup.elastic()
+        state, path = self._state, self.setup.task.path_to(self.tip(), None, None, None)
+        limits = self._actuation.limits(state, self.setup.dt, slowing=True)
+        with suppress(VgtmError):
+            self._attempt.run(state, self._shaping.target(state, self.setup.dt, path, 0.0, 1.0, limits[:2]))
+        self._clock.seconds.update(dict.fromkeys(self._clock.seconds, 0.0))
 
     @property
     def setup(self) -> Setup:
@@ -167,5 +180,4 @@ class QPResolver(Resolver, serves="qp"):
 
     def again(self, problem: Problem) -> QPResolver:
         """See :class:`Resolver`."""
-        # A kernel takes longer to compile than a maneuver to solve without it.
-        return QPResolver(build_arm(problem, compiled=False))
+        return QPResolver(build_arm(problem))

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.curve.redundancy import Refit, add_control_vertices, remove_control_vertices
@@ -100,7 +99,6 @@ class Shaping:
             engine = setup.engine.drawn(layout) if layout.family is setup.layout.family else None
             if engine is None:
                 engine = make_engine(setup.solver, layout, setup.kinematics, setup.task, setup.tracking)
-                finish_compiling()
             elastic = setup.elastic
             if elastic is not None:
                 elastic = elastic_engine(setup.solver, layout, setup.kinematics, setup.task)

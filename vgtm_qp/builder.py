@@ -1,0 +1,280 @@
+"""The process that compiles kernels: it reads functions from its input and leaves shared libraries in the cache.
+
+It is a process of its own, in a session of its own. The one that computes hands over its functions and goes on: it
+waits neither for generated code nor for the C compiler, and it may end before the libraries are there.
+
+A library is made in a folder beside it, ``NAME.so.new``, and moved to its place when it is whole. Who makes that folder
+makes the library; other processes that want the same one wait for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import pickle
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+
+from vgtm_qp.compiled import FLAGS, HUNG, QUICK, digest_file, is_sound
+
+_LONG = 100_000
+"""Length of a source text, in characters, from which compiling lasts seconds."""
+
+_MOST_COMPILERS, _MOST_LINKERS = 4, 64
+"""Processes at a time; most linkers only wait for their objects."""
+
+_NICENESS = 5
+"""What the compilers are behind other work."""
+
+_TICK = 0.05
+"""Seconds after which a file that another process makes is looked for again."""
+
+_ABANDONED = 3.0
+"""Ratio of the age of a folder that nobody works in any more to the time after which a compiler counts as hung."""
+
+_WORTH_IT = 100
+"""Number of lines below which functions are not compiled separately."""
+
+_FUNCTION = re.compile(r"^static int (casadi_f\d+)\(.*?^}\n", re.MULTILINE | re.DOTALL)
+_HELPER = re.compile(
+    r"^(?:static |inline )*casadi_real (casadi_\w+)\([^;{]*\{(?:[^\n]*\}\n|.*?^\}\n)",
+    re.MULTILINE | re.DOTALL,
+)
+_PRELUDE = """#include <math.h>
+#define casadi_real double
+#define casadi_int long long int
+"""
+
+
+def source_of(function: ca.Function) -> str:
+    """Return the C code of a function."""
+    generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
+    generator.add(function)
+    return str(generator.dump())
+
+
+def split(source: str) -> tuple[str, dict[str, str]]:
+    """Return `source` with its long straight-line functions left out but declared, and those by their new names.
+
+    A function that calls no other, and uses nothing but one-line helpers, has a name made of its text: what is mapped
+    over faces or bays is one function in however many kernels.
+    """
+    helpers = {match.group(1): match.group(0) for match in _HELPER.finditer(source)}
+    units: dict[str, str] = {}
+    renamed: dict[str, str] = {}
+    for match in _FUNCTION.finditer(source):
+        name, text = match.group(1), match.group(0)
+        used = set(re.findall(r"\bcasadi_\w+", text)) - {name, "casadi_real", "casadi_int"}
+        if text.count("\n") < _WORTH_IT or not used <= helpers.keys():
+            continue
+        body = text[text.index("(") :]
+        before = "".join(
+            re.sub(r"^(?:static |inline )*", "static inline ", helpers[helper]) for helper in sorted(used)
+        )
+        unit = f"vgtm_{hashlib.sha256((before + body).encode()).hexdigest()[:32]}"
+        units[unit] = f"{_PRELUDE}{before}int {unit}{body}"
+        renamed[name] = unit
+        source = source.replace(text, f"int {unit}{body[: body.index('{')].rstrip()};\n", 1)
+    for name, unit in renamed.items():
+        source = re.sub(rf"^#define {name} .*\n", "", source, flags=re.MULTILINE)
+        source = re.sub(rf"\b{name}\b", unit, source)
+    return source, units
+
+
+def _with_fast_helpers(source: str) -> str:
+    """Return `source` with all before its first function, matrix products among it, compiled as the rest is not."""
+    head = re.search(r"^/\* \w+:\(", source, flags=re.MULTILINE)
+    if head is None:
+        return source
+    before, after = source[: head.start()], source[head.start() :]
+    return (
+        '#include <math.h>\n#pragma GCC push_options\n#pragma GCC optimize ("O2")\n'
+        f"{before}#pragma GCC pop_options\n{after}"
+    )
+
+
+class Builder:
+    """The compilers at work and the objects they make.
+
+    Attributes
+    ----------
+    patience : float
+        Seconds after which a compiler counts as hung.
+    hung : bool
+        Whether one hung.
+    """
+
+    def __init__(self) -> None:
+        self.patience = 60.0
+        self.hung = self._stopped = False
+        self._lock = threading.Lock()
+        self._compilers = ThreadPoolExecutor(min(_MOST_COMPILERS, os.cpu_count() or 1))
+        self._linkers = ThreadPoolExecutor(_MOST_LINKERS)
+        self._objects: dict[Path, Future[bool]] = {}
+        self._running: set[subprocess.Popen[bytes]] = set()
+
+    def build(self, job: dict[str, Any]) -> None:
+        """Begin to make a ``library`` by the compiler ``cc`` of a serialised ``function``, or of a ``text`` of C.
+
+        The job's ``key`` tells compilers and machines apart; a text has ``flags`` of its own.
+        """
+        library, cc = Path(job["library"]), job["cc"]
+        if is_sound(library):
+            return
+        main, texts = library.with_suffix(".o"), {}
+        if "text" in job:
+            rest, flags = job["text"], job["flags"]
+        else:
+            rest, units = split(source_of(ca.Function.deserialize(job["function"])))
+            texts = {library.with_name(f"{name}-{job['key']}.o"): text for name, text in units.items()}
+            flags = QUICK if len(rest) > _LONG else ()
+            rest = _with_fast_helpers(rest) if flags else rest
+        texts[main] = rest
+        # The longest first: nothing waits for it at the end.
+        objects = {
+            path: self._compile(cc, texts[path], path, flags if path == main else ())
+            for path in sorted(texts, key=lambda path: -len(texts[path]))
+        }
+        self._linkers.submit(self._link, cc, objects, library)
+
+    def finish(self) -> None:
+        """Wait for all libraries."""
+        self._linkers.shutdown()
+        self._compilers.shutdown()
+
+    def stop(self) -> None:
+        """End the compilers that run, with all their children, and begin no other."""
+        with self._lock:
+            self._stopped = True
+            running = list(self._running)
+        for process in running:
+            _end(process)
+
+    def _compile(self, cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Future[bool]:
+        """Begin to compile `text` into the object `target`, unless that is done or being done."""
+        begun = self._objects.get(target)
+        if begun is None or (begun.done() and not is_sound(target)):
+            command = [*shlex.split(cc), *FLAGS, *flags, "-x", "c", "-c", "-"]
+            self._objects[target] = self._compilers.submit(self._make, target, command, text)
+        return self._objects[target]
+
+    def _link(self, cc: str, objects: dict[Path, Future[bool]], library: Path) -> None:
+        """Make the shared library of `objects`."""
+        if all(begun.result() for begun in objects.values()):
+            command = [*shlex.split(cc), "-shared", *map(str, objects), "-lm"]
+            self._make(library, command, spent=library.with_suffix(".o"))
+
+    def _make(self, target: Path, command: list[str], text: str = "", spent: Path | None = None) -> bool:
+        """Have a compiler read `text` and write all of `target`, or nothing; return whether it is there.
+
+        The file `spent` is removed before the target is there.
+        """
+        folder = target.with_name(f"{target.name}.new")
+        with contextlib.suppress(OSError):
+            while not (self._stopped or is_sound(target)):
+                try:
+                    folder.mkdir(mode=0o700)
+                except FileExistsError:
+                    # Another process makes it, or was killed while it did.
+                    if _age(folder) > _ABANDONED * self.patience:
+                        shutil.rmtree(folder, ignore_errors=True)
+                    time.sleep(_TICK)
+                    continue
+                try:
+                    made = folder / "made"
+                    if not is_sound(target) and self._run([*command, "-o", str(made)], text, folder):
+                        if spent is not None:
+                            spent.unlink(missing_ok=True)
+                            digest_file(spent).unlink(missing_ok=True)
+                        _publish(made, target)
+                finally:
+                    shutil.rmtree(folder, ignore_errors=True)
+                break
+        return is_sound(target)
+
+    def _run(self, command: list[str], text: str, folder: Path) -> bool:
+        """Run a compiler; return whether it succeeded. One that hangs is ended, and no other is begun."""
+        with self._lock:
+            if self._stopped or self.hung:
+                return False
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                # Its end is seen at once, where a process without a pipe is asked twenty times a second.
+                stderr=subprocess.PIPE,
+                env={**os.environ, "TMPDIR": str(folder)},
+                start_new_session=True,
+            )
+            self._running.add(process)
+        with process:
+            try:
+                process.communicate(text.encode(), timeout=self.patience)
+            except subprocess.TimeoutExpired:
+                self.hung = True
+                _end(process)
+        with self._lock:
+            self._running.discard(process)
+        return process.returncode == 0
+
+
+def _age(folder: Path) -> float:
+    """Return how long ago a folder was changed, s; zero where it is gone."""
+    try:
+        return time.time() - folder.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _publish(made: Path, target: Path) -> None:
+    """Move a file of the cache to its place, its digest before it."""
+    made.chmod(0o644)
+    digest = digest_file(made)
+    digest.write_text(hashlib.sha256(made.read_bytes()).hexdigest())
+    digest.chmod(0o644)
+    # A file whose digest is not there yet would be made again by others.
+    digest.replace(digest_file(target))
+    made.replace(target)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill what is left of a compiler and its children, which are a session of their own."""
+    if process.poll() is None:
+        with contextlib.suppress(OSError):
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
+
+
+def main() -> int:
+    """Make the library of each job that comes by standard input."""
+    if hasattr(os, "nice"):
+        os.nice(_NICENESS)
+    builder = Builder()
+
+    def stop(*_: Any) -> None:
+        builder.stop()
+        raise SystemExit(1)
+
+    signal.signal(signal.SIGTERM, stop)
+    # The last job is None, or cut short.
+    with contextlib.suppress(EOFError, pickle.UnpicklingError):
+        while (job := pickle.load(sys.stdin.buffer)) is not None:
+            builder.patience = job["patience"]
+            with contextlib.suppress(OSError, RuntimeError):
+                builder.build(job)
+    builder.finish()
+    return HUNG if builder.hung else 0
