@@ -281,7 +281,7 @@ def test_clearance_rows_are_the_derivatives_of_the_exact_distances(name, fractio
             assert float(np.sum(gradient * step)) == pytest.approx((ahead - behind) / (2 * h), abs=2e-5), (
                 pairs.name(k)
             )
-    assert compared > 0.8 * len(lower)
+    assert compared > 0.6 * len(lower)
 
 
 def test_joined_clearance_rows_keep_their_names():
