@@ -29,7 +29,7 @@ _BEYOND = 60.0
 
 _INSTANT = 1e-9
 
-_LEAST_HELD = 0.25
+_LEAST_HELD = 0.5
 """Least share of a piece of path for which stations stay on the curve, where they may leave it."""
 
 _HELD_BACK = "stations on the curve hold the arm back"

@@ -24,7 +24,7 @@ from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import StepNumbers, norm
-from vgtm_qp.qp.residual import FailedStepError, InfeasibleStepError
+from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.qp.settle import LEFT, MOST_STEPS, SETTLING_STEPS, Gain, enough_tip_error, held, missing_function
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.rows.tip import TipGoal
@@ -318,9 +318,17 @@ class FusedEngine(Engine):
 
         It does not apply if the path turns within the step, the base moves, or the curve's rows are computed in Python.
         """
-        target, solver = asked.target, self._solver
-        if not solver.is_ready:
+        if not self._solver.is_ready:
             return self._plain.move(asked, accuracy, spent)
+        try:
+            return self._quick(asked, accuracy, spent)
+        except (EvaluationError, AnswerError):
+            # The other way may have an answer: it has another version of DAQP, and rounds otherwise.
+            return self._plain.move(asked, accuracy, spent)
+
+    def _quick(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
+        """Return the move by the compiled call."""
+        target, solver = asked.target, self._solver
         solver.aim(accuracy)
         is_straight = target.base is None and target.path.is_straight(target.start, target.end)
         if not is_straight or self.layout.general is not None:
@@ -331,11 +339,6 @@ class FusedEngine(Engine):
         except InfeasibleStepError:
             # The general way may find an answer without the margin.
             return super().move(asked, accuracy, spent)
-        except EvaluationError:
-            return self._plain.move(asked, accuracy, spent)
-        except FailedStepError as error:
-            error.build = lambda: self.qp(asked)
-            raise
         finally:
             spent("qp")
 
