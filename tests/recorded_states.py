@@ -57,6 +57,7 @@ SENSITIVE = frozenset(
         "octahedral 4, piqp",
         "octahedral 5, elastic tip",
         "octahedral 5, hard tip",
+        "octahedral 6, jams",
         "octahedral 6, pointing",
     }
 )

@@ -11,7 +11,7 @@ import pytest
 
 import vgtm_qp as vq
 from vgtm_qp.bench.contestants import make_baseline
-from vgtm_qp.bench.peers import ArmScene, MinkStep, PinkStep, mjcf
+from vgtm_qp.bench.peers import JointScene, MinkStep, PinkStep, mjcf
 from vgtm_qp.bench.scenes import make_scenes
 from vgtm_qp.bench.tour import make_goals
 
@@ -30,12 +30,12 @@ def some_joints(count: int) -> np.ndarray:
     return np.random.default_rng(20).uniform(-1.2, 1.2, (count, 7))
 
 
-def places(scene: ArmScene, q: np.ndarray) -> np.ndarray:
+def places(scene: JointScene, q: np.ndarray) -> np.ndarray:
     """The base, the joints' origins and the tip, (9, 3), by the package's own kinematics."""
     return scene.arm.chain.at(np.append(q, np.zeros(6)))[0][:9]
 
 
-def exact_distances(scene: ArmScene, q: np.ndarray) -> list[float]:
+def exact_distances(scene: JointScene, q: np.ndarray) -> list[float]:
     """The distances of all pairs in ascending order, m, by closed forms; a pair may have two contacts."""
     points = scene.arm.points(np.append(q, np.zeros(6)))
     found = scene.setup.monitor.near(points, 0.0, 10.0, self_reach=10.0)
@@ -49,7 +49,7 @@ def exact_distances(scene: ArmScene, q: np.ndarray) -> list[float]:
 
 def test_the_model_for_mujoco_has_the_arm_s_joints_links_and_boxes(problem: vq.Problem) -> None:
     mujoco = pytest.importorskip("mujoco")
-    scene = ArmScene.of(problem)
+    scene = JointScene.of(problem)
     model = mujoco.MjModel.from_xml_string(mjcf(scene))
     data = mujoco.MjData(model)
     assert model.jnt_range == pytest.approx(scene.arm.stroke)
@@ -96,7 +96,7 @@ def test_a_peer_stands_where_it_is_placed_and_reaches_goals_within_its_limits(
     problem: vq.Problem, name: Any
 ) -> None:
     pytest.importorskip(name)
-    scene, resolver = ArmScene.of(problem), vq.Resolver(problem)
+    scene, resolver = JointScene.of(problem), vq.Resolver(problem)
     peer = PEERS[name](problem)
     for q in some_joints(5):
         peer.place(replace(resolver.state, quantities=q))
@@ -115,7 +115,7 @@ def test_a_peer_stands_where_it_is_placed_and_reaches_goals_within_its_limits(
 @pytest.mark.parametrize("name", list(PEERS))
 def test_a_peer_keeps_from_the_cube_that_it_would_come_near(problem: vq.Problem, name: Any) -> None:
     pytest.importorskip(name)
-    scene, resolver = ArmScene.of(problem), vq.Resolver(problem)
+    scene, resolver = JointScene.of(problem), vq.Resolver(problem)
     least = []
     for each in (problem.replace({"obstacle": []}), problem):
         peer = PEERS[name](each)

@@ -41,7 +41,7 @@ class Link(NamedTuple):
     radius: float
 
 
-class ArmScene(NamedTuple):
+class JointScene(NamedTuple):
     """What a peer's model is made of: the arm of a setup, its links, and pairs of links that keep apart."""
 
     setup: Setup
@@ -51,7 +51,7 @@ class ArmScene(NamedTuple):
     problem: Problem
 
     @classmethod
-    def of(cls, problem: Problem) -> ArmScene:
+    def of(cls, problem: Problem) -> JointScene:
         """Return the scene of a problem.
 
         Raises
@@ -86,7 +86,7 @@ class MinkStep:
     """Steps by mink 1.x: frame and posture task, limits of joints, speeds and collisions, solved by DAQP."""
 
     def __init__(self, problem: Problem) -> None:
-        scene = ArmScene.of(problem)
+        scene = JointScene.of(problem)
         self._mink = mink = _installed("mink", "mink")
         model = _installed("mujoco", "mujoco").MjModel.from_xml_string(mjcf(scene))
         arm, setup = scene.arm, scene.setup
@@ -146,7 +146,7 @@ class PinkStep:
     """Steps by pink 4.x: frame and posture task, limits of joints and speeds, a barrier of distances, by DAQP."""
 
     def __init__(self, problem: Problem) -> None:
-        scene = ArmScene.of(problem)
+        scene = JointScene.of(problem)
         self._pink = pink = _installed("pink", "pin-pink")
         pin, coal = _installed("pinocchio", "pin"), _installed("coal", "coal")
         model, shapes = pinocchio_model(scene, pin, coal)
@@ -194,7 +194,7 @@ class PinkStep:
         return True
 
 
-def mjcf(scene: ArmScene) -> str:
+def mjcf(scene: JointScene) -> str:
     """Return the scene as a MuJoCo model: geoms ``link 0``... and ``cube 0``..., site ``tip``."""
     arm, chain = scene.arm, scene.arm.chain
     root = ElementTree.Element("mujoco")
@@ -222,7 +222,7 @@ def mjcf(scene: ArmScene) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def pinocchio_model(scene: ArmScene, pin: ModuleType, coal: ModuleType) -> tuple[Any, Any]:
+def pinocchio_model(scene: JointScene, pin: ModuleType, coal: ModuleType) -> tuple[Any, Any]:
     """Return the scene as a Pinocchio model with frame ``tip``, and its shapes with the pairs that keep apart."""
     arm, chain = scene.arm, scene.arm.chain
     model, shapes = pin.Model(), pin.GeometryModel()
@@ -257,7 +257,7 @@ def pinocchio_model(scene: ArmScene, pin: ModuleType, coal: ModuleType) -> tuple
     return model, shapes
 
 
-def _counts(scene: ArmScene) -> tuple[tuple[str, int], tuple[str, int]]:
+def _counts(scene: JointScene) -> tuple[tuple[str, int], tuple[str, int]]:
     return ("link", len(scene.links)), ("cube", len(scene.problem.obstacle))
 
 
