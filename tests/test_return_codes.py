@@ -220,8 +220,8 @@ def test_random_scenes_end_alike_with_and_without_a_compiler(rng):
     alike = same = 0
     for scene, (status, failures, states, nodes), told in zip(scenes, interpreted, compiled, strict=True):
         assert failures == told[1] == [], scene
-        # Rounding differs, and DAQP leaves bounds by up to 1e-10 m: an arm that is nearly stuck may go on by other pieces
-        # of path, and seldom does so in the one way and stop in the other.
+        # Rounding differs, and DAQP leaves bounds by up to 1e-10 m: an arm that is nearly stuck may go on by other
+        # pieces of path, and seldom does so in the one way and stop in the other.
         alike += status == told[0]
         same += states == told[2] and bool(np.allclose(nodes, told[3], rtol=0.0, atol=1e-5))
     assert alike >= len(scenes) - 1
