@@ -1,5 +1,6 @@
 from itertools import pairwise
 
+import casadi as ca
 import numpy as np
 import pytest
 from arms import TRUSSES
@@ -7,12 +8,15 @@ from brute_force import brute_force
 from scipy.spatial.transform import Rotation
 
 from vgtm_qp.arm.truss.arm import TrussArm
+from vgtm_qp.compiled import Kernel, compiler
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.candidates import every_pair
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
+from vgtm_qp.geometry.watch import SOURCE as WATCH
 from vgtm_qp.geometry.watch import Watch
+from vgtm_qp.native import Program, building
 
 MEMBERS = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
 
@@ -243,3 +247,29 @@ def test_floors_below_zero_are_those_of_surfaces_that_overlap_already(floor):
     watch = watch_of(monitor)
     assert not watch.follow(X, X + 0.2 * FORWARD, floor, floor)
     assert watch.follow(X - 0.2 * FORWARD, X - 0.1 * FORWARD, floor, floor)
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("broken", range(3))
+def test_a_pair_without_a_bound_is_never_proven_by_the_pairs_beside_it(broken):
+    """Its distance is NaN in one state; in the next, nothing is known of its way."""
+    assert building(WATCH).finish() is not None
+    ends, known = ca.SX.sym("ends", 24), ca.SX.sym("known", 19)
+    contact = Kernel(ca.Function("contact", [ends, known], [ca.repmat(known[0], 19)]), compiled=False)
+    pairs = Program(WATCH, "Pairs")
+    state, bounds = np.zeros((2, 3)), np.full(3, 0.05)
+    given = np.zeros((3, 19))
+    given[:, 0] = 0.05
+    given[broken, 0] = np.nan
+    places = {"before": state, "after": state.copy()}
+    moved = {"middle": np.zeros((3, 3)), "turned": np.zeros(3), "furthest": np.zeros(3)}
+    numbers = {"body": np.arange(3), "other": np.zeros(3), "points": np.zeros((3, 4))}
+    pairs.set(**{name: array.astype(np.int32) for name, array in numbers.items()}, **places, **moved)
+    pairs.set(count=3, is_self=0, lower=bounds, known=given, limit=0.1, next=2.0, contact=contact)
+    pairs.set(ends=contact.inputs[0], pair=contact.inputs[1], found=contact.outputs[0])
+    pairs.set(rows=np.zeros(3, dtype=np.int64), contacts=np.zeros((6, 9)))
+    for _ in range(2):
+        assert pairs.call("evaluate") == 0
+        assert pairs.data.near == 3
+        assert pairs.data.overlaps
+    assert not pairs.data.lowest >= 0.0

@@ -1,6 +1,7 @@
 """Our own C: sources that lie beside their Python, compiled once, called with structures of numbers and addresses.
 
-A source declares one structure, whose fields :func:`structure` reads from it, so that the C is their only definition.
+A source declares the structures that its functions take. :func:`structure` reads their fields from it, so that the C is
+their only definition.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from vgtm_qp.errors import EvaluationError
 _STRUCT = re.compile(r"typedef struct \{((?:(?!typedef).)*?)\} (\w+);", re.DOTALL)
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _FUNCTION_POINTER = re.compile(r"\(\*(\w+)\)")
+
+_HEADER = Path(__file__).with_suffix(".h")
 
 INCLUDES = Path(ca.__file__).parent / "include"
 """Headers of the libraries in CasADi's wheel, DAQP's among them."""
@@ -60,7 +63,7 @@ def building(source: Path) -> Building:
 
 @cache
 def _building(source: Path, *_: object) -> Building:
-    return Building(source.stem, source.read_text(), (f"-I{INCLUDES}",))
+    return Building(source.stem, _HEADER.read_text() + source.read_text(), (f"-I{INCLUDES}",))
 
 
 class Program:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,7 +81,7 @@ class ArmSymbols(ABC):
     given : list of int
         Nodes whose displacement with the base is given; the others follow by the fixed quantities.
     can_eliminate : bool
-        Whether coordinates can be eliminated in order, by :meth:`response`, :meth:`closed` and :meth:`held`.
+        Whether coordinates can be eliminated in order, by :meth:`response` and :meth:`closed`.
     """
 
     shape: tuple[int, int]
@@ -130,16 +130,9 @@ class ArmSymbols(ABC):
         aims[self._actuators] = ca.fmax(lower, ca.fmin(upper, quantities[self._actuators]))
         return aims
 
-    def error(self, quantities: Any, lower: Any, upper: Any) -> Any:
-        """Return the norm of the errors of `quantities` (M, 1), boxes (n_a,) included."""
-        return ca.norm_2(self.aims(quantities, lower, upper) - quantities)
-
-    def held(self, tracked: Sequence[int]) -> Callable[[Any, Any], Any] | None:  # noqa: ARG002
-        """Return the Newton step of a configuration whose `tracked` stations go to points (3, K) of the curve.
-
-        None if these and the fixed quantities do not determine the configuration stage by stage.
-        """
-        return None
+    def follows(self, tracked: Sequence[int]) -> bool:  # noqa: ARG002
+        """Whether fixed quantities and the places of `tracked` stations determine the configuration, stage by stage."""
+        return False
 
 
 def rotated(vector: Any) -> Any:

@@ -1,21 +1,16 @@
 /* Pairs of bodies and pieces over a straight motion: which may have come near, and the contacts of these. */
 
-#include <math.h>
-#include <string.h>
-
-#define EXPORT __attribute__((visibility("default")))
-
-typedef long long Index;
-
-typedef struct {
-    int (*eval)(const double **, double **, Index *, double *, int);
-    const double **arg;
-    double **res;
-    Index *iw;
-    double *w;
-} Kernel;
+/* Numbers of the ends of a pair before and after a motion; of what is known of it, of which the last three are a normal;
+   and of its two contacts, of which the sixth to eighth are a normal: see follow_function. */
+enum { ENDS = 24, KNOWN = 19, KNOWN_NORMAL = 16, CONTACTS = 18, NORMAL = 5 };
 
 enum { DONE, NO_VALUE };
+
+/* The lesser of two numbers; NaN if one of them is, for ever. */
+static double least_of(double a, double b)
+{
+    return b >= a || a != a ? a : b;
+}
 
 /* How the axes of bodies move: of each the displacement of its middle, half that of one end from the other, and the
    greatest of its ends'. */
@@ -95,21 +90,21 @@ EXPORT int evaluate(Pairs *p)
     if (is_known) return DONE;
     for (int k = 0; k < p->count; k++) {
         if (p->lower[k] >= reach) continue;
-        double *known = p->known + 19 * k, *contacts = p->contacts + 18 * p->near;
+        double *known = p->known + KNOWN * k, *contacts = p->contacts + CONTACTS * p->near;
         for (int i = 0; i < 4; i++) {
             memcpy(p->ends + 3 * i, p->before + 3 * p->points[4 * k + i], 3 * sizeof(double));
-            memcpy(p->ends + 12 + 3 * i, p->after + 3 * p->points[4 * k + i], 3 * sizeof(double));
+            memcpy(p->ends + ENDS / 2 + 3 * i, p->after + 3 * p->points[4 * k + i], 3 * sizeof(double));
         }
-        memcpy(p->pair, known, 19 * sizeof(double));
-        if (p->contact.eval(p->contact.arg, p->contact.res, p->contact.iw, p->contact.w, 0)) return NO_VALUE;
-        memcpy(contacts, p->found, 18 * sizeof(double));
-        memcpy(known + 16, p->found + 5, 3 * sizeof(double));
+        memcpy(p->pair, known, KNOWN * sizeof(double));
+        if (call(&p->contact)) return NO_VALUE;
+        memcpy(contacts, p->found, CONTACTS * sizeof(double));
+        memcpy(known + KNOWN_NORMAL, p->found + NORMAL, 3 * sizeof(double));
         /* The bound from the motion alone holds as well. */
-        double bound = p->found[18] > p->lower[k] ? p->found[18] : p->lower[k];
-        if (!(bound >= p->lowest)) p->lowest = bound;
+        double bound = p->found[CONTACTS] > p->lower[k] ? p->found[CONTACTS] : p->lower[k];
+        p->lowest = least_of(p->lowest, bound);
         p->lower[k] = p->found[0];
         if (!(p->found[0] > 0.0)) p->overlaps = 1;
-        if (!(p->found[0] >= least)) least = p->found[0];
+        least = least_of(least, p->found[0]);
         p->rows[p->near++] = k;
     }
     p->is_close = least < p->limit;

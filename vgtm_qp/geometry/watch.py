@@ -26,7 +26,7 @@ from vgtm_qp.geometry.pairs import Contacts
 from vgtm_qp.geometry.shapes import GeometryError
 from vgtm_qp.native import Program, building
 
-_SOURCE = Path(__file__).with_name("watch.c")
+SOURCE = Path(__file__).with_name("watch.c")
 
 _MOST_PAIRS = 8000
 """Greatest number of pairs of a scene that can be watched."""
@@ -55,7 +55,7 @@ def _contact(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
 
 def is_ready(shapes: Iterable[str]) -> bool:
     """Whether scenes of these shapes can be watched: false for ever where nothing can be compiled."""
-    source = building(_SOURCE)
+    source = building(SOURCE)
     if not source.ask():
         for shape in shapes:
             _contact(shape, compiler())[1].ask()
@@ -73,7 +73,7 @@ class _WatchedGroup:
         function, compiling = _contact(group.shape, compiler())
         contact = Kernel(function, compiled=compiling)
         self._rows, self._contacts = np.zeros(count, dtype=np.int64), np.zeros((2 * count, CONTACT))
-        self._program = Program(_SOURCE, "Pairs")
+        self._program = Program(SOURCE, "Pairs")
         self._program.set(
             count=count,
             is_self=int(group.is_self),
@@ -171,7 +171,7 @@ class Watch:
     def _start(self, X: Array) -> Program:
         """List all pairs, with their distances at `X`."""
         bodies, groups = len(self._scene.bodies), every_pair(self._scene, X)
-        self._places, motion = np.concatenate([X, X]), Program(_SOURCE, "Motion")
+        self._places, motion = np.concatenate([X, X]), Program(SOURCE, "Motion")
         found = {"middle": np.zeros((bodies, 3)), "turned": np.zeros(bodies), "furthest": np.zeros(bodies)}
         motion.set(
             points=len(X),

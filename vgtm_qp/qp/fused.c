@@ -4,22 +4,7 @@
    between them. A Fused belongs to one resolver: nothing is static, so that threads with a resolver each are safe.
    Matrices are row by row. */
 
-#include <math.h>
-#include <string.h>
-
 #include <daqp/api.h>
-
-#define EXPORT __attribute__((visibility("default")))
-
-typedef long long Index;
-
-typedef struct {
-    int (*eval)(const double **, double **, Index *, double *, int);
-    const double **arg;
-    double **res;
-    Index *iw;
-    double *w;
-} Kernel;
 
 enum { DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED, FAILED };
 
@@ -75,11 +60,6 @@ typedef struct {
     int flag, iterations;
     double *work;
 } Fused;
-
-static int call(const Kernel *kernel)
-{
-    return kernel->eval(kernel->arg, kernel->res, kernel->iw, kernel->w, 0);
-}
 
 static double dot(const double *a, const double *b, int count)
 {
@@ -221,25 +201,19 @@ EXPORT int solve(Fused *f)
 static void advance(Fused *f, const double *x, int whole)
 {
     int count = f->actuators, last = f->unknowns - 1;
+    double *moved = f->work;
+    memset(moved, 0, sizeof(double) * f->nodes);
+    if (whole) memcpy(moved, f->stack + last * f->squares, sizeof(double) * f->nodes);
+    for (int i = 0; i < count; i++)
+        for (int k = 0; k < f->nodes; k++) moved[k] += x[i] * f->stack[i * f->squares + k];
     f->furthest = 0.0;
-    if (f->by_nodes) {
-        double *moved = f->work;
-        memset(moved, 0, sizeof(double) * f->nodes);
-        if (whole) memcpy(moved, f->stack + last * f->squares, sizeof(double) * f->nodes);
-        for (int i = 0; i < count; i++)
-            for (int k = 0; k < f->nodes; k++) moved[k] += x[i] * f->stack[i * f->squares + k];
-        for (int k = 0; k < f->nodes; k++) {
-            f->q[f->place[k]] += f->scale * moved[k];
-            if (!(fabs(f->scale * moved[k]) <= f->furthest)) f->furthest = fabs(f->scale * moved[k]);
-        }
-    } else {
-        for (int i = 0; i < count; i++) f->q[f->place[i]] += x[i];
-        for (int k = 0; k < f->nodes; k++) {
-            double moved = whole ? f->stack[last * f->squares + k] : 0.0;
-            for (int i = 0; i < count; i++) moved += x[i] * f->stack[i * f->squares + k];
-            if (!(fabs(f->scale * moved) <= f->furthest)) f->furthest = fabs(f->scale * moved);
-        }
+    for (int k = 0; k < f->nodes; k++) {
+        moved[k] *= f->scale;
+        /* NaN stays. */
+        if (fabs(moved[k]) > f->furthest || moved[k] != moved[k]) f->furthest = fabs(moved[k]);
     }
+    for (int k = 0; k < (f->by_nodes ? f->nodes : count); k++)
+        f->q[f->place[k]] += f->by_nodes ? moved[k] : x[k];
     if (!f->vertices) return;
     const double *free = x + count;
     if (whole)

@@ -47,6 +47,8 @@ from vgtm_qp.rows.tip import TipGoal
 
 SOURCE = Path(__file__).with_name("fused.c")
 _NOWHERE: Array = np.zeros((0, 3))
+_LIBRARIES = (".so", ".dylib", ".dll")
+
 _ROOM, _SLOTS = 24, 4
 """Rows of clearance for which there is room at first, and nodes of each."""
 
@@ -65,7 +67,9 @@ class _Code(IntEnum):
 @cache
 def _daqp() -> dict[str, int]:
     """Return the addresses of the functions of DAQP in CasADi's wheel, whose headers ``fused.c`` includes."""
-    library = ctypes.CDLL(str(next(Path(ca.__file__).parent.glob("*daqp.so*"))))
+    found = Path(ca.__file__).parent.glob("*daqp.*")
+    of_daqp = (path for path in found if path.stem in ("libdaqp", "daqp") and path.suffix in _LIBRARIES)
+    library = ctypes.CDLL(str(next(of_daqp)))
     names = {"quadprog": "daqp_quadprog", "defaults": "daqp_default_settings"}
     return {field: ctypes.cast(library[name], ctypes.c_void_p).value or 0 for field, name in names.items()}
 

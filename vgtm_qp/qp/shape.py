@@ -95,17 +95,23 @@ class CurveShape:
 
     def at(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
         """Return positions and frames alone, with zeros for all else; see :meth:`rows`."""
+        curve, s = self._nodes_of(vertices, torsion, base_frame)
+        nothing = np.zeros((len(s), 3, curve.coordinates))
+        spacing = np.zeros(self.spacings), np.zeros((self.spacings, curve.coordinates))
+        return CurveRows(curve.position(s), nothing, self._frame(curve, s), nothing, *spacing)
+
+    def _nodes_of(self, vertices: Array, torsion: Array, base_frame: Array) -> tuple[Curve, Array]:
+        """Return the curve, and the parameters (K,) of its nodes."""
         curve = Curve(self.family, vertices, torsion, base_frame)
-        s = curve.arc_parameter(self.nodes) if self.by_arc_length else self.nodes
-        count, size = len(s), curve.coordinates
+        return curve, curve.arc_parameter(self.nodes) if self.by_arc_length else self.nodes
+
+    def _frame(self, curve: Curve, s: Array) -> Array:
+        """Return (K, 3, 3) the frames that stations track; without roll only the tangents, in the third column."""
         if self.tracks_roll:
-            frame = curve.frame(s) @ self._home_roll
-        else:
-            frame = np.zeros((count, 3, 3))
-            frame[:, :, 2] = curve.tangent(s)
-        nothing = np.zeros((count, 3, size))
-        spacing = np.zeros(self.spacings), np.zeros((self.spacings, size))
-        return CurveRows(curve.position(s), nothing, frame, nothing, *spacing)
+            return curve.frame(s) @ self._home_roll
+        frame = np.zeros((len(s), 3, 3))
+        frame[:, :, 2] = curve.tangent(s)
+        return frame
 
     def rows(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
         """Return the rows at control vertices (V, 3), torsion (T,), with the frame (3, 3) of the base face.
@@ -118,16 +124,13 @@ class CurveShape:
         CurveError
             The curve has no tangent or no frame somewhere.
         """
-        curve = Curve(self.family, vertices, torsion, base_frame)
-        s = curve.arc_parameter(self.nodes) if self.by_arc_length else self.nodes
-        position_rows = curve.position_jacobian(s)
+        curve, s = self._nodes_of(vertices, torsion, base_frame)
+        position_rows, frame = curve.position_jacobian(s), self._frame(curve, s)
         if self.tracks_roll:
-            frame, spin_rows = curve.frame(s) @ self._home_roll, curve.orientation_jacobian(s)
+            spin_rows = curve.orientation_jacobian(s)
         else:
             # Without roll only the tangent turns, and no integrals along the curve are needed.
-            frame, tangent = np.zeros((len(s), 3, 3)), curve.tangent(s)
-            frame[:, :, 2] = tangent
-            turned = np.cross(tangent[:, None, :], np.swapaxes(curve.tangent_jacobian(s), 1, 2))
+            turned = np.cross(frame[:, None, :, 2], np.swapaxes(curve.tangent_jacobian(s), 1, 2))
             spin_rows = np.swapaxes(turned, 1, 2)
         if self.by_arc_length:
             rates = curve.arc_node_rates(s)[:, None, :]

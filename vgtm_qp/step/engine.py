@@ -193,7 +193,7 @@ class GeneralEngine(Engine):
         # With hard tracking, stations and fixed quantities may determine the configuration.
         is_plain = layout.hard_tracking and layout.general is None and not layout.hard_turns
         tracked = layout.tracked.tolist()
-        self._on_curve = is_plain and layout.arm.symbols(Constants()).held(tracked) is not None
+        self._on_curve = is_plain and layout.arm.symbols(Constants()).follows(tracked)
         self._last: tuple[QPInput, StepNumbers, StepSolution] | None = None
         self._strokes: Array = np.zeros(0)
 

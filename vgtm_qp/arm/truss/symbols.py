@@ -6,7 +6,7 @@ follows from K = D^-1 (E - L K_earlier).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -48,19 +48,6 @@ def elimination_stages(truss: Truss) -> list[PlacedNodes]:
         earlier = used[(node_stage[used] < stage) & ~truss.base[used]]
         stages.append(PlacedNodes(nodes, members, earlier))
     return stages
-
-
-def stage_faces(truss: Truss, stages: list[PlacedNodes], tracked: Sequence[int]) -> Index | None:
-    """Return the tracked face of each stage where its place determines the stage's nodes with the fixed members.
-
-    None where that is not so: a face's three coordinates must stand for three actuated members.
-    """
-    nodes_of = {frozenset(truss.faces[face].tolist()): int(face) for face in tracked}
-    faces = [nodes_of.get(frozenset(stage.nodes.tolist()), -1) for stage in stages]
-    if not faces or min(faces) < 0 or len(faces) != len(tracked):
-        return None
-    three = all(int(truss.actuated[stage.members].sum()) == 3 for stage in stages)
-    return np.array(faces) if three else None
 
 
 class TrussSymbols(ArmSymbols):
@@ -133,30 +120,13 @@ class TrussSymbols(ArmSymbols):
         rhs = [error[stage.members.tolist()] for stage in self._stages]
         return X + self._substituted(self._blocks(gradients), rhs)
 
-    def held(self, tracked: Sequence[int]) -> Callable[[ca.MX, ca.MX], ca.MX] | None:
-        """See ``arm.ArmSymbols``: actuated members take the lengths that follow."""
-        faces = stage_faces(self._truss, self._stages, tracked)
-        if faces is None:
-            return None
-        truss, order = self._truss, list(tracked)
-
-        def step(X: ca.MX, points: ca.MX) -> ca.MX:
-            lengths, gradients = self._lengths(X)
-            error = self.home - lengths
-            centres = (X[:, truss.faces[face].tolist()] @ ca.DM(truss.face_weights[face]) for face in order)
-            gaps = points - ca.horzcat(*centres)
-            blocks, rhs = [], []
-            for stage, (D, L), face in zip(
-                self._stages, self._blocks(gradients), faces.tolist(), strict=True
-            ):
-                fixed = np.flatnonzero(~truss.actuated[stage.members]).tolist()
-                weight = dict(zip(truss.faces[face].tolist(), truss.face_weights[face], strict=True))
-                centre = ca.sparsify(ca.DM(np.kron([weight[int(n)] for n in stage.nodes], np.eye(3))))
-                blocks.append((ca.vertcat(D[fixed, :], centre), ca.vertcat(L[fixed, :], ca.MX(3, L.size2()))))
-                rhs.append(ca.vertcat(error[stage.members[fixed].tolist()], gaps[:, order.index(face)]))
-            return X + self._substituted(blocks, rhs)
-
-        return step
+    def follows(self, tracked: Sequence[int]) -> bool:
+        """See ``arm.ArmSymbols``: each stage has a tracked face, whose coordinates stand for three actuated members."""
+        truss = self._truss
+        faces = {frozenset(truss.faces[face].tolist()) for face in tracked}
+        stages = [frozenset(stage.nodes.tolist()) for stage in self._stages]
+        three = all(int(truss.actuated[stage.members].sum()) == 3 for stage in self._stages)
+        return bool(stages) and three and len(stages) == len(tracked) and faces.issuperset(stages)
 
     def response(self, X: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
         gradients, rhs = self.motion(X, at, moved)
