@@ -253,7 +253,6 @@ def test_a_pair_that_is_followed_has_its_contacts_and_a_bound_whatever_normal_it
     assume(wanted[0]["distance"] > 1e-6)
     rows = rows[rows[:, 0] < FAR]
     assert rows[0, 0] + radius == pytest.approx(wanted[0]["distance"], abs=1e-12)
-    # Of points that are equally near, rounding chooses: each contact is held to its own place on the body.
     for row in rows:
         place, normal = row[1:3] @ after[:2], row[5:8]
         apart = axis_distances(shape, np.tile(place, 2)[None], moved[None])[0]
@@ -261,6 +260,24 @@ def test_a_pair_that_is_followed_has_its_contacts_and_a_bound_whatever_normal_it
         assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-12)
         if mutual:
             np.testing.assert_allclose(place + row[3:5] @ after[2:], normal * apart, atol=1e-9)
+    # Of points that are equally near, rounding chooses: a hair's breadth elsewhere, others are nearest.
+    moves = np.random.default_rng(0).normal(size=(4, 6))
+    nearby = [contacts(shape, end + 1e-10 * move, moved) for move in moves]
+    if all(len(other) == len(wanted) and same_places(other, wanted) for other in nearby):
+        assert len(rows) == len(wanted)
+        for row, one in zip(rows, wanted, strict=True):
+            assert row[0] + radius == pytest.approx(one["distance"], abs=1e-12)
+            np.testing.assert_allclose(row[5:8], one["normal"], atol=1e-9)
+            other = -row[3:5] @ after[2:] if mutual else one["point"]
+            np.testing.assert_allclose(row[1:3] @ after[:2] - other, row[5:8] * one["distance"], atol=1e-9)
+
+
+def same_places(contacts, others):
+    """Whether contacts are at the same places, to 1e-6 of a body's length and 1e-6 rad."""
+    return all(
+        abs(a["t"] - b["t"]) < 1e-6 and np.abs(a["normal"] - b["normal"]).max() < 1e-6
+        for a, b in zip(contacts, others, strict=True)
+    )
 
 
 @pytest.mark.smoke

@@ -217,12 +217,13 @@ def test_random_scenes_end_alike_with_and_without_a_compiler(rng):
     scenes = [*BEFORE, *([seed, 0] for seed in rng.integers(2**31, size=3).tolist())]
     interpreted, compiled = solved(scenes, VGTM_CC="none"), solved(scenes)
     assert len(interpreted) == len(compiled) == len(scenes)
-    alike = same = 0
+    elsewhere = []
     for scene, (status, failures, states, nodes), told in zip(scenes, interpreted, compiled, strict=True):
-        assert failures == told[1] == [], scene
-        # Rounding differs, and DAQP leaves bounds by up to 1e-10 m: an arm that is nearly stuck may go on by other
-        # pieces of path, and seldom does so in the one way and stop in the other.
-        alike += status == told[0]
-        same += states == told[2] and bool(np.allclose(nodes, told[3], rtol=0.0, atol=1e-5))
-    assert alike >= len(scenes) - 1
-    assert same >= len(scenes) - 2
+        assert (status, failures) == (told[0], told[1]), scene
+        assert failures == [], scene
+        # Rounding differs. Near a dead end it decides which piece of path is tried next.
+        if status == "solved" and not (
+            states == told[2] and np.allclose(nodes, told[3], rtol=0.0, atol=1e-6)
+        ):
+            elsewhere.append(scene)
+    assert len(elsewhere) <= 1, elsewhere
