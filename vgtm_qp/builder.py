@@ -144,7 +144,9 @@ class Builder:
         texts[main] = rest
         # The longest first: nothing waits for it at the end.
         objects = {
-            path: self._compile(cc, texts[path], path, flags if path == main else ())
+            path: self._compile(
+                cc, texts[path], path, flags if path == main else (), library if path == main else None
+            )
             for path in sorted(texts, key=lambda path: -len(texts[path]))
         }
         self._linkers.submit(self._link, cc, objects, library)
@@ -162,12 +164,17 @@ class Builder:
         for process in running:
             _end(process)
 
-    def _compile(self, cc: str, text: str, target: Path, flags: tuple[str, ...]) -> Future[bool]:
-        """Begin to compile `text` into the object `target`, unless that is done or being done."""
+    def _compile(
+        self, cc: str, text: str, target: Path, flags: tuple[str, ...], library: Path | None
+    ) -> Future[bool]:
+        """Begin to compile `text` into the object `target`, unless that is done or being done.
+
+        If the object is for one `library` alone, it is not needed once that is there or being linked.
+        """
         begun = self._objects.get(target)
         if begun is None or (begun.done() and not is_sound(target)):
             command = [*shlex.split(cc), *FLAGS, *flags, "-x", "c", "-c", "-"]
-            self._objects[target] = self._compilers.submit(self._make, target, command, text)
+            self._objects[target] = self._compilers.submit(self._make, target, command, text, library=library)
         return self._objects[target]
 
     def _link(self, cc: str, objects: dict[Path, Future[bool]], library: Path) -> None:
@@ -176,20 +183,33 @@ class Builder:
             command = [*shlex.split(cc), "-shared", *map(str, objects), "-lm"]
             self._make(library, command, spent=library.with_suffix(".o"))
 
-    def _make(self, target: Path, command: list[str], text: str = "", spent: Path | None = None) -> bool:
+    def _make(
+        self,
+        target: Path,
+        command: list[str],
+        text: str = "",
+        *,
+        spent: Path | None = None,
+        library: Path | None = None,
+    ) -> bool:
         """Have a compiler read `text` and write all of `target`, or nothing; return whether it is there.
 
-        The file `spent` is removed before the target is there.
+        The file `spent` is removed before the target is there. See :meth:`_compile` for `library`.
         """
-        folder = target.with_name(f"{target.name}.new")
+        folder = _folder_of(target)
         with contextlib.suppress(OSError):
-            while not (self._stopped or is_sound(target)):
+            while not (self._stopped or is_sound(target) or (library is not None and is_sound(library))):
                 try:
                     folder.mkdir(mode=0o700)
                 except FileExistsError:
                     # Another process makes it, or was killed while it did.
-                    if _age(folder) > _ABANDONED * self.patience:
+                    if not self._is_being_made(target):
                         shutil.rmtree(folder, ignore_errors=True)
+                    time.sleep(_TICK)
+                    continue
+                if library is not None and (is_sound(library) or self._is_being_made(library)):
+                    # Another process links it, and may have removed the object that it made.
+                    shutil.rmtree(folder, ignore_errors=True)
                     time.sleep(_TICK)
                     continue
                 try:
@@ -203,6 +223,11 @@ class Builder:
                     shutil.rmtree(folder, ignore_errors=True)
                 break
         return is_sound(target)
+
+    def _is_being_made(self, target: Path) -> bool:
+        """Whether a process makes `target`; one that was killed while it did left a folder that grows old."""
+        folder = _folder_of(target)
+        return folder.exists() and _age(folder) <= _ABANDONED * self.patience
 
     def _run(self, command: list[str], text: str, folder: Path) -> bool:
         """Run a compiler; return whether it succeeded. One that hangs is ended, and no other is begun."""
@@ -228,6 +253,11 @@ class Builder:
         with self._lock:
             self._running.discard(process)
         return process.returncode == 0
+
+
+def _folder_of(target: Path) -> Path:
+    """Return the folder in which a file of the cache is made."""
+    return target.with_name(f"{target.name}.new")
 
 
 def _age(folder: Path) -> float:
