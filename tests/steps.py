@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import piqp
 import qpsolvers
 import scipy.sparse
 from arms import random_pose
@@ -18,6 +20,7 @@ from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
+from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.step.path import Path
@@ -88,7 +91,8 @@ def make_step(
     vertices[2:] += 0.03 * rng.normal(size=vertices[2:].shape)
     normal = rng.normal(size=(3, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    nodes = truss.members[rng.integers(truss.member_count, size=(3, 2))].reshape(3, 4)
+    pairs = [rng.choice(truss.member_count, 2, replace=False) for _ in range(3)]
+    nodes = truss.members[np.array(pairs)].reshape(3, 4)
     share = rng.uniform(size=(3, 4, 1)) * [[1.0], [1.0], [-1.0], [-1.0]]
     rows = ClearanceRows(nodes, share * normal[:, None, :], np.full(3, -1.0), str)
     Y = X + 0.005 * rng.normal(size=X.shape)
@@ -101,6 +105,19 @@ def pressing(rows: ClearanceRows, answer: StepSolution) -> ClearanceRows:
     moved = np.where(np.isfinite(answer.nodes), answer.nodes, 0.0)
     value = np.einsum("rsc,rsc->r", rows.coefficients, moved[rows.nodes])
     return ClearanceRows(rows.nodes, rows.coefficients, value + np.array([1e-4, -1e-2, -1e-2]), rows.name)
+
+
+def answers(engines: Iterable[Any], asked: QPInput) -> list[StepSolution] | None:
+    """Every engine's answer; none where rows drawn at random contradict one another, which all have to say."""
+    found: list[StepSolution] = []
+    refused = []
+    for engine in engines:
+        try:
+            found.append(engine.solve(asked))
+        except InfeasibleStepError:
+            refused.append(engine)
+    assert not (found and refused), refused
+    return found or None
 
 
 def assert_same_answer(found: Any, wanted: Any, tolerance: float = 1e-10) -> None:
@@ -162,6 +179,8 @@ def solved(qp: StepQP) -> tuple[Array, Array]:
     )
     gap = {"eps_duality_gap_abs": 1e-13, "eps_duality_gap_rel": 1e-13}
     found = qpsolvers.solve_problem(problem, solver="piqp", eps_abs=1e-10, eps_rel=1e-12, **gap)
+    if not found.found and found.extras["info"].status == piqp.PIQP_PRIMAL_INFEASIBLE:
+        raise InfeasibleStepError("the hard rows of the step contradict one another")
     assert found.found
     multipliers, of_sides = np.zeros(len(equal)), np.zeros(len(h))
     of_sides[kept] = found.z

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
@@ -68,6 +68,7 @@ def test_removing_what_was_added_gives_the_old_curve_back(family, seed, count):
 
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from([family for family in FAMILIES if family.control_vertices > 4]), st.integers(0, 10**6))
+@example(bezier(6), 131072)  # A hundred samples missed the greatest change by a thousandth.
 def test_removal_keeps_ends_and_base_tangent_and_reports_the_change(family, seed):
     curve = bent_curve(family, seed)
     lowered, change = remove_control_vertices(curve, 2)

@@ -1,7 +1,9 @@
+from collections import Counter
+
 import numpy as np
 import pytest
-from brute_force import brute_force
-from geometry_reference import octahedral_arm
+from brute_force import brute_force, piece_at
+from geometry_reference import octahedral_arm, segment_distance
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -215,22 +217,35 @@ def test_parallel_member_has_two_rows():
 
 
 def test_rows_predict_the_change_of_distance(rng):
+    """Of the two points that a row names; of the pair itself where it has one row and the axis is outside."""
     X, clearance = random_scene(rng)
     near = clearance.near(X, 0.0, reach=1.5, self_reach=1.0)
     step = 1e-6
     change = step * rng.normal(size=X.shape)
-    later = clearance.near(X + change, step, reach=1.6, self_reach=1.1)
-    after = {}
-    for k in range(len(later)):
-        after.setdefault((later.pair(k), round(float(later.weights[k, 1]), 3)), float(later.distance[k]))
+    before, after = (brute_force(clearance, X + s * change, s * step) for s in (0.0, 1.0))
+    rows = Counter(near.pair(k) for k in range(len(near)))
     compared = 0
     for k in range(len(near)):
-        key = (near.pair(k), round(float(near.weights[k, 1]), 3))
-        if key not in after:
-            continue
-        moved = near.weights[k] @ change[near.points[k]]
-        expected = near.normal[k] @ moved - near.normal_speed[k] * step
-        assert after[key] - near.distance[k] == pytest.approx(expected, abs=1e-3 * step)
+        pair = near.pair(k)
+        radii = clearance.bodies.radius[near.body[k]]
+        if pair.is_self:
+            radii += clearance.bodies.radius[near.other[k]]
+        if near.distance[k] < 1e-3 - radii:
+            continue  # An axis inside an obstacle has distance 0 until it is outside again.
+
+        def apart(s, k=k, pair=pair, radii=radii):
+            moved = (near.weights[k][:, None] * (X + s * change)[near.points[k]]).reshape(2, 2, 3).sum(axis=1)
+            if pair.is_self:
+                return np.linalg.norm(moved.sum(axis=0)) - radii
+            point = np.concatenate([moved[0], moved[0]])
+            obstacle = clearance.pieces.shape[pair.other], piece_at(clearance, pair.other, s * step)
+            return segment_distance(str(obstacle[0]), point, obstacle[1]) - radii
+
+        assert apart(0.0) == pytest.approx(near.distance[k], abs=1e-9)
+        expected = near.normal[k] @ (near.weights[k] @ change[near.points[k]]) - near.normal_speed[k] * step
+        assert apart(1.0) - apart(0.0) == pytest.approx(expected, abs=1e-3 * step)
+        if rows[pair] == 1:
+            assert after[pair] - before[pair] == pytest.approx(expected, abs=1e-3 * step)
         compared += 1
     assert compared > 10
 

@@ -16,7 +16,7 @@ BASE_ROWS = 5
 """Conditions that hold a curve at its base: p_0 in its place, p_1 on the base normal."""
 
 _LEAST_VERTICES = 3
-_SAMPLES = 100
+_SAMPLES = 1000
 
 
 class Refit(NamedTuple):
