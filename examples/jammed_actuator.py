@@ -17,6 +17,6 @@ moved = np.ptp(hurt.member_lengths[after, column])
 print(f"it moved by {moved:.9f} m after it had jammed")
 print(f"verified: {hurt.certificate.ok}; clearance {hurt.clearance.min():.4f} m")
 if hurt.status != "solved":
-    print("stopped by", ", ".join(hurt.blocked_by))
+    print("stopped by", hurt.stopped_by)
 
 hurt.plot_strokes().savefig("jammed_actuator.png", dpi=150)

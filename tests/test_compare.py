@@ -51,22 +51,6 @@ def test_each_method_is_held_against_the_same_verification(report: vq.Report) ->
     assert corrected.actuator_travel > 0.5
 
 
-def test_inside_an_obstacle_the_clearance_between_states_is_not_greater_than_at_them(
-    report: vq.Report,
-) -> None:
-    maneuver = report.maneuvers["five-bay arm between two cubes", "pseudoinverse"]
-    assert maneuver.certificate is not None
-    assert maneuver.certificate.clearance_between.value == -0.03, (
-        "a certificate measures no deeper than the radius"
-    )
-    summary = maneuver.summary()
-    assert summary["min_clearance"] < -0.4
-    assert summary["min_clearance_between"] == summary["min_clearance"]
-    outside = report.maneuvers["five-bay arm between two cubes", "qp"]
-    assert outside.certificate is not None
-    assert outside.summary()["min_clearance_between"] == outside.certificate.clearance_between.value
-
-
 def test_a_breakdown_is_shown_with_its_step(report: vq.Report) -> None:
     row = report.row("curve-pseudoinverse-plain")
     assert row.status == "blocked"
@@ -92,7 +76,7 @@ def test_a_method_that_an_arm_cannot_have_is_refused_in_its_row() -> None:
     report = vq.compare(problem, methods=["curve-pseudoinverse", "pseudoinverse"])
     assert report.rows[0].status == "refused"
     assert "truss.base_motion" in report.rows[0].reason
-    assert report.rows[1].status == "solved"
+    assert report.rows[1].status == "infeasible", "its members drift"
     assert "refused" in report.json()
     report.figure()
 

@@ -69,7 +69,8 @@ def verify(
             note(f"vgtm: {error}")
             continue
         held = describe_problem(maneuver, real)
-        codes.append(outcome_code(maneuver.with_certificate(certificate)))
+        maneuver = maneuver.with_certificate(certificate)
+        codes.append(outcome_code(maneuver))
         entries.append(
             {
                 "result": str(path),
@@ -77,6 +78,7 @@ def verify(
                 "status": maneuver.status,
                 "reached": maneuver.reached,
                 "blocked_by": list(maneuver.blocked_by),
+                "stopped_by": maneuver.stopped_by,
                 "certificate": certificate.to_dict(),
                 "held_against": held,
             }

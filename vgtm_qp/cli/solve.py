@@ -117,8 +117,8 @@ def _report(summary: dict[str, Any], *, serial: bool) -> str:
     )
     verified = "verified" if summary["verified"] else "VERIFICATION FAILED"
     lines = [f"{summary['name']}: {summary['status']}, {verified}"]
-    if summary["blocked_by"]:
-        lines += [f"  stopped by {name}" for name in summary["blocked_by"][:4]]
+    if summary["stopped_by"]:
+        lines.append(f"  stopped by {summary['stopped_by']}")
     if summary["way_out"]:
         lines.append(
             f"  the problem as given was a dead end; retried with {summary['way_out']} "
@@ -128,8 +128,7 @@ def _report(summary: dict[str, Any], *, serial: bool) -> str:
     step = summary["step_time"]
     rows = [
         ("path covered", f"{100 * summary['reached']:.4g} % in {summary['steps']} steps"),
-        ("clearance at states", _number(summary["min_clearance"], "m", "nothing near")),
-        ("clearance between states", _number(summary["min_clearance_between"], "m", "nothing near")),
+        ("least clearance", _number(summary["min_clearance"], "m", "nothing near")),
         (f"clearance of {body} from {body}", _number(summary["min_self_clearance"], "m", "not watched")),
         (f"error of {fixed}", _number(summary["max_member_error"], unit)),
         ("stroke violation", _number(summary["max_stroke_violation"], unit)),

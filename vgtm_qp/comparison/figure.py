@@ -93,7 +93,7 @@ def _draw_curves(
         handles.append(Line2D([], [], label=label, **style))
         safe = maneuver.manifest["problem"]["clearance"]["safe"]
         clearance.axhline(safe, color="0.5", linewidth=0.6)
-    clearance.set_ylabel("least clearance [m]", fontsize=8)
+    clearance.set_ylabel("clearance at the states [m]", fontsize=8)
     drift.set_ylabel("worst fixed member [m]", fontsize=8)
     for axes in (clearance, drift):
         axes.set_xlabel("part of the path", fontsize=8)

@@ -24,7 +24,9 @@ class Row:
         It reached the end and kept every limit and clearance, with a tolerance of 1 mm for members and tip: the
         standard for methods without drift correction.
     status : str
-        ``solved``, ``blocked``, ``refused`` (the method cannot be set up for this arm) or ``interrupted``.
+        That of the maneuver, ``refused`` (the method cannot be set up for this arm) or ``interrupted``.
+    least_clearance : float or None
+        From obstacles, over all states and between them.
     reached : float
         Share of the path covered, 0 to 1.
     reason : str
@@ -59,16 +61,16 @@ def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
     certificate = maneuver.certificate
     assert certificate is not None, "a maneuver is verified before it is compared"
     summary, failures = maneuver.summary(), certificate.failures()
-    done = maneuver.status == "solved"
+    done = maneuver.arrived
     member, tip = certificate.member_error.value or 0.0, certificate.tip_error.value or 0.0
     drifting = max(member, tip) <= _DRIFT
     others = [line for line in failures if not line.startswith(("member error", "tip error"))]
     travel = np.abs(np.diff(maneuver.actuator_values, axis=0)).sum()
-    reason = next(iter([*others, *failures]), "") if done else ", ".join(maneuver.blocked_by[:3])
+    reason = next(iter([*others, *failures]), "") if done else maneuver.stopped_by
     return Row(
         problem=problem,
         method=method,
-        solved=done and certificate.ok,
+        solved=maneuver.status == "solved",
         kept=done and drifting and not others,
         status=maneuver.status,
         reached=maneuver.reached,
@@ -76,7 +78,7 @@ def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
         reason=reason,
         tip_error=certificate.tip_error.value,
         member_drift=member,
-        least_clearance=certificate.clearance_between.value,
+        least_clearance=maneuver.least_clearance,
         stroke_violation=certificate.stroke_violation.value,
         rate_violation=certificate.rate_violation.value,
         actuator_travel=float(travel),

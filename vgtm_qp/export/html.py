@@ -24,7 +24,8 @@ def html_text(maneuver: Result) -> str:
     time, nodes, vertices = maneuver.time, maneuver.nodes, maneuver.control_vertices
     at = np.linspace(time[0], time[-1], _FRAMES) if len(time) > 1 else time
     moving, curves = resampled(time, nodes, at), resampled(time, vertices, at)
-    clearance = resampled(time, np.where(np.isfinite(maneuver.clearance), maneuver.clearance, -1.0), at)
+    # Of the last state: between two states it is not on the line between their clearances.
+    clearance = maneuver.clearance[np.searchsorted(time, at + 1e-9, side="right") - 1]
     tip = maneuver.tip_position
 
     with viser_server() as server:
@@ -49,8 +50,8 @@ def html_text(maneuver: Result) -> str:
 
 def _read_out(maneuver: Result, time: float, clearance: float) -> str:
     text = f"{time:.1f} s"
-    if np.isfinite(maneuver.clearance).any():
+    if np.isfinite(clearance):
         text += f"   clearance {1000.0 * clearance:.0f} mm"
     if time >= maneuver.time[-1] and maneuver.status != "solved":
-        text += f"   {maneuver.status}: {', '.join(maneuver.blocked_by[:2])}"
+        text += f"   {maneuver.status}: {maneuver.why_not}"
     return text

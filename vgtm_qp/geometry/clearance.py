@@ -140,7 +140,11 @@ class Clearance:
         return order[np.sort(np.unique(like[order], axis=0, return_index=True)[1])]
 
     def least(self, X: Array, time: float = 0.0, *, among: str = "all") -> tuple[float, Pair | None]:
-        """Return the exact least surface distance and its pair; ``(inf, None)`` where there is no pair.
+        """Return the exact least clearance, m, and its pair; ``(inf, None)`` where there is no pair.
+
+        The clearance of a pair is the distance of the body's axis from the solid obstacle, or from the other axis, less
+        the radius or radii: where an axis reaches into what it should keep away from, it is minus the radius, and no
+        deeper. The contacts of :meth:`near` are signed by the depth there, since they lead the way out.
 
         Parameters
         ----------
@@ -151,8 +155,9 @@ class Clearance:
         best, pair = np.inf, None
         enclosed = self.scene.contacts(self._solids.enclosed(X, time) if False in wanted else [])
         if len(enclosed):
-            k = int(np.argmin(enclosed.distance))
-            best, pair = float(enclosed.distance[k]), enclosed.pair(k)
+            inside = -self.bodies.radius[enclosed.body]
+            k = int(np.argmin(inside))
+            best, pair = float(inside[k]), enclosed.pair(k)
         candidates, reach, self_reach = self._candidates, 0.0, 0.0
         while True:
             motion = candidates.cover(X, time, reach, self_reach)

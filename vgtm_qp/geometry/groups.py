@@ -133,7 +133,7 @@ class Group:
     numbers : (C, 8) int
         These, `body`, `other`, `is_self`, and zero: 1 in those of a contact that FCL supplied.
     radius : (C,)
-        Of the body, or the sum of both radii, m.
+        Of the body less the obstacle's allowance, or the sum of both radii, m.
     distance : (C,)
         Surface distance at the reference configuration, m, ascending once :meth:`keep_near` was called.
     is_self, moving : bool
@@ -156,6 +156,8 @@ class Group:
         other_ends = bodies.points[other] if self.is_self else ends
         if self.is_self:
             self.radius = self.radius + bodies.radius[other]
+        else:
+            self.radius = self.radius - self.scene.pieces.allowance[other]
         self.numbers = np.pad(np.column_stack([ends, other_ends, body, other]), ((0, 0), (0, 2)))
         self.numbers[:, 6] = self.is_self
         self.points, self.body, self.other = self.numbers[:, :4], self.numbers[:, 4], self.numbers[:, 5]
@@ -224,15 +226,15 @@ class Group:
     def nearest(
         self, motion: Sequence[Displacement], X: Array, time: float, best: float
     ) -> tuple[float, int, int]:
-        """Return the least distance below `best`, m, its row, and how many pairs were evaluated after the first few.
+        """Return the least clearance below `best`, m, its row, and how many pairs were evaluated after the first few.
 
-        The row is -1 where no distance is below.
+        The row is -1 where no clearance is below.
         """
         # The nearest pairs at the reference are probably the nearest still; they make `best` small for the others.
         rows, row = np.arange(min(len(self), _FIRST)), -1
         for first in (True, False):
             if len(rows):
-                distance = self.distances(X, time, rows)
+                distance = np.maximum(self.distances(X, time, rows), -self.radius[rows])
                 k = int(np.argmin(distance))
                 if distance[k] < best:
                     best, row = float(distance[k]), int(rows[k])

@@ -38,6 +38,8 @@ class Obstacle:
         m/s.
     solid : bool
         Whether the triangles of a mesh bound a volume; the other shapes are solid.
+    allowance : float
+        How much nearer than to others bodies may come to it, m: its distances are greater by that.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Obstacle:
     pieces: Array
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     solid: bool = True
+    allowance: float = 0.0
 
 
 def box(
@@ -190,6 +193,8 @@ class ObstaclePieces:
         The latter is the index of the obstacle each belongs to.
     velocity, speed, fastest : (P, 3), (P,), float
         m/s; the last one is the greatest speed.
+    allowance : (P,)
+        That of the obstacle, m.
     """
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
@@ -198,6 +203,7 @@ class ObstaclePieces:
         self.shape = np.repeat([o.shape for o in obstacles] or [""], counts or [0])
         self.obstacle = np.repeat(np.arange(len(obstacles)), counts)
         self.velocity = np.repeat(np.reshape([o.velocity for o in obstacles], (-1, 3)), counts, axis=0)
+        self.allowance = np.repeat([o.allowance for o in obstacles] or [0.0], counts or [0])
         self.speed = np.asarray(np.linalg.norm(self.velocity, axis=1))
         self.fastest = float(self.speed.max(initial=0.0))
         self.moving = self.fastest > 0.0

@@ -39,7 +39,7 @@ class Solids:
             group = Group(self._scene, "triangle", np.repeat(body, len(piece)), np.tile(piece, len(body)))
             found = group.evaluate(group.at(X, time, np.arange(len(group))))[:, 0]
             nearest = found[:, 0].reshape(len(body), -1).argmin(axis=1) + len(piece) * np.arange(len(body))
-            found, radius = found[nearest], bodies.radius[body]
+            found, radius = found[nearest], group.radius[nearest]
             depth = found[:, 0] + radius
             found[:, 0] = -depth - radius
             # The way out, where the axis does not touch the surface.

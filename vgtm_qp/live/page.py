@@ -269,7 +269,9 @@ class Page:
             self._show(maneuver)
             self._toggle()
             if maneuver.status != "solved":
-                self.message = f"{maneuver.status} at {100 * maneuver.reached:.0f} % of the path"
+                self.message = (
+                    f"{maneuver.status} at {100 * maneuver.reached:.0f} % of the path: {maneuver.why_not}"
+                )
 
         self._try(run)
 

@@ -60,9 +60,9 @@ class Measure:
 class Certificate:
     """Result of ``verify``: worst values over all states of a maneuver, and between them.
 
-    A clearance is a surface distance: never less than ``-member radius``, the value of a member whose axis
-    touches an obstacle. Clearances between states are proven lower bounds, at most 1e-6 m below the least
-    distance.
+    A clearance is the distance of a member's axis from a solid obstacle less the radius, or of two axes less both: from
+    surface to surface, and minus the radius where the axis is inside, however deep. Clearances between states are
+    proven lower bounds, at most 1e-6 m below the least one.
 
     Attributes
     ----------

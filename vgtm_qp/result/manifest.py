@@ -2,12 +2,12 @@
 
 It has `schema_version`; the `problem` in the form of its file, and `problem_digests`, what the function of that name
 returns; the `arm` as its `record` gives it; the `curve` as ``Layout.record`` gives it, null without one; `status`,
-`reached`, the share of the path covered, 0 to 1, and `blocked_by`, the names of what stopped the arm; the `stop` as its
-`to_dict` gives it; `way_out`, the change of the problem with which a retry came further; `recovered`, pairs below their
-clearance in the home pose and their distances there, m; `method` and `solver`; `setup_time`, s; `directory`, where
-relative paths of the problem start; `meshes`, what `mesh_record` returns for each; `versions`; the `certificate`, null
-before verification; `jacobian_rank`, that of the last step where the method reveals it; and `clearance_rows`, how many
-rows of the QPs that moved the arm were supplied by `fcl`, and how many were `exact`.
+one of ``STATUSES``, `reached`, the share of the path covered, 0 to 1, and `blocked_by`, the names of what stopped the
+arm; the `stop` as its `to_dict` gives it; `way_out`, the change of the problem with which a retry came further;
+`recovered`, pairs below their clearance in the home pose and their distances there, m; `method` and `solver`;
+`setup_time`, s; `directory`, where relative paths of the problem start; `meshes`, what `mesh_record` returns for each;
+`versions`; the `certificate`, null before verification; `jacobian_rank`, that of the last step where the method reveals
+it; and `clearance_rows`, how many rows of the QPs that moved the arm were supplied by `fcl`, and how many were `exact`.
 """
 
 from __future__ import annotations
@@ -32,6 +32,11 @@ SCHEMA_VERSION = 1
 """Version of the result file that this package writes and reads."""
 
 STATUSES = ("solved", "blocked", "infeasible")
+"""The whole path is covered, and verification, if there was one, found nothing; the arm stopped on the way; the whole
+path is covered, but by states or motions that break what was asked for."""
+
+WHOLE_PATH = 1.0 - 1e-9
+"""Share of the path from which the arm has arrived."""
 
 _PACKAGES = ("vgtm-qp", "numpy", "casadi", "daqp", "osqp", "piqp", "python-fcl", "qpsolvers", "trimesh")
 _MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "blocked_by", "versions")
@@ -65,10 +70,18 @@ def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:
     return isinstance(value, list) and all(is_right(entry) for entry in value)
 
 
+def _is_stop(value: Any) -> bool:
+    if not isinstance(value, dict) or not _is_text(value.get("text", "")):
+        return False
+    return _is_list(
+        value.get("remedies", []), lambda changes: _is_list(changes, lambda x: isinstance(x, dict))
+    )
+
+
 _VALUES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "blocked_by": (lambda value: _is_list(value, _is_text), "a list of names"),
     "curve": (lambda value: isinstance(value, dict), "a JSON object, or null"),
-    "stop": (lambda value: isinstance(value, dict), "a JSON object, or null"),
+    "stop": (_is_stop, "a JSON object, its text a string, its remedies lists of objects; or null"),
     "way_out": (_is_text, "a string"),
     "recovered": (lambda value: _is_list(value, _is_pair), "a list of pairs and distances"),
     "problem_digests": (
@@ -153,7 +166,9 @@ def check_manifest(manifest: Any) -> dict[str, Any]:
     if copy.get("certificate") is not None:
         if not isinstance(copy["certificate"], dict):
             raise ResultError("manifest.certificate is not a JSON object")
-        Certificate.from_dict(copy["certificate"])
+        ok = Certificate.from_dict(copy["certificate"]).ok
+        if copy["status"] != "blocked" and reached >= WHOLE_PATH:
+            copy["status"] = "solved" if ok else "infeasible"
     return copy
 
 

@@ -14,7 +14,7 @@ from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.file import check_arrays, frozen, names_of, plain, read_result, write_result
-from vgtm_qp.result.manifest import check_manifest
+from vgtm_qp.result.manifest import WHOLE_PATH, check_manifest
 from vgtm_qp.result.poses import base_poses
 
 _LEFT_OUT: Any = None
@@ -34,7 +34,8 @@ class Result:
     tip_position, tip_rotation, tip_target_position : (T, 3), (T, 3, 3), (T, 3)
         Pose of the end effector, and the target for which each state was accepted, m.
     clearance, self_clearance : (T,)
-        Least distance to obstacles, and between members that share no node, m; infinite if nothing is near.
+        Least clearance at each state from obstacles, and between members that share no node, m, as the certificate
+        defines it; infinite if nothing is near.
     progress : (T,)
         Share of the path covered, 0 to 1.
     step_time, phase_names, phase_time : (T,), (P,), (T, P)
@@ -97,8 +98,8 @@ class Result:
         text = f"{self._name}: {self.status}, {100.0 * self.reached:.4g} % of the path in {self.steps} steps."
         if way := self.manifest.get("way_out"):
             text += f" The problem as given was a dead end; this is the retry with {way}."
-        if self.blocked_by:
-            text += f" Stopped by {', '.join(self.blocked_by[:4])}."
+        if self.stopped_by:
+            text += f" Stopped by {self.stopped_by}."
         certificate = self.certificate
         if certificate is None:
             return f"{text} Not verified yet."
@@ -152,8 +153,13 @@ class Result:
 
     @property
     def status(self) -> str:
-        """``"solved"``, ``"blocked"`` or ``"infeasible"``."""
+        """``"solved"``, ``"blocked"``, or ``"infeasible"``: it arrived, but breaks what was asked for."""
         return str(self.manifest["status"])
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the arm covered the whole path, in whatever way."""
+        return self.reached >= WHOLE_PATH
 
     @property
     def reached(self) -> float:
@@ -162,8 +168,37 @@ class Result:
 
     @property
     def blocked_by(self) -> tuple[str, ...]:
-        """Names of the obstacles, members and limits that stopped it."""
+        """Names of all obstacles, members and limits that together stopped it."""
         return tuple(self.manifest["blocked_by"])
+
+    @property
+    def stopped_by(self) -> str:
+        """What stopped it and what would let it go on, for people; empty if it was not stopped."""
+        text: str = (self.manifest.get("stop") or {}).get("text", "")
+        return text or ", ".join(self.blocked_by[:3])
+
+    @property
+    def remedies(self) -> list[list[dict[str, Any]]]:
+        """Alternatives with which the arm goes on past its stop: each a list of changes of limits, as plain data."""
+        return list((self.manifest.get("stop") or {}).get("remedies", []))
+
+    @property
+    def why_not(self) -> str:
+        """Why it is not solved: what stopped it, or else the first thing that it breaks; empty if it is solved."""
+        certificate = self.certificate
+        return self.stopped_by or next(iter(() if certificate is None else certificate.failures()), "")
+
+    @property
+    def least_clearance(self) -> float | None:
+        """Least clearance from obstacles over all states and between them, m; None if nothing is near.
+
+        Before verification it is that of the states alone. Pairs that began too near, which a certificate excuses,
+        count here.
+        """
+        certificate = self.certificate
+        between = None if certificate is None else certificate.clearance_between.value
+        found = [float(self.clearance.min()), np.inf if between is None else between]
+        return min(found) if min(found) < np.inf else None
 
     @property
     def steps(self) -> int:
@@ -183,19 +218,13 @@ class Result:
     def summary(self, result: str | Path | None = None) -> dict[str, Any]:
         """Return what ``vgtm solve --json`` prints, as strict JSON data; `result` is the path of the file.
 
-        Entries that come from the certificate are None before verification. A certificate measures penetration
-        no deeper than a member's radius; beyond that the clearance at the states replaces the one between them.
+        Entries that come from the certificate are None before verification.
         """
         certificate, manifest = self.certificate, self.manifest
-        finite = self.clearance[np.isfinite(self.clearance)]
-        least = float(finite.min()) if len(finite) else None
 
         def worst(name: str) -> float | None:
             return None if certificate is None else certificate.measures[name].value
 
-        between = worst("clearance_between")
-        if between is not None and least is not None:
-            between = min(between, least)
         return {
             "name": manifest["problem"].get("name", ""),
             "status": self.status,
@@ -204,8 +233,8 @@ class Result:
             "bays": manifest["arm"].get("bays"),
             "method": manifest.get("method"),
             "solver": manifest.get("solver"),
-            "min_clearance": least,
-            "min_clearance_between": between,
+            "min_clearance": self.least_clearance,
+            "min_clearance_between": None if certificate is None else self.least_clearance,
             "min_self_clearance": worst("self_clearance"),
             "max_member_error": worst("member_error"),
             "max_stroke_violation": worst("stroke_violation"),
@@ -215,6 +244,8 @@ class Result:
             "step_time": self._step_time(),
             "setup_time": manifest.get("setup_time"),
             "blocked_by": list(self.blocked_by),
+            "stopped_by": self.stopped_by,
+            "remedies": self.remedies,
             "clearance_rows": manifest.get("clearance_rows"),
             "way_out": str(manifest.get("way_out", "")),
             "verified": None if certificate is None else certificate.ok,

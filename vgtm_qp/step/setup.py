@@ -93,7 +93,7 @@ class Setup:
         return self.slow_approach and self.tip_mode == "scaled"
 
     def least_clearance(self, q: Array, time: float, among: str = "all") -> float:
-        """Return the exact least surface distance at a configuration, m; see ``Clearance.least``."""
+        """Return the exact least clearance at a configuration, m; see ``Clearance.least``."""
         return (self.measure or self.monitor).least(self.arm.points(q), time, among=among)[0]
 
     def base_at(self, time: float) -> Pose | None:

@@ -91,8 +91,8 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
     differences = {
         "tip_position": np.abs(maneuver.tip_position - tip),
         "tip_rotation": np.abs(maneuver.tip_rotation - rotation),
-        "clearance": _clearance_difference(maneuver.clearance, clearance, arm),
-        "self_clearance": _clearance_difference(maneuver.self_clearance, self_clearance, arm),
+        "clearance": _difference(maneuver.clearance, clearance),
+        "self_clearance": _difference(maneuver.self_clearance, self_clearance),
     }
     if maneuver.joints is None:
         differences["member_lengths"] = np.abs(maneuver.member_lengths - arm.quantities(motion.states))
@@ -122,7 +122,12 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
             *_jams_between_rows(maneuver),
             *_outcome_contradictions(maneuver),
         ),
-        notes=(*differing, *notes, *remarks),
+        notes=(
+            *differing,
+            *notes,
+            *remarks,
+            *([f"stopped by {stop}"] if (stop := maneuver.stopped_by) else []),
+        ),
     )
 
 
@@ -210,12 +215,10 @@ def _least_clearances(motion: RecordedMotion, encounters: Sequence[Encounters]) 
     return at, between, np.array([least.value for least in each])
 
 
-def _clearance_difference(stored: Array, found: Array, arm: Arm) -> Array:
-    """Return (T,) differences of clearances; depths of members inside obstacles are not compared."""
-    floor = -float(arm.radius.min(initial=np.inf))
+def _difference(stored: Array, found: Array) -> Array:
+    """Return (T,) differences of clearances, which are infinite where nothing is near."""
     with np.errstate(invalid="ignore"):
-        difference = np.abs(np.maximum(stored, floor) - np.maximum(found, floor))
-    return np.asarray(np.where(stored == found, 0.0, difference))
+        return np.asarray(np.where(stored == found, 0.0, np.abs(stored - found)))
 
 
 def _locks(maneuver: Result) -> list[tuple[str, float]]:
@@ -294,7 +297,6 @@ def _outcome_contradictions(maneuver: Result) -> list[str]:
     found = []
     if abs(maneuver.progress[-1] - maneuver.reached) > 1e-9:
         found.append(f"reached is {maneuver.reached:.9g}; the last progress is {maneuver.progress[-1]:.9g}")
-    complete = maneuver.reached >= 1.0 - 1e-9
-    if (maneuver.status == "solved") != complete:
+    if maneuver.status != "infeasible" and (maneuver.status == "solved") != maneuver.arrived:
         found.append(f'status is "{maneuver.status}", but the arm reached {maneuver.reached:.9g} of the path')
     return found

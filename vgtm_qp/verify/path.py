@@ -71,8 +71,8 @@ def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], l
         targets = maneuver.tip_target_position
         target_error = _to_polyline(targets[:, axes], corners[:, axes])
         missed = float(np.linalg.norm(targets[-1, axes] - corners[-1, axes]))
-        if maneuver.status == "solved" and missed > TIP_TOLERANCE:
-            contradictions.append(f"solved, but the last target is {missed:.3g} m from the end of the path")
+        if maneuver.arrived and missed > TIP_TOLERANCE:
+            contradictions.append(f"arrived, but the last target is {missed:.3g} m from the end of the path")
     contradictions += _last_direction(maneuver, wanted.get("waypoint") or ())
     return target_error, contradictions, notes
 
@@ -119,15 +119,15 @@ def _to_polyline(points: Array, corners: Array) -> Array:
 
 
 def _last_direction(maneuver: Result, waypoints: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield whether a solved maneuver ends in another direction than the last waypoint that names one."""
+    """Yield whether a maneuver that arrives ends in another direction than the last waypoint that names one."""
     for kind, targets in _direction_targets(maneuver).items():
         key = _DIRECTIONS[kind][1]
         goals = [np.asarray(entry[key], dtype=np.float64) for entry in waypoints if entry.get(key)]
-        if maneuver.status == "solved" and goals and targets is not None:
+        if maneuver.arrived and goals and targets is not None:
             goal = rotation_matrix(goals[-1]) if kind == "orientation" else goals[-1]
             off = float(angles(targets[-1:], goal[None])[0])
             if off > DIRECTION_TOLERANCE:
-                yield f"solved, but the last {kind} target is {off:.3g} rad from the problem's"
+                yield f"arrived, but the last {kind} target is {off:.3g} rad from the problem's"
 
 
 def angles(first: Array, second: Array) -> Array:

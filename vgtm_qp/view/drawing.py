@@ -216,5 +216,7 @@ def _hidden(obstacles: Sequence[ObstacleMesh], eye: Array, points: Array) -> int
 def resampled(time: Array, values: Array, at: Array) -> Array:
     """Return `values` (T, ...) at times `at`, on straight lines between the states as in the certificate."""
     flat = values.reshape(len(time), -1)
-    columns = [np.interp(at, time, column) for column in flat.T]
-    return np.stack(columns, axis=1).reshape(len(at), *values.shape[1:]) if columns else values[: len(at)]
+    found = np.empty((len(at), flat.shape[1]))
+    for k, column in enumerate(flat.T):
+        found[:, k] = np.interp(at, time, column)
+    return found.reshape(len(at), *values.shape[1:])
