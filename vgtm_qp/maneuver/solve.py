@@ -6,6 +6,7 @@ import multiprocessing
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -22,6 +23,7 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, problem_digests, recorded_versions
 from vgtm_qp.step.checks import check_problem
+from vgtm_qp.step.remedies import Remedy
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
@@ -29,6 +31,11 @@ from vgtm_qp.verify import verify as check
 
 _STALLED_PROGRESS = 1e-3
 _STALLED_STEPS = 10
+
+_PART = 0.25
+"""Share of the progress that a remedy promises to first order, from which on the arm goes on with it."""
+_MORE = (1.0, 2.0, 4.0)
+"""Factors of a remedy's amounts that are tried."""
 
 Progress = Callable[[float, Step], None]
 
@@ -67,6 +74,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
         stop = attempt.run(progress)
         if stop is not None:
             way, attempt, stop = _retry(problem, attempt, stop, progress)
+            stop = None if stop is None else replace(stop, remedies=_tried(attempt, stop))
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
     maneuver = _assemble(problem, resolver, attempt, stop, setup_time, way, digests)
@@ -169,6 +177,22 @@ class _Attempt:
                 progress(self.progress, step)
         return None
 
+    def goes_on(self, remedy: Remedy) -> bool:
+        """Return whether the arm gets past where it stopped with a remedy; the attempt stays as it is."""
+        resolver, plan, value = self.resolver.relaxed(remedy), self.plan, self.value
+        if resolver is None:
+            return False
+        aim, dt = plan.next_mark(value)
+        enough = value + _PART * remedy.progress * (aim - value)
+        for _ in range(_STALLED_STEPS):
+            step = resolver.follow(plan.path, value, aim, dt=dt)
+            if step.left_path or not step.moved:
+                break
+            value += step.progress * (aim - value)
+            if value >= enough:
+                return True
+        return False
+
     def _explain(self, aim: float, dt: float, step: Step, state: State | None = None) -> Stop:
         return self.resolver.explain(self.plan.path, self.value, aim, dt=dt, last=step, state=state)
 
@@ -247,6 +271,14 @@ def _retry(
         if attempt.progress > best[1].progress + _STALLED_PROGRESS:
             best = (name, attempt, found)
     return best
+
+
+def _tried(attempt: _Attempt, stop: Stop) -> tuple[Remedy, ...]:
+    """Return the remedies of a stop with which the arm goes on, by as much as it takes."""
+    found = []
+    for remedy in stop.remedies:
+        found += [next(filter(attempt.goes_on, map(remedy.times, _MORE)), None)]
+    return tuple(remedy for remedy in found if remedy is not None)
 
 
 def _assemble(

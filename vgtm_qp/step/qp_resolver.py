@@ -19,6 +19,7 @@ from vgtm_qp.step.braking import ANY_RANK, Braking
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import checked_arm
 from vgtm_qp.step.path import Path
+from vgtm_qp.step.remedies import Remedy, relaxed
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
@@ -177,6 +178,14 @@ class QPResolver(Resolver, serves="qp"):
     def too_near(self, state: State) -> Shortfall:
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
         return self._separation.shortfall(state.q, state.time)
+
+    def relaxed(self, remedy: Remedy) -> QPResolver:
+        """See :class:`Resolver`."""
+        other = QPResolver(relaxed(self.setup, remedy.changes))
+        for name in self._actuation.locked:
+            other.lock(name)
+        other.state = replace(self.state, shortfall=None)
+        return other
 
     def again(self, problem: Problem) -> QPResolver:
         """See :class:`Resolver`."""

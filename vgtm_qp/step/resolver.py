@@ -15,6 +15,7 @@ from vgtm_qp.qp.full import StepQP
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.path import Path
+from vgtm_qp.step.remedies import Remedy
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import Step
@@ -265,6 +266,13 @@ class Resolver:
         """Return a resolver at home for a second try of a maneuver, with other weights of the null space.
 
         None if the method has no such choice.
+        """
+        return None
+
+    def relaxed(self, remedy: Remedy) -> Resolver | None:  # noqa: ARG002
+        """Return a resolver of the same arm in the same state, whose limits give as a remedy of a stop says.
+
+        It shares its workspaces with this one. None if the method has no limits.
         """
         return None
 

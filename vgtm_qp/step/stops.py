@@ -1,37 +1,31 @@
-"""Why an arm stops: the smallest set of rows that together hold it back on its path, found at the state itself.
+"""Why an arm stops, and what would let it go on, found at the state itself.
 
-To first order the arm can cover the share alpha of a piece of path that is the greatest one with
-
-    J d_rho = E d_a,   tip rows d_rho = alpha rate,   clearance and angle rows,   limits <= d_a <= limits,
-
-a linear program in the actuators' displacements. The rows with multipliers hold it back. Those that can be left out
-without letting the arm further are dropped one after another, until each remaining row is needed. An arm may stop
-although the linear program allows a little progress: near a fold of its motion the curvature uses that up.
+The rows with multipliers in the linear program of ``step/first_order.py`` hold the arm back. Those that can be left out
+without letting it further are dropped one after another, until each remaining row is needed. An arm may stop although
+the linear program allows a little progress: near a fold of its motion the curvature uses that up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Arm
-from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.actuation import Limits
+from vgtm_qp.step.first_order import FirstOrder, obstacle_of
+from vgtm_qp.step.remedies import Remedy, remedies
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import TOO_LONG, Setup
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step
-from vgtm_qp.step.task import over_all_nodes, tip_response
 
-_TRUST = 0.05
-"""Trust region: greatest displacement of an actuator in the linear program, m."""
 _BLOCKED = 0.02
 """Share of the path, within the trust region, below which the arm counts as blocked."""
 _FREER = 2.0
@@ -39,6 +33,10 @@ _FREER = 2.0
 _SINGULAR = 0.1
 """Share below which the tip moves far less than the actuators do."""
 _PRESSES = 1e-7
+_FURTHER = (2.0, 4.0, 8.0, 16.0)
+"""Factors of the piece of path on which the arm is held, if it is free on that itself."""
+_NAMED = 3
+"""Number of rows that a text names."""
 
 CANNOT_BRAKE = "the arm could not brake after it"
 """Reason of a step that is refused because no braking was found after it."""
@@ -84,6 +82,8 @@ class Stop:
         Reason of the last attempt.
     away : tuple of float
         (3,) direction in which the obstacles in the set push the arm, weighted by multipliers; zero without obstacles.
+    remedies : tuple of Remedy
+        Up to three alternatives, the smallest first: each lets the arm go on, to first order.
     """
 
     kind: StopKind
@@ -91,6 +91,7 @@ class Stop:
     obstacles: tuple[str, ...] = ()
     reason: str = ""
     away: tuple[float, ...] = (0.0, 0.0, 0.0)
+    remedies: tuple[Remedy, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,9 +99,17 @@ class Stop:
         return tuple(self.multipliers) or (str(self if self.kind is StopKind.SOLVER else self.kind),)
 
     def __str__(self) -> str:
+        """Return what lets the arm go on; or else the rows that hold it, or the reason."""
+        if self.reason and self.reason in self.multipliers:
+            # Of a method without rows, which says in its own words why it broke down.
+            return self.reason
+        if self.remedies:
+            return f"{self.kind}; to go on: {', or '.join(map(str, self.remedies))}"
         is_unclear = self.kind in (StopKind.STEP_LIMIT, StopKind.NONLINEAR, StopKind.SOLVER)
         reason = self.reason if is_unclear or _is_braking(self.reason) else ""
-        return ": ".join(part for part in (str(self.kind), ", ".join(self.multipliers), reason) if part)
+        names = list(self.multipliers)
+        held = ", ".join(names[:_NAMED]) + (f" and {more} more" if (more := len(names) - _NAMED) > 0 else "")
+        return ": ".join(part for part in (str(self.kind), held, reason) if part)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data."""
@@ -109,6 +118,8 @@ class Stop:
             "multipliers": dict(self.multipliers),
             "obstacles": list(self.obstacles),
             "reason": self.reason,
+            "remedies": [[change.to_dict() for change in remedy.changes] for remedy in self.remedies],
+            "text": str(self),
         }
 
 
@@ -129,8 +140,9 @@ def explain(
         reason, pressing, solver_failed = last.reason, last.multipliers, last.solver_failed
         if last.left_path:
             reason, solver_failed = BASE_MOVES_ON, False
+    make = partial(FirstOrder, setup, separation, state, goal, limits)
     try:
-        program = _Program(setup, separation, state, goal, limits)
+        program = make()
     except SolverError:
         return Stop(StopKind.SINGULAR, reason=reason)
     share, costs = program.solve(np.ones(program.count, dtype=bool))
@@ -146,7 +158,8 @@ def explain(
             return Stop(StopKind.STEP_LIMIT, reason=reason)
         other = StopKind.ACCELERATION if _is_braking(reason) else StopKind.NONLINEAR
         kinds = {_kind(setup, name) for name in pressing}
-        return Stop(_first(kinds, other), pressing, _obstacles(setup, pressing), reason)
+        ways = _remedies(setup, program, make)
+        return Stop(_first(kinds, other), pressing, _obstacles(setup, pressing), reason, remedies=ways)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
         kept[k] = False
         if program.solve(kept)[0] > bar:
@@ -155,14 +168,28 @@ def explain(
     multipliers: dict[str, float] = {}
     kinds, away = set(), np.zeros(3)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: -costs[k]):
-        name, cost = program.name(k), float(costs[k])
+        name, cost = program.names[k], float(costs[k])
         multipliers[name] = max(multipliers.get(name, 0.0), cost)
         kinds.add(kind := _kind(setup, name))
         if kind is StopKind.OBSTACLE:
             away += cost * program.normal(k)
     is_stretched = kinds == {StopKind.STROKE} and np.count_nonzero(kept) >= setup.arm.segments and is_outward
     kind = StopKind.OUT_OF_REACH if is_stretched else _first(kinds, StopKind.NONLINEAR)
-    return Stop(kind, multipliers, _obstacles(setup, multipliers), reason, tuple(away.tolist()))
+    ways = _remedies(setup, program, make)
+    return Stop(kind, multipliers, _obstacles(setup, multipliers), reason, tuple(away.tolist()), ways)
+
+
+def _remedies(setup: Setup, program: FirstOrder, make: Callable[..., FirstOrder]) -> tuple[Remedy, ...]:
+    """Return the remedies of a stop; if the arm is free to first order there, of what holds it further on.
+
+    `make` gives the linear program for a ``reach``.
+    """
+    found = remedies(setup, program)
+    for reach in _FURTHER:
+        if found:
+            break
+        found = remedies(setup, make(reach=reach))
+    return found
 
 
 def _is_braking(reason: str) -> bool:
@@ -177,8 +204,8 @@ def _first(kinds: Iterable[StopKind], other: StopKind) -> StopKind:
 
 def _obstacles(setup: Setup, names: Iterable[str]) -> tuple[str, ...]:
     """Return the names of the obstacles in the names of rows."""
-    found = [o.name for o in setup.monitor.obstacles if any(name.endswith(f" / {o.name}") for name in names)]
-    return tuple(found)
+    found = {obstacle_of(setup, name) for name in names}
+    return tuple(o.name for o in setup.monitor.obstacles if o.name in found)
 
 
 def _kind(setup: Setup, name: str) -> StopKind:
@@ -187,76 +214,6 @@ def _kind(setup: Setup, name: str) -> StopKind:
     if first == "clearance":
         return StopKind.OBSTACLE if _obstacles(setup, [name]) else StopKind.MEMBERS
     return StopKind(first)
-
-
-class _Program:
-    """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits.
-
-    Raises
-    ------
-    SolverError
-        The pose is singular: the quantities do not determine how the nodes move.
-    """
-
-    def __init__(
-        self, setup: Setup, separation: Separation, state: State, goal: TipGoal, limits: Limits
-    ) -> None:
-        arm, kinematics = setup.arm, setup.kinematics
-        kinematics.evaluate(state.q)
-        every = over_all_nodes(arm, kinematics.motion().response()[0])
-        tip = setup.task.rows(state.nodes, kinematics, goal)
-        length = float(np.linalg.norm(tip.rate))
-        # Share of the path that the arm covers within the trust region, roughly.
-        self._unit = min(1.0, _TRUST / length) if length > 0.0 else 1.0
-        self._equal = np.column_stack([tip_response(arm, tip.jacobian, every), -tip.rate * self._unit])
-        self._rows = separation.rows(state.q, state.time, 0.0, 2.0 * _TRUST, {}, 0.0)
-        near = np.einsum("rsc,rscn->rn", self._rows.coefficients, every[self._rows.nodes])
-        self._near = np.column_stack([-near, np.zeros(len(near))])
-        self._near_bound = np.maximum(setup.margin - self._rows.lower, 0.0)
-        now = state.quantities[arm.actuators]
-        self._low = np.minimum(limits.lower - now, 0.0)
-        self._high = np.maximum(limits.upper - now, 0.0)
-        self._limits = limits
-        self.count = len(self._rows) + 2 * len(now)
-
-    def solve(self, kept: NDArray[np.bool_]) -> tuple[float, Array]:
-        """Return the greatest share alpha with the `kept` rows, and the multiplier of every row."""
-        # Its import takes a tenth of what a start takes.
-        from scipy.optimize import linprog
-
-        near, actuators = len(self._rows), len(self._low)
-        low = np.where(kept[near : near + actuators], np.maximum(self._low, -_TRUST), -_TRUST)
-        high = np.where(kept[near + actuators :], np.minimum(self._high, _TRUST), _TRUST)
-        rows = np.flatnonzero(kept[:near])
-        cost = np.zeros(actuators + 1)
-        cost[-1] = -1.0
-        answer = linprog(
-            cost,
-            A_ub=self._near[rows],
-            b_ub=self._near_bound[rows],
-            A_eq=self._equal,
-            b_eq=np.zeros(len(self._equal)),
-            bounds=[*zip(low, high, strict=True), (0.0, 1.0)],
-            method="highs",
-        )
-        multipliers = np.zeros(self.count)
-        if answer.status != 0:
-            return 0.0, multipliers
-        multipliers[rows] = -answer.ineqlin.marginals
-        multipliers[near : near + actuators] = np.where(low > -_TRUST, answer.lower.marginals[:-1], 0.0)
-        multipliers[near + actuators :] = np.where(high < _TRUST, -answer.upper.marginals[:-1], 0.0)
-        return float(answer.x[-1]), np.maximum(multipliers, 0.0) * self._unit
-
-    def name(self, k: int) -> str:
-        """Return the name of row `k`."""
-        near, actuators = len(self._rows), len(self._low)
-        if k < near:
-            return self._rows.name(k)
-        return self._limits.name((k - near) % actuators, upper=k >= near + actuators)
-
-    def normal(self, k: int) -> Array:
-        """Return (3,) the direction in which a translation of the arm leaves the obstacle of row `k`."""
-        return np.asarray(self._rows.coefficients[k].sum(axis=0))
 
 
 def _is_outward(arm: Arm, state: State, goal: TipGoal) -> bool:

@@ -1,0 +1,216 @@
+"""What would let a stopped arm go on: the fewest limits that must give, and by how much."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vgtm_qp.arrays import Array
+from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.rows.limits import STROKE
+from vgtm_qp.step.first_order import ANGLE, CLEARANCE, FREE, MEMBERS, FirstOrder, Limit
+from vgtm_qp.step.setup import Setup
+
+MOST = 3
+"""Greatest number of remedies, and of changes in one."""
+_TRIED = 8
+"""Number of the most decisive limits that are tried as the next change."""
+_BEST = 4
+"""Number of the sets of changes, those with which the arm gets furthest, that are tried with one change more."""
+_PRESSES = 1e-7
+_MARGIN = 1.5
+"""Factor of what is needed to first order: the curvature of the motion takes its part."""
+
+
+class Change(NamedTuple):
+    """By how much one limit gives.
+
+    Attributes
+    ----------
+    limit : Limit
+    amount : float
+        m, rad, m/s or rad/s, rounded up to two digits; infinite where the obstacle has to go.
+    unit : str
+    """
+
+    limit: Limit
+    amount: float
+    unit: str
+
+    def __str__(self) -> str:
+        (kind, _, upper), name = self.limit, self.limit.name or "all actuators"
+        if math.isinf(self.amount):
+            return f"{name}: out of the way"
+        if "rad" in self.unit:
+            size = f"{math.degrees(self.amount):.3g} {self.unit.replace('rad', 'degrees')}"
+        else:
+            size = (
+                f"{1000.0 * self.amount:.3g} m{self.unit}"
+                if self.amount < 1.0
+                else f"{self.amount:.3g} {self.unit}"
+            )
+        if kind == CLEARANCE:
+            return f"{name}: {size} less clearance"
+        if kind == MEMBERS:
+            return f"bodies of the arm: {size} less clearance"
+        if kind == ANGLE:
+            return f"bodies that meet: {size} less angle"
+        where = f" at its {'upper' if upper else 'lower'} end" if kind == STROKE else ""
+        return f"{name}: {size} more {kind}{where}"
+
+    def times(self, factor: float) -> Change:
+        """Return a change by the amount times a factor, rounded up."""
+        return self._replace(amount=_rounded_up(factor * self.amount))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data; an obstacle that has to go has the amount None."""
+        amount = None if math.isinf(self.amount) else self.amount
+        return {**self.limit._asdict(), "amount": amount, "unit": self.unit, "text": str(self)}
+
+
+class Remedy(NamedTuple):
+    """Changes that together let the arm go on.
+
+    Attributes
+    ----------
+    changes : tuple of Change
+        One to three.
+    progress : float
+        Share of the piece of path that the arm then covers to first order.
+    """
+
+    changes: tuple[Change, ...]
+    progress: float
+
+    def __str__(self) -> str:
+        return " and ".join(str(change) for change in self.changes)
+
+    def times(self, factor: float) -> Remedy:
+        """Return the same changes by their amounts times a factor."""
+        return self._replace(changes=tuple(change.times(factor) for change in self.changes))
+
+
+def remedies(setup: Setup, program: FirstOrder) -> tuple[Remedy, ...]:
+    """Return up to `MOST` alternatives, the fewest and smallest changes first; none if no few changes free the arm.
+
+    A change is half as large again as to first order it must be for the progress within the trust region.
+    """
+    sets = list(_freeing(program)) or list(_freeing(program, for_all=True))
+    found = [_remedy(setup, program, limits) for limits in sets]
+    # An obstacle that has to go is the last resort.
+    found.sort(key=lambda remedy: sum(change.amount for change in remedy.changes))
+    return tuple(found[:MOST])
+
+
+def _freeing(program: FirstOrder, *, for_all: bool = False) -> Iterator[tuple[Limit, ...]]:
+    """Yield the smallest sets of limits without which the arm is free to first order; none of more than `MOST`.
+
+    Limits are those of single actuators, or `for_all` of them.
+    """
+
+    def pressing(costs: Array) -> list[Limit]:
+        order = np.argsort(-costs, kind="stable")[: np.count_nonzero(costs > _PRESSES)]
+        each = (limit for k in order if (limit := program.limits[k]) is not None)
+        return list(dict.fromkeys(limit.for_all if for_all else limit for limit in each))[:_TRIED]
+
+    share, costs = program.without(())
+    best: list[tuple[float, tuple[Limit, ...], list[Limit]]] = [(share, (), pressing(costs))]
+    for _ in range(MOST):
+        sets = dict.fromkeys(
+            tuple(sorted((*limits, more)))
+            for _, limits, others in best
+            for more in others
+            if more not in limits
+        )
+        tried = []
+        for limits in sets:
+            share, costs = program.without(limits)
+            tried.append((share, limits, pressing(costs)))
+        tried.sort(key=lambda entry: -entry[0])
+        free = [limits for share, limits, _ in tried if share >= FREE]
+        if free:
+            yield from free
+            return
+        best = tried[:_BEST]
+
+
+def _remedy(setup: Setup, program: FirstOrder, limits: tuple[Limit, ...]) -> Remedy:
+    """Return the least changes of limits without which the arm is free."""
+    most = [_greatest(setup, limit) for limit in limits]
+    amounts = program.least_changes(limits, most)
+    if amounts is None:
+        # Obstacles in the set have to go; the others give as much as they must then.
+        amounts = program.least_changes(limits, [math.inf] * len(limits))
+        assert amounts is not None, "without these limits the arm is free"
+        amounts = np.where(amounts > most, math.inf, amounts)
+    changes = []
+    for limit, amount, greatest in zip(limits, amounts.tolist(), most, strict=True):
+        size, unit = amount, "m"
+        if limit.kind == ANGLE:
+            unit = "rad"
+        elif limit.kind not in (CLEARANCE, MEMBERS):
+            unit = " or ".join(sorted({unit for _, unit in _actuators(setup, limit)}))
+            if limit.kind != STROKE:
+                size, unit = amount / setup.dt, f"{unit}/s"
+        size = _rounded_up(_MARGIN * size)
+        changes.append(Change(limit, min(size, greatest) if amount <= greatest else size, unit))
+    return Remedy(tuple(sorted(changes, key=lambda change: change.amount)), program.progress)
+
+
+def _greatest(setup: Setup, limit: Limit) -> float:
+    """Return by how much a limit can give, m or rad: clearances and angles down to zero."""
+    kept = {CLEARANCE: setup.safe, MEMBERS: setup.self_safe, ANGLE: setup.minimum_angle}
+    return kept.get(limit.kind, math.inf)
+
+
+def _rounded_up(amount: float) -> float:
+    """Return an amount rounded up to two digits."""
+    if amount <= 0.0 or math.isinf(amount):
+        return amount
+    digit = 10.0 ** (math.floor(math.log10(amount)) - 1)
+    return float(f"{math.ceil(amount / digit - 1e-9) * digit:.2g}")
+
+
+def _actuators(setup: Setup, limit: Limit) -> list[tuple[int, str]]:
+    """Return numbers, among the arm's quantities, and units of the actuators that a limit is of."""
+    arm = setup.arm
+    each = zip(arm.actuators.tolist(), arm.actuator_units, strict=True)
+    return [(k, unit) for k, unit in each if limit.name in ("", arm.quantity_names[k])]
+
+
+def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
+    """Return an arm that shares everything with that of `setup` but the limits that changed."""
+    arm = copy.copy(setup.arm)
+    arm.stroke, arm.rate = arm.stroke.copy(), arm.rate.copy()
+    allowance, self_safe, angle = dict[str, float](), setup.self_safe, setup.minimum_angle
+    for limit, amount, _ in changes:
+        kind, name, upper = limit
+        rows = [k for k, _ in _actuators(setup, limit)]
+        if kind == CLEARANCE:
+            allowance[name] = amount
+        elif kind == MEMBERS:
+            self_safe = max(self_safe - amount, 0.0)
+        elif kind == ANGLE:
+            angle = max(angle - amount, 0.0)
+        elif kind == STROKE:
+            arm.stroke[rows, int(upper)] += amount if upper else -amount
+        else:
+            arm.rate[rows] += amount
+    before = setup.monitor
+    obstacles = [
+        replace(obstacle, allowance=allowance.get(obstacle.name, 0.0))
+        for obstacle in before.obstacles
+        if not math.isinf(allowance.get(obstacle.name, 0.0))
+    ]
+    options: dict[str, Any] = {
+        "safe": before.safe,
+        "influence": before.influence,
+        "by_fcl": before.fcl is not None,
+    }
+    monitor = Clearance(before.bodies, obstacles, self_collision=before.self_collision, **options)
+    return replace(setup, arm=arm, monitor=monitor, measure=None, self_safe=self_safe, minimum_angle=angle)
