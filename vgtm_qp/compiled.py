@@ -67,10 +67,10 @@ HUNG = 3
 _FORM = "1"
 """Form of the libraries that builders make of a function: another number makes all of them anew."""
 
-OFTEN, SELDOM = 8, 5000
+OFTEN, SELDOM = 8, 600
 """Number of calls from which on a kernel is compiled while another core is idle, and while none is.
 
-A compiler takes as much time as thousands of interpreted calls.
+A compiler takes about as much time as so many interpreted calls.
 """
 
 _often = OFTEN
