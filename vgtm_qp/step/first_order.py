@@ -25,7 +25,9 @@ from vgtm_qp.step.state import State
 from vgtm_qp.step.task import over_all_nodes, tip_response
 
 _TRUST = 0.05
-"""Trust region: greatest displacement of an actuator in the linear program, m."""
+"""Trust region: greatest change of an actuator in the linear program, rad or a share of the arm's unit."""
+_PRESSES = 1e-7
+"""Multiplier from which on a row presses."""
 _FURTHER = 4.0
 """Least trust region for a tip that must not be late, over the length of its piece of path."""
 
@@ -61,6 +63,8 @@ class Limit(NamedTuple):
 class FirstOrder:
     """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits.
 
+    Its numbers are those of an arm of unit size: lengths are over the arm's unit, and angles as they are.
+
     Attributes
     ----------
     unit, progress : float
@@ -88,20 +92,23 @@ class FirstOrder:
         kinematics.evaluate(state.q)
         every = over_all_nodes(arm, kinematics.motion().response()[0])
         tip = setup.task.rows(state.nodes, kinematics, goal)
-        length = float(np.linalg.norm(tip.rate))
+        # Changes of the actuators, m or rad, that stand for 1.
+        self._size, self._sizes = arm.unit, arm.unit / arm.levers
+        length = float(np.linalg.norm(tip.rate)) / self._size
         self._trust, self.unit = reach * _TRUST, reach * (min(1.0, _TRUST / length) if length > 0.0 else 1.0)
         if setup.tip_mode == "hard":
             # The tip must not be late: less than the whole piece is nothing.
             self._trust, self.unit = reach * max(_TRUST, _FURTHER * length), reach
         self.progress = min(self.unit / reach, 1.0)
-        self._equal = np.column_stack([tip_response(arm, tip.jacobian, every), -tip.rate * self.unit])
-        self._rows = separation.rows(state.q, state.time, 0.0, 2.0 * self._trust, {}, 0.0)
+        response = tip_response(arm, tip.jacobian, every) * self._sizes
+        self._equal = np.column_stack([response, -tip.rate * self.unit]) / self._size
+        self._rows = separation.rows(state.q, state.time, 0.0, 2.0 * self._trust * self._size, {}, 0.0)
         near = np.einsum("rsc,rscn->rn", self._rows.coefficients, every[self._rows.nodes])
-        self._near = np.column_stack([-near, np.zeros(len(near))])
-        self._near_bound = np.maximum(setup.margin - self._rows.lower, 0.0)
+        self._near = np.column_stack([-near * self._sizes, np.zeros(len(near))]) / self._size
+        self._near_bound = np.maximum(setup.margin - self._rows.lower, 0.0) / self._size
         now = state.quantities[arm.actuators]
-        self._low = np.minimum(limits.lower - now, 0.0)
-        self._high = np.maximum(limits.upper - now, 0.0)
+        self._low = np.minimum(limits.lower - now, 0.0) / self._sizes
+        self._high = np.maximum(limits.upper - now, 0.0) / self._sizes
         self.count = len(self._rows) + 2 * len(now)
         self.names = (
             *(self._rows.name(k) for k in range(len(self._rows))),
@@ -112,7 +119,7 @@ class FirstOrder:
         )
 
     def solve(self, kept: NDArray[np.bool_]) -> tuple[float, Array]:
-        """Return the greatest share alpha with the `kept` rows, and the multiplier of every row."""
+        """Return the greatest share alpha with the `kept` rows, and the multiplier of every row, 1/m or 1/rad."""
         near, actuators = len(self._rows), len(self._low)
         low = np.where(kept[near : near + actuators], np.maximum(self._low, -self._trust), -self._trust)
         high = np.where(kept[near + actuators :], np.minimum(self._high, self._trust), self._trust)
@@ -128,7 +135,8 @@ class FirstOrder:
         multipliers[rows] = -answer.ineqlin.marginals
         multipliers[near : near + actuators] = np.where(low > -self._trust, answer.lower.marginals[:-1], 0.0)
         multipliers[near + actuators :] = np.where(high < self._trust, -answer.upper.marginals[:-1], 0.0)
-        return float(answer.x[-1]), np.maximum(multipliers, 0.0) * self.unit
+        sizes = np.repeat([self._size, *self._sizes, *self._sizes], [near, *[1] * (2 * actuators)])
+        return float(answer.x[-1]), np.where(multipliers > _PRESSES, multipliers, 0.0) * self.unit / sizes
 
     def without(self, limits: Iterable[Limit]) -> tuple[float, Array]:
         """Return what :meth:`solve` does without the rows of some limits."""
@@ -148,10 +156,14 @@ class FirstOrder:
         """
         near, actuators, changed = len(self._rows), len(self._low), len(limits)
         low, high = np.maximum(self._low, -self._trust), np.minimum(self._high, self._trust)
-        slack = np.zeros((near, changed))
+        slack, sizes = np.zeros((near, changed)), np.full(changed, self._size)
         rows, bounds = [], []
         for g, limit in enumerate(limits):
-            for k in self._rows_of(limit):
+            of_limit = self._rows_of(limit)
+            if of_limit[0] >= near:
+                # Where some actuators turn and others do not, each gets at least what it needs.
+                sizes[g] = max(self._sizes[(k - near) % actuators] for k in of_limit)
+            for k in of_limit:
                 if k < near:
                     slack[k, g] = -1.0
                     continue
@@ -168,9 +180,9 @@ class FirstOrder:
             np.hstack([self._equal[:, :-1], np.zeros((len(self._equal), changed))]),
             -FREE * self._equal[:, -1],
             low=(*low, *np.zeros(changed)),
-            high=(*high, *most),
+            high=(*high, *(most / sizes)),
         )
-        return np.asarray(answer.x[actuators:]) if answer.status == 0 else None
+        return np.asarray(answer.x[actuators:]) * sizes if answer.status == 0 else None
 
     def normal(self, k: int) -> Array:
         """Return (3,) the direction in which a translation of the arm leaves the obstacle of row `k`."""

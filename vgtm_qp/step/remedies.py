@@ -22,7 +22,6 @@ _TRIED = 8
 """Number of the most decisive limits that are tried as the next change."""
 _BEST = 4
 """Number of the sets of changes, those with which the arm gets furthest, that are tried with one change more."""
-_PRESSES = 1e-7
 _MARGIN = 1.5
 """Factor of what is needed to first order: the curvature of the motion takes its part."""
 
@@ -114,7 +113,7 @@ def _freeing(program: FirstOrder, *, for_all: bool = False) -> Iterator[tuple[Li
     """
 
     def pressing(costs: Array) -> list[Limit]:
-        order = np.argsort(-costs, kind="stable")[: np.count_nonzero(costs > _PRESSES)]
+        order = np.argsort(-costs, kind="stable")[: np.count_nonzero(costs)]
         each = (limit for k in order if (limit := program.limits[k]) is not None)
         return list(dict.fromkeys(limit.for_all if for_all else limit for limit in each))[:_TRIED]
 
@@ -211,6 +210,7 @@ def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
         "safe": before.safe,
         "influence": before.influence,
         "by_fcl": before.fcl is not None,
+        "unit": setup.arm.unit,
     }
     monitor = Clearance(before.bodies, obstacles, self_collision=before.self_collision, **options)
     return replace(setup, arm=arm, monitor=monitor, measure=None, self_safe=self_safe, minimum_angle=angle)

@@ -32,7 +32,6 @@ _FREER = 2.0
 """Growth of the share without a row from which on that row counts as one that holds the arm."""
 _SINGULAR = 0.1
 """Share below which the tip moves far less than the actuators do."""
-_PRESSES = 1e-7
 _FURTHER = (2.0, 4.0, 8.0, 16.0)
 """Factors of the piece of path on which the arm is held, if it is free on that itself."""
 _NAMED = 3
@@ -149,7 +148,7 @@ def explain(
     if solver_failed and share > _BLOCKED:
         return Stop(StopKind.SOLVER, reason=reason)
     bar = min(max(_BLOCKED, _FREER * share), 0.5 * (1.0 + share))
-    kept = costs > _PRESSES
+    kept = costs > 0.0
     is_outward = _is_outward(setup.arm, state, goal)
     if not kept.any() or program.solve(np.zeros(program.count, dtype=bool))[0] <= bar:
         if share <= _SINGULAR:
