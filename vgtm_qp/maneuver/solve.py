@@ -275,10 +275,8 @@ def _retry(
 
 def _tried(attempt: _Attempt, stop: Stop) -> tuple[Remedy, ...]:
     """Return the remedies of a stop with which the arm goes on, by as much as it takes."""
-    found = []
-    for remedy in stop.remedies:
-        found += [next(filter(attempt.goes_on, map(remedy.times, _MORE)), None)]
-    return tuple(remedy for remedy in found if remedy is not None)
+    enough = (next(filter(attempt.goes_on, map(remedy.times, _MORE)), None) for remedy in stop.remedies)
+    return tuple(remedy for remedy in enough if remedy is not None)
 
 
 def _assemble(

@@ -32,8 +32,9 @@ SCHEMA_VERSION = 1
 """Version of the result file that this package writes and reads."""
 
 STATUSES = ("solved", "blocked", "infeasible")
-"""The whole path is covered, and verification, if there was one, found nothing; the arm stopped on the way; the whole
-path is covered, but by states or motions that break what was asked for."""
+"""Solved: the whole path is covered, and verification, if there was one, found nothing. Blocked: the arm stopped on the
+way. Infeasible: the whole path is covered, but something that was asked for is broken.
+"""
 
 WHOLE_PATH = 1.0 - 1e-9
 """Share of the path from which the arm has arrived."""
