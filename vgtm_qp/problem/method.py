@@ -80,9 +80,12 @@ class Weights(Table, called="[method.weights]"):
     """
 
     node_rate: Weight = Field(default=1.0, description="node displacements, m^2; unit 1")
-    actuator_rate: Weight = Field(default=0.02, description="changes of actuators, m^2, or rad^2 times u^2; unit 1")
+    actuator_rate: Weight = Field(
+        default=0.02, description="changes of actuators, m^2, or rad^2 times u^2; unit 1"
+    )
     stroke_centring: Weight = Field(
-        default=0.02, description="actuators after the step less their home values, m^2, or rad^2 times u^2; unit 1"
+        default=0.02,
+        description="actuators after the step less their home values, m^2, or rad^2 times u^2; unit 1",
     )
     curve_rate: Weight = Field(default=0.02, description="displacements of the control vertices, m^2; unit 1")
     tracking: Weight = Field(
@@ -113,7 +116,7 @@ class Weights(Table, called="[method.weights]"):
     )
     progress: Weight = Field(
         default=1000.0,
-        description="share of the step along the path that is given up in mode scaled, squared; times the step's length squared",
+        description="share of a step's path that is given up in mode scaled, squared; times the square of its length",
     )
 
 

@@ -95,7 +95,7 @@ class Accuracy(NamedTuple):
     member: float
     tip: float
     start: float
-    tracking: float
+    tracking: float = 1e-7
 
 
 class Move(NamedTuple):

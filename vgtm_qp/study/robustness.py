@@ -1,52 +1,104 @@
-"""Random scenes of every module: how many are solved, what breaks, and what stops the rest."""
+"""Random scenes of everything that a problem may say: what is solved, what breaks, and what stops the rest."""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from time import process_time
 
 from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.tables import markdown_table, wilson_interval
+from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.solve import solve
+from vgtm_qp.problem import Problem
 from vgtm_qp.study.drawing import label, panels, select
-from vgtm_qp.study.scenes import random_scene
+from vgtm_qp.study.varied import varied_scene
 from vgtm_qp.study.workers import Row, Task
 
 SEED = 1991
+_APART = 10
+"""Of so many scenes one is solved without a compiler, too: its steps take ten times as long."""
 
 
 def tasks(short: bool, *, scenes: int | None = None, seed: int = SEED, steps: int = 30) -> list[Task]:
-    """Return one task a scene."""
+    """Return one task a scene, and for every tenth scene another one without a compiler."""
     count = scenes if scenes is not None else 10 if short else 1000
-    return [{"seed": seed, "number": k, "steps": steps} for k in range(count)]
+    scene = {"seed": seed, "steps": steps}
+    return [
+        {**scene, "number": k, "compiler": compiler}
+        for k in range(count)
+        for compiler in ([True, False] if k % _APART == 0 else [True])
+    ]
 
 
-def run(seed: int, number: int, steps: int) -> Row:
-    """Solve one scene and return its row.
+def run(seed: int, number: int, steps: int, compiler: bool) -> Row:
+    """Solve one scene, with a `compiler` or without, and return its row.
 
-    Keys: what the scene is (``module``, ``bays``, ``cubes``, ``directed``, ``reachable``), ``status``, the part of the
-    path that was ``reached``, ``states``, ``failures`` of the independent check, ``stop``, ``blocked_by``, ``way_out``
-    and CPU ``seconds``.
+    Keys: what the scene is, see :func:`features`; ``status``, the part of the path that was ``reached``, ``states``,
+    ``failures`` of the independent check, ``stop``, ``blocked_by``, ``way_out`` and CPU ``seconds``.
     """
-    scene = random_scene(seed, number, steps=steps)
-    problem = scene.problem
-    truss = problem.to_dict()["truss"]
+    problem = varied_scene(seed, number, steps=steps)
+    found: Row = {"module": problem.to_dict()["truss"]["module"], "features": features(problem)}
     started = process_time()
-    maneuver = solve(problem)
+    try:
+        with _compiler(compiler):
+            maneuver = solve(problem)
+    except ProblemError as error:
+        nothing: Row = {
+            "status": "refused",
+            "reached": 0.0,
+            "failures": [],
+            "blocked_by": str(error),
+            "way_out": "",
+        }
+        return {**found, **nothing, "states": 0, "stop": "", "seconds": process_time() - started}
     summary, stop = maneuver.summary(), maneuver.manifest["stop"]
     return {
-        "module": truss["module"],
-        "bays": truss["bays"],
-        "cubes": len(problem.obstacle),
-        "directed": "pointing" in problem.end_effector.track,
-        "reachable": scene.reachable,
+        **found,
         **{key: summary[key] for key in ("status", "reached", "failures", "blocked_by", "way_out")},
         "states": len(maneuver.time),
         "stop": stop["kind"] if stop else "",
         "seconds": process_time() - started,
     }
+
+
+@contextmanager
+def _compiler(wanted: bool) -> Iterator[None]:
+    """Let problems be solved with the machine's compiler, or with none."""
+    before = os.environ.get("VGTM_CC")
+    if not wanted:
+        os.environ["VGTM_CC"] = "none"
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop("VGTM_CC", None)
+        else:
+            os.environ["VGTM_CC"] = before
+
+
+def features(problem: Problem) -> list[str]:
+    """Return in words what makes a scene harder than an arm of pin joints among cubes at rest."""
+    table = problem.to_dict()
+    truss, curve, method = table["truss"], table["curve"], table["method"]
+    shapes = {obstacle["shape"] for obstacle in table["obstacle"]}
+    found = {
+        "a direction of the tip": "pointing" in table["end_effector"]["track"],
+        "offset joints": truss["joint_offset"] > 0.0,
+        "limited accelerations": truss.get("acceleration") is not None,
+        "jams": bool(truss["locked"]),
+        "a moving base": bool(truss["base_motion"]),
+        "moving obstacles": any(any(obstacle["velocity"]) for obstacle in table["obstacle"]),
+        **{f"obstacles: {shape}": shape in shapes for shape in ("sphere", "cylinder", "mesh")},
+        f"curve: {curve['family']}": method["tracking"] != "none",
+        "a general curve": curve["nodes"] == "arc-length" or curve["torsion_vertices"] > 0,
+        "no curve": method["tracking"] == "none",
+        f"tip: {table['end_effector']['mode']}": True,
+    }
+    return [words for words, is_there in found.items() if is_there]
 
 
 def draw(rows: Sequence[Row]) -> Figure:
@@ -64,20 +116,21 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 def text(rows: Sequence[Row]) -> str:
-    """Give what was solved, what broke, and what stopped the rest."""
+    """Give what was solved, what broke, what stopped the rest, and what differs without a compiler."""
     if not rows:
         return "No scene was run."
-    broken = sum(bool(row["failures"]) for row in rows)
-    groups = {
-        "goal reachable by construction": select(rows, reachable=True),
-        "any goal": select(rows, reachable=False),
-        "with a direction of the tip": select(rows, directed=True),
-    }
-    for module in sorted({row["module"] for row in rows}):
-        groups[module] = select(rows, module=module)
+    every, rows = rows, select(rows, compiler=True)
+    broken, refused = sum(bool(row["failures"]) for row in every), len(select(rows, status="refused"))
+    groups = {module: select(rows, module=module) for module in sorted({row["module"] for row in rows})}
+    for words in sorted({words for row in rows for words in row["features"]}):
+        groups[words] = [row for row in rows if words in row["features"]]
+    statuses = {row["number"]: row["status"] for row in rows}
+    again = select(every, compiler=False)
+    same = sum(statuses.get(row["number"]) == row["status"] for row in again)
     parts = [
         f"Seed {rows[0]['seed']}, scenes 0 to {max(row['number'] for row in rows)}, {rows[0]['steps']} steps each. "
-        f"{share_of(rows)} solved; states that break a tolerance by the independent check: in {broken} scenes.",
+        f"{share_of(rows)} solved, {refused} refused; states that break a tolerance by the independent check: in "
+        f"{broken} scenes. Without a compiler {same} of {len(again)} end with the same status.",
         markdown_table(("", "solved"), [(name, share_of(some)) for name, some in groups.items()]),
     ]
     solved = select(rows, status="solved")
