@@ -188,6 +188,8 @@ def test_changes_read_as_people_say_them():
     for change in told:
         more = change.times(2.0)
         assert 2.0 * change.amount <= more.amount <= 2.2 * change.amount
+    change = Change(Limit(CLEARANCE, "right cube"), 0.05, "m", 0.08)
+    assert change.times(2.0).amount == 0.08, "no clearance below zero"
 
 
 @pytest.mark.parametrize("stop", [{"text": 5}, {"remedies": 5}, {"remedies": ["none"]}, {"remedies": [[3]]}])

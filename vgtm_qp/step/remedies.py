@@ -35,11 +35,14 @@ class Change(NamedTuple):
     amount : float
         m, rad, m/s or rad/s, rounded up to two digits; infinite where the obstacle has to go.
     unit : str
+    most : float
+        By how much the limit can give: clearances and angles down to zero.
     """
 
     limit: Limit
     amount: float
     unit: str
+    most: float = math.inf
 
     def __str__(self) -> str:
         (kind, _, upper), name = self.limit, self.limit.name or "all actuators"
@@ -63,8 +66,10 @@ class Change(NamedTuple):
         return f"{name}: {size} more {kind}{where}"
 
     def times(self, factor: float) -> Change:
-        """Return a change by the amount times a factor, rounded up."""
-        return self._replace(amount=_rounded_up(factor * self.amount))
+        """Return a change by the amount times a factor, rounded up, but no more than the limit can give."""
+        if math.isinf(self.amount):
+            return self
+        return self._replace(amount=min(_rounded_up(factor * self.amount), self.most))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data; an obstacle that has to go has the amount None."""
@@ -157,7 +162,7 @@ def _remedy(setup: Setup, program: FirstOrder, limits: tuple[Limit, ...]) -> Rem
             if limit.kind != STROKE:
                 size, unit = amount / setup.dt, f"{unit}/s"
         size = _rounded_up(_MARGIN * size)
-        changes.append(Change(limit, min(size, greatest) if amount <= greatest else size, unit))
+        changes.append(Change(limit, min(size, greatest) if amount <= greatest else size, unit, greatest))
     return Remedy(tuple(sorted(changes, key=lambda change: change.amount)), program.progress)
 
 
@@ -187,7 +192,7 @@ def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
     arm = copy.copy(setup.arm)
     arm.stroke, arm.rate = arm.stroke.copy(), arm.rate.copy()
     allowance, self_safe, angle = dict[str, float](), setup.self_safe, setup.minimum_angle
-    for limit, amount, _ in changes:
+    for limit, amount, *_ in changes:
         kind, name, upper = limit
         rows = [k for k, _ in _actuators(setup, limit)]
         if kind == CLEARANCE:
