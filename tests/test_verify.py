@@ -349,10 +349,10 @@ def test_bound_between_states_is_below_every_instant_and_close(
             moment = nodes[0] + share * (nodes[1] - nodes[0])
             sampled.append(frozen(pair, moment, share))
         assert bound_value <= min(sampled) + 1e-12
-        assert limit.value <= min(sampled) + RESOLUTION
+        assert limit.value <= min(sampled) + motion.resolution
         # Where a joint's triangle folds up on the way, its ends have no bound of their bend.
         if np.isfinite(motion.bend(0, np.arange(6))).all():
-            assert bound_value >= limit.value - RESOLUTION - 1e-12
+            assert bound_value >= limit.value - motion.resolution - 1e-12
     assert len(motion.ends) == 2
 
 
