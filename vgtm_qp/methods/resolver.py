@@ -61,8 +61,10 @@ class MethodResolver(Resolver, ABC):
         kinematics, before = self.setup.kinematics, self.state
         kinematics.evaluate(moved.nodes)
         lengths = frozen(kinematics.quantities)
+        time, late = before.after(dt)
         self.state = State(
-            time=before.time + dt,
+            time=time,
+            late=late,
             q=(q := frozen(moved.nodes)),
             nodes=q,
             control_vertices=frozen(moved.control_vertices),
