@@ -19,7 +19,7 @@ from vgtm_qp.cli.output import ExitCode, document, note
 from vgtm_qp.cli.problems import check, list_problems, schema
 from vgtm_qp.cli.results import export, replay, verify, view
 from vgtm_qp.cli.solve import solve
-from vgtm_qp.errors import ProblemError, VgtmError, nearest
+from vgtm_qp.errors import AlteredResultError, ProblemError, VgtmError, nearest
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 """What the system says of a disk that takes no more."""
@@ -102,6 +102,8 @@ def _outcome(error: BaseException) -> tuple[ExitCode, str]:
             return ExitCode.USAGE, _explained(error)
         case VgtmError() if _lacks_room(error):
             return ExitCode.INTERNAL, f"the system refuses: {error}"
+        case AlteredResultError():
+            return ExitCode.UNVERIFIED, str(error)
         case VgtmError():
             return ExitCode.USAGE, str(error)
         case KeyboardInterrupt():

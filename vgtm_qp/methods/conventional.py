@@ -209,7 +209,7 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
 
     Raises
     ------
-    ProblemError, TrussError
+    ProblemError
         The arm cannot be built.
     """
 

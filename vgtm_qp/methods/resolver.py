@@ -102,7 +102,7 @@ def arm_without_curve(problem: Problem) -> Setup:
 
     Raises
     ------
-    ProblemError, TrussError
+    ProblemError
         The arm cannot be built.
     """
     return build_arm(problem.replace({"method": problem.method.kept_by("qp", "none")}), solves=False)

@@ -12,7 +12,7 @@ although the linear program allows a little progress: near a fold of its motion 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -77,7 +77,8 @@ class Stop:
         order: ``acceleration`` if the arm could not brake after it, ``step limit`` if it is longer than the problem
         allows, ``solver`` if the QP solver gave no accurate answer, else ``nonlinear``.
     multipliers : dict
-        Rows of the set, the most decisive first, and the share of the path that each costs per metre (radian).
+        Rows of the set, the most decisive first, and the share of the path that each costs per metre (radian); 0 for
+        an obstacle that strikes an arm at rest.
     obstacles : tuple of str
         Names of the obstacles in the set.
     reason : str
@@ -163,6 +164,22 @@ def explain(
     is_stretched = kinds == {StopKind.STROKE} and np.count_nonzero(kept) >= setup.arm.segments and is_outward
     kind = StopKind.OUT_OF_REACH if is_stretched else _first(kinds, StopKind.NONLINEAR)
     return Stop(kind, multipliers, _obstacles(setup, multipliers), reason, tuple(away.tolist()))
+
+
+def struck(stop: Stop, setup: Setup, separation: Separation, state: State, dt: float) -> Stop:
+    """Return a stop with the obstacles first that come too near in `dt`, s, to an arm that stays in `state`.
+
+    The rows of a step are those of its end, where a fast obstacle may be on the other side of the arm already.
+    """
+    if not setup.monitor.pieces.moving:
+        return stop
+    then, short = state.after(dt)[0], separation.shortfall_of(state)
+    failing = separation.between(state.q, state.q, state.time, then, short).failing
+    names = {failing.name(k): 0.0 for k in np.argsort(failing.distance) if not failing.is_self[k]}
+    if not names:
+        return stop
+    names |= stop.multipliers
+    return replace(stop, kind=StopKind.OBSTACLE, multipliers=names, obstacles=_obstacles(setup, names))
 
 
 def _is_braking(reason: str) -> bool:

@@ -163,7 +163,9 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
         "base_error": _worst(moved, "m", MEMBER_TOLERANCE, [f"node {k}" for k in arm.base]),
         "stroke_violation": beyond(np.maximum(arm.stroke[:, 0] - lengths, lengths - arm.stroke[:, 1]), unit),
         "rate_violation": beyond(np.abs(rates) - rounding - arm.rate, f"{per}/s"),
-        "acceleration_violation": beyond(np.abs(accelerations) - its_rounding - arm.acceleration, f"{per}/s^2"),
+        "acceleration_violation": beyond(
+            np.abs(accelerations) - its_rounding - arm.acceleration, f"{per}/s^2"
+        ),
     }
 
 
