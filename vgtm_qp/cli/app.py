@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import sys
 import traceback
 import warnings
@@ -69,6 +70,8 @@ for order, (name, command) in enumerate(_COMMANDS.items()):
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run one command line, that of the process by default, and return its exit code."""
     given = list(sys.argv[1:] if tokens is None else tokens)
+    # What it logs of a damaged file is a traceback; the errors that it raises are said in a line.
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())
     try:
         with _plain_warnings():
             code = app(given, exit_on_error=False, print_error=False, result_action="return_value")

@@ -56,7 +56,7 @@ def read_path(file: str | Path) -> PathTable:
         elif time <= before:
             expected = f"a time after that of the row before, {before:g} s"
             mistakes.append(Mistake(f"line {line}, column t", f"{time:g}", expected))
-        elif time and not SHORTEST_STEP <= time - max(before, 0.0) <= LONGEST_STEP:
+        elif time > 0 and not SHORTEST_STEP <= time - max(before, 0.0) <= LONGEST_STEP:
             expected = f"a step of {SHORTEST_STEP:g} to {LONGEST_STEP:g} s"
             mistakes.append(Mistake(f"line {line}, column t", f"{time - max(before, 0.0):g} s", expected))
         if math.isfinite(time):
