@@ -346,6 +346,10 @@ class Bench:
                     assert all(mistake[key] for key in ("file", "key", "expected")), said
                 if tokens[0] in ("check", "solve"):
                     assert answer["mistakes"], said
+            elif tokens[0] == "solve":
+                honest = {0: "solved", 3: "blocked"}
+                assert answer["status"] == honest.get(code, answer["status"]), said
+                assert answer["verified"] is (code != 4), said
         elif code:
             assert err.getvalue().strip(), said
         return code, said

@@ -30,6 +30,8 @@ ACTUATOR_GROUP = 1
 """Group of the position actuators, so that a replay through equality constraints can switch them off."""
 
 _STIFFNESS = 2.0e5
+_THINNEST = 1e-6
+"""Least radius of what is drawn, m: MuJoCo takes none that is zero."""
 
 
 def mjcf(maneuver: Result) -> str:
@@ -79,7 +81,7 @@ def node_masses(arm: RecordedArm) -> Array:
 
 
 def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
-    masses, radius = node_masses(arm), float(np.median(arm.radius))
+    masses, radius = node_masses(arm), max(float(np.median(arm.radius)), _THINNEST)
     for k, name in enumerate(names):
         body = _add(world, "body", name=name, pos=arm.home[k])
         if k in arm.base:
@@ -123,7 +125,9 @@ def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
     tendons, equalities, actuators = (_add(root, kind) for kind in ("tendon", "equality", "actuator"))
     for k, member in enumerate(arm.member_names):
         colour = stroke_colours(np.array(0.5)) if arm.actuated[k] else np.array(FIXED_COLOUR)
-        tendon = _add(tendons, "spatial", name=member, width=arm.radius[k], rgba=(*colour, 1.0))
+        tendon = _add(
+            tendons, "spatial", name=member, width=max(arm.radius[k], _THINNEST), rgba=(*colour, 1.0)
+        )
         for node in arm.members[k]:
             _add(tendon, "site", site=names[node])
         stiff = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}
