@@ -69,6 +69,7 @@ leads them, and which of two members that touch in one node is named first is ro
 
 BY_ELASTIC_TRACKING = (
     "bundled five_bay_blocked_by_wall",
+    "bundled longeron_past_a_cube",
     "loop octahedral 6, locks",
     "loop octahedral 6, pointing",
     "octahedral 4, far goal",

@@ -455,14 +455,14 @@ def test_the_gain_is_the_least_motion_of_the_tip(rng):
     for _ in range(4):
         numbers = random_numbers(case, rng, box=0.1, push=0.05, near=0)
         answer = solver.solve(numbers)
-        at_bound = held(answer.actuators, numbers.lower, numbers.upper)
+        at_bound = held(answer.actuators, numbers.lower, numbers.upper, 1.0)
         stopped += at_bound.sum()
         gain = solver.gain(at_bound)
         response = np.linalg.inv(numbers.motion.jacobian())[:, truss.actuators]
         tip = numbers.tip_jacobian @ response[(layout.node_column[truss.tip][:, None] + np.arange(3)).ravel()]
         stiffness = weights.actuator_rate + weights.stroke_centring
         hessian = weights.node_rate * response.T @ response + stiffness * np.eye(len(at_bound))
-        wanted = settling_gain(hessian, tip, ~at_bound)
+        wanted = settling_gain(hessian, tip, layout.levers, ~at_bound)
         assert (gain is None) == (wanted is None)
         if wanted is not None:
             np.testing.assert_allclose(gain, wanted, atol=1e-9 * np.abs(wanted).max())

@@ -33,6 +33,7 @@ import sys
 import threading
 import warnings
 import weakref
+from collections import Counter
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -66,8 +67,13 @@ HUNG = 3
 _FORM = "1"
 """Form of the libraries that builders make of a function: another number makes all of them anew."""
 
-_OFTEN = 8
-"""Number of calls from which on a kernel is worth compiling."""
+OFTEN, SELDOM = 8, 600
+"""Number of calls from which on a kernel is compiled while another core is idle, and while none is.
+
+A compiler takes about as much time as so many interpreted calls.
+"""
+
+_often = OFTEN
 
 _PATIENCE = 60.0
 """Seconds after which a compiler counts as hung."""
@@ -319,8 +325,11 @@ class Building:
             self.calls += 1
             if self._builder is not None:
                 self._look()
-            elif self.calls >= _OFTEN:
-                self.begin()
+            else:
+                # Resolvers of arms alike count together.
+                _asked[self._target] += 1
+                if _asked[self._target] >= _often:
+                    self.begin()
         return self.is_settled
 
     def begin(self) -> None:
@@ -408,8 +417,16 @@ class Compiling(Building):
 
 
 _waiting: weakref.WeakSet[Building] = weakref.WeakSet()
+_asked: Counter[Path] = Counter()
+"""Numbers of calls for which libraries were asked in vain."""
 _hanging: set[str] = set()
 """Compilers that hung, and are not asked again by this process."""
+
+
+def compile_after(calls: int) -> None:
+    """Let this process compile a kernel from so many calls on: ``OFTEN``, or ``SELDOM`` where it is one of many."""
+    global _often
+    _often = calls
 
 
 def finish_compiling() -> bool:

@@ -221,6 +221,9 @@ class Arm(ABC):
     end_effector : Tip
     height : float
         Length of the axis from the base to the tip at home, m.
+    unit : float
+        Mean distance of the nodes that a member or link joins, at home, m. Tolerances and weights of lengths are shares
+        of it, so that an arm moves in the same way whatever its size.
     bodies : Bodies
         Spanned by the points of :meth:`points`.
     """
@@ -244,12 +247,23 @@ class Arm(ABC):
     stations: Stations
     end_effector: Tip
     height: float
+    unit: float
     bodies: Bodies
 
     @cached_property
     def actuators(self) -> Index:
         """(n_a,) indices of the actuated quantities."""
         return np.flatnonzero(self.actuated)
+
+    @cached_property
+    def levers(self) -> Array:
+        """(n_a,) lengths, m, that compare changes of the actuators: 1 for lengths, :attr:`unit` for angles."""
+        return np.array([self.unit if unit == "rad" else 1.0 for unit in self.actuator_units])
+
+    @property
+    def fineness(self) -> float:
+        """Factor of the published tolerances of lengths: they are finer for arms whose :attr:`unit` is below 1 m."""
+        return min(1.0, self.unit)
 
     @property
     @abstractmethod

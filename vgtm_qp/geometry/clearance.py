@@ -45,6 +45,8 @@ class Clearance:
         Whether small scenes at rest are watched; the answers are the same.
     by_fcl : bool
         Whether :meth:`near` may use python-fcl for the contacts.
+    unit : float
+        Unit of length of the tolerances of its answers, m.
     """
 
     def __init__(
@@ -57,8 +59,9 @@ class Clearance:
         self_collision: bool = True,
         watch: bool = True,
         by_fcl: bool = True,
+        unit: float = 1.0,
     ) -> None:
-        self.scene = Scene(bodies, obstacles, self_collision, by_fcl)
+        self.scene = Scene(bodies, obstacles, self_collision, by_fcl, unit)
         self.bodies, self.obstacles, self.self_collision = bodies, self.scene.obstacles, self_collision
         self.pieces, self.names, self.fcl = self.scene.pieces, self.scene.names, self.scene.fcl
         self.safe, self.influence = safe, influence

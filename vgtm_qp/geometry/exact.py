@@ -26,10 +26,10 @@ NORMAL = slice(5, 8)
 """Which of them are its normal."""
 
 PROOF = 1e-6
-"""An answer of FCL holds if its flaw is no greater, m."""
+"""An answer of FCL holds if its flaw is no greater, over the unit of length."""
 
 NORMAL_FROM = 1e-3
-"""Distance of two axes, m, below which the normal would be mostly rounding."""
+"""Distance of two axes, over the unit of length, below which the normal would be mostly rounding."""
 
 SECOND_CONTACT = 0.2
 """Two contacts of a body with one piece are apart by at least this fraction of the body's length."""
@@ -89,8 +89,8 @@ def proof_function(shape: str) -> ca.Function:
 
     With x the point of the body nearest to the answer's, y the other point, and n = (x - y) / |x - y|: the two are no
     nearer to each other than the gap g between their supporting planes along n, and no further apart than x and y. The
-    flaw is |d - g| + ||x - y| - d|, and how far the answer's point is from x, and y from the other; or ``FAR``
-    where g is not greater than `NORMAL_FROM`. The contact has the distance g, less the radius.
+    flaw is |d - g| + ||x - y| - d|, and how far the answer's point is from x, and y from the other. The contact has
+    the distance g, less the radius; its normal is mostly rounding where g is below `NORMAL_FROM`.
     """
     pair, answer = ca.SX.sym("pair", 7 + width(shape)), ca.SX.sym("answer", 7)
     body, other, claimed, y = pair[:6], pair[6:-1], answer[0], answer[4:]
@@ -104,7 +104,6 @@ def proof_function(shape: str) -> ca.Function:
         s, stray = 0.0, ca.fmax(APART[shape](ca.vertcat(y, y), other)[0].distance, 0.0)
     gap = ca.fmin(ca.dot(normal, body[:3]), ca.dot(normal, body[3:])) - _support(shape, other, normal)
     flaw = ca.fabs(claimed - gap) + ca.fabs(apart - claimed) + off + stray
-    flaw = ca.if_else(gap > NORMAL_FROM, flaw, FAR)
     contact = ca.cse(ca.vertcat(gap - pair[-1], _weights(shape, t, s), normal, flaw))
     return ca.Function(
         f"proof_{shape}", [pair, answer], [ca.densify(contact)], ["pair", "answer"], ["contact"]

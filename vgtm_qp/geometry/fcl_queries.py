@@ -19,7 +19,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.shapes import ObstaclePieces
 
 _UNITS = 1e5
-"""FCL's units in a metre. Its iterations end at 1e-6 units: in metres, that would turn normals at a rim by 1e-3 rad."""
+"""FCL's units in a unit of length. Its iterations end at 1e-6 of its units; that would turn normals by 1e-3 rad."""
 
 _TRIANGLE = np.array([3, 0, 1, 2, 3, 0, 2, 1])
 """Both sides of a triangle as faces: FCL has no distance to its own triangles, but to a convex set of three points."""
@@ -55,9 +55,9 @@ class FclQueries:
         Queries so far, and those whose answer was not proven.
     """
 
-    def __init__(self, pieces: ObstaclePieces) -> None:
+    def __init__(self, pieces: ObstaclePieces, unit: float = 1.0) -> None:
         self.asked = self.refused = 0
-        self._pieces = pieces
+        self._pieces, self._scale = pieces, _UNITS / unit
         self._objects: dict[int, Any] = {}
         self._body, self._other = _Axis(), _Axis()
         self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
@@ -77,7 +77,7 @@ class FclQueries:
             s, at which moving pieces are where they are asked about.
         """
         self.asked += len(pairs)
-        ends, body = _UNITS * pairs[:, :12], self._body
+        ends, body = self._scale * pairs[:, :12], self._body
         middles, spans = _axes(ends[:, :3], ends[:, 3:6])
         if pieces is None:
             others = map(self._other.placed, *_axes(ends[:, 6:9], ends[:, 9:]))
@@ -91,18 +91,19 @@ class FclQueries:
             here, there = result.nearest_points
             found += here.tolist()
             found += there.tolist()
-        return np.array(found).reshape(len(pairs), 7) / _UNITS
+        return np.array(found).reshape(len(pairs), 7) / self._scale
 
     def _piece(self, piece: int, time: float) -> fcl.CollisionObject:
         """Return the object of a piece, where it is at `time`, s."""
         known = self._objects.get(piece)
         if known is None:
-            known = self._objects[piece] = _object(self._pieces.shape[piece], self._pieces.parameters[piece])
+            shape, row = self._pieces.shape[piece], self._pieces.parameters[piece]
+            known = self._objects[piece] = _object(shape, row, self._scale)
         if self._pieces.moving:
             at = time * self._pieces.velocity[piece]
             if self._pieces.shape[piece] != "triangle":
                 at += self._pieces.center[piece]
-            known.setTranslation(_UNITS * at)
+            known.setTranslation(self._scale * at)
         return known
 
 
@@ -111,18 +112,18 @@ def _axes(first: Array, second: Array) -> tuple[list[Array], list[list[float]]]:
     return list(0.5 * (first + second)), (second - first).tolist()
 
 
-def _object(shape: str, row: Array) -> fcl.CollisionObject:
-    """Return a piece at time 0; see ``Obstacle.pieces`` for its numbers (15,)."""
+def _object(shape: str, row: Array, scale: float) -> fcl.CollisionObject:
+    """Return a piece at time 0 in FCL's units; see ``Obstacle.pieces`` for its numbers (15,)."""
     if shape == "triangle":
-        return fcl.CollisionObject(fcl.Convex(_UNITS * row[:9].reshape(3, 3), 2, _TRIANGLE), fcl.Transform())
-    first, second, third = _UNITS * row[12:]
+        return fcl.CollisionObject(fcl.Convex(scale * row[:9].reshape(3, 3), 2, _TRIANGLE), fcl.Transform())
+    first, second, third = scale * row[12:]
     if shape == "sphere":
         geometry = fcl.Sphere(first)
     elif shape == "box":
         geometry = fcl.Box(2.0 * first, 2.0 * second, 2.0 * third)
     else:
         geometry = fcl.Cylinder(first, 2.0 * second)
-    return fcl.CollisionObject(geometry, fcl.Transform(row[3:12].reshape(3, 3), _UNITS * row[:3]))
+    return fcl.CollisionObject(geometry, fcl.Transform(row[3:12].reshape(3, 3), scale * row[:3]))
 
 
 def _quaternion(x: float, y: float, z: float, length: float) -> list[float]:

@@ -14,6 +14,7 @@ from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.exact import (
     CONTACT,
     NORMAL,
+    NORMAL_FROM,
     PROOF,
     distance_function,
     proof_function,
@@ -41,6 +42,8 @@ class Scene:
     ----------
     has_self : bool
         Whether pairs of bodies that are not neighbours count.
+    unit : float
+        Unit of length of the tolerances of FCL's answers, m.
     fcl : FclQueries or None
         Supplies contacts; None if only closed forms are used.
     nothing : Contacts
@@ -49,12 +52,14 @@ class Scene:
         Of the others in its pairs; ``"segment"`` is a body.
     """
 
-    def __init__(self, bodies: Bodies, obstacles: Sequence[Obstacle], has_self: bool, by_fcl: bool) -> None:
-        self.bodies, self.obstacles, self.has_self = bodies, tuple(obstacles), has_self
+    def __init__(
+        self, bodies: Bodies, obstacles: Sequence[Obstacle], has_self: bool, by_fcl: bool, unit: float
+    ) -> None:
+        self.bodies, self.obstacles, self.has_self, self.unit = bodies, tuple(obstacles), has_self, unit
         self.pieces = ObstaclePieces(self.obstacles)
         names = tuple(obstacle.name for obstacle in self.obstacles)
         self.names = PairNames(bodies, names, tuple(self.pieces.obstacle.tolist()))
-        self.fcl = FclQueries(self.pieces) if by_fcl else None
+        self.fcl = FclQueries(self.pieces, unit) if by_fcl else None
         self.nothing = self._contacts(np.zeros((0, 8), dtype=np.int64), np.zeros((0, CONTACT)))
         self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if has_self else set()))
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
@@ -257,8 +262,9 @@ class Group:
         answers = fcl.answers(pairs, None if self.is_self else numbers[:, 5].tolist(), time)
         proven = self.scene.batch(proof_function, self.shape)(pairs, answers)
         proven[of_two, 1:3] = found[of_two, 1:3]
-        # NaN fails the comparison.
-        holds = proven[:, -1] <= PROOF
+        # NaN fails the comparisons.
+        unit, gap = self.scene.unit, proven[:, 0] + pairs[:, -1]
+        holds = (proven[:, -1] <= PROOF * unit) & (gap > NORMAL_FROM * unit)
         fcl.refused += len(rows) - int(np.count_nonzero(holds))
         np.copyto(found[:, :-1], proven[:, :-1], where=holds[:, None])
         numbers[:, -1] = holds

@@ -119,9 +119,9 @@ class CurveMotion:
         vertices, size = p.size, curve.coordinates
         hessian, gradient = np.zeros((size, size)), np.zeros(size)
         rate = self._terms.get("curve_rate", 0.0)
-        hessian[np.diag_indices_from(hessian)] += rate or (
-            1.0 if set(self._terms) <= {"obstacle_potential"} else 1e-9
-        )
+        rate = rate or (1.0 if set(self._terms) <= {"obstacle_potential"} else 1e-9)
+        area = self._setup.arm.unit**2
+        hessian[np.diag_indices_from(hessian)] += rate * np.where(np.arange(size) < vertices, 1.0, area)
         legs = np.diff(self._weights @ p, axis=0)
         lengths = np.linalg.norm(legs, axis=1)
         if gain := self._terms.get("spacing"):
@@ -134,6 +134,7 @@ class CurveMotion:
             gradient[:vertices] += gain * self._bending @ p.ravel()
         if gain := self._terms.get("obstacle_potential"):
             rows, distance = self._near(curve, X, time)
+            gain *= area
             stiffness = gain * potential_curvature(distance, self._setup.influence)
             hessian[:vertices, :vertices] += (rows.T * stiffness) @ rows
             gradient[:vertices] += gain * potential_slope(distance, self._setup.influence) @ rows

@@ -38,7 +38,8 @@ class TrussObjective:
     def __init__(self, names: tuple[str, ...], weights: Weights, setup: Setup) -> None:
         self._setup = setup
         self._centring = weights.stroke_centring if "stroke_centring" in names else 0.0
-        self._potential = weights.obstacle_potential if "obstacle_potential" in names else 0.0
+        area = setup.arm.unit**2
+        self._potential = area * weights.obstacle_potential if "obstacle_potential" in names else 0.0
         actuator = self._centring + (weights.actuator_rate if "actuator_rate" in names else 0.0)
         node = weights.node_rate if "node_rate" in names else 0.0
         # Without terms of displacements the objective is their norm, which J^+ minimises. Beside other terms a small

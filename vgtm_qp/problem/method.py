@@ -74,22 +74,28 @@ CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 
 
 class Weights(Table, called="[method.weights]"):
-    """Weights of the terms of one step's QP; the terms are half squares of displacements over the step."""
+    """Weights of the terms of one step's QP; the terms are half squares of displacements over the step.
+
+    With u the mean length of members or links, which brings angles to lengths.
+    """
 
     node_rate: Weight = Field(default=1.0, description="node displacements, m^2; unit 1")
-    actuator_rate: Weight = Field(default=0.02, description="changes of actuator lengths, m^2; unit 1")
+    actuator_rate: Weight = Field(
+        default=0.02, description="changes of actuators, m^2, or rad^2 times u^2; unit 1"
+    )
     stroke_centring: Weight = Field(
-        default=0.02, description="actuator lengths after the step less their home lengths, m^2; unit 1"
+        default=0.02,
+        description="actuators after the step less their home values, m^2, or rad^2 times u^2; unit 1",
     )
     curve_rate: Weight = Field(default=0.02, description="displacements of the control vertices, m^2; unit 1")
     tracking: Weight = Field(
         default=0.1, description="gaps between faces and curve after the step, m^2; unit 1"
     )
     tangent: Weight = Field(
-        default=0.05, description="angles between face normals and curve, rad^2; unit m^2/rad^2"
+        default=0.05, description="angles between face normals and curve, rad^2; times u^2"
     )
     roll: Weight = Field(
-        default=0.05, description="roll between faces and curve, rad^2, with torsion_vertices; unit m^2/rad^2"
+        default=0.05, description="roll between faces and curve, rad^2, with torsion_vertices; times u^2"
     )
     spacing: Weight = Field(
         default=0.0, description="spacings of the curve nodes less those at home, m^2; unit 1"
@@ -102,15 +108,16 @@ class Weights(Table, called="[method.weights]"):
     )
     obstacle_potential: Weight = Field(
         default=0.0,
-        description="potential of the obstacles within influence, for the pseudoinverse methods; unit m^2",
+        description="potential of the obstacles within influence, for the pseudoinverse methods; times u^2",
     )
     end_effector: Weight = Field(
         default=1000.0,
-        description="penalty on the tip's gap to its goal in mode elastic, m or rad; unit m or m^2/rad",
+        description="penalty on the tip's gap to its goal in mode elastic, m times u, or rad times u^2",
     )
     progress: Weight = Field(
         default=1000.0,
-        description="share of the step along the path that is given up in mode scaled, squared; unit m^2",
+        description="share of the step along the path that is given up in mode scaled, squared; times the step's "
+        "length squared",
     )
 
 
@@ -127,7 +134,7 @@ class Gains(Table, called="[method.gains]"):
         default=1e-4, description="displacements of the control vertices in the null space, m^2; unit 1"
     )
     obstacle_potential: Weight = Field(
-        default=1e-3, description="potential of the obstacles within influence; unit m^2"
+        default=1e-3, description="potential of the obstacles within influence; times u^2"
     )
 
 

@@ -89,7 +89,7 @@ class CondensedSolver:
         free[: len(at_bound)], free[-len(self._after) :] = ~at_bound, False
         # A gap is the station less the curve.
         rows = np.concatenate([(qp.A @ Z)[builder.tip_rows], Z[builder.hard_gaps]])
-        gain = settling_gain(Z.T @ (qp.P @ Z), rows, free)
+        gain = settling_gain(Z.T @ (qp.P @ Z), rows, self.layout.levers, free)
         nothing = np.zeros(len(qp.row_lower)), np.zeros(builder.size), 0
         return None if gain is None else Gain(gain, lambda x: builder.solution(Z @ x, *nothing))
 

@@ -153,7 +153,7 @@ class FullBuilder:
         q = np.zeros(self.size)
         q[self.column["actuators"]] = numbers.actuator_gradient
         q[self.column["vertices"]] = numbers.vertex_gradient.reshape(-1)
-        q[self.column["slack"]] = layout.weights.end_effector
+        q[self.column["slack"]] = layout.weights.end_effector * layout.arm.unit * layout.slack_levers
         q[self.column["progress"]] = numbers.progress_gradient
         self._hessian.data[-1] = numbers.progress_curvature
 
@@ -214,7 +214,7 @@ class FullBuilder:
             "nodes": (labels("node ", "node displacement", "m", nodes), weights.node_rate),
             "actuators": (
                 [Label(f"stroke: {name}", "actuator displacement", of) for name, of in actuators],
-                weights.actuator_rate + weights.stroke_centring,
+                sparse.diags(layout.actuator_weights),
             ),
             "vertices": (
                 labels("control vertex p", "control vertex displacement", "m", range(layout.vertices)),
@@ -222,7 +222,7 @@ class FullBuilder:
             ),
             "torsion": (
                 labels("torsion ", "torsion", "rad", range(1, layout.torsion + 1), " "),
-                weights.curve_rate,
+                layout.torsion_weight,
             ),
             "position": (
                 labels(f"gap: {word} ", "tracking gap", "m", tracked),
@@ -241,7 +241,7 @@ class FullBuilder:
                     Label(f"tip slack {name.removeprefix('tip ')}{sign}", "tip slack", unit(name))
                     for name, sign in slacks
                 ],
-                slack_curvature(weights.end_effector),
+                sparse.diags(slack_curvature(weights.end_effector) * layout.slack_levers**2),
             ),
             "progress": ([Label("progress along the path", "progress", "1")], np.ones((1, 1))),
         }

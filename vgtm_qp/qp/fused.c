@@ -14,12 +14,14 @@ typedef struct {
     int unknowns, actuators, nodes, squares, tips, hard, legs, near, vertices, torsion, coordinates;
     /* Whether q moves with the nodes; a row of clearance names this many nodes. */
     int by_nodes, slots;
-    /* Root of the node rate's weight, inverted; weight of the actuators' changes. */
-    double scale, actuator_weight;
+    /* Root of the node rate's weight, inverted; weights (n_a) of the actuators' changes. */
+    double scale;
+    const double *actuator_weight;
     /* Distance from a bound that counts as held; path left that counts as none; worst condition of a gain. */
     double at_bound, left, worst_condition;
     int settling_steps, closing_steps;
     double too_far;
+    const double *levers;          /* (m) lengths that compare the equalities */
 
     /* (StepGraph.inputs) -> results of row_function; (q, lower, upper) -> (closer q, quantities, errors);
        (StepGraph.inputs, gone) -> results of missing_function. */
@@ -93,7 +95,7 @@ static void objective(Fused *f)
     g[last] = f->linear[last];
     for (int k = 0; k < n; k++) H[last * n + k] = H[k * n + last] = 0.0;
     H[last * n + last] = f->curvature[0];
-    for (int k = 0; k < count; k++) H[k * n + k] += f->actuator_weight;
+    for (int k = 0; k < count; k++) H[k * n + k] += f->actuator_weight[k];
     if (!curve) return;
     int size = 5 + curve;
     for (int i = 0; i < curve; i++)
@@ -261,7 +263,8 @@ static int gain_of(Fused *f, Gain *g, double *work)
     for (int k = 0; k < m; k++) {
         double *half = g->half + k * free;
         for (int i = 0; i < free; i++)
-            half[i] = (f->constraint[k * n + g->of[i]] - dot(g->factor + i * free, half, i)) / g->factor[i * free + i];
+            half[i] = (f->levers[k] * f->constraint[k * n + g->of[i]] - dot(g->factor + i * free, half, i))
+                / g->factor[i * free + i];
     }
     for (int i = 0; i < m; i++)
         for (int j = 0; j <= i; j++) g->normal[i * m + j] = dot(g->half + i * free, g->half + j * free, free);
@@ -280,7 +283,7 @@ static void change_by(const Fused *f, const Gain *g, const double *missing, doub
     int n = f->unknowns, m = f->tips + f->hard, free = g->free;
     double *shares = work, *part = work + m;
     for (int i = 0; i < m; i++)
-        shares[i] = (missing[i] - dot(g->normal + i * m, shares, i)) / g->normal[i * m + i];
+        shares[i] = (f->levers[i] * missing[i] - dot(g->normal + i * m, shares, i)) / g->normal[i * m + i];
     memset(part, 0, sizeof(double) * free);
     for (int i = m - 1; i >= 0; i--) {
         shares[i] /= g->normal[i * m + i];
@@ -313,7 +316,9 @@ EXPORT int settle(Fused *f)
             continue;
         }
         if (call(&f->missing)) return UNSETTLED;
-        f->off = norm(f->missed, m);
+        f->off = 0.0;
+        for (int k = 0; k < m; k++) f->off += f->levers[k] * f->missed[k] * f->levers[k] * f->missed[k];
+        f->off = sqrt(f->off);
         if (!(f->off <= f->start)) return UNSETTLED;
         if (f->off <= f->enough_tip || steps == f->settling_steps) break;
         if (!steps && !gain_of(f, &gain, work)) break;

@@ -179,9 +179,9 @@ class FusedSolver:
         """See ``CondensedSolver.gain_of``; for the QP solved last."""
         work, count = self._workspace, self._workspace.actuators
         free = np.ones(work.size, dtype=bool)
-        free[:count] = ~held(work.x[:count], work.lower[:count], work.upper[:count])
+        free[:count] = ~held(work.x[:count], work.lower[:count], work.upper[:count], self.layout.arm.fineness)
         free[-1] = False
-        gain = settling_gain(work.hessian, work.constraint[: work.equal], free)
+        gain = settling_gain(work.hessian, work.constraint[: work.equal], self.layout.levers, free)
         return None if gain is None else Gain(gain, lambda x: self._whole(x, 0, moves=False))
 
     def _whole(self, x: Array, near: int, *, moves: bool = True) -> StepSolution:
@@ -348,7 +348,7 @@ class _Workspace:
         )
         place, by_nodes = _places(layout)
         work = nodes + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
-        self._program = Program(SOURCE, "Fused")
+        self._program, arm = Program(SOURCE, "Fused"), layout.arm
         self._program.set(
             unknowns=size,
             actuators=self.actuators,
@@ -362,14 +362,15 @@ class _Workspace:
             coordinates=self.q.size,
             by_nodes=int(by_nodes),
             scale=1.0 / float(np.sqrt(layout.weights.node_rate)),
-            actuator_weight=layout.weights.actuator_rate + layout.weights.stroke_centring,
-            at_bound=AT_BOUND,
-            left=LEFT,
+            actuator_weight=layout.actuator_weights,
+            at_bound=AT_BOUND * arm.fineness,
+            left=LEFT * arm.fineness,
+            levers=layout.levers,
             worst_condition=WORST_CONDITION,
             settling_steps=SETTLING_STEPS,
             closing_steps=MOST_STEPS,
-            too_far=TOO_FAR,
-            feasibility=DAQP.accuracy,
+            too_far=TOO_FAR * arm.unit,
+            feasibility=DAQP.accuracy * arm.fineness,
             **_daqp(),
             stack=out[0],
             linear=out[4],

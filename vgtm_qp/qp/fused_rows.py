@@ -24,7 +24,8 @@ def row_function(layout: Layout) -> Bound:
     """
     constants, arm, weights = Constants(), layout.arm, layout.weights
     graph = StepGraph(layout, arm.symbols(constants), constants)
-    node_rate, centring = graph.weights(weights.node_rate, weights.stroke_centring)
+    (node_rate,) = graph.weights(weights.node_rate)
+    centring = graph.table("centring", layout.centring_weights)
     response = graph.symbols.response(graph.q, graph.at, graph.moved)
     actuators, free, rows = len(arm.actuators), layout.free_curve, len(layout.tip_rows)
     place = {int(node): 3 * k for k, node in enumerate(arm.free)}

@@ -15,6 +15,7 @@ from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.rows.tip import axes as tip_axes
+from vgtm_qp.rows.tip import levers
 
 _ENDS_AT_TIP = 3
 """Fewest control vertices with which a curve can begin at the base, along its normal, and end anywhere."""
@@ -24,6 +25,12 @@ _LEAST_LEG = 0.1
 
 _GOAL_REACH = 0.01
 """Greatest share of the arm's length by which a control vertex is drawn towards its goal in one step."""
+
+
+def with_angles(weights: Weights, arm: Arm) -> Weights:
+    """Return weights in which those of stations' squared angles are m^2/rad^2: times the square of the arm's unit."""
+    area = arm.unit**2
+    return weights.model_copy(update={"tangent": area * weights.tangent, "roll": area * weights.roll})
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +51,7 @@ class Layout:
     elastic_tip : bool
         The end effector's rows have slacks with an exact penalty.
     weights : Weights
+        With those of squared angles in m^2/rad^2, see :func:`with_angles`.
     hard_turns : bool
         The stations' turns as equalities too, beside their positions.
     shape : CurveShape or None
@@ -156,6 +164,37 @@ class Layout:
         return 3 * self.vertices - 5 + self.torsion if self.vertices else 0
 
     @cached_property
+    def centring_weights(self) -> Array:
+        """(n_a,) weights of the actuators' values less those at home, squared; m^2/rad^2 for angles."""
+        return np.asarray(self.weights.stroke_centring * self.arm.levers**2)
+
+    @cached_property
+    def actuator_weights(self) -> Array:
+        """(n_a,) weights of the squares of all changes of the actuators: by their rate, and by centring."""
+        return np.asarray(self.weights.actuator_rate * self.arm.levers**2 + self.centring_weights)
+
+    @property
+    def torsion_weight(self) -> float:
+        """Weight of squared changes of the torsion, m^2/rad^2."""
+        return self.weights.curve_rate * self.arm.unit**2
+
+    @cached_property
+    def tip_levers(self) -> Array:
+        """(n_e,) lengths, m, that compare the tip's coordinates."""
+        return np.array(levers(self.tip_rows, self.arm.unit))
+
+    @property
+    def slack_levers(self) -> Array:
+        """The same for the slacks of an elastic tip, above its goal and then below; empty where there are none."""
+        return np.tile(self.tip_levers, 2 if self.elastic_tip else 0)
+
+    @cached_property
+    def levers(self) -> Array:
+        """(n_e + H,) the same for all equalities of a step: those of the tip, then of stations."""
+        gaps, tilts = np.ones(self.hard_gaps.size), np.full(self.hard_tilts.size, self.arm.unit)
+        return np.concatenate([self.tip_levers, np.concatenate([gaps, tilts])[self.hard]])
+
+    @cached_property
     def gap_weights(self) -> Array:
         """(K, 3) weights of the stations' gaps; zero where they are equalities."""
         return np.where(self.hard_gaps, 0.0, self.weights.tracking)
@@ -233,7 +272,7 @@ class Layout:
     def curve_hessian(self) -> Array:
         """(D, D) the same over all coordinates of the curve: control vertices, then torsion."""
         vertices = np.kron(self.vertex_hessian, np.eye(3))
-        return np.asarray(block_diag(vertices, self.weights.curve_rate * np.eye(self.torsion)))
+        return np.asarray(block_diag(vertices, self.torsion_weight * np.eye(self.torsion)))
 
     def goal_pull(self, vertices: Array, goals: Array | None) -> Array:
         """Return (V, 3) the gradient of the control vertices' goals (V, 3), m; NaN where a vertex has none.

@@ -109,7 +109,7 @@ class Linearisation:
             curve,
             *motion,
         ) = (output.copy() for output in kernel.outputs)
-        weights, moves = layout.weights, asked.motion
+        moves = asked.motion
         home = layout.arm.home_quantities[layout.arm.actuators]
         vertices = asked.vertices
         shift, base_axes = np.zeros(3), axes.reshape(2, 3)
@@ -129,7 +129,7 @@ class Linearisation:
             motion=layout.arm.motion_rows(*motion),
             lower=asked.lower - strokes,
             upper=asked.upper - strokes,
-            actuator_gradient=weights.stroke_centring * (strokes - home) if moves else np.zeros_like(strokes),
+            actuator_gradient=moves * layout.centring_weights * (strokes - home),
             tip_jacobian=tip.reshape(-1, tips).T,
             tip_rate=rate,
             tip_rhs=error,

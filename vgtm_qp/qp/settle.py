@@ -27,13 +27,13 @@ MOST_STEPS = 12
 """Greatest number of Newton steps to exact quantities."""
 
 TOO_FAR = 1e-2
-"""Error of a quantity after a QP above which Newton's iteration is not tried."""
+"""Error of a quantity after a QP, over the arm's unit, above which Newton's iteration is not tried."""
 
 LEFT = 1e-8
-"""Remaining path of the tip, m or rad, that counts as zero."""
+"""Remaining path of the tip, m or rad, that counts as zero, for arms of a fineness of 1."""
 
 AT_BOUND = 1e-6
-"""Distance from a bound below which an actuator counts as held there, m."""
+"""Distance from a bound below which an actuator counts as held there, m or rad, for arms of a fineness of 1."""
 
 
 _SETTLED = 1e-3
@@ -56,12 +56,13 @@ def enough_tip_error(q: Array, tolerance: float) -> float:
     return max(_SETTLED * tolerance, 1e3 * _ROUNDING * float(np.abs(q).max()))
 
 
-def held(displacement: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
+def held(displacement: Array, lower: Array, upper: Array, fineness: float) -> NDArray[np.bool_]:
     """Return which actuators (n_a,) a QP left at a bound, by their position: multipliers may vanish there."""
-    return np.asarray((displacement < lower + AT_BOUND) | (displacement > upper - AT_BOUND))
+    near = AT_BOUND * fineness
+    return np.asarray((displacement < lower + near) | (displacement > upper - near))
 
 
-def settling_gain(hessian: Array, rows: Array, free: NDArray[np.bool_]) -> Array | None:
+def settling_gain(hessian: Array, rows: Array, levers: Array, free: NDArray[np.bool_]) -> Array | None:
     """Return (n, m) the least changes of the unknowns that change the values of the `rows` by one each.
 
     None if the `free` unknowns determine no such changes.
@@ -72,6 +73,8 @@ def settling_gain(hessian: Array, rows: Array, free: NDArray[np.bool_]) -> Array
         Of the QP, whose metric says what is least.
     rows : (m, n)
         Equalities: those of the tip, and of stations that are kept on the curve.
+    levers : (m,)
+        Lengths that compare them, see ``Layout.levers``.
     free : (n,)
         Unknowns that may change.
     """
@@ -79,7 +82,7 @@ def settling_gain(hessian: Array, rows: Array, free: NDArray[np.bool_]) -> Array
         return None
     try:
         factor = np.linalg.cholesky(hessian[np.ix_(free, free)])
-        half = solve_triangular(factor, rows[:, free].T, lower=True)
+        half = solve_triangular(factor, levers * rows[:, free].T, lower=True)
         normal = np.linalg.cholesky(half.T @ half)
     except (np.linalg.LinAlgError, ValueError):
         return None
@@ -88,7 +91,7 @@ def settling_gain(hessian: Array, rows: Array, free: NDArray[np.bool_]) -> Array
         return None
     gain = np.zeros((len(free), len(rows)))
     shares = cho_solve((normal, True), np.eye(len(rows)))
-    gain[free] = solve_triangular(factor, half @ shares, lower=True, trans=1)
+    gain[free] = solve_triangular(factor, half @ shares, lower=True, trans=1) * levers
     return gain
 
 

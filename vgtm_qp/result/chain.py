@@ -56,6 +56,8 @@ class RecordedChain:
         self.acceleration = table.numbers("acceleration", (joints,), limits=True)
         self.tip, self.tip_frame = table.numbers("tip", (3,)), table.numbers("tip_frame", (3, 3))
         self.radius = table.numbers("radius", (links,))
+        steps = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
+        self.size = float(steps[steps > 0.0].mean()) if steps.any() else 1.0
         self.links = table.integers("links", (links, 2), joints + 2)
         self.members = table.integers("joined", (links, 2), 2 * links + joints + 2)
         self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)

@@ -23,16 +23,19 @@ _AXES = {"tip x": 0, "tip y": 1, "tip z": 2}
 _TINY = 1e-30
 """Added under a square root to keep it smooth at zero."""
 
-SHORT_WAY = 0.01
-"""Displacement of the tip in a step, m, below which its progress has a larger weight.
+_SHORT_WAY = 0.01
+"""Displacement of the tip in a step, over the arm's unit, below which its progress has a larger weight.
 
 The weight is the square of the displacement. The other objectives have forces that do not shrink with it, so that with
-the square alone the last micrometres would never be covered: below this value the weight is displacement * SHORT_WAY.
-On a path of zero length progress costs nothing, and any positive weight will do.
+the square alone the last micrometres would never be covered: below this value the weight is the product of both. On a
+path of zero length progress costs nothing, and any positive weight will do.
 """
 
-CLOSED = 2e-8
-"""Tip error that a motion need not close, m or rad: within the tolerance of an accepted state."""
+_NO_WAY = 1e-6
+"""Displacement, over the arm's unit, that counts as none."""
+
+_CLOSED = 2e-8
+"""Tip error that a motion need not close, m: twice the tolerance of a settled state."""
 
 _OPPOSITE = 1e-9
 """Angle from the opposite direction, rad, below which half a turn about any axis will do."""
@@ -147,23 +150,26 @@ def _axis(rotation: Any, twist: Any, cosine: Any) -> Any:
     return column * (sense / ca.sqrt(ca.dot(column, column) + _TINY))
 
 
-def worth_closing(error: Any, motion: Any) -> Any:
+def worth_closing(error: Any, motion: Any, levers: Any, fineness: Any) -> Any:
     """Return an error (n_e, 1), or zeros in a motion (1) if it is within the tolerance of an accepted state.
+
+    The `levers` (n_e, 1) turn it into lengths, m; `fineness` is that of the arm.
 
     An arm held on all sides cannot close even such an error, and its QP would be infeasible. With zeros, resting is
     feasible, and the multipliers show the rows that hold the arm.
     """
-    closed = ca.logic_and(motion > 0, ca.norm_inf(error) <= CLOSED)
+    closed = ca.logic_and(motion > 0, ca.norm_inf(levers * error) <= _CLOSED * fineness)
     return ca.if_else(closed, ca.DM.zeros(*error.shape), error)
 
 
-def progress_weight(rate: Any) -> Any:
+def progress_weight(rate: Any, levers: Any, unit: Any) -> Any:
     """Return the weight of the progress along the path, m^2, from the tip's displacement (n_e, 1) over it.
 
-    It is the square of the displacement, except for short ones, see :data:`SHORT_WAY`.
+    It is the square of the displacement, except for short ones, see :data:`_SHORT_WAY`. The `levers` (n_e, 1) turn it
+    into lengths, m; `unit` is that of the arm, m.
     """
-    way = ca.norm_2(rate)
-    return ca.if_else(way > 1e-6, way * ca.fmax(way, SHORT_WAY), 1.0)
+    way = ca.norm_2(levers * rate)
+    return ca.if_else(way > _NO_WAY * unit, way * ca.fmax(way, _SHORT_WAY * unit), unit**2)
 
 
 def progress_gradient(curvature: Any, progress: Any) -> Any:
@@ -174,8 +180,13 @@ def progress_gradient(curvature: Any, progress: Any) -> Any:
     return curvature * (progress - 2.0)
 
 
-def tip_function(rows: Sequence[str]) -> ca.Function:
-    """Return the rows of a tip as a function of numbers.
+def levers(rows: Sequence[str], unit_length: float) -> list[float]:
+    """Return the lengths, m, that compare the rows' changes: 1 for positions, the arm's unit for angles."""
+    return [1.0 if unit(row) == "m" else unit_length for row in rows]
+
+
+def tip_function(rows: Sequence[str], unit_length: float) -> ca.Function:
+    """Return the rows of a tip as a function of numbers, for an arm of that unit, m.
 
     Arguments: position (3), rotation (3, 3); goal (3), turned (3, 3), velocity and spin (3) of that; motion, 1 or 0,
     see :func:`worth_closing`. Results: error (n_e), rate (n_e), axes of the turns (r, 3), weight of the progress.
@@ -184,12 +195,12 @@ def tip_function(rows: Sequence[str]) -> ca.Function:
     goal, turned = ca.SX.sym("goal", 3), ca.SX.sym("turned", 3, 3)
     velocity, spin = ca.SX.sym("velocity", 3), ca.SX.sym("spin", 3)
     motion = ca.SX.sym("motion")
-    rate = combined(rows, velocity, spin, rotation)
+    rate, arms = combined(rows, velocity, spin, rotation), ca.DM(levers(rows, unit_length))
     results = [
-        worth_closing(error(rows, position, rotation, goal, turned), motion),
+        worth_closing(error(rows, position, rotation, goal, turned), motion, arms, min(1.0, unit_length)),
         rate,
         turned_axes(rows, rotation),
-        progress_weight(rate),
+        progress_weight(rate, arms, unit_length),
     ]
     inputs = [position, rotation, goal, turned, velocity, spin, motion]
     return ca.Function("tip", inputs, [ca.densify(result) for result in results])

@@ -83,7 +83,7 @@ class Acceptance:
         if goal is not None:
             off = self._tip_error(q, X, goal)
             if not off <= self._tip + rounding:
-                return f"the new state has its tip {off:.3g} m or rad from its goal"
+                return f"the new state has its tip {off:.3g} m from its goal"
         return ""
 
     def _worst(self, errors: Array) -> str:
@@ -92,11 +92,11 @@ class Acceptance:
         return f"{self._arm.quantity_names[k]} {abs(errors[k]):.3g} m or rad"
 
     def _tip_error(self, q: Array, X: Array, goal: TipGoal) -> float:
-        """Return the norm of the tip's error, m and rad."""
+        """Return the norm of the tip's error, m: angles times the arm's unit."""
         if self._task.turns is not None:
             self._kinematics.evaluate_quantities(q)
         position = self._arm.end_effector.position(X)
-        return norm(self._task.error(position, self._kinematics.tip_rotation, goal))
+        return self._task.off(position, self._kinematics.tip_rotation, goal)
 
 
 class TrackingError:
@@ -120,14 +120,17 @@ class TrackingError:
             self._turns.inputs[3][:] = layout.curve_slopes.reshape(-1)
 
     def greatest(self, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
-        """Return the greatest gap, m, or turn, rad, at a configuration and its curve (V, 3), m, and (T,), rad."""
+        """Return the greatest gap, or turn times the arm's unit, m.
+
+        It is that of a configuration and its curve: control vertices (V, 3), m, and torsion (T,), rad.
+        """
         layout, arm, shape = self._layout, self._layout.arm, self._layout.general
         points, frames = layout.curve_weights @ vertices, None
         if shape is not None and (layout.hard_turns or shape.by_arc_length):
             rows = shape.at(vertices, torsion, base_frame(arm, base))
             points, frames = rows.position, rows.frame
         worst = float(np.abs(arm.stations.centres(arm.nodes(q))[layout.tracked] - points).max())
-        return max(worst, self._greatest_turn(q, vertices, frames)) if layout.hard_turns else worst
+        return max(worst, arm.unit * self._greatest_turn(q, vertices, frames)) if layout.hard_turns else worst
 
     def _greatest_turn(self, q: Array, vertices: Array, frames: Array | None) -> float:
         tracked, inputs = self._layout.tracked, self._turns.inputs

@@ -17,8 +17,11 @@ from vgtm_qp.step.state import State
 Box = tuple[Array, Array]
 """Least and greatest values (n_a,) of the actuators after a step."""
 
-_APPROACH, _LEAST_APPROACH = 0.3, 2e-3
-"""Largest share of the distance to the end of its stroke that an actuator may use in one step, and least one, m."""
+_APPROACH = 0.3
+"""Largest share of the distance to the end of its stroke that an actuator may use in one step."""
+
+_LEAST_APPROACH = 2e-3
+"""What it may always use: rad, or a share of the arm's unit."""
 
 _ROUNDING = float(np.finfo(float).eps)
 
@@ -75,10 +78,11 @@ class Actuation:
         self._acceleration = arm.acceleration[arm.actuators]
         self.starts_at_once = bool(np.isinf(self._acceleration).all())
         # An error of a length, divided twice by the time, is an error of an acceleration: it is kept near rounding.
-        exact = max(1e-12, 32.0 * _ROUNDING * arm.height)
-        self.tolerance = 1e-10 if self.starts_at_once else exact
+        exact = max(1e-12 * arm.fineness, 32.0 * _ROUNDING * arm.height)
+        self.tolerance = 1e-10 * arm.fineness if self.starts_at_once else exact
         self._settled = enough_length(arm.home_configuration, self.tolerance)
         self._slows_down = setup.slows_down and self.starts_at_once
+        self._least_approach = _LEAST_APPROACH * arm.unit / arm.levers
         self.locked: set[str] = set()
         self._held = np.zeros(len(self.names), dtype=bool)
         self._jams = sorted(setup.jams, key=lambda jam: -jam[1])
@@ -135,7 +139,7 @@ class Actuation:
         ends = stroke, rate, self._acceleration
         lower, upper = actuator_box(value, rates, *ends, dt, state.duration or None)
         if slowing and self._slows_down:
-            down, up = _approach(value - stroke[:, 0]), _approach(stroke[:, 1] - value)
+            down, up = self._approach(value - stroke[:, 0]), self._approach(stroke[:, 1] - value)
             slow_lower, slow_upper = np.minimum(value - down, upper), np.maximum(value + up, lower)
             lower, upper = np.maximum(lower, slow_lower), np.minimum(upper, slow_upper)
         return Limits(lower, upper, self.names, value, rate * dt, *ends[::2], self._held)
@@ -146,8 +150,7 @@ class Actuation:
         lower, upper = np.maximum(box[0], value - reach), np.minimum(box[1], value + reach)
         return (lower, upper) if np.all(lower <= upper) else None
 
-
-def _approach(distance: Array) -> Array:
-    """Return how far a slowing actuator may move in one step at a `distance` (n_a,) before the end, m."""
-    distance = np.maximum(distance, 0.0)
-    return np.asarray(np.maximum(_APPROACH * distance, np.minimum(distance, _LEAST_APPROACH)))
+    def _approach(self, distance: Array) -> Array:
+        """Return how far slowing actuators may move in one step at a `distance` (n_a,) before the end, m or rad."""
+        distance = np.maximum(distance, 0.0)
+        return np.asarray(np.maximum(_APPROACH * distance, np.minimum(distance, self._least_approach)))

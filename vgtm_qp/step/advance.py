@@ -19,7 +19,8 @@ from vgtm_qp.step.stops import CANNOT_BRAKE
 from vgtm_qp.step.target import Target
 
 _TRUST = 0.2
-"""Greatest change of an actuator per share of the step, m, after the whole step failed."""
+"""Greatest change of an actuator per share of the step, rad or a share of the arm's unit, after the whole step failed.
+"""
 
 _LONGER = 2.0
 """Greatest ratio of an actuator's change to the displacement of its nodes."""
@@ -54,6 +55,7 @@ class Advancer:
     def __init__(self, attempt: Attempt, actuation: Actuation, shaping: Shaping) -> None:
         self._attempt, self._actuation, self._shaping = attempt, actuation, shaping
         self._tip_mode, self._step_limit = shaping.setup.tip_mode, shaping.setup.step_limit
+        self._arm = shaping.setup.arm
 
     def brakes(self, dt: float) -> Brakes:
         """Return how the arm brakes in steps of `dt`, s."""
@@ -104,7 +106,8 @@ class Advancer:
     ) -> Iterator[Advance]:
         """Yield the attempts at the `first` share of a piece, and at halves of that down to its `smallest` share."""
         values, box = self._actuation.values(state), (target.lower, target.upper)
-        share, trust = first, min(_TRUST, _LONGER * self._step_limit) / first
+        longest = min(_TRUST * self._arm.unit, _LONGER * self._step_limit)
+        share, trust = first, longest / self._arm.levers / first
         yield self._try_piece(state, target, dt, first, box, tracking)
         while share > first * smallest:
             share /= 2

@@ -35,7 +35,7 @@ _TOO_FAR = 1e3
 """Displacement of a node, over the arm's length, from which on the answer of a QP shows a singular pose."""
 
 _DEVIATION = 0.1
-"""Greatest deviation of points from their chords in one step, m."""
+"""Greatest deviation of points from their chords in one step, over the arm's unit."""
 
 _SETTLING = 5e-3
 """Tip error after a QP, over the arm's length, above which another QP is solved."""
@@ -78,7 +78,10 @@ class Attempt:
         self._has_limit, self._too_long = setup.step_limit < np.inf, setup.too_long
         self.separation = separation
         self.phases = Phases("distance", "qp", "correction", "acceptance")
-        self.accuracy = Accuracy(actuation.tolerance, tip=1e-8, start=_SETTLING * setup.arm.height)
+        arm = setup.arm
+        self.accuracy = Accuracy(
+            actuation.tolerance, tip=1e-8 * arm.unit, start=_SETTLING * arm.height, tracking=1e-7 * arm.unit
+        )
         self.acceptance = Acceptance(setup, self.accuracy)
         self.use(setup)
 
@@ -128,12 +131,16 @@ class Attempt:
     ) -> Step:
         """Return the step of an engine that drives apart pairs too near each other; if that fails, only keeps them."""
         short = self.separation.shortfall_of(state)
-        for gain in (RECOVERY, 0.0) if short else (0.0,):
+        for gain in (self._recovery(short), 0.0) if short else (0.0,):
             asked, reach = self._first(state, target, share, progress, short, gain)
             step = self._run(state, asked, reach, short, gain, engine, tracking)
             if step.moved:
                 break
         return step
+
+    def _recovery(self, short: Shortfall) -> float:
+        """Return the distance by which pairs that are too near are driven apart, m."""
+        return RECOVERY * self._arm.unit if short else 0.0
 
     def gave_way(self, state: State) -> bool:
         """Return whether stations of a state are off the curve that exact tracking keeps them on."""
@@ -147,7 +154,7 @@ class Attempt:
     def first_input(self, state: State, target: Target) -> QPInput:
         """Return the input of the first QP of a step from `state`."""
         short = self.separation.shortfall_of(state)
-        return self._first(state, target, 1.0, 0.0, short, RECOVERY if short else 0.0)[0]
+        return self._first(state, target, 1.0, 0.0, short, self._recovery(short))[0]
 
     def _first(
         self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
@@ -229,7 +236,7 @@ class Attempt:
             phases.add("acceptance")
             if after is None:
                 continue
-            if not separation.deviation(state.q, q) < _DEVIATION:
+            if not separation.deviation(state.q, q) < _DEVIATION * self._arm.unit:
                 return blocked("the arm turns too far in one step")
             if self._has_limit and (too_long := self._too_long(self._arm.nodes(q) - state.nodes)):
                 return blocked(too_long)

@@ -25,7 +25,7 @@ from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.bays import BaySolver
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import FusedSolver
-from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.layout import Layout, with_angles
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, dense_solver, make_solver
@@ -73,6 +73,7 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
         "safe": clearance.safe,
         "influence": clearance.influence,
         "by_fcl": clearance.distance == "fcl",
+        "unit": arm.unit,
     }
     if solves:
         how = {"compiled": compiled, "plain": plain}
@@ -129,13 +130,13 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         The arm cannot keep its stations on the curve exactly as asked.
     """
     method, stations, spec = problem.method, arm.stations, problem.curve
-    elastic = problem.end_effector.mode == "elastic"
+    elastic, weights = problem.end_effector.mode == "elastic", with_angles(method.weights, arm)
     if method.goes_by_bays and len(stations) < 2:
         text = '"coupled" or "none": the others go along the faces, and this arm has fewer than two'
         raise problem.error([problem.mistake(("method", "tracking"), text)])
     if method.tracking == "none" or len(stations) < 2:
         tables = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
-        layout = Layout(arm, *tables, task.row_names, method.weights, elastic_tip=elastic)
+        layout = Layout(arm, *tables, task.row_names, weights, elastic_tip=elastic)
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
     is_hard, mistakes = method.holds_curve, list(_beyond_the_arm(problem, arm, task))
     if method.gives_way and mistakes and method.hard_coordinates == ("position",):
@@ -180,7 +181,7 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         family.weights(s, 1),
         tracked,
         task.row_names,
-        method.weights,
+        weights,
         hard_tracking=is_hard,
         hard_turns=is_hard and len(method.hard_coordinates) > 1,
         elastic_tip=elastic,

@@ -18,7 +18,7 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import PeriodValues
 from vgtm_qp.qp.long.solver import ChainSolver
 from vgtm_qp.qp.numbers import Legs, RowNumbers, beyond
-from vgtm_qp.qp.settle import enough_length, enough_tip_error, held
+from vgtm_qp.qp.settle import TOO_FAR, enough_length, enough_tip_error, held
 from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 from vgtm_qp.step.closing import Closing, Correct, converge
@@ -124,12 +124,12 @@ class ChainEngine(Engine):
             nonlocal wanted, gain, steers
             is_off = steers
             if by_strokes and own is not first:
-                error = self._task.error(*self._tip_of(own, turned=self._task.turns is not None), goal)
-                off = float(np.abs(error).max())
+                tip = self._tip_of(own, turned=self._task.turns is not None)
+                error, off = self._task.error(*tip, goal), self._task.off(*tip, goal)
                 if off > accuracy.start:
                     return np.inf, None
                 if steers and gain is None and off > enough_tip:
-                    gain = solver.gain(held(*self._answer))
+                    gain = solver.gain(held(*self._answer, self.layout.arm.fineness))
                     steers = gain is not None
                 if is_off := gain is not None and off > enough_tip:
                     wanted = wanted + gain @ error
@@ -137,14 +137,14 @@ class ChainEngine(Engine):
             closer, worst = closing.step(own)
             return worst, closer.copy if is_off or not worst <= enough else None
 
-        own, worst = converge(first, measure)
+        own, worst = converge(first, measure, TOO_FAR * self.layout.arm.unit)
         closed = self._closed(X, own, worst)
         strokes = closed.quantities[self.layout.arm.actuators]
         if not (
             by_strokes or (worst <= accuracy.member and np.abs(beyond(strokes, *bounds)).max() <= enough)
         ):
             closed = self._any_closing.close(closed.q, *bounds, accuracy.member)
-        off = float(np.abs(self._task.error(closed.tip_position, closed.tip_rotation, goal)).max())
+        off = self._task.off(closed.tip_position, closed.tip_rotation, goal)
         is_there = off <= accuracy.tip and closed.error <= accuracy.member
         return Settled(closed, curve) if is_there else None
 

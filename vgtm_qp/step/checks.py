@@ -22,7 +22,7 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import over_all_nodes, tip_response
 
 _POINT = 1e-6
-"""Length of the member that stands for a point, m; distances are printed to no more digits."""
+"""Length of the member that stands for a point, over the arm's unit; distances are printed to no more digits."""
 
 
 def checked_arm(problem: Problem) -> Setup:
@@ -145,7 +145,7 @@ def _out_of_reach(problem: Problem, setup: Setup) -> Iterator[Mistake]:
     for target, key, value in _targets(problem):
         distance = np.linalg.norm((target - arm.home[base])[:, axes], axis=1)
         k = int(np.argmax(distance - reach))
-        if distance[k] > reach[k] + _POINT:
+        if distance[k] > reach[k] + _POINT * arm.unit:
             node = f'base node "{arm.node_names[base[k]]}"'
             where = (
                 f"a position at most {reach[k]:.3f} m from {node}, all {arm.bodies.kind}s at their longest"
@@ -159,13 +159,14 @@ def _inside_obstacles(problem: Problem, setup: Setup, hollow: float) -> Iterator
     if len(setup.task.axes) < 3 or not obstacles:
         return
     arm, safe = setup.arm, problem.clearance.safe
+    point_size = _POINT * arm.unit
     at_tip = np.isin(arm.bodies.joints, arm.end_effector.nodes).any(axis=1)
     needed = safe + float(arm.bodies.radius[at_tip].min())
     spot = capsules([[0, 1]], 0.0)
     point = Clearance(spot, obstacles, safe=safe, influence=needed, self_collision=False, by_fcl=False)
     for target, key, value in _targets(problem):
-        distance, pair = point.least(np.stack([target, target + _POINT / 2]))
-        if pair is not None and distance + hollow + _POINT < needed:
+        distance, pair = point.least(np.stack([target, target + point_size / 2]))
+        if pair is not None and distance + hollow + point_size < needed:
             obstacle = obstacles[point.pieces.obstacle[pair.other]].name
             found = f"{-distance:.3g} m inside it" if distance <= 0.0 else f"{distance:.3g} m from it"
             expected = f'a position {needed:g} m from obstacle "{obstacle}" (clearance and member radius)'

@@ -19,7 +19,7 @@ Correct = Callable[[], Array]
 
 
 def converge(
-    q: Array, measure: Callable[[Array], tuple[float, Correct | None]], too_far: float = TOO_FAR
+    q: Array, measure: Callable[[Array], tuple[float, Correct | None]], too_far: float
 ) -> tuple[Array, float]:
     """Return the configuration to which Newton's method leads, and its error, infinite in a singular pose.
 
@@ -42,6 +42,7 @@ class Closing:
 
     def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
         self._layout, self._arm, self._kinematics = layout, layout.arm, kinematics
+        self._too_far = TOO_FAR * layout.arm.unit
         self._actuators, self._fixed = layout.arm.actuators, ~layout.arm.actuated
 
     @cached_property
@@ -57,12 +58,12 @@ class Closing:
         return LengthSolver(self._arm.bays, np.flatnonzero(self._fixed), held)
 
     def close(
-        self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float = TOO_FAR
+        self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float | None = None
     ) -> Closed:
         """Return the configuration near `q` whose actuators keep their values, or go to the nearest one allowed.
 
         `lower`, `upper` (n_a,) are their bounds. The error is infinite in a singular pose; the iteration ends at errors
-        beyond `too_far`.
+        beyond `too_far`, m or rad.
         """
         kinematics, wanted = self._kinematics, self._arm.home_quantities.copy()
 
@@ -73,7 +74,7 @@ class Closing:
         def solve(error: Array) -> Array:
             return self._lengths.solve(kinematics.gradient, error)
 
-        return self._newton(q, missing, solve, tolerance, too_far)
+        return self._newton(q, missing, solve, tolerance, self._too_far if too_far is None else too_far)
 
     def close_on_curve(
         self, q: Array, points: Array, lower: Array, upper: Array, tolerance: float

@@ -83,7 +83,7 @@ class Engine(ABC):
         if progress < 1.0:
             span, goal = target.end - target.start, asked.goal
             left = (1.0 - progress) * abs(span) * float(np.abs([goal.velocity, goal.spin]).max())
-            if left <= LEFT:
+            if left <= LEFT * arm.fineness:
                 # Interior-point solvers stop just short of the end; the arm would need one more step.
                 progress = 1.0
         furthest = float(np.abs(solution.nodes).max())
@@ -151,7 +151,7 @@ class Equalities:
         for step in range(SETTLING_STEPS + 1):
             closed = self._closing.close(q, target.lower, target.upper, accuracy.member)
             missing = self._missing_at(closed.q, curve, asked, goal)
-            off = norm(missing)
+            off = norm(self._layout.levers * missing)
             if not (closed.error <= accuracy.member and off <= accuracy.start):
                 return None
             if step == SETTLING_STEPS or off <= enough_tip_error(closed.q, accuracy.tip):
@@ -216,7 +216,7 @@ class GeneralEngine(Engine):
         assert self._last is not None
         slack = self._last[2].tip_slack
         settled = None
-        if slack <= _ON_PATH:
+        if slack <= _ON_PATH * self.layout.arm.fineness:
             ways = {
                 "equalities": self._by_equalities,
                 "curve": self._on_its_curve,
@@ -238,7 +238,7 @@ class GeneralEngine(Engine):
     ) -> Settled | None:
         assert self._last is not None
         asked, numbers, solution = self._last
-        at_bound = held(solution.actuators, numbers.lower, numbers.upper)
+        at_bound = held(solution.actuators, numbers.lower, numbers.upper, self.layout.arm.fineness)
         gain = partial(self._condensed.gain_of, numbers, at_bound)
         return self.equalities.settle(q, curve, asked, goal, accuracy, gain)
 
@@ -265,7 +265,7 @@ class GeneralEngine(Engine):
         for step in range(MOST_STEPS + 1):
             closed = self._closing.close(q, *(np.clip(strokes, *bounds),) * 2, accuracy.member)
             error = self._task.error(closed.tip_position, closed.tip_rotation, goal)
-            off = float(np.abs(error).max())
+            off = self._task.off(closed.tip_position, closed.tip_rotation, goal)
             if not (closed.error <= accuracy.member and off <= accuracy.start):
                 return None
             if step == MOST_STEPS or off <= enough_tip_error(closed.q, accuracy.tip):
@@ -280,11 +280,13 @@ class GeneralEngine(Engine):
         """Return the actuators' changes (n_a, n_e) per tip error after the last QP; None if they cannot settle it."""
         assert self._last is not None
         _, numbers, solution = self._last
-        return self._solver.gain(held(solution.actuators, numbers.lower, numbers.upper))
+        return self._solver.gain(
+            held(solution.actuators, numbers.lower, numbers.upper, self.layout.arm.fineness)
+        )
 
     def _off(self, closed: Closed, goal: TipGoal) -> float:
-        """Return the greatest tip error, m or rad."""
-        return float(np.abs(self._task.error(closed.tip_position, closed.tip_rotation, goal)).max())
+        """Return the norm of the tip's error, m."""
+        return self._task.off(closed.tip_position, closed.tip_rotation, goal)
 
 
 class FusedEngine(Engine):

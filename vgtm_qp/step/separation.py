@@ -19,16 +19,16 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 
 RECOVERY = 0.01
-"""Distance by which a step drives apart a pair that is too near at its start, m."""
+"""Distance by which a step drives apart a pair that is too near at its start, over the arm's unit."""
 
 _ROUNDING = 1e-10
-"""Shortfall of a clearance that counts as rounding, m."""
+"""Shortfall of a clearance that counts as rounding, m, for arms of a fineness of 1."""
 
 _APPROACH = 0.4
 """Largest share of its remaining clearance that a pair may use in one step."""
 
 _LEAST_APPROACH = 2e-3
-"""Approach that a slowing pair is always allowed in one step, m."""
+"""Approach that a slowing pair is always allowed in one step, over the arm's unit."""
 
 _MOST_PIECES = 16
 """Greatest number of pieces into which a motion is cut if points leave their chords."""
@@ -37,7 +37,7 @@ _NEAR_ANGLE = 0.3
 """Excess over the least angle, rad, above which bodies that meet have no row."""
 
 _BETWEEN = 5e-5
-"""Approach between states that is allowed to bodies whose points leave their chords, m.
+"""Approach between states that is allowed to bodies whose points leave their chords, over the arm's unit.
 
 It is half of the published tolerance.
 """
@@ -53,7 +53,8 @@ class Separation:
     def __init__(self, setup: Setup) -> None:
         self._setup, self._arm, self._monitor = setup, setup.arm, setup.monitor
         self._approach = _APPROACH if setup.slows_down else 1.0
-        self._floors = setup.safe - _ROUNDING, setup.self_safe - _ROUNDING
+        self._rounding, self._between = _ROUNDING * setup.arm.fineness, _BETWEEN * setup.arm.unit
+        self._floors = setup.safe - self._rounding, setup.self_safe - self._rounding
         meeting = setup.monitor.bodies.joints
         self._corners = corners(meeting if setup.minimum_angle > 0.0 else meeting[:0])
 
@@ -87,7 +88,7 @@ class Separation:
         if report.certified and not before and not self._arm.leaves_chords:
             return report, {}
         after = self.shortfall(q, time)
-        if all(distance >= before.get(pair, np.inf) - _ROUNDING for pair, distance in after.items()):
+        if all(distance >= before.get(pair, np.inf) - self._rounding for pair, distance in after.items()):
             return report, after
         return report, None
 
@@ -103,13 +104,14 @@ class Separation:
                 floor = min(floor, distance)
         points, between = self._arm.points, self._monitor.between
         if not self._arm.leaves_chords:
-            floors = floor - _ROUNDING, max(self_floor - _ROUNDING, 0.0)
+            floors = floor - self._rounding, max(self_floor - self._rounding, 0.0)
             return between(points(start), points(end), start_time, end_time, *floors)
         deviation = self.deviation(start, end)
         # In k pieces, the deviation from the chords is 1 / k^2 of the whole.
-        needed = math.ceil(math.sqrt(max(deviation / _BETWEEN, 1.0))) if deviation < 1.0 else 1
+        is_far = deviation >= self._arm.unit
+        needed = 1 if is_far else math.ceil(math.sqrt(max(deviation / self._between, 1.0)))
         pieces, lowest = min(needed, _MOST_PIECES), np.inf
-        spare = deviation / pieces**2 - _BETWEEN
+        spare = deviation / pieces**2 - self._between
         floors = floor + spare, max(self_floor + spare, 0.0)
         for k in range(pieces):
             here, there = (points(start + share * (end - start)) for share in (k / pieces, (k + 1) / pieces))
@@ -171,7 +173,7 @@ class Separation:
             if self._monitor.pieces.moving:
                 rows.lower += contacts.normal_speed * duration
             # The remaining clearance is that after the obstacles have moved.
-            rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH)
+            rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH * self._arm.unit)
 
     def with_rows_between(
         self, rows: ClearanceRows, state: State, q: Array, time: float, fractions: list[float]

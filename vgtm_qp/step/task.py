@@ -13,8 +13,9 @@ from vgtm_qp.arm.arm import Arm, Kinematics
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError
+from vgtm_qp.qp.numbers import norm
 from vgtm_qp.rotation import rotation_from_vector, turn_between
-from vgtm_qp.rows.tip import TipGoal, axes, row_names, tip_function
+from vgtm_qp.rows.tip import TipGoal, axes, levers, row_names, tip_function
 from vgtm_qp.step.path import Path
 
 _UNCHANGED = "the state of the arm is unchanged"
@@ -50,7 +51,8 @@ class TipTask:
                 f'"{self.turns}" needs a tip of three or more nodes; this one has {len(tip.nodes)}'
             )
         self.axes = np.array(axes(self.row_names), dtype=np.int64)
-        self._rows = Kernel(tip_function(self.row_names), compiled=False)
+        self._rows = Kernel(tip_function(self.row_names, arm.unit), compiled=False)
+        self._levers = np.array(levers(self.row_names, arm.unit))
         self._position_jacobian = np.kron(tip.weights, np.eye(3))[self.axes]
 
     def residual(
@@ -69,6 +71,10 @@ class TipTask:
         self._rows()
         error, rate, across, weight = self._rows.outputs
         return error.copy(), rate.copy(), across.reshape(3, -1).T.copy(), float(weight[0])
+
+    def off(self, position: Array, rotation: Array, goal: TipGoal) -> float:
+        """Return the norm of the error, m: angles times the arm's unit."""
+        return norm(self._levers * self.error(position, rotation, goal))
 
     def error(self, position: Array, rotation: Array, goal: TipGoal) -> Array:
         """Return the error (n_e,) alone, m or rad, as every step of settling needs it."""

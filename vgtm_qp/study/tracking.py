@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from time import process_time
 
 import numpy as np
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.solve import solve
+from vgtm_qp.problem import Problem
 from vgtm_qp.study.drawing import label, panels, select
 from vgtm_qp.study.robustness import SEED, share_of
 from vgtm_qp.study.scenes import random_scene
@@ -41,6 +43,12 @@ def tasks(
     return [{**scene, "number": k, "tracking": form} for k in range(count) for form in forms]
 
 
+@lru_cache(maxsize=2)
+def _scene(seed: int, number: int, steps: int) -> Problem:
+    """Return the problem of a scene, which is the same for all forms."""
+    return random_scene(seed, number, steps=steps).problem
+
+
 def run(seed: int, number: int, steps: int, tracking: str) -> Row:
     """Solve one scene with one form of tracking and return its row.
 
@@ -49,7 +57,7 @@ def run(seed: int, number: int, steps: int, tracking: str) -> Row:
     greatest ``gap``, m, None without a curve; the ``travel`` of all actuators, m; the median ``step``, s, and CPU
     ``seconds``.
     """
-    problem = random_scene(seed, number, steps=steps).problem
+    problem = _scene(seed, number, steps)
     module, started = problem.to_dict()["truss"]["module"], process_time()
     try:
         maneuver = solve(problem.replace(TRACKINGS[tracking]))

@@ -15,6 +15,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+from vgtm_qp.compiled import OFTEN, SELDOM, compile_after
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.machine import pin_threads
 
@@ -110,10 +111,10 @@ def run_dask(function: str, tasks: Sequence[Task], address: str) -> Iterator[tup
 class _Worker:
     """A process that answers one task at a time, and the time at which it counts as hung."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_alone: bool) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self._process = context.Process(target=_serve, args=(theirs, is_alone), daemon=True)
         self._process.start()
         theirs.close()
 
@@ -145,7 +146,7 @@ def _pool(
     try:
         while waiting or busy:
             while waiting and len(busy) < workers:
-                busy.append(_Worker())
+                busy.append(_Worker(is_alone=workers == 1))
                 busy[-1].give(function, *waiting.popleft())
             ready: list[Any] = wait([worker.pipe for worker in busy], timeout=0.5)
             for worker in list(busy):
@@ -166,9 +167,11 @@ def _pool(
             worker.stop()
 
 
-def _serve(pipe: Connection) -> None:
+def _serve(pipe: Connection, is_alone: bool) -> None:
     """Answer tasks until the other end closes; an interrupt is the other process's business."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Beside other processes, to compile the kernels of an arm costs more than a few maneuvers with it gain.
+    compile_after(OFTEN if is_alone else SELDOM)
     while True:
         try:
             function, task = pipe.recv()

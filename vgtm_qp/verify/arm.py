@@ -72,6 +72,8 @@ class RecordedArm:
         if len(members) and members.max() >= nodes:
             raise ResultError(f"array members names a node outside 0..{nodes - 1} of manifest.arm.home")
         self.members, self.corners = members, triangle[members]
+        first, last = self.home[members.T]
+        self.size = float(np.linalg.norm(last - first, axis=1).mean()) if len(members) else 1.0
         self.quantity_names, self.home_quantities = self.member_names, self.length
         self.free = np.setdiff1d(np.arange(nodes), self.base)
         # Fewer than three nodes have no attitude.

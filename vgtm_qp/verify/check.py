@@ -17,7 +17,6 @@ from vgtm_qp.verify.arm import Arm, recorded_arm
 from vgtm_qp.verify.clearance import (
     BETWEEN_TOLERANCE,
     CLEARANCE_TOLERANCE,
-    RESOLUTION,
     AgainstBody,
     AgainstMembers,
     Encounters,
@@ -87,7 +86,8 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
     if len(motion.states) > _FEW_STATES and 3 * len(arm.free) > _MANY_UNKNOWNS:
         notes.append(f"singular values are those of {_FEW_STATES} states")
     tip, rotation = arm.tip_position(motion.states), arm.tip_rotations(motion.states)
-    target_error, astray, remarks = check_path(maneuver, tip)
+    at_tip = TIP_TOLERANCE * arm.size
+    target_error, astray, remarks = check_path(maneuver, tip, at_tip)
     effector = maneuver.manifest["problem"].get("end_effector") or {}
     is_elastic = effector.get("mode") == "elastic"
     differences = {
@@ -103,15 +103,15 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
     return Certificate(
         **_limits(maneuver, arm, arm.quantities(motion.states)),
         **clearances,
-        tip_error=_worst(tip_error(maneuver, tip), "m", None if is_elastic else TIP_TOLERANCE),
+        tip_error=_worst(tip_error(maneuver, tip), "m", None if is_elastic else at_tip),
         tip_direction_error=_worst(
             direction_error(maneuver, rotation), "rad", None if is_elastic else DIRECTION_TOLERANCE
         ),
-        target_error=_worst(target_error, "m", TIP_TOLERANCE),
+        target_error=_worst(target_error, "m", at_tip),
         array_error=_worst(differences[furthest], "m", ARRAY_TOLERANCE, array=furthest),
         length_singular_value=_least_of(values[:, 0], ""),
         tip_singular_value=_least_of(values[:, 1], "m/m"),
-        **curve_measures(maneuver, rotation),
+        **curve_measures(maneuver, rotation, arm.size),
         tip_error_per_millimetre=_worst(values[:, 2] if len(values) else None, "mm", None),
         fcl_rows=Measure(reported.get("fcl"), ""),
         exact_rows=Measure(reported.get("exact"), ""),
@@ -192,11 +192,12 @@ def _clearances(
         at, between, _ = _least_clearances(motion, against)
         self_at, self_between, _ = _least_clearances(motion, members)
     angle = float(rules.get("minimum_angle") or -np.inf)
+    spare = BETWEEN_TOLERANCE * motion.arm.size
     measures = {
         "clearance": _least(at, safe - CLEARANCE_TOLERANCE),
-        "clearance_between": _least(between, safe - BETWEEN_TOLERANCE),
+        "clearance_between": _least(between, safe - spare),
         "self_clearance": _least(self_at, self_safe - CLEARANCE_TOLERANCE),
-        "self_clearance_between": _least(self_between, self_safe - BETWEEN_TOLERANCE),
+        "self_clearance_between": _least(self_between, self_safe - spare),
         "member_angle": _least(_member_angle(motion), angle - DIRECTION_TOLERANCE, "rad"),
     }
     return measures, clearance, self_clearance, wrong, notes
@@ -215,7 +216,7 @@ def _least_clearances(motion: RecordedMotion, encounters: Sequence[Encounters]) 
         for pairs in encounters:
             limit, bound = pairs.between(step, limit, bound)
     # The bound names an interval; if the clearance found there is as low, its instant is more precise.
-    where = limit.where if bound.value >= limit.value - RESOLUTION else bound.where
+    where = limit.where if bound.value >= limit.value - motion.resolution else bound.where
     between = Least(min(bound.value, limit.value), where)
     return at, between, np.array([least.value for least in each])
 

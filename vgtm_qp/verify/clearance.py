@@ -23,9 +23,9 @@ Pairs = tuple[Index, Index]
 CLEARANCE_TOLERANCE = 1e-9
 """Clearances at states, m."""
 BETWEEN_TOLERANCE = 1e-4
-"""Clearances between states, m."""
+"""Clearances between states, over the mean length of members or links."""
 RESOLUTION = 1e-6
-"""Greatest gap of the bound between states below the least clearance found there, m."""
+"""Greatest gap of the bound between states below the least clearance found there, over the same."""
 
 _GREATEST_DEPTH = 48
 _GREATEST_COUNT = 1_000_000
@@ -41,6 +41,7 @@ class RecordedMotion:
     def __init__(self, arm: Arm, time: Array, states: Array) -> None:
         self.arm, self.time, self.states = arm, time, states
         self.ends = arm.states_ends(states)
+        self.resolution = RESOLUTION * arm.size
 
     def ends_between(self, step: int, body: Index, share: Array) -> Array:
         """Return (P, 2, 3) the ends, m, of bodies (P,) at shares (P,) of the motion from state `step` to the next."""
@@ -130,7 +131,7 @@ class Encounters(ABC):
             pair = next(self._counting(low, high, state, state, reach), None)
             if pair is not None:
                 # Boxes along the axes may be exactly as far apart as the pair: rounding must not drop it.
-                return float(self.distances(state, pair).min()) + RESOLUTION
+                return float(self.distances(state, pair).min()) + self.motion.resolution
             reach *= 2.0
         return np.inf
 
@@ -174,7 +175,7 @@ class Encounters(ABC):
                 held = np.minimum(*(self._apart(ends, normal, pair) for ends in edges))
                 touching = self._apart(points, np.zeros_like(normal), pair)
                 proven = np.maximum(proven, np.maximum(held - bend * width**2 / 8.0, touching))
-            open_ = (proven < limit.value - RESOLUTION) & np.isfinite(bend)
+            open_ = (proven < limit.value - self.motion.resolution) & np.isfinite(bend)
             if depth == _GREATEST_DEPTH - 1 or open_.sum() > _GREATEST_COUNT:
                 open_[:] = False
             settled = np.where(open_, np.inf, proven)

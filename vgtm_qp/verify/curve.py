@@ -16,7 +16,7 @@ from vgtm_qp.result.result import Result
 from vgtm_qp.verify.path import DIRECTION_TOLERANCE, angles
 
 TRACKING_TOLERANCE = 1e-6
-"""Tolerance of stations with exact tracking and of the curve's end, m."""
+"""Tolerance of stations with exact tracking and of the curve's end, over the mean length of members or links."""
 
 _PIECES = 400
 """Chords of each Bezier segment whose lengths make its arc length."""
@@ -110,12 +110,15 @@ class RecordedCurve(NamedTuple):
         return np.asarray(ends[:, 1] - ends[:, 0])
 
 
-def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
-    """Return the measures of a maneuver's curve, whose tip has the attitudes `rotation` (T, 3, 3)."""
+def curve_measures(maneuver: Result, rotation: Array, size: float) -> dict[str, Measure]:
+    """Return the measures of a maneuver's curve, whose tip has the attitudes `rotation` (T, 3, 3).
+
+    Tolerances are for members or links whose mean length is `size`, m.
+    """
     record, vertices = maneuver.manifest.get("curve"), maneuver.control_vertices
     if record is None or not vertices.shape[1]:
         return {}
-    table = Record(record, "manifest.curve")
+    table, tolerance = Record(record, "manifest.curve"), TRACKING_TOLERANCE * size
     curve = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices.shape[1])
     stations = np.einsum("kq,tkqc->tkc", curve.weights, maneuver.nodes[:, curve.stations])
     off = np.linalg.norm(stations - curve.points(vertices), axis=2)
@@ -128,14 +131,14 @@ def curve_measures(maneuver: Result, rotation: Array) -> dict[str, Measure]:
         "tracking_gap": Measure(
             float(off[row, k]),
             "m",
-            TRACKING_TOLERANCE if is_hard else None,
+            tolerance if is_hard else None,
             "most",
             f"row {row}, station {k + 1}",
         ),
-        "states_off_curve": Measure(float(np.mean(moved.max(axis=1) > TRACKING_TOLERANCE)), "of the states"),
+        "states_off_curve": Measure(float(np.mean(moved.max(axis=1) > tolerance)), "of the states"),
     }
     ends = {
-        "curve_end_gap": ("ends_at_tip", off[:, -1], "m", TRACKING_TOLERANCE),
+        "curve_end_gap": ("ends_at_tip", off[:, -1], "m", tolerance),
         "curve_end_angle": (
             "ends_along_tip",
             angles(curve.end_direction(vertices), rotation[:, :, 2]),

@@ -15,7 +15,7 @@ from vgtm_qp.result.poses import rotation_matrix
 from vgtm_qp.result.result import Result
 
 TIP_TOLERANCE = 1e-6
-"""Tolerance of the tip's position and of its target's distance from the path, m."""
+"""Tolerance of the tip's position and of its target's distance from the path, over the mean member or link."""
 DIRECTION_TOLERANCE = 1e-6
 """Tolerance of the tip's direction and orientation, rad."""
 
@@ -42,8 +42,8 @@ def direction_error(maneuver: Result, rotation: Array) -> Array | None:
     return np.max(errors, axis=0) if errors else None
 
 
-def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], list[str]]:
-    """Check the targets of a maneuver whose tip was at `tip` (T, 3), m.
+def check_path(maneuver: Result, tip: Array, tolerance: float) -> tuple[Array | None, list[str], list[str]]:
+    """Check the targets of a maneuver whose tip was at `tip` (T, 3), m, to a tolerance, m.
 
     Return the distance (T,) of each position target from the path, m, or None if there is no path of positions; then
     contradictions and notes, as in the certificate.
@@ -71,7 +71,7 @@ def check_path(maneuver: Result, tip: Array) -> tuple[Array | None, list[str], l
         targets = maneuver.tip_target_position
         target_error = _to_polyline(targets[:, axes], corners[:, axes])
         missed = float(np.linalg.norm(targets[-1, axes] - corners[-1, axes]))
-        if maneuver.status == "solved" and missed > TIP_TOLERANCE:
+        if maneuver.status == "solved" and missed > tolerance:
             contradictions.append(f"solved, but the last target is {missed:.3g} m from the end of the path")
     contradictions += _last_direction(maneuver, wanted.get("waypoint") or ())
     return target_error, contradictions, notes

@@ -71,7 +71,7 @@ def _nearer(group: Encounters, pairs: Pairs, name: str, distance: Array, floor: 
             )
         limit, bound = group.divide(state, pairs, Least(), Least())
         least_between = min(limit.value, bound.value)
-        if least_between < least - BETWEEN_TOLERANCE:
+        if least_between < least - BETWEEN_TOLERANCE * group.motion.arm.size:
             wrong.append(
                 f"recovered: {name} comes as near as {least_between:.9g} m in step {state + 1} from {least:.9g} m"
             )

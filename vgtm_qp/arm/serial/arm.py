@@ -65,6 +65,7 @@ class SerialArm(JointSpaceArm):
         self.node_names = ("base", *self.quantity_names, "tip", *beside)
         self.home, jacobian = self.chain.at(self.home_configuration)
         self.height = float(np.linalg.norm(np.diff(self.home[: count + 2], axis=0), axis=1).sum())
+        self.unit = self.chain.mean_length
         origins = np.array([0, *(1 + j for j in tracked), count + 1])
         first = count + 2 + 2 * np.arange(len(origins))
         nodes = np.column_stack([origins, first, first + 1])

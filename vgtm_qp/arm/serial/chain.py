@@ -72,9 +72,14 @@ class SerialChain:
         return np.asarray(np.linalg.norm(np.vstack([self.position, self.tip]), axis=1))
 
     @cached_property
+    def mean_length(self) -> float:
+        """Mean of those lengths that are not zero, m."""
+        return float(np.mean(self.lengths[self.lengths > 0.0]))
+
+    @property
     def spread(self) -> float:
         """Distance of the two nodes that orient a station from its origin: a tenth of the mean link, m."""
-        return 0.1 * float(np.mean(self.lengths[self.lengths > 0.0]))
+        return 0.1 * self.mean_length
 
     @property
     def constants(self) -> dict[str, Array]:

@@ -31,6 +31,8 @@ class TrussArm(Arm):
         self.home = self.home_configuration = truss.home
         self.base, self.free = truss.base, truss.free
         self.home_quantities, self.height = truss.home_lengths, truss.height
+        first, last = truss.home[truss.members.T]
+        self.unit = float(np.linalg.norm(last - first, axis=1).mean())
         self.actuated, self.actuator_units = truss.actuated, ("m",) * len(truss.actuators)
         self.stroke, self.rate, self.acceleration = truss.stroke, truss.rate, truss.acceleration
         self.stations = Stations(
