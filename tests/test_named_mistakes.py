@@ -142,7 +142,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 COMMANDS = [
     ("verify",),
-    ("export", "--to", "csv", "-o", "x.csv"),
+    ("export", "--to", "html", "-o", "x.html"),
     ("export", "--to", "mjcf", "-o", "x.xml"),
     ("export", "--to", "png", "-o", "x.png"),
     ("replay",),
@@ -154,6 +154,10 @@ EDITS = {
     "a wrong kind": (
         lambda content, manifest: manifest["problem"].update(clearance=3),
         "manifest.problem.clearance",
+    ),
+    "more nodes": (
+        lambda content, manifest: content.update(nodes=np.pad(content["nodes"], ((0, 0), (0, 1), (0, 0)))),
+        "array nodes holds 10 nodes; manifest.arm describes 9",
     ),
     "too great": (
         lambda content, manifest: content.update(tip_position=1e300 * content["tip_position"]),

@@ -11,7 +11,7 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.verify.arm import RecordedArm, arm_of
 from vgtm_qp.view.drawing import (
     FIXED_COLOUR,
     OBSTACLE_COLOUR,
@@ -46,12 +46,9 @@ def mjcf(maneuver: Result) -> str:
     Raises
     ------
     ExportError
-        The truss has offset joints, whose attitude point masses cannot have.
+        The arm is no truss, or has offset joints, whose attitude point masses cannot have.
     """
-    record = maneuver.manifest["arm"]
-    arm = RecordedArm(record, maneuver.members)
-    if not arm.has_pin_joints:
-        raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
+    record, arm = maneuver.manifest["arm"], pinned_truss(maneuver)
     name = str(maneuver.manifest["problem"].get("name", "truss"))
     root = Element("mujoco", model=name)
     _add(root, "compiler", angle="radian", autolimits="true")
@@ -72,6 +69,16 @@ def mjcf(maneuver: Result) -> str:
     _add_keyframes(root, maneuver, arm, [mesh for mesh in obstacles if mesh.velocity.any()])
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def pinned_truss(maneuver: Result) -> RecordedArm:
+    """Return the truss of a maneuver; ExportError where a MuJoCo model of it would not be the same."""
+    arm = arm_of(maneuver)
+    if not isinstance(arm, RecordedArm):
+        raise ExportError(f"this is the result of a {arm.kind} arm; expected that of a truss")
+    if not arm.has_pin_joints:
+        raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
+    return arm
 
 
 def node_masses(arm: RecordedArm) -> Array:

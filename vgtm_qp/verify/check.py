@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import Arm, recorded_arm
+from vgtm_qp.verify.arm import Arm, arm_of
 from vgtm_qp.verify.clearance import (
     BETWEEN_TOLERANCE,
     CLEARANCE_TOLERANCE,
@@ -75,11 +74,7 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
         The arm record in the manifest is malformed, or describes another number of nodes.
     """
     maneuver, foreign, differing = held_against(maneuver, problem)
-    arm = recorded_arm(maneuver.manifest["arm"], maneuver.members)
-    if maneuver.nodes.shape[1] != len(arm.home):
-        raise ResultError(
-            f"array nodes holds {maneuver.nodes.shape[1]} nodes; manifest.arm describes {len(arm.home)}"
-        )
+    arm = arm_of(maneuver)
     motion = RecordedMotion(arm, maneuver.time, maneuver.configurations)
     clearances, clearance, self_clearance, wrong, notes = _clearances(maneuver, motion)
     values = _singular_values(arm, motion.states)

@@ -13,7 +13,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.verify.arm import Arm, recorded_arm
+from vgtm_qp.verify.arm import Arm, arm_of
 
 FIXED_COLOUR = (0.70, 0.72, 0.74)
 OBSTACLE_COLOUR = (0.90, 0.62, 0.0)
@@ -100,7 +100,7 @@ def stroke_colours(share: Array) -> Array:
 def drawing_of_maneuver(maneuver: Result) -> Drawing:
     """Return the drawing of a result, from its manifest; raise ResultError where its record of the arm is wrong."""
     manifest = maneuver.manifest
-    arm = recorded_arm(manifest["arm"], maneuver.members)
+    arm = arm_of(maneuver)
     vertices = maneuver.control_vertices.shape[1]
     return make_drawing(manifest["problem"], arm, vertices, manifest.get("directory") or ".")
 
