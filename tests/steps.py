@@ -86,7 +86,7 @@ def make_step(
         np.stack([here, here + np.array([0.03, 0.02, -0.02])]),
         np.stack([rotation, turn @ rotation]),
     )
-    target = Target(path, 0.0, 1.0, lengths - 0.2, lengths + 0.2, 1.0, MOVED_BASE if base else None)
+    target = Target(path, 0.0, 1.0, lengths - 0.2, lengths + 0.2, 1.0, 1.0, MOVED_BASE if base else None)
     vertices = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, arm.height]
     vertices[2:] += 0.03 * rng.normal(size=vertices[2:].shape)
     normal = rng.normal(size=(3, 3))

@@ -140,7 +140,7 @@ def test_both_engines_hold_faces_on_the_curve_where_these_determine_the_nodes(na
     lengths, here = kinematics.quantities[arm.actuators].copy(), arm.end_effector.position(X)
     rotation = np.stack([kinematics.tip_rotation] * 2)
     path = Path(np.array([0.0, 1.0]), here + np.outer([0.0, 1.0], [0.02, 0.01, -0.015]), rotation)
-    target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
+    target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0, 1.0)
     centres = arm.stations.centres(X)[[0, *layout.tracked]]
     vertices = np.linspace(0, 1, layout.vertices)[:, None] * (centres[-1] - centres[0]) + centres[0]
     asked = QPInput(X, X, vertices, np.zeros(0), target, path.at(0.0), 0.0, ClearanceRows(), True)

@@ -45,7 +45,7 @@ def one_qp(penalty):
         np.stack([rotation] * 2),
     )
     lengths = truss.home_lengths[truss.actuators]
-    target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0)
+    target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0, 1.0)
     separation = Separation(arm)
     rows = separation.rows(X, 0.0, 1.0, 0.1, {}, 0.0)
     numbers = numbers_at(arm, X, arm.control_vertices, target, 0.0, rows, motion=True)

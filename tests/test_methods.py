@@ -51,7 +51,7 @@ def test_without_active_limits_the_qp_is_the_pseudoinverse(module: str, algebra:
     assert step.progress == 1.0, step.reason
 
     unlimited = np.full(len(setup.arm.actuators), 1e9)
-    target = Target(plan.path, start, end, -unlimited, unlimited, there.state.time + 0.05)
+    target = Target(plan.path, start, end, -unlimited, unlimited, there.state.time + 0.05, 0.05)
     q = np.array(there.state.nodes)
     numbers = numbers_at(setup, q, np.zeros((0, 3)), target, 0.0, ClearanceRows(), motion=True)
     answer = CondensedSolver(setup.layout).solve(numbers)

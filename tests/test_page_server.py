@@ -6,6 +6,7 @@ import base64
 import os
 import socket
 from collections.abc import Iterator
+from threading import Event
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ import vgtm_qp as vq
 from vgtm_qp.cli import main
 from vgtm_qp.live.page import Page, view
 from vgtm_qp.live.session import Session
+from vgtm_qp.methods import PRESETS
 from vgtm_qp.view.server import refusal, viser_server
 
 pytest.importorskip("viser")
@@ -136,6 +138,20 @@ def act(page: Any, *actions: Any) -> None:
     page.read_inbox()
 
 
+def test_instruments_that_fail_do_not_end_the_page(monkeypatch, capsys):
+    def broken(*_: object) -> str:
+        stop.set()
+        raise ZeroDivisionError("by design")
+
+    stop = Event()
+    with viser_server() as server:
+        page = Page(server, Session(vq.load_problem("five_bay_free")), None)
+        monkeypatch.setattr("vgtm_qp.live.page.read_out", broken)
+        page.run(stop)
+    assert "by design" in page.message
+    assert "by design" in capsys.readouterr().err
+
+
 def test_whatever_a_widget_raises_is_shown_and_the_page_goes_on(capsys: pytest.CaptureFixture[str]):
     with viser_server() as server:
         page = Page(server, Session(vq.load_problem("five_bay_free")), None)
@@ -147,7 +163,7 @@ def test_whatever_a_widget_raises_is_shown_and_the_page_goes_on(capsys: pytest.C
         assert page.message
 
 
-@pytest.mark.parametrize("method", ["pseudoinverse", "curve-pseudoinverse", "qp-none"])
+@pytest.mark.parametrize("method", PRESETS)
 def test_a_maneuver_of_another_method_is_solved_and_played(method: str):
     problem = vq.load_problem("five_bay_free").replace({"maneuver.steps": 4})
     with viser_server() as server:

@@ -76,7 +76,7 @@ def test_a_tip_that_cannot_be_moved_is_not_settled(compiled, tmp_path, monkeypat
     def settled(*free):
         """Where settling ends after a QP in which but a few actuators may move."""
         width = np.isin(np.arange(len(lengths)), free).astype(float)
-        target = Target(still, 0.0, 1.0, lengths - width, lengths + width, 1.0)
+        target = Target(still, 0.0, 1.0, lengths - width, lengths + width, 1.0, 1.0)
         asked = QPInput(q, q, *curve, target, target.goal(0.0), 0.0, ClearanceRows(), motion=False)
         goal = TipGoal(tip + np.array([1e-3, -2e-3, 1e-3]), rotation, np.zeros(3), np.zeros(3))
         found = []

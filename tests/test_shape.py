@@ -121,7 +121,7 @@ def test_the_rows_of_a_general_curve_are_those_of_the_equations(module, bays, cu
         q, at, vertices, torsion = near_home(setup, rng)
         lower = rng.uniform(0.5, 1.0, count)
         pose = Pose(0.05 * rng.normal(size=3), Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix())
-        target = Target(path, 0.5, 1.75, lower, lower + 0.1, 1.0, pose, setup.vertex_goals)
+        target = Target(path, 0.5, 1.75, lower, lower + 0.1, 1.0, 1.0, pose, setup.vertex_goals)
         goal, none = target.goal(0.4), ClearanceRows()
         asked = QPInput(q, at, vertices, torsion, target, goal, 0.4, none, motion).linear(layout)
         np.testing.assert_allclose(asked.goal.velocity, 1.25 * np.diff(path.positions, axis=0)[0] / 2.0)
@@ -149,7 +149,7 @@ def test_rows_of_gaps_and_turns_are_the_derivatives_of_their_residuals(module, b
     points, turned = rng.normal(size=vertices.shape), rng.normal(size=torsion.shape)
     lengths = arm.home_quantities[arm.actuators]
     still = Path(np.array([0.0, 1.0]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
-    target = Target(still, 0.0, 1.0, lengths, lengths, 1.0, None, setup.vertex_goals)
+    target = Target(still, 0.0, 1.0, lengths, lengths, 1.0, 1.0, None, setup.vertex_goals)
 
     def numbers(step):
         at, none = q + step * moved, ClearanceRows()

@@ -100,7 +100,7 @@ def random_numbers(
     )
     now = kinematics.quantities[truss.actuators]
     room = box * rng.uniform(0.2, 1.0, size=(2, len(now)))
-    target = Target(path, 0.0, 1.0, now - room[0], now + room[1], 0.0, MOVED_BASE if base else None)
+    target = Target(path, 0.0, 1.0, now - room[0], now + room[1], 0.0, 1.0, MOVED_BASE if base else None)
     vertices = np.linspace(0, 1, layout.vertices)[:, None] * [0.0, 0.0, truss.height]
     vertices = vertices + off * rng.normal(size=vertices.shape)
     nodes = truss.members[rng.integers(truss.member_count, size=(near, 2))].reshape(near, 4)

@@ -61,7 +61,14 @@ class Scene:
         lengths = self.kinematics.quantities[truss.actuators]
         pose = Pose(0.01 * rng.normal(size=3), rotation_from_vector(0.01 * rng.normal(size=3)))
         self.target = Target(
-            self.path, 0.0, 2.0, lengths - 0.1, lengths + 0.2, time=1.0, base=pose if base else None
+            self.path,
+            0.0,
+            2.0,
+            lengths - 0.1,
+            lengths + 0.2,
+            time=1.0,
+            duration=1.0,
+            base=pose if base else None,
         )
         self.linearisation = Linearisation(self.layout, compiled=False)
 
@@ -762,7 +769,7 @@ def crowded(resolver, count):
     tip, rotation = resolver.tip()
     path = Path(np.array([0.0, 1.0]), np.stack([tip, tip + 0.001]), np.stack([rotation, rotation]))
     strokes = state.quantities[setup.arm.actuators]
-    target = Target(path, 0.0, 1.0, strokes - 0.1, strokes + 0.1, state.time + 0.2)
+    target = Target(path, 0.0, 1.0, strokes - 0.1, strokes + 0.1, state.time + 0.2, 0.2)
     nodes = np.tile(np.arange(4), (count, 1))
     rows = ClearanceRows(nodes, np.ones((count, 4, 3)), np.full(count, -1.0))
     return QPInput(

@@ -192,3 +192,20 @@ def test_a_dead_end_of_a_curve_that_gives_way_too_late_is_passed_without_holding
     assert maneuver.status == "solved"
     assert maneuver.manifest["way_out"] == "elastic tracking"
     assert maneuver.certificate.ok, maneuver.certificate.failures()
+
+
+@pytest.mark.parametrize("method", [{}, {"tracking": "none"}, {"tracking": "recursive"}])
+@pytest.mark.parametrize("speed", [1e4, 100.0, 3.0])
+def test_an_obstacle_that_strikes_the_arm_is_named_however_fast(method, speed):
+    duration, steps = 2.0, 4
+    # It arrives in the middle of the third step.
+    center = [1.0 + 0.6 * duration * speed, 0.0, 1.2]
+    thing = {"name": "thrown", "shape": "box", "center": center, "size": 0.4, "velocity": [-speed, 0.0, 0.0]}
+    waypoint = {"time": duration, "position": [0.1, 0.0, 2.3]}
+    maneuver = {"steps": steps, "waypoint": [waypoint]}
+    changes = {"obstacle": [thing], "maneuver": maneuver, "method": {"retries": False, **method}}
+    found = vq.solve(problem(**changes))
+    assert found.certificate.ok, found.certificate.failures()
+    stop = found.manifest["stop"]
+    assert (stop["kind"], stop["obstacles"]) == ("obstacle", ["thrown"])
+    assert found.blocked_by[0].endswith("/ thrown")

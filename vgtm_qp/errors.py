@@ -65,6 +65,10 @@ class ResultError(VgtmError):
     """A result file is cut, altered, or of another version."""
 
 
+class AlteredResultError(ResultError):
+    """A result file whose content was changed: it is one, but not as it was written."""
+
+
 class ExportError(VgtmError):
     """A maneuver cannot be written in the wanted form, or replayed there."""
 

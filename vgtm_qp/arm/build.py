@@ -20,9 +20,8 @@ def make_arm(problem: Problem) -> Arm:
     Raises
     ------
     ProblemError
-        A locked member is not actuated, or the joints make no arm that can be moved.
-    TrussError
-        The truss is not statically determinate.
+        A locked member is not actuated, the joints make no arm that can be moved, or the truss is not statically
+        determinate.
     """
     if problem.arm is not None:
         mistakes = list(_beyond_serial(problem, problem.arm))
@@ -30,11 +29,14 @@ def make_arm(problem: Problem) -> Arm:
             raise problem.error(mistakes)
         return SerialArm(problem.arm)
     assert problem.truss is not None
-    try:
-        return TrussArm(build_truss(problem.truss))
-    except LockError as error:
-        wrong = [Mistake(f"truss.locked[{place}]", shown(name), said) for place, name, said in error.wrong]
-        raise problem.error(wrong) from None
+    with problem.blaming(("truss",), "nodes and members of a statically determinate truss"):
+        try:
+            return TrussArm(build_truss(problem.truss))
+        except LockError as error:
+            wrong = [
+                Mistake(f"truss.locked[{place}]", shown(name), said) for place, name, said in error.wrong
+            ]
+            raise problem.error(wrong) from None
 
 
 def _beyond_serial(problem: Problem, spec: ArmTable) -> Iterator[Mistake]:

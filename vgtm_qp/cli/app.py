@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import sys
 import traceback
 import warnings
@@ -19,7 +20,7 @@ from vgtm_qp.cli.output import ExitCode, document, note
 from vgtm_qp.cli.problems import check, list_problems, schema
 from vgtm_qp.cli.results import export, replay, verify, view
 from vgtm_qp.cli.solve import solve
-from vgtm_qp.errors import ProblemError, VgtmError, nearest
+from vgtm_qp.errors import AlteredResultError, ProblemError, VgtmError, nearest
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 """What the system says of a disk that takes no more."""
@@ -69,6 +70,8 @@ for order, (name, command) in enumerate(_COMMANDS.items()):
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run one command line, that of the process by default, and return its exit code."""
     given = list(sys.argv[1:] if tokens is None else tokens)
+    # What it logs of a damaged file is a traceback; the errors that it raises are said in a line.
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())
     try:
         with _plain_warnings():
             code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
@@ -102,6 +105,8 @@ def _outcome(error: BaseException) -> tuple[ExitCode, str]:
             return ExitCode.USAGE, _explained(error)
         case VgtmError() if _lacks_room(error):
             return ExitCode.INTERNAL, f"the system refuses: {error}"
+        case AlteredResultError():
+            return ExitCode.UNVERIFIED, str(error)
         case VgtmError():
             return ExitCode.USAGE, str(error)
         case KeyboardInterrupt():

@@ -9,6 +9,7 @@ def check(problem: ProblemName, /, *, json: Json = False) -> None:
     """Check a problem file: its keys and values, its arm, its obstacles and goals at the home pose."""
     from dataclasses import asdict
 
+    from vgtm_qp.methods import Resolver
     from vgtm_qp.problem import load_problem
     from vgtm_qp.step.build import build_arm
     from vgtm_qp.step.checks import check_problem, find_warnings
@@ -19,6 +20,9 @@ def check(problem: ProblemName, /, *, json: Json = False) -> None:
     mistakes = check_problem(loaded, setup)
     if mistakes:
         raise loaded.error(mistakes)
+    if loaded.method.name != "qp":
+        # Other methods ask more of an arm.
+        Resolver(loaded)
     warnings = find_warnings(loaded, setup)
     for warning in warnings:
         note(f"{source}: warning: {warning}")

@@ -50,7 +50,7 @@ def verify(
     A file that is no result file is wrong usage (exit code 2); one that is altered or outside a tolerance
     fails the verification (4); a maneuver that is right as far as it goes, but was blocked, gives 3.
     """
-    from vgtm_qp.errors import ResultError
+    from vgtm_qp.errors import AlteredResultError, ResultError
     from vgtm_qp.maneuver.maneuver import load_result
     from vgtm_qp.problem import load_problem
     from vgtm_qp.verify import verify as certify
@@ -61,10 +61,12 @@ def verify(
     entries: list[dict[str, Any]] = []
     for path in results:
         try:
-            maneuver = load_result(path)
-            certificate = certify(maneuver, problem=real)
+            with _about(path):
+                maneuver = load_result(path)
+                certificate = certify(maneuver, problem=real)
         except ResultError as error:
-            codes.append(ExitCode.UNVERIFIED if zipfile.is_zipfile(path) else ExitCode.USAGE)
+            is_altered = isinstance(error, AlteredResultError)
+            codes.append(ExitCode.UNVERIFIED if is_altered else ExitCode.USAGE)
             entries.append({"result": str(path), "verified": False, "error": str(error)})
             note(f"vgtm: {error}")
             continue
@@ -124,12 +126,13 @@ def view(
     from vgtm_qp.view.scene import import_viser
 
     import_viser()
-    loaded = load_result(shown) if shown.lower().endswith(".npz") else load_problem(shown)
-    note("interrupt (Ctrl-C) to end")
-    try:
-        serve(loaded, port=port, ready=say)
-    except KeyboardInterrupt:
-        note("ended")
+    with _about(Path(shown)):
+        loaded = load_result(shown) if shown.lower().endswith(".npz") else load_problem(shown)
+        note("interrupt (Ctrl-C) to end")
+        try:
+            serve(loaded, port=port, ready=say)
+        except KeyboardInterrupt:
+            note("ended")
 
 
 def export(
@@ -147,22 +150,23 @@ def export(
     suffix = FORMATS[to].suffix
     path = result.with_suffix(suffix) if output is None else output
     check_writable(path, "--output", (suffix,))
-    maneuver = load_result(result)
     with _about(result):
-        file = export_maneuver(maneuver, path, to=to)
+        file = export_maneuver(load_result(result), path, to=to)
     written = {"result": str(result), "format": to, "file": str(file), "bytes": file.stat().st_size}
     answer(written, f"{to}: {file}", as_json=json)
 
 
 @contextmanager
 def _about(result: Path) -> Iterator[None]:
-    """Name the result file in what is raised about its content."""
-    from vgtm_qp.errors import ResultError
+    """Name the result file in what is raised about its content, and tell one that was altered from other files."""
+    from vgtm_qp.errors import AlteredResultError, ResultError
 
     try:
         yield
     except ResultError as error:
-        raise ResultError(f"{result}: {error}") from None
+        said = str(error).removeprefix(f"{result}: ")
+        kind = AlteredResultError if zipfile.is_zipfile(result) else ResultError
+        raise kind(f"{result}: {said}") from None
 
 
 def replay(result: ResultFile, /, *, json: Json = False) -> None:
@@ -170,8 +174,7 @@ def replay(result: ResultFile, /, *, json: Json = False) -> None:
     from vgtm_qp.export.replay import replay as run
     from vgtm_qp.maneuver.maneuver import load_result
 
-    maneuver = load_result(result)
     with _about(result):
-        replayed = run(maneuver)
+        replayed = run(load_result(result))
     rows = [("", "certificate", "kinematic", "physics"), *replayed.rows()]
     answer({"result": str(result), **replayed.to_dict()}, table(rows, indent="  "), as_json=json)

@@ -11,7 +11,7 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.verify.arm import RecordedArm, arm_of
 from vgtm_qp.view.drawing import (
     FIXED_COLOUR,
     OBSTACLE_COLOUR,
@@ -30,6 +30,8 @@ ACTUATOR_GROUP = 1
 """Group of the position actuators, so that a replay through equality constraints can switch them off."""
 
 _STIFFNESS = 2.0e5
+_THINNEST = 1e-6
+"""Least radius of what is drawn, m: MuJoCo takes none that is zero."""
 
 
 def mjcf(maneuver: Result) -> str:
@@ -44,12 +46,9 @@ def mjcf(maneuver: Result) -> str:
     Raises
     ------
     ExportError
-        The truss has offset joints, whose attitude point masses cannot have.
+        The arm is no truss, or has offset joints, whose attitude point masses cannot have.
     """
-    record = maneuver.manifest["arm"]
-    arm = RecordedArm(record, maneuver.members)
-    if not arm.has_pin_joints:
-        raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
+    record, arm = maneuver.manifest["arm"], pinned_truss(maneuver)
     name = str(maneuver.manifest["problem"].get("name", "truss"))
     root = Element("mujoco", model=name)
     _add(root, "compiler", angle="radian", autolimits="true")
@@ -72,6 +71,16 @@ def mjcf(maneuver: Result) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
+def pinned_truss(maneuver: Result) -> RecordedArm:
+    """Return the truss of a maneuver; ExportError where a MuJoCo model of it would not be the same."""
+    arm = arm_of(maneuver)
+    if not isinstance(arm, RecordedArm):
+        raise ExportError(f"this is the result of a {arm.kind} arm; expected that of a truss")
+    if not arm.has_pin_joints:
+        raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
+    return arm
+
+
 def node_masses(arm: RecordedArm) -> Array:
     """Return (N,) the mass at each node, kg: half of every member that ends there."""
     half = 0.5 * MASS_PER_LENGTH * arm.length
@@ -79,7 +88,7 @@ def node_masses(arm: RecordedArm) -> Array:
 
 
 def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
-    masses, radius = node_masses(arm), float(np.median(arm.radius))
+    masses, radius = node_masses(arm), max(float(np.median(arm.radius)), _THINNEST)
     for k, name in enumerate(names):
         body = _add(world, "body", name=name, pos=arm.home[k])
         if k in arm.base:
@@ -123,7 +132,9 @@ def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
     tendons, equalities, actuators = (_add(root, kind) for kind in ("tendon", "equality", "actuator"))
     for k, member in enumerate(arm.member_names):
         colour = stroke_colours(np.array(0.5)) if arm.actuated[k] else np.array(FIXED_COLOUR)
-        tendon = _add(tendons, "spatial", name=member, width=arm.radius[k], rgba=(*colour, 1.0))
+        tendon = _add(
+            tendons, "spatial", name=member, width=max(arm.radius[k], _THINNEST), rgba=(*colour, 1.0)
+        )
         for node in arm.members[k]:
             _add(tendon, "site", site=names[node])
         stiff = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}

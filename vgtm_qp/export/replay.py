@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import MissingExtraError
-from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf
+from vgtm_qp.errors import ExportError, MissingExtraError
+from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf, pinned_truss
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import RecordedArm
 from vgtm_qp.verify.clearance import AgainstBody, RecordedMotion
 from vgtm_qp.verify.obstacles import read_obstacles
 
@@ -114,8 +113,11 @@ class _Simulation:
         except ImportError:
             raise MissingExtraError("mujoco", "mujoco") from None
         self._mujoco, self._maneuver = mujoco, maneuver
-        self._arm = RecordedArm(maneuver.manifest["arm"], maneuver.members)
-        self._model: Any = mujoco.MjModel.from_xml_string(mjcf(maneuver))
+        self._arm = pinned_truss(maneuver)
+        try:
+            self._model: Any = mujoco.MjModel.from_xml_string(mjcf(maneuver))
+        except ValueError as error:
+            raise ExportError(f"MuJoCo takes no such model: {str(error).splitlines()[0]}") from None
         self._data: Any = mujoco.MjData(self._model)
         manifest = maneuver.manifest
         directory = Path(manifest.get("directory") or ".")

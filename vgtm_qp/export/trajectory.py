@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import MissingExtraError
+from vgtm_qp.errors import ExportError, MissingExtraError
 from vgtm_qp.result.result import Result
 
 _HEADER = """std_msgs/Header header
@@ -133,6 +133,8 @@ def mcap_bytes(maneuver: Result) -> bytes:
 
 
 def _nanoseconds(seconds: float) -> int:
+    if not 0.0 <= seconds < 2.0**31:
+        raise ExportError(f"ROS has times from 0 to {2**31} s; this maneuver is at {seconds:g} s")
     return round(1e9 * seconds)
 
 

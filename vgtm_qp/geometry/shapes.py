@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.geometry.exact import WIDTH
+from vgtm_qp.problem.fields import GREATEST_LENGTH
 
 _MESH_FORMATS = (".stl", ".obj", ".ply", ".off")
 
@@ -116,7 +117,8 @@ def mesh(
     Raises
     ------
     GeometryError
-        The file is missing or cannot be read, it holds no triangle, or a number is wrong.
+        The file is missing or cannot be read, it holds no triangle, a number is wrong, or the triangles of a closed
+        mesh are not wound alike.
     """
     import trimesh
 
@@ -129,18 +131,28 @@ def mesh(
             raise GeometryError(f'obstacle "{name}": {path.name} is not one of {", ".join(_MESH_FORMATS)}')
         try:
             surface = trimesh.load_mesh(path)
+            found = np.asarray(surface.triangles, dtype=float)
         except Exception as error:  # a reader of foreign files raises anything
             raise GeometryError(f'obstacle "{name}": cannot read {path}: {error}') from None
+        if len(found) and found.shape[1:] != (3, 3):
+            raise GeometryError(f'obstacle "{name}": {path} holds other faces than triangles in space')
     if len(surface.faces) == 0:
         raise GeometryError(f'obstacle "{name}": the mesh holds no triangle')
+    if not np.abs(surface.triangles).max() <= GREATEST_LENGTH:
+        raise GeometryError(
+            f'obstacle "{name}": the mesh holds a coordinate beyond {GREATEST_LENGTH:g} or none'
+        )
     solid = bool(surface.is_watertight)
     if solid:
+        if not surface.is_winding_consistent:
+            raise GeometryError(
+                f'obstacle "{name}": neighbours among its triangles are not wound alike, which leaves open what is '
+                "inside; expected corners counter-clockwise seen from outside"
+            )
         surface.fix_normals()
     turn = _rotation(name, rotation)
     corners = _positive(name, np.array([scale]))[0] * np.asarray(surface.triangles, dtype=float)
     corners = corners @ turn.T + _vector(name, "center", center)
-    if not np.isfinite(corners).all():
-        raise GeometryError(f'obstacle "{name}": the mesh holds a coordinate that is not finite')
     pieces = np.zeros((len(corners), WIDTH))
     pieces[:, :9] = corners.reshape(-1, 9)
     return Obstacle(name, "triangle", pieces, _vector(name, "velocity", velocity), solid)

@@ -126,9 +126,13 @@ class Page:
             else:
                 self._survive(partial(self._advance, changed))
             if started - read_at > _READ_OUT_PERIOD:
-                self._read_out.content = read_out(self.session, self.message)
+                self._survive(self._tell)
                 read_at = started
             stop.wait(max(0.0, _PERIOD - (perf_counter() - started)))
+
+    def _tell(self) -> None:
+        """Show the instruments as they are now."""
+        self._read_out.content = read_out(self.session, self.message)
 
     def _advance(self, changed: bool) -> None:
         """Step towards what is wanted, and draw the arm if it moved or something else `changed`."""
@@ -262,7 +266,7 @@ class Page:
         """Solve the session's problem from home, and play what comes of it."""
         self._pause()
         self.message = "solving ..."
-        self._read_out.content = read_out(self.session, self.message)
+        self._tell()
 
         def run() -> None:
             maneuver = solve(self.session.problem)

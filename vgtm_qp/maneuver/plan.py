@@ -48,7 +48,10 @@ def make_plan(problem: Problem, position: Array, rotation: Array) -> Plan:
     maneuver = problem.maneuver
     if isinstance(maneuver, WaypointManeuver):
         return _through_waypoints(maneuver, position, rotation)
-    return _along_file(maneuver, position, rotation)
+    with problem.blaming(
+        ("maneuver", "path"), "rows whose times still differ after the run to the first of them"
+    ):
+        return _along_file(maneuver, position, rotation)
 
 
 def _through_waypoints(maneuver: WaypointManeuver, position: Array, rotation: Array) -> Plan:

@@ -55,7 +55,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
 
     Raises
     ------
-    ProblemError, TrussError, SolverError
+    ProblemError
         The problem cannot be set up, or is not a Problem; no step was made.
     """
     check_is_problem(problem)
@@ -71,10 +71,11 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
 
     way = ""
     try:
-        stop = attempt.run(progress)
-        if stop is not None:
-            way, attempt, stop = _retry(problem, attempt, stop, progress)
-            stop = None if stop is None else replace(stop, remedies=_tried(attempt, stop))
+        with problem.blaming(("maneuver",), "a path that steps can follow"):
+            stop = attempt.run(progress)
+            if stop is not None:
+                way, attempt, stop = _retry(problem, attempt, stop, progress)
+                stop = None if stop is None else replace(stop, remedies=_tried(attempt, stop))
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
     maneuver = _assemble(problem, resolver, attempt, stop, setup_time, way, digests)
@@ -124,7 +125,7 @@ def compile_steps(problem: Problem) -> None:
 
     Raises
     ------
-    ProblemError, TrussError, SolverError
+    ProblemError
         As `solve`.
     """
     resolver = Resolver(problem)

@@ -209,7 +209,7 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
 
     Raises
     ------
-    ProblemError, TrussError
+    ProblemError
         The arm cannot be built.
     """
 
@@ -243,7 +243,7 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
         system = self._linear(X, displacement_to(path.at(end), path.at(start)))
         gradient, x_g = system.gradient, system.x_g
         if setup.base_motion is not None:
-            motion = setup.arm.based(X, setup.base_motion.pose(state.time + dt)) - X
+            motion = setup.arm.based(X, setup.base_motion.pose(state.after(dt)[0])) - X
             x_g = x_g - truss.scatter.base_rate(gradient, motion)[self._fixed]
             X += motion
         terms = self._objective.at(X, kinematics.quantities, state.time)

@@ -22,7 +22,7 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
 
     Raises
     ------
-    CurveError, ProblemError, TrussError
+    ProblemError
         The arm cannot be built, or cannot track a curve.
     """
 
@@ -45,7 +45,8 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
         if mistakes:
             raise problem.error(mistakes)
         self.motion = CurveMotion(problem, setup)
-        segments = make_segments(setup.layout, setup.task.turns)
+        with problem.blaming(("method", "name"), '"qp", or an arm whose every bay can follow the curve'):
+            segments = make_segments(setup.layout, setup.task.turns)
         self.tracker = Tracker(
             setup.layout, setup.kinematics, segments, parallel=method.tracking == "parallel"
         )

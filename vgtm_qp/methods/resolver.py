@@ -61,8 +61,10 @@ class MethodResolver(Resolver, ABC):
         kinematics, before = self.setup.kinematics, self.state
         kinematics.evaluate(moved.nodes)
         lengths = frozen(kinematics.quantities)
+        time, late = before.after(dt)
         self.state = State(
-            time=before.time + dt,
+            time=time,
+            late=late,
             q=(q := frozen(moved.nodes)),
             nodes=q,
             control_vertices=frozen(moved.control_vertices),
@@ -100,7 +102,7 @@ def arm_without_curve(problem: Problem) -> Setup:
 
     Raises
     ------
-    ProblemError, TrussError
+    ProblemError
         The arm cannot be built.
     """
     return build_arm(problem.replace({"method": problem.method.kept_by("qp", "none")}), solves=False)

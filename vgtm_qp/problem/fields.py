@@ -25,12 +25,14 @@ from vgtm_qp.errors import nearest
 # Beyond these a square overflows the tolerances of the certificate; no arm is that long or that fine.
 LEAST_LENGTH = 1e-6
 GREATEST_LENGTH = 1e6
+SHORTEST_STEP, LONGEST_STEP = 1e-7, 5e7
+"""Least and greatest duration of a step of a maneuver, s; a control loop may go a little beyond these."""
 ORIGIN = (0.0, 0.0, 0.0)
 
 
-def unexpected(phrase: str) -> PydanticCustomError:
-    """Return the error of a value that is not what `phrase` says."""
-    return PydanticCustomError("expected", phrase)
+def unexpected(phrase: str, *, reserved: bool = False) -> PydanticCustomError:
+    """Return the error of a value that is not what `phrase` says, or of one that this version has `reserved`."""
+    return PydanticCustomError("reserved" if reserved else "expected", phrase)
 
 
 def expect(phrase: str) -> WrapValidator:

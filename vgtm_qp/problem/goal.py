@@ -7,7 +7,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from vgtm_qp.problem.fields import ByKey, Direction, File, Seconds, Vector, count, entry
+from vgtm_qp.problem.fields import (
+    LONGEST_STEP,
+    SHORTEST_STEP,
+    ByKey,
+    Direction,
+    File,
+    Seconds,
+    Vector,
+    count,
+    entry,
+)
 from vgtm_qp.problem.table import Place, Table, increasing
 
 Coordinates = Literal["position", "pointing", "orientation", "x", "y", "z"]
@@ -67,6 +77,9 @@ class WaypointManeuver(Table, called="a maneuver through waypoints"):
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from increasing("waypoint", [waypoint.time for waypoint in self.waypoint])
+        yield from _step_durations(
+            ("waypoint", len(self.waypoint) - 1, "time"), self.waypoint[-1].time, self.steps
+        )
 
 
 class PathManeuver(Table, called="a maneuver along a path file"):
@@ -80,6 +93,19 @@ class PathManeuver(Table, called="a maneuver along a path file"):
     approach_time: Seconds | None = Field(
         default=None, description="duration of that run, s; approach_steps mean row intervals where absent"
     )
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        if self.approach_time is not None:
+            yield from _step_durations(("approach_time",), self.approach_time, max(self.approach_steps, 1))
+
+
+def _step_durations(place: Place, whole: float, steps: int) -> Iterator[tuple[Place, str]]:
+    """Yield the place of a time, s, if so many steps of it are shorter or longer than a step can be."""
+    if not SHORTEST_STEP <= whole / steps <= LONGEST_STEP:
+        yield (
+            place,
+            f"from {SHORTEST_STEP:g} to {LONGEST_STEP:g} s a step: these {steps} take {whole / steps:g} s each",
+        )
 
 
 def _pick(value: Any) -> type[Table] | None:

@@ -140,6 +140,8 @@ class Gains(Table, called="[method.gains]"):
 class Method(Table, called="[method]"):
     """How each step is solved."""
 
+    decisive = "name"
+
     name: Literal["qp", "pseudoinverse", "curve-pseudoinverse"] = Field(
         default="qp", description="the QP, eq. (28), or eqs. (37)-(39)"
     )

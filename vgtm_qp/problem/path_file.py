@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vgtm_qp.errors import Mistake, ProblemError, nearest
-from vgtm_qp.problem.fields import GREATEST_LENGTH
+from vgtm_qp.problem.fields import GREATEST_LENGTH, LONGEST_STEP, SHORTEST_STEP
 from vgtm_qp.problem.table import shown
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ _COLUMNS = ("t", "x", "y", "z")
 _TURNS = ("rx", "ry", "rz")
 _GREATEST_BYTES = 200_000_000
 _GREATEST_MISTAKES = 100
+_NUMBER = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,9 @@ def read_path(file: str | Path) -> PathTable:
         elif time <= before:
             expected = f"a time after that of the row before, {before:g} s"
             mistakes.append(Mistake(f"line {line}, column t", f"{time:g}", expected))
+        elif time > 0 and not SHORTEST_STEP <= time - max(before, 0.0) <= LONGEST_STEP:
+            expected = f"a step of {SHORTEST_STEP:g} to {LONGEST_STEP:g} s"
+            mistakes.append(Mistake(f"line {line}, column t", f"{time - max(before, 0.0):g} s", expected))
         if math.isfinite(time):
             before = time
     if not rows:
@@ -120,5 +124,5 @@ def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mist
         if abs(number) <= GREATEST_LENGTH:
             row[name] = number
         else:
-            mistakes.append(Mistake(f"line {line}, column {name}", shown(cell), "a finite number"))
+            mistakes.append(Mistake(f"line {line}, column {name}", shown(cell), _NUMBER))
     return row

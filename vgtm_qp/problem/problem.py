@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, PrivateAttr, WithJsonSchema
 
-from vgtm_qp.errors import Mistake, ProblemError
+from vgtm_qp.errors import Mistake, ProblemError, VgtmError
 from vgtm_qp.problem.arm import ArmTable
 from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
@@ -114,6 +115,20 @@ class Problem(Table, called="a problem"):
     def error(self, mistakes: Sequence[Mistake]) -> ProblemError:
         """Return the error of mistakes that a later check found."""
         return ProblemError(str(self.source or self.name), mistakes)
+
+    @contextmanager
+    def blaming(self, place: Place, expected: str) -> Iterator[None]:
+        """Raise every other error of this package as a mistake at a place, and say what is `expected` there.
+
+        An error that ends in "; expected ..." says it itself.
+        """
+        try:
+            yield
+        except ProblemError:
+            raise
+        except VgtmError as error:
+            found, _, other = str(error).partition("; expected ")
+            raise self.error([Mistake(key_path(self, place), found, other or expected)]) from error
 
     def _unused(self) -> Iterator[tuple[Place, str]]:
         if self.curve.control_vertex_goals and not self.method.draws_vertices:

@@ -46,6 +46,8 @@ class Table(BaseModel):
     called: ClassVar[str] = "this table"
     later: ClassVar[Mapping[str, str]] = {}
     """Keys whose names are reserved for what this version does not do, and what it takes instead."""
+    decisive: ClassVar[str] = ""
+    """The key on which the meaning of the others rests: where its value is wrong, nothing is said of them."""
 
     def __init_subclass__(cls, *, called: str | None = None, **options: Any) -> None:
         """Name the table in messages as `called`, where given."""
@@ -87,9 +89,10 @@ class Table(BaseModel):
             except ValidationError as error:
                 errors = error.errors(include_url=False)
                 misspelt = cls._misspelt(errors)
+                decided = [found for found in errors if found["loc"] == (cls.decisive,)]
                 details = [
                     cls._detail(found)
-                    for found in errors
+                    for found in decided or errors
                     if not (_echo(found) or (found["type"] == "missing" and found["loc"] in misspelt))
                 ]
             else:
@@ -108,7 +111,7 @@ class Table(BaseModel):
         source = (info.context or {}).get("source") or cls.__name__
         mistakes = [
             Mistake(key_path(data, found["loc"]), shown(found["input"]), found["msg"])
-            for found in wrong.errors(include_url=False)
+            for found in _refusals_first(wrong.errors(include_url=False))
         ]
         raise ProblemError(str(source), mistakes) from None
 
@@ -124,10 +127,12 @@ class Table(BaseModel):
         """Return an error of pydantic in the words of a problem file."""
         kind, place, value = found["type"], found["loc"], found["input"]
         context = found.get("ctx", {})
-        if kind == "expected":
+        reserved = kind == "reserved"
+        if kind in ("expected", "reserved"):
             phrase = found["msg"]
         elif kind == "extra_forbidden":
             keys, unknown = list(cls.model_fields), str(place[-1])
+            reserved = unknown in cls.later
             phrase = cls.later.get(
                 unknown, f"one of the keys of {cls.called}: {', '.join(keys)}{nearest(unknown, keys)}"
             )
@@ -140,7 +145,7 @@ class Table(BaseModel):
             place, value = (*place, key), value.get(key, _MISSING)
             phrase = _one_of(context["choices"].split(","), value)
             if value in context["later"].split(","):
-                phrase += "; that one is reserved for a later version"
+                reserved, phrase = True, f"{phrase}; that one is reserved for a later version"
         elif kind == "literal_error":
             phrase = _one_of(re.findall("'([^']+)'", context["expected"]), value)
         elif kind == "tuple_type" and isinstance(value, Mapping):
@@ -149,7 +154,15 @@ class Table(BaseModel):
             phrase = _PHRASES[kind].format_map(context)
         else:
             phrase = found["msg"][:1].lower() + found["msg"][1:]
-        return InitErrorDetails(type=unexpected(phrase), loc=place, input=value)
+        return InitErrorDetails(type=unexpected(phrase, reserved=reserved), loc=place, input=value)
+
+
+def _refusals_first(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
+    """Return the errors, first those of what this version does not have: of keys that go together, the first one."""
+    refused = {
+        (found["loc"][:-1], found["msg"]): found for found in reversed(errors) if found["type"] == "reserved"
+    }
+    return [*reversed(refused.values()), *(found for found in errors if found["type"] != "reserved")]
 
 
 def increasing(key: str, times: list[float]) -> Iterator[tuple[Place, str]]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import ExportError, ResultError
 from vgtm_qp.result.manifest import check_manifest, dump_manifest, parse_manifest, stored_problem
+from vgtm_qp.result.record import GREATEST
 
 _STALE_SECONDS = 60.0
 _WIDEST = 8
@@ -168,6 +169,9 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
         if array.dtype.kind == "f" and (np.isnan(array).any() or (not unbounded and np.isinf(array).any())):
             row = int(np.argwhere(~np.isfinite(array))[0][0])
             raise ResultError(f"array {name} holds a value that is not a number, row {row}")
+        if array.dtype.kind == "f" and (beyond := np.isfinite(array) & (np.abs(array) > GREATEST)).any():
+            row = int(np.argwhere(beyond)[0][0])
+            raise ResultError(f"array {name} holds a number beyond {GREATEST:g}, row {row}")
     members = arrays.get("members", np.zeros(0))
     if members.size and (members.min() < 0 or members.max() >= sizes["N"]):
         raise ResultError(f"array members names a node outside 0..{sizes['N'] - 1}")

@@ -13,8 +13,8 @@ from vgtm_qp.errors import ResultError
 Shape = tuple[int | None, ...]
 """Sizes of the axes; None where any will do."""
 
-_GREATEST = 1e12
-"""Greatest number of a record: squares and products of such numbers are finite."""
+GREATEST = 1e12
+"""Greatest number of a record or an array: squares and products of such numbers are finite."""
 
 
 class Record:
@@ -36,12 +36,12 @@ class Record:
             flat = array.reshape(-1)
             given = [value for value in flat if value is not None]
             if all(isinstance(value, float) or type(value) is int for value in given):
-                if any(abs(value) > _GREATEST for value in given):
-                    raise self._error(key, f"numbers up to {_GREATEST:g} or nulls")
+                if any(abs(value) > GREATEST for value in given):
+                    raise self._error(key, f"numbers up to {GREATEST:g} or nulls")
                 array = np.array([np.inf if value is None else value for value in flat]).reshape(array.shape)
-        beyond = array.dtype.kind in "iuf" and np.abs(array[np.isfinite(array)]).max(initial=0) > _GREATEST
+        beyond = array.dtype.kind in "iuf" and np.abs(array[np.isfinite(array)]).max(initial=0) > GREATEST
         if array.size and (array.dtype.kind not in "iuf" or beyond):
-            raise self._error(key, f"numbers up to {_GREATEST:g}{' or nulls' if limits else ''}")
+            raise self._error(key, f"numbers up to {GREATEST:g}{' or nulls' if limits else ''}")
         return np.asarray(array, dtype=np.float64)
 
     def integers(self, key: str, shape: Shape, below: int) -> NDArray[np.int64]:

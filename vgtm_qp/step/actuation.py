@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, nearest
+from vgtm_qp.qp.settle import enough_length
 from vgtm_qp.rows.limits import actuator_box, binding
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
@@ -21,6 +22,8 @@ _APPROACH = 0.3
 
 _LEAST_APPROACH = 2e-3
 """What it may always use: rad, or a share of the arm's unit."""
+
+_ROUNDING = float(np.finfo(float).eps)
 
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
@@ -63,6 +66,8 @@ class Actuation:
         Names of all actuators (n_a,), and of those locked so far.
     starts_at_once : bool
         Whether no acceleration is limited.
+    tolerance : float
+        Of the values to which quantities are settled, m or rad.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -72,6 +77,10 @@ class Actuation:
         self._stroke, self._rate = arm.stroke[arm.actuators], arm.rate[arm.actuators]
         self._acceleration = arm.acceleration[arm.actuators]
         self.starts_at_once = bool(np.isinf(self._acceleration).all())
+        # An error of a length, divided twice by the time, is an error of an acceleration: it is kept near rounding.
+        exact = max(1e-12 * arm.fineness, 32.0 * _ROUNDING * arm.height)
+        self.tolerance = 1e-10 * arm.fineness if self.starts_at_once else exact
+        self._settled = enough_length(arm.home_configuration, self.tolerance)
         self._slows_down = setup.slows_down and self.starts_at_once
         self._least_approach = _LEAST_APPROACH * arm.unit / arm.levers
         self.locked: set[str] = set()
@@ -125,13 +134,15 @@ class Actuation:
         With `slowing`, actuators slow down before the ends of their strokes, if the problem asks for it.
         """
         value, rates, stroke = self.values(state), state.rates.take(self._actuators), self._stroke
-        ends = stroke, self._rate, self._acceleration
+        # In a very short step the error that settling leaves would be a rate of its own.
+        rate = np.maximum(self._rate - self._settled / dt, 0.0)
+        ends = stroke, rate, self._acceleration
         lower, upper = actuator_box(value, rates, *ends, dt, state.duration or None)
         if slowing and self._slows_down:
             down, up = self._approach(value - stroke[:, 0]), self._approach(stroke[:, 1] - value)
             slow_lower, slow_upper = np.minimum(value - down, upper), np.maximum(value + up, lower)
             lower, upper = np.maximum(lower, slow_lower), np.minimum(upper, slow_upper)
-        return Limits(lower, upper, self.names, value, self._rate * dt, *ends[::2], self._held)
+        return Limits(lower, upper, self.names, value, rate * dt, *ends[::2], self._held)
 
     def creeping(self, state: State, box: Box, dt: float) -> Box | None:
         """Return the part of a box from which every actuator can stop at once; None if there is none."""

@@ -43,8 +43,6 @@ _SETTLING = 5e-3
 _FURTHER = 1e-6
 """Least gain in progress for which stations leave the curve."""
 
-_ROUNDING = float(np.finfo(float).eps)
-
 
 class Tracking(Enum):
     """Whether stations stay on the curve in an attempt, may leave it, or leave it only if the arm then gets further."""
@@ -80,12 +78,9 @@ class Attempt:
         self._has_limit, self._too_long = setup.step_limit < np.inf, setup.too_long
         self.separation = separation
         self.phases = Phases("distance", "qp", "correction", "acceptance")
-        # An error of a length, divided twice by the time, is an error of an acceleration: it is kept near rounding.
         arm = setup.arm
-        exact = max(1e-12 * arm.fineness, 32.0 * _ROUNDING * arm.height)
-        member = 1e-10 * arm.fineness if actuation.starts_at_once else exact
         self.accuracy = Accuracy(
-            member, tip=1e-8 * arm.unit, start=_SETTLING * arm.height, tracking=1e-7 * arm.unit
+            actuation.tolerance, tip=1e-8 * arm.unit, start=_SETTLING * arm.height, tracking=1e-7 * arm.unit
         )
         self.acceptance = Acceptance(setup, self.accuracy)
         self.use(setup)
@@ -169,7 +164,7 @@ class Attempt:
         reach = self._influence
         if share >= 1.0:
             reach = _MOTION_MARGIN * self._expected(target, goal, guess)
-        rows = self.separation.rows(q, state.time, target.time - state.time, reach, short, gain)
+        rows = self.separation.rows(q, state.time, target.duration, reach, short, gain)
         if target.base is not None:
             # The displacement of nodes with the base is known.
             rows = rows.after(arm.nodes(arm.based(q, target.base)) - arm.nodes(q))
@@ -246,7 +241,7 @@ class Attempt:
             if self._has_limit and (too_long := self._too_long(self._arm.nodes(q) - state.nodes)):
                 return blocked(too_long)
             if report.certified:
-                then = state.next(self._arm, target.time, closed, vertices, move.torsion, after)
+                then = state.next(self._arm, target.duration, closed, vertices, move.torsion, after)
                 status = StepStatus.REACHED if move.progress >= WHOLE else StepStatus.SLOWED
                 gave_way = tracking is None and self._tracking is not None
                 return Step(

@@ -220,7 +220,7 @@ class Brakes:
         setup, attempt = self.shaping.setup, self.attempt
         arm, base, separation = setup.arm, setup.base_motion, attempt.separation
         strokes = np.clip(self.actuation.values(state), *limits)
-        q, vertices, then = state.q, state.control_vertices, state.time + self.dt
+        q, vertices, then = state.q, state.control_vertices, state.after(self.dt)[0]
         if base is not None:
             before, after = base.pose(state.time), base.pose(then)
             q = arm.based(arm.carried(q, before, after), after)
@@ -237,7 +237,7 @@ class Brakes:
         flaw = attempt.acceptance.flaw(closed, state.q, still, None, vertices, state.torsion)
         if flaw or setup.too_long(arm.nodes(closed.q) - state.nodes):
             return None
-        return state.next(arm, then, closed, vertices, state.torsion, found)
+        return state.next(arm, self.dt, closed, vertices, state.torsion, found)
 
 
 _NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))

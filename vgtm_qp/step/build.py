@@ -54,22 +54,22 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
     Raises
     ------
     ProblemError
-        The problem asks for something this arm cannot do at all; each mistake is named.
-    TrussError
-        The truss is not statically determinate.
+        There is no such arm, or the problem asks for something that it cannot do at all; each mistake is named.
     """
     check_is_problem(problem)
     check_solver(problem)
     arm = make_arm(problem)
     kinematics = arm.kinematics()
     kinematics.evaluate(arm.home_configuration)
-    task = TipTask(problem.end_effector.track, arm)
-    home = home_curve(problem, arm, task)
+    with problem.blaming(("end_effector", "track"), "coordinates that this tip has"):
+        task = TipTask(problem.end_effector.track, arm)
+    with problem.blaming(("curve",), "a curve that starts in this arm's home pose"):
+        home = home_curve(problem, arm, task)
     clearance, spec = problem.clearance, problem.truss or problem.arm
     solver, tracking = problem.method.solver, problem.method.tracking
     assert spec is not None
     options: dict[str, Any] = {
-        "obstacles": [make_obstacle(obstacle) for obstacle in problem.obstacle],
+        "obstacles": list(_obstacles(problem)),
         "safe": clearance.safe,
         "influence": clearance.influence,
         "by_fcl": clearance.distance == "fcl",
@@ -77,7 +77,8 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
     }
     if solves:
         how = {"compiled": compiled, "plain": plain}
-        engine = make_engine(solver, home.layout, kinematics, task, tracking, **how)
+        with problem.blaming(("method", "tracking"), '"coupled" or "none"'):
+            engine = make_engine(solver, home.layout, kinematics, task, tracking, **how)
     else:
         engine = GeneralEngine(home.layout, kinematics, task, CondensedSolver(home.layout), compiled=False)
     gives_way = home.layout.hard_tracking and problem.method.gives_way
@@ -130,10 +131,10 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
     """
     method, stations, spec = problem.method, arm.stations, problem.curve
     elastic, weights = problem.end_effector.mode == "elastic", with_angles(method.weights, arm)
-    if method.goes_by_bays and not len(stations):
-        text = '"coupled" or "none": the others go along the faces, and this arm has none'
+    if method.goes_by_bays and len(stations) < 2:
+        text = '"coupled" or "none": the others go along the faces, and this arm has fewer than two'
         raise problem.error([problem.mistake(("method", "tracking"), text)])
-    if method.tracking == "none" or not len(stations):
+    if method.tracking == "none" or len(stations) < 2:
         tables = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
         layout = Layout(arm, *tables, task.row_names, weights, elastic_tip=elastic)
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
@@ -292,6 +293,13 @@ def check_solver(problem: Problem) -> None:
         expected = f"one of the solvers installed here, {quoted(choices)}{nearest(name, choices)}"
         mistake = problem.mistake(("method", "solver"), expected)
         raise problem.error([mistake])
+
+
+def _obstacles(problem: Problem) -> Iterator[shapes.Obstacle]:
+    for k, spec in enumerate(problem.obstacle):
+        place = ("obstacle", k, "file") if spec.shape == "mesh" else ("obstacle", k)
+        with problem.blaming(place, "a mesh of triangles with finite coordinates, m"):
+            yield make_obstacle(spec)
 
 
 def make_obstacle(spec: Any) -> shapes.Obstacle:

@@ -26,7 +26,7 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import Shortfall, State, frozen
 from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.step.stops import Stop, explain
+from vgtm_qp.step.stops import Stop, explain, struck
 from vgtm_qp.step.task import duration
 
 _SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
@@ -170,10 +170,11 @@ class QPResolver(Resolver, serves="qp"):
         state: State | None = None,
     ) -> Stop:
         """See :class:`Resolver`."""
-        state = state or self.state
-        limits = self._actuation.limits(state, self.setup.dt if dt is None else dt).of_stop()
+        state, dt = state or self.state, self.setup.dt if dt is None else dt
+        limits = self._actuation.limits(state, dt).of_stop()
         goal = path.at(start).over(end - start)
-        return explain(self.setup, self._separation, state, goal, limits, last)
+        stop = explain(self.setup, self._separation, state, goal, limits, last)
+        return struck(stop, self.setup, self._separation, state, dt)
 
     def too_near(self, state: State) -> Shortfall:
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""

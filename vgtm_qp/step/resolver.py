@@ -44,7 +44,7 @@ class Resolver:
 
     Raises
     ------
-    CurveError, ProblemError, SolverError, TrussError
+    ProblemError
         The arm cannot be built, or not moved by that method.
     """
 

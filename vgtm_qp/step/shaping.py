@@ -39,8 +39,8 @@ class Shaping:
 
     def target(self, state: State, dt: float, path: Path, start: float, end: float, box: Box) -> Target:
         """Return the target of a step of `dt`, s, from `state` over the values `start` to `end` of a path."""
-        then = state.time + dt
-        return Target(path, start, end, *box, then, self.setup.base_at(then), self._places)
+        then, _ = state.after(dt)
+        return Target(path, start, end, *box, then, dt, self.setup.base_at(then), self._places)
 
     @property
     def goals(self) -> dict[int, Array]:

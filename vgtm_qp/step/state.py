@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -53,6 +54,8 @@ class State:
         Duration of that step, s; 0 at home, where the arm rests.
     shortfall : Shortfall or None
         Pairs below their clearance; None if not computed yet.
+    late : float
+        Duration that `time` lacks by rounding, s: a large clock does not show short steps, their sum it does.
     """
 
     time: float
@@ -65,12 +68,18 @@ class State:
     duration: float = 0.0
     torsion: Array = field(default_factory=lambda: frozen(np.zeros(0)))
     shortfall: Shortfall | None = None
+    late: float = 0.0
+
+    def after(self, duration: float) -> tuple[float, float]:
+        """Return `time` and `late` after a step of a `duration`, s."""
+        time = math.fsum((self.time, self.late, duration))
+        return time, math.fsum((self.time, self.late, duration, -time))
 
     def next(
-        self, arm: Arm, time: float, closed: Closed, vertices: Array, torsion: Array, shortfall: Shortfall
+        self, arm: Arm, duration: float, closed: Closed, vertices: Array, torsion: Array, shortfall: Shortfall
     ) -> State:
-        """Return the state of `arm` after a step that ends at `time`, s; all arrays are read-only from now on."""
-        duration, q, quantities = time - self.time, _sealed(closed.q), _sealed(closed.quantities)
+        """Return the state of `arm` after a step of a `duration`, s; all arrays are read-only from now on."""
+        (time, late), q, quantities = self.after(duration), _sealed(closed.q), _sealed(closed.quantities)
         return State(
             time=time,
             q=q,
@@ -82,4 +91,5 @@ class State:
             motion=_sealed(q - self.q),
             duration=duration,
             shortfall=shortfall,
+            late=late,
         )

@@ -8,7 +8,7 @@ the linear program allows a little progress: near a fold of its motion the curva
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from typing import Any
@@ -74,7 +74,8 @@ class Stop:
         order: ``acceleration`` if the arm could not brake after it, ``step limit`` if it is longer than the problem
         allows, ``solver`` if the QP solver gave no accurate answer, else ``nonlinear``.
     multipliers : dict
-        Rows of the set, the most decisive first, and the share of the path that each costs per metre (radian).
+        Rows of the set, the most decisive first, and the share of the path that each costs per metre (radian); 0 for
+        an obstacle that strikes an arm at rest.
     obstacles : tuple of str
         Names of the obstacles in the set.
     reason : str
@@ -189,6 +190,22 @@ def _remedies(setup: Setup, program: FirstOrder, make: Callable[..., FirstOrder]
             break
         found = remedies(setup, make(reach=reach))
     return found
+
+
+def struck(stop: Stop, setup: Setup, separation: Separation, state: State, dt: float) -> Stop:
+    """Return a stop with the obstacles first that come too near in `dt`, s, to an arm that stays in `state`.
+
+    The rows of a step are those of its end, where a fast obstacle may be on the other side of the arm already.
+    """
+    if not setup.monitor.pieces.moving:
+        return stop
+    then, short = state.after(dt)[0], separation.shortfall_of(state)
+    failing = separation.between(state.q, state.q, state.time, then, short).failing
+    names = {failing.name(k): 0.0 for k in np.argsort(failing.distance) if not failing.is_self[k]}
+    if not names:
+        return stop
+    names |= stop.multipliers
+    return replace(stop, kind=StopKind.OBSTACLE, multipliers=names, obstacles=_obstacles(setup, names))
 
 
 def _is_braking(reason: str) -> bool:

@@ -26,8 +26,8 @@ class Target:
         The path, and its values between which the step moves; progress alpha runs from 0 to 1 over them.
     lower, upper : (n_a,)
         Values of the actuators allowed at the end of the step.
-    time : float
-        Time at the end of the step, s.
+    time, duration : float
+        Time at the end of the step, and how long the step takes, s: a difference of times would lack digits.
     base : Pose or None
         Pose of the base then; None if it rests.
     vertex_goals : (V, 3) or None
@@ -40,6 +40,7 @@ class Target:
     lower: Array
     upper: Array
     time: float
+    duration: float
     base: Pose | None = None
     vertex_goals: Array | None = None
 

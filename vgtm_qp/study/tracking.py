@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.tables import markdown_table
-from vgtm_qp.errors import CurveError, ProblemError
+from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.drawing import label, panels, select
@@ -61,7 +61,7 @@ def run(seed: int, number: int, steps: int, tracking: str) -> Row:
     module, started = problem.to_dict()["truss"]["module"], process_time()
     try:
         maneuver = solve(problem.replace(TRACKINGS[tracking]))
-    except (CurveError, ProblemError) as error:
+    except ProblemError as error:
         nothing = {"reached": 0.0, "failures": [], "way_out": "", "states": 0}
         nothing |= dict.fromkeys(("exact", "gap", "travel", "step"))
         return {"module": module, "status": f"refused: {error}", **nothing, "seconds": 0.0}

@@ -12,6 +12,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.chain import RecordedChain, extreme_values
 from vgtm_qp.result.record import Record
+from vgtm_qp.result.result import Result
 from vgtm_qp.verify.truss_table import table_contradictions
 
 _TOLERANCE = 1e-9
@@ -237,6 +238,14 @@ Arm = RecordedArm | RecordedChain
 def recorded_arm(record: Mapping[str, Any], members: Index) -> Arm:
     """Return the arm of a manifest's record; `members` (M, 2) are the nodes of each member of a truss."""
     return RecordedChain(record) if record.get("kind") == RecordedChain.kind else RecordedArm(record, members)
+
+
+def arm_of(maneuver: Result) -> Arm:
+    """Return the arm of a result; ResultError where its record is malformed, or describes another number of nodes."""
+    arm, count = recorded_arm(maneuver.manifest["arm"], maneuver.members), maneuver.nodes.shape[1]
+    if count != len(arm.home):
+        raise ResultError(f"array nodes holds {count} nodes; manifest.arm describes {len(arm.home)}")
+    return arm
 
 
 def polygon_frame(points: Array, angles: Array | None) -> tuple[Array, Array]:

@@ -16,6 +16,9 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.result.poses import rotation_matrix
 from vgtm_qp.verify.distance import Separation, segment_ball, segment_box, segment_cylinder, segment_triangle
 
+_GREATEST = 1e6
+"""Greatest coordinate of a mesh, in its file's unit: squares of such numbers are exact enough."""
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -168,7 +171,12 @@ def _read_mesh(
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         surface = trimesh.load_mesh(path, process=True)
-        triangles = np.asarray(surface.triangles, dtype=np.float64)
+        triangles = np.asarray(surface.triangles, dtype=np.float64).reshape(-1, 3, 3)
+        closed = bool(surface.is_watertight)
+        if not 0.0 <= np.abs(triangles).max() <= _GREATEST:
+            raise ValueError(f"a coordinate is beyond {_GREATEST:g}")
+        if closed and not surface.is_winding_consistent:
+            raise ValueError("its triangles are not wound alike, which leaves open what is inside")
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         return None, f"mesh {name}: {path} cannot be read, so its clearance is unknown: {error}"
     if record is None:
@@ -182,4 +190,4 @@ def _read_mesh(
     else:
         complaint = ""
     scale = float(entry.get("scale") or 1.0)
-    return mesh(triangles * scale, closed=bool(surface.is_watertight)), complaint
+    return mesh(triangles * scale, closed=closed), complaint

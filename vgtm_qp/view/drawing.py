@@ -13,7 +13,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.verify.arm import Arm, recorded_arm
+from vgtm_qp.verify.arm import Arm, arm_of
 
 FIXED_COLOUR = (0.70, 0.72, 0.74)
 OBSTACLE_COLOUR = (0.90, 0.62, 0.0)
@@ -100,7 +100,7 @@ def stroke_colours(share: Array) -> Array:
 def drawing_of_maneuver(maneuver: Result) -> Drawing:
     """Return the drawing of a result, from its manifest; raise ResultError where its record of the arm is wrong."""
     manifest = maneuver.manifest
-    arm = recorded_arm(manifest["arm"], maneuver.members)
+    arm = arm_of(maneuver)
     vertices = maneuver.control_vertices.shape[1]
     return make_drawing(manifest["problem"], arm, vertices, manifest.get("directory") or ".")
 
@@ -118,7 +118,7 @@ def make_drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory:
 
 
 def obstacle_meshes(entries: Sequence[Mapping[str, Any]], directory: Path) -> tuple[ObstacleMesh, ...]:
-    """Return the surfaces of ``[[obstacle]]`` tables; a mesh whose file is gone is left out."""
+    """Return the surfaces of ``[[obstacle]]`` tables; a mesh whose file is gone or damaged is left out."""
     found = []
     for entry in entries:
         surface = _surface(entry, directory)
@@ -148,12 +148,13 @@ def _surface(entry: Mapping[str, Any], directory: Path) -> Any:
     if shape == "cylinder":
         radius, height = float(entry["radius"]), float(entry["height"])
         return trimesh.creation.cylinder(radius=radius, height=height, sections=48)
-    path = directory / str(entry["file"])
-    if not path.is_file():
+    try:
+        surface = trimesh.load_mesh(directory / str(entry["file"]))
+        surface.apply_scale(float(entry.get("scale") or 1.0))
+        is_drawn = surface.triangles.shape[1:] == (3, 3) and np.isfinite(surface.triangles).all()
+    except Exception:  # trimesh raises whatever the reader of the format raises
         return None
-    surface = trimesh.load_mesh(path)
-    surface.apply_scale(float(entry.get("scale") or 1.0))
-    return surface
+    return surface if is_drawn and len(surface.triangles) else None
 
 
 class Camera(NamedTuple):

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import recorded_arm
+from vgtm_qp.verify.arm import arm_of
 from vgtm_qp.verify.path import TIP_TOLERANCE, tip_error
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -50,7 +50,7 @@ def _draw_strokes(axes: Axes, maneuver: Result) -> None:
     In m where all have the same stroke, as parts of it, %, where not. The members that come nearest to a limit
     are named; the others are grey.
     """
-    arm = recorded_arm(maneuver.manifest["arm"], maneuver.members)
+    arm = arm_of(maneuver)
     limited = np.isfinite(arm.stroke[arm.actuated]).all(axis=1)
     actuators = np.flatnonzero(arm.actuated)[limited]
     low, high = arm.stroke[actuators].T
