@@ -198,10 +198,20 @@ def tip_jacobian(rows: Sequence[str], truss: Truss, X: Array, at: Array) -> Arra
     return np.vstack([kept, tip_axes(rows, tip_rotation(truss, X)) @ tip_spin(truss, at)])
 
 
-def progress_weight(rate: Array) -> float:
-    """Return what progress is weighted by: the square of the tip's way, of which 10 mm count at least once."""
+def progress_weight(rate: Array, unit: float = 1.0) -> float:
+    """Return what progress is weighted by: the square of the tip's way, of which a hundredth unit counts at least."""
     way = float(norm(rate))
-    return way * max(way, 0.01) if way > 1e-6 else 1.0
+    return way * max(way, 0.01 * unit) if way > 1e-6 * unit else unit**2
+
+
+def unit_of(truss: Truss) -> float:
+    """Return the mean distance of two nodes that a member joins, at home, m."""
+    return float(np.mean([norm(truss.home[i] - truss.home[j]) for i, j in truss.members]))
+
+
+def as_lengths(rows: Sequence[str], values: Array, unit: float) -> Array:
+    """Return values of the tip's rows with angles times the unit."""
+    return values * np.array([1.0 if row in _AXES else unit for row in rows])
 
 
 # Reference curve, eqs. (32)-(39).
@@ -275,7 +285,9 @@ def numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
     rotation = tip_rotation(truss, X)
     error = tip_error(rows, truss.tip_weights @ X[truss.tip], rotation, asked.goal)
     rate = tip_rate(rows, rotation, asked.goal)
-    curvature = weights.progress * progress_weight(rate)
+    unit = unit_of(truss)
+    curvature = weights.progress * progress_weight(as_lengths(rows, rate, unit), unit)
+    closed = np.abs(as_lengths(rows, error, unit)).max() <= 2e-8 * min(1.0, unit)
     found = {
         "motion": matrix,
         "motion_rhs": rhs,
@@ -284,7 +296,7 @@ def numbers(layout: Layout, asked: StepInput) -> dict[str, Array]:
         "actuator_gradient": asked.motion * weights.stroke_centring * (strokes - rest),
         "tip_jacobian": tip_jacobian(rows, truss, X, at),
         "tip_rate": rate,
-        "tip_rhs": 0.0 * error if asked.motion and np.abs(error).max() <= 2e-8 else error,
+        "tip_rhs": 0.0 * error if asked.motion and closed else error,
         "progress_lower": 1.0 - asked.progress if layout.elastic_tip else -asked.progress,
         "progress_upper": 1.0 - asked.progress,
         "progress_gradient": curvature * (asked.progress - 2.0),

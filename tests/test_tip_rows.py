@@ -20,9 +20,9 @@ def assert_close(found, wanted, atol):
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=atol)
 
 
-def tip_of(track, position, rotation, goal, motion=False):
+def tip_of(track, position, rotation, goal, motion=False, unit=1.0):
     """Error, rate, turned axes and weight by the package's own function."""
-    function = tip_function(row_names(track))
+    function = tip_function(row_names(track), unit)
     found = function(
         position, rotation, goal.position, goal.rotation, goal.velocity, goal.spin, 1.0 if motion else 0.0
     )
@@ -51,6 +51,8 @@ def test_the_rows_of_a_tip_are_those_of_the_formulas(track, rng):
         assert_close(rate, wanted, atol=1e-14)
         assert_close(across, oracle.tip_axes(rows, rotation), atol=1e-14)
         assert weight == pytest.approx(oracle.progress_weight(wanted))
+        scaled = tip_of(track, position, rotation, goal, unit=0.3)[3]
+        assert scaled == pytest.approx(oracle.progress_weight(oracle.as_lengths(rows, wanted, 0.3), 0.3))
 
 
 @pytest.mark.parametrize("way", [0.0, 1e-7, 1e-5, 1e-3, 0.1, 1.0])
@@ -58,6 +60,10 @@ def test_progress_counts_more_on_a_short_way(way):
     goal = TipGoal(np.zeros(3), np.eye(3), way * np.array([0.6, 0.0, 0.8]), np.zeros(3))
     weight = tip_of(("position",), np.zeros(3), np.eye(3), goal)[3]
     assert weight == pytest.approx({0.0: 1.0, 1e-7: 1.0, 1e-5: 1e-7, 1e-3: 1e-5}.get(way, way * way))
+    larger = goal._replace(velocity=20.0 * goal.velocity)
+    assert tip_of(("position",), np.zeros(3), np.eye(3), larger, unit=20.0)[3] == pytest.approx(
+        400.0 * weight
+    )
 
 
 @pytest.mark.parametrize("off", [1e-7, 2.1e-8, 1.9e-8, 1e-10, 0.0])
@@ -67,6 +73,9 @@ def test_a_motion_need_not_close_what_a_state_may_have(off):
         error = tip_of(("position", "pointing"), np.zeros(3), np.eye(3), goal, motion=motion)[0]
         wanted = 0.0 if motion and off < 2e-8 else -off
         np.testing.assert_array_equal(error, [0.0, wanted, 0.0, 0.0, 0.0])
+        small = goal._replace(position=0.01 * goal.position)
+        error = tip_of(("position", "pointing"), np.zeros(3), np.eye(3), small, motion=motion, unit=0.01)[0]
+        np.testing.assert_allclose(error[1], 0.01 * wanted, rtol=1e-12, atol=0.0)
 
 
 def test_towards_the_opposite_direction_the_tip_turns_half_round_about_its_own_x_axis(rng):
