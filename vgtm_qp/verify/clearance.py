@@ -28,7 +28,8 @@ RESOLUTION = 1e-6
 """Greatest gap of the bound between states below the least clearance found there, over the same."""
 
 _GREATEST_DEPTH = 48
-_GREATEST_COUNT = 1_000_000
+_GREATEST_COUNT = 400_000
+"""Numbers of halvings, and of open intervals, from which on a bound stays as it is."""
 _CHUNK = 200_000
 
 
@@ -41,7 +42,9 @@ class RecordedMotion:
     def __init__(self, arm: Arm, time: Array, states: Array) -> None:
         self.arm, self.time, self.states = arm, time, states
         self.ends = arm.states_ends(states)
-        self.resolution = RESOLUTION * arm.size
+        # No bound is nearer than the rounding of positions.
+        rounding = 64.0 * float(np.finfo(float).eps) * float(np.abs(self.ends).max(initial=0.0))
+        self.resolution = max(RESOLUTION * arm.size, rounding)
 
     def ends_between(self, step: int, body: Index, share: Array) -> Array:
         """Return (P, 2, 3) the ends, m, of bodies (P,) at shares (P,) of the motion from state `step` to the next."""
