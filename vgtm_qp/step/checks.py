@@ -165,9 +165,11 @@ def _inside_obstacles(problem: Problem, setup: Setup, hollow: float) -> Iterator
     spot = capsules([[0, 1]], 0.0)
     point = Clearance(spot, obstacles, safe=safe, influence=needed, self_collision=False, by_fcl=False)
     for target, key, value in _targets(problem):
-        distance, pair = point.least(np.stack([target, target + point_size / 2]))
-        if pair is not None and distance + hollow + point_size < needed:
-            obstacle = obstacles[point.pieces.obstacle[pair.other]].name
+        # A contact says how deep a point is inside, which the clearance does not.
+        contacts = point.near(np.stack([target, target + point_size / 2]))
+        k = int(np.argmin(contacts.distance)) if len(contacts) else -1
+        if k >= 0 and (distance := float(contacts.distance[k])) + hollow + point_size < needed:
+            obstacle = obstacles[point.pieces.obstacle[contacts.other[k]]].name
             found = f"{-distance:.3g} m inside it" if distance <= 0.0 else f"{distance:.3g} m from it"
             expected = f'a position {needed:g} m from obstacle "{obstacle}" (clearance and member radius)'
             yield Mistake(key, value, f"{expected}; this one is {found}")
