@@ -159,10 +159,12 @@ def export(
 @contextmanager
 def _about(result: Path) -> Iterator[None]:
     """Name the result file in what is raised about its content, and tell one that was altered from other files."""
-    from vgtm_qp.errors import AlteredResultError, ResultError
+    from vgtm_qp.errors import AlteredResultError, ExportError, ResultError
 
     try:
         yield
+    except ExportError as error:
+        raise ExportError(f"{result}: {error}") from None
     except ResultError as error:
         said = str(error).removeprefix(f"{result}: ")
         kind = AlteredResultError if zipfile.is_zipfile(result) else ResultError

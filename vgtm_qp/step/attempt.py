@@ -34,8 +34,8 @@ _MOTION_MARGIN = 2.5
 _TOO_FAR = 1e3
 """Displacement of a node, over the arm's length, from which on the answer of a QP shows a singular pose."""
 
-_DEVIATION = 0.1
-"""Greatest deviation of points from their chords in one step, over the arm's unit."""
+_DEVIATION = 0.05
+"""Greatest deviation of points from their chords in one step, over the arm's length."""
 
 _SETTLING = 5e-3
 """Tip error after a QP, over the arm's length, above which another QP is solved."""
@@ -236,7 +236,7 @@ class Attempt:
             phases.add("acceptance")
             if after is None:
                 continue
-            if not separation.deviation(state.q, q) < _DEVIATION * self._arm.unit:
+            if not separation.deviation(state.q, q) < _DEVIATION * self._arm.height:
                 return blocked("the arm turns too far in one step")
             if self._has_limit and (too_long := self._too_long(self._arm.nodes(q) - state.nodes)):
                 return blocked(too_long)
