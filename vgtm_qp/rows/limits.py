@@ -81,6 +81,8 @@ def binding(
     """
     # Without a limited acceleration, only slowing before the end of the stroke gives a smaller bound.
     other = np.where(np.isinf(acceleration), STROKE, ACCELERATION)
-    kind = np.where(np.abs(bound - fastest) < _SAME, RATE, other)
-    kind = np.where(np.abs(bound - end) < _SAME, STROKE, kind)
+    # Bounds that are infinite are nobody's.
+    with np.errstate(invalid="ignore"):
+        kind = np.where(np.abs(bound - fastest) < _SAME, RATE, other)
+        kind = np.where(np.abs(bound - end) < _SAME, STROKE, kind)
     return [str(name) for name in np.where(locked, LOCKED, kind)]

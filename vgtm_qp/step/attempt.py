@@ -34,7 +34,7 @@ _MOTION_MARGIN = 2.5
 _TOO_FAR = 1e3
 """Displacement of a node, over the arm's length, from which on the answer of a QP shows a singular pose."""
 
-_DEVIATION = 0.05
+_DEVIATION = 0.1
 """Greatest deviation of points from their chords in one step, over the arm's length."""
 
 _SETTLING = 5e-3
