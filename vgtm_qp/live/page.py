@@ -23,6 +23,7 @@ from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.methods import method_name, methods_for
 from vgtm_qp.problem import Problem
 from vgtm_qp.result.manifest import stored_problem
+from vgtm_qp.verify.arm import arm_of
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled, stroke_colours
 from vgtm_qp.view.scene import ArmScene
 from vgtm_qp.view.server import LOOPBACK, is_loopback, is_unspecified, viser_server
@@ -65,6 +66,9 @@ def view(
             stacklevel=2,
         )
     maneuver = shown if isinstance(shown, Maneuver) else None
+    if maneuver:
+        # Refused before a page is opened that could not show it.
+        arm_of(maneuver)
     problem = stored_problem(maneuver.manifest["problem"]) if maneuver else shown
     assert isinstance(problem, Problem)
     with viser_server(port, host) as server:
