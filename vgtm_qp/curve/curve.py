@@ -13,7 +13,7 @@ from vgtm_qp.curve.families import CurveFamily, bernstein, within
 from vgtm_qp.errors import CurveError
 from vgtm_qp.rotation import rotation_from_vector, turn_between
 
-_FRAME_STEPS_PER_CELL = 4
+_FRAME_STEPS_PER_CELL = 1
 _NO_STEP = 1e-9
 _NEWTON_STEPS = 100
 _CONVERGED = 1e-13

@@ -16,8 +16,8 @@ from vgtm_qp.errors import CurveError, nearest
 
 FAMILIES = ("bezier", "b-spline", "beta-spline")
 
-_QUADRATURE_CELLS = 32
-_GAUSS_POINTS = 6
+_QUADRATURE_CELLS = 128
+_GAUSS_POINTS = 8
 _OUTSIDE = 1e-12
 
 

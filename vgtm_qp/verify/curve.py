@@ -18,8 +18,8 @@ from vgtm_qp.verify.path import DIRECTION_TOLERANCE, angles
 TRACKING_TOLERANCE = 1e-6
 """Tolerance of stations with exact tracking and of the curve's end, over the mean length of members or links."""
 
-_PIECES = 400
-"""Chords of each Bezier segment whose lengths make its arc length."""
+_PIECES, _FEWEST = 1600, 100
+"""Chords whose lengths make the arc length of a curve, and fewest of each of its Bezier segments."""
 _REFINEMENTS = 3
 
 _ROUNDING = 1e-9
@@ -83,7 +83,8 @@ class RecordedCurve(NamedTuple):
         if not self.by_arc_length:
             return self.at(np.tile(self.nodes, (len(vertices), 1)), vertices)
         states = np.arange(len(vertices))[:, None]
-        within = np.arange(2 * _PIECES) / (2 * _PIECES)
+        pieces = max(_PIECES // (len(self.breaks) - 1), _FEWEST)
+        within = np.arange(2 * pieces) / (2 * pieces)
         fine = (self.breaks[:-1, None] + np.diff(self.breaks)[:, None] * within).reshape(-1)
         fine = np.append(fine, self.breaks[-1])
         points = self.at(np.tile(fine, (len(vertices), 1)), vertices)
