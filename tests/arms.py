@@ -125,3 +125,16 @@ def arm_problem(
     return Problem.from_dict(
         {"schema_version": 1, "truss": spec, "maneuver": {"steps": steps, "waypoint": [point]}, **more}
     )
+
+
+def three_bays(**changes: Any) -> Problem:
+    """An octahedral arm of three bays that bends over, without another try where it stops; changes by key path."""
+    table = {
+        "name": "three bays",
+        "truss": {"module": "octahedral", "bays": 3, "stroke": [0.6, 1.5]},
+        "curve": {"control_vertices": 4},
+        "maneuver": {"steps": 15, "waypoint": [{"time": 4.0, "position": [0.9, 0.0, 1.9]}]},
+        "clearance": {"safe": 0.05, "influence": 0.5},
+        "method": {"retries": False},
+    }
+    return Problem.from_dict(table).replace(changes)

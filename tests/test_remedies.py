@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arms import three_bays
 
 import vgtm_qp as vq
 from vgtm_qp.cli import main
@@ -20,18 +21,6 @@ from vgtm_qp.step.remedies import Change, Remedy, relaxed
 from vgtm_qp.step.stops import StopKind
 
 WALL = {"name": "wall", "shape": "box", "center": [1.2, 0.0, 2.0], "size": [0.3, 6.0, 6.0]}
-
-
-def three_bays(**changes):
-    found = {
-        "name": "three bays",
-        "truss": {"module": "octahedral", "bays": 3, "stroke": [0.6, 1.5]},
-        "curve": {"control_vertices": 4},
-        "maneuver": {"steps": 15, "waypoint": [{"time": 4.0, "position": [0.9, 0.0, 1.9]}]},
-        "clearance": {"safe": 0.05, "influence": 0.5},
-        "method": {"retries": False},
-    }
-    return vq.Problem.from_dict(found).replace(changes)
 
 
 def stopped(problem):

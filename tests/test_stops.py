@@ -6,24 +6,11 @@ import json
 
 import numpy as np
 import pytest
+from arms import three_bays
 
 import vgtm_qp as vq
 from vgtm_qp.maneuver.retries import DeadEnd, bulge, retries
 from vgtm_qp.step.stops import Stop, StopKind
-
-BASE = {
-    "name": "three bays",
-    "truss": {"module": "octahedral", "bays": 3, "stroke": [0.6, 1.5]},
-    "curve": {"control_vertices": 4},
-    "maneuver": {"steps": 15, "waypoint": [{"time": 4.0, "position": [0.9, 0.0, 1.9]}]},
-    "clearance": {"safe": 0.05, "influence": 0.5},
-    "method": {"retries": False},
-}
-
-
-def problem(**changes):
-    found = vq.Problem.from_dict(BASE)
-    return found.replace(changes) if changes else found
 
 
 def boxes(random):
@@ -38,7 +25,7 @@ def boxes(random):
 @pytest.mark.parametrize("_", range(10))
 def test_without_the_named_obstacles_or_limits_a_blocked_arm_gets_further(_, rng):
     obstacles = boxes(rng)
-    blocked = vq.solve(problem(obstacle=obstacles))
+    blocked = vq.solve(three_bays(obstacle=obstacles))
     assert blocked.certificate.ok, blocked.certificate.failures()
     stop = blocked.manifest["stop"]
     if blocked.status == "solved":
@@ -50,13 +37,13 @@ def test_without_the_named_obstacles_or_limits_a_blocked_arm_gets_further(_, rng
     changes = {"obstacle": [entry for entry in obstacles if entry["name"] not in stop["obstacles"]]}
     if not stop["obstacles"]:
         changes = {"truss.stroke": [0.4, 1.7], "clearance.self_collision": False, "obstacle": obstacles}
-    freer = vq.solve(problem(**changes))
+    freer = vq.solve(three_bays(**changes))
     assert freer.status == "solved" or freer.reached > blocked.reached + 1e-3
 
 
 def test_some_of_the_random_scenes_are_blocked_by_obstacles():
     kinds = [
-        vq.solve(problem(obstacle=boxes(np.random.default_rng(seed))), verify=False).manifest["stop"]
+        vq.solve(three_bays(obstacle=boxes(np.random.default_rng(seed))), verify=False).manifest["stop"]
         for seed in range(6)
     ]
     assert any(stop and stop["kind"] == "obstacle" for stop in kinds)
@@ -75,18 +62,18 @@ def test_the_wall_is_named_and_the_set_is_small():
 @pytest.mark.smoke
 def test_a_stretched_arm_is_out_of_reach_of_what_lies_further():
     waypoint = [{"time": 4.0, "position": [0.0, 0.0, 2.62]}]
-    maneuver = vq.solve(problem(**{"maneuver.waypoint": waypoint, "truss.stroke": [0.9, 1.2]}))
+    maneuver = vq.solve(three_bays(**{"maneuver.waypoint": waypoint, "truss.stroke": [0.9, 1.2]}))
     assert maneuver.status == "blocked"
     stop = maneuver.manifest["stop"]
     assert stop["kind"] in ("out of reach", "stroke")
     assert all(name.startswith("stroke: ") for name in stop["multipliers"])
-    wider = vq.solve(problem(**{"maneuver.waypoint": waypoint, "truss.stroke": [0.5, 1.6]}))
+    wider = vq.solve(three_bays(**{"maneuver.waypoint": waypoint, "truss.stroke": [0.5, 1.6]}))
     assert wider.reached > maneuver.reached
 
 
 def test_a_resolver_explains_a_stop_in_a_control_loop_and_keeps_its_state():
     resolver = vq.Resolver(
-        problem(
+        three_bays(
             obstacle=[{"name": "wall", "shape": "box", "center": [1.2, 0.0, 2.0], "size": [0.3, 6.0, 6.0]}]
         )
     )
@@ -109,7 +96,7 @@ def test_a_resolver_explains_a_stop_in_a_control_loop_and_keeps_its_state():
 
 @pytest.mark.parametrize("bad", [[np.nan, 0.0, 1.0], [np.inf, 0.0, 1.0], [1.0, 2.0], "up"])
 def test_a_target_that_is_no_number_is_refused_and_the_state_kept(bad):
-    resolver = vq.Resolver(problem())
+    resolver = vq.Resolver(three_bays())
     resolver.step(position=[0.1, 0.0, 2.4])
     before = resolver.state
     with pytest.raises(vq.GoalError, match="unchanged"):
@@ -152,7 +139,7 @@ def test_an_arm_that_no_obstacle_pushes_aside_is_bulged_the_way_its_path_goes_on
 
 @pytest.mark.smoke
 def test_the_ways_out_are_those_that_a_problem_has():
-    patient = problem(**{"method.retries": True})
+    patient = three_bays(**{"method.retries": True})
     first, *names = [name for name, _ in retries(patient, dead_end(vertices=4))]
     assert first == "elastic tracking"
     assert names[0] == "actuators drawn to their home lengths"
@@ -162,7 +149,7 @@ def test_the_ways_out_are_those_that_a_problem_has():
     assert len(set(names)) == len(names)
     for name, other in retries(patient, dead_end(vertices=4)):
         assert other != patient, name
-    assert not list(retries(problem(), dead_end()))
+    assert not list(retries(three_bays(), dead_end()))
     for kind in (StopKind.SINGULAR, StopKind.OUT_OF_REACH, StopKind.LOCKED, StopKind.INTERRUPTED):
         assert not list(retries(patient, dead_end(kind)))
     bare = patient.replace({"method.tracking": "none"})
@@ -204,7 +191,7 @@ def test_an_obstacle_that_strikes_the_arm_is_named_however_fast(method, speed):
     waypoint = {"time": duration, "position": [0.1, 0.0, 2.3]}
     maneuver = {"steps": steps, "waypoint": [waypoint]}
     changes = {"obstacle": [thing], "maneuver": maneuver, "method": {"retries": False, **method}}
-    found = vq.solve(problem(**changes))
+    found = vq.solve(three_bays(**changes))
     assert found.certificate.ok, found.certificate.failures()
     stop = found.manifest["stop"]
     assert (stop["kind"], stop["obstacles"]) == ("obstacle", ["thrown"])

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import os
 import platform
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -49,6 +51,27 @@ def environment(changes: Mapping[str, str]) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def noting_interrupts(noted: threading.Event) -> Iterator[None]:
+    """Set `noted` at each interrupt, which has its usual effect too, as long as the main thread is in here.
+
+    Whoever catches every exception swallows that effect, as CasADi does while it is imported.
+    """
+    before: Any = None
+
+    def interrupt(_signum: int, _frame: Any) -> None:
+        noted.set()
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
 
 
 def machine_record() -> dict[str, Any]:

@@ -222,8 +222,8 @@ class Arm(ABC):
     height : float
         Length of the axis from the base to the tip at home, m.
     unit : float
-        Mean distance of the nodes that a member or link joins, at home, m. Tolerances and weights of lengths are shares
-        of it, so that an arm moves in the same way whatever its size.
+        The characteristic length: mean distance of the nodes that a member or link joins, at home, m. Tolerances and
+        weights of lengths are shares of it, so that an arm moves in the same way whatever its size.
     bodies : Bodies
         Spanned by the points of :meth:`points`.
     """

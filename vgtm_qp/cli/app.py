@@ -16,11 +16,12 @@ from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError
 
 from vgtm_qp.cli.doctor import doctor
 from vgtm_qp.cli.experiments import bench, compare, study
-from vgtm_qp.cli.output import ExitCode, document, note, noting_interrupts
+from vgtm_qp.cli.output import ExitCode, asked_to_end, document, note
 from vgtm_qp.cli.problems import check, list_problems, schema
 from vgtm_qp.cli.results import export, replay, verify, view
 from vgtm_qp.cli.solve import solve
 from vgtm_qp.errors import AlteredResultError, ProblemError, VgtmError, nearest
+from vgtm_qp.machine import noting_interrupts
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 """What the system says of a disk that takes no more."""
@@ -73,7 +74,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
     # What it logs of a damaged file is a traceback; the errors that it raises are said in a line.
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     try:
-        with noting_interrupts(), _plain_warnings():
+        asked_to_end.clear()
+        with noting_interrupts(asked_to_end), _plain_warnings():
             code = app(given, exit_on_error=False, print_error=False, result_action="return_value")
         if code == ExitCode.INTERRUPTED:
             _stop_compilers()

@@ -109,29 +109,8 @@ def why_not_writable(folder: Path) -> str:
         return f"{folder}: {error.strerror}"
 
 
-_asked_to_end = threading.Event()
-
-
-@contextmanager
-def noting_interrupts() -> Iterator[None]:
-    """Remember the interrupts of a command, which have their usual effect too.
-
-    Libraries that catch whatever happens while they are imported, as CasADi does, swallow that effect.
-    """
-    _asked_to_end.clear()
-    before: Any = None
-
-    def interrupt(_signum: int, _frame: Any) -> None:
-        _asked_to_end.set()
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is threading.main_thread():
-        before = signal.signal(signal.SIGINT, interrupt)
-    try:
-        yield
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
+asked_to_end = threading.Event()
+"""Set by an interrupt of the command that runs."""
 
 
 @contextmanager
@@ -154,7 +133,7 @@ def following(title: str, *, shown: bool) -> Iterator[Progress]:
         if before is None and threading.current_thread() is threading.main_thread():
             before = signal.signal(signal.SIGINT, interrupt)
         advance(fraction, 1.0)
-        if interrupted.is_set() or _asked_to_end.is_set():
+        if interrupted.is_set() or asked_to_end.is_set():
             raise KeyboardInterrupt
 
     with bar(title, shown=shown) as advance:

@@ -62,7 +62,7 @@ class Certificate:
 
     A clearance is the distance of a member's axis from a solid obstacle less the radius, or of two axes less both: from
     surface to surface, and minus the radius where the axis is inside, however deep. Clearances between states are
-    proven lower bounds, at most 1e-6 m below the least one.
+    proven lower bounds, at most 1e-6 of the mean member or link below the least one.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Certificate:
         Greatest singular value of the same: mm at the tip for actuator errors whose squares sum to 1 mm^2.
     tracking_gap, states_off_curve : Measure
         Greatest distance of a station from its node on the reference curve, m, and the share of the states in which it
-        is more than 1e-6 m; but for the home pose, to which the curve is fitted.
+        is more than 1e-6 of the mean member or link; but for the home pose, to which the curve is fitted.
     curve_end_gap, curve_end_angle : Measure
         Greatest distance of the curve's end from the end effector, m, and angle between their directions, rad, where
         the method ties them.

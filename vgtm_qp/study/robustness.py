@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from time import process_time
 
 from matplotlib.figure import Figure
 
 from vgtm_qp.comparison.tables import markdown_table, wilson_interval
 from vgtm_qp.errors import ProblemError
+from vgtm_qp.machine import environment
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.drawing import label, panels, select
@@ -44,7 +44,7 @@ def run(seed: int, number: int, steps: int, compiler: bool) -> Row:
     found: Row = {"module": problem.to_dict()["truss"]["module"], "features": features(problem)}
     started = process_time()
     try:
-        with _compiler(compiler):
+        with nullcontext() if compiler else environment({"VGTM_CC": "none"}):
             maneuver = solve(problem)
     except ProblemError as error:
         nothing: Row = {
@@ -63,21 +63,6 @@ def run(seed: int, number: int, steps: int, compiler: bool) -> Row:
         "stop": stop["kind"] if stop else "",
         "seconds": process_time() - started,
     }
-
-
-@contextmanager
-def _compiler(wanted: bool) -> Iterator[None]:
-    """Let problems be solved with the machine's compiler, or with none."""
-    before = os.environ.get("VGTM_CC")
-    if not wanted:
-        os.environ["VGTM_CC"] = "none"
-    try:
-        yield
-    finally:
-        if before is None:
-            os.environ.pop("VGTM_CC", None)
-        else:
-            os.environ["VGTM_CC"] = before
 
 
 def features(problem: Problem) -> list[str]:

@@ -9,15 +9,13 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from vgtm_qp.compiled import OFTEN, SELDOM, compile_after
 from vgtm_qp.errors import MissingExtraError
-from vgtm_qp.machine import pin_threads
+from vgtm_qp.machine import noting_interrupts, pin_threads
 
 Task = dict[str, Any]
 Row = dict[str, Any]
@@ -40,32 +38,14 @@ def run_task(function: str, task: Task) -> Row:
 
 def run_here(function: str, tasks: Sequence[Task]) -> Iterator[tuple[int, Row]]:
     """Yield number and row of each task, one after another in this process; an interrupted task has no row."""
-    with _noting_interrupts() as interrupted:
+    interrupted = threading.Event()
+    with noting_interrupts(interrupted):
         for k, task in enumerate(tasks):
             row = run_task(function, task)
             if interrupted.is_set():
                 # A maneuver ends with the steps that it made, as if it were blocked.
                 raise KeyboardInterrupt
             yield k, row
-
-
-@contextmanager
-def _noting_interrupts() -> Iterator[threading.Event]:
-    """Give an event that is set by the first interrupt, which has its usual effect too."""
-    interrupted = threading.Event()
-    before: Any = None
-
-    def interrupt(_signum: int, _frame: Any) -> None:
-        interrupted.set()
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is threading.main_thread():
-        before = signal.signal(signal.SIGINT, interrupt)
-    try:
-        yield interrupted
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
 
 
 def run_processes(
@@ -169,6 +149,8 @@ def _pool(
 
 def _serve(pipe: Connection, is_alone: bool) -> None:
     """Answer tasks until the other end closes; an interrupt is the other process's business."""
+    from vgtm_qp.compiled import OFTEN, SELDOM, compile_after
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Beside other processes, to compile the kernels of an arm costs more than a few maneuvers with it gain.
     compile_after(OFTEN if is_alone else SELDOM)

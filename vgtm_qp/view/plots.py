@@ -79,7 +79,13 @@ def _draw_tip_error(axes: Axes, maneuver: Result) -> None:
     if error is not None:
         shown = np.maximum(error, _SMALLEST)
         axes.semilogy(maneuver.time, shown, color=_COLOURS[0], marker=".", markersize=3.0)
-    axes.axhline(TIP_TOLERANCE, color="#b91c1c", linestyle="--", linewidth=0.9, label="tolerance")
+    axes.axhline(
+        TIP_TOLERANCE * arm_of(maneuver).size,
+        color="#b91c1c",
+        linestyle="--",
+        linewidth=0.9,
+        label="tolerance",
+    )
     axes.set(ylabel="tip error (m)", ylim=(_SMALLEST / 2.0, None))
     axes.legend(frameon=False)
 
