@@ -151,7 +151,7 @@ def test_a_tour_goes_there_and_back_and_asks_again_for_what_was_not_reached() ->
 
 def test_a_tour_that_makes_no_progress_is_stuck() -> None:
     tour = Tour([goal_at(0.0), goal_at(1.0)])
-    for _ in range(9):
+    for _ in range(4):
         tour.advance(step_of(vq.StepStatus.SLOWED, 1e-4))
     assert tour.stuck == ""
     tour.advance(step_of(vq.StepStatus.SLOWED, 1e-4))

@@ -6,12 +6,11 @@ from typing import NamedTuple
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.maneuver.solve import STALLED_PROGRESS, STALLED_STEPS
 from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.step import Step, StepStatus
-
-_STALLED_PROGRESS, _STALLED_STEPS = 1e-3, 10
 
 
 class Goal(NamedTuple):
@@ -61,8 +60,8 @@ class Tour:
 
     def advance(self, step: Step) -> None:
         """Note what a step towards the goal did."""
-        self._stalled = self._stalled + 1 if step.progress < _STALLED_PROGRESS else 0
-        if step.status is StepStatus.BLOCKED or self._stalled == _STALLED_STEPS:
+        self._stalled = self._stalled + 1 if step.progress < STALLED_PROGRESS else 0
+        if step.status is StepStatus.BLOCKED or self._stalled == STALLED_STEPS:
             self.stuck = ", ".join(step.blocked_by) or "nothing that has a name"
             return
         last = len(self._goals) - 1

@@ -29,9 +29,13 @@ from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.verify import verify as check
 
-_STALLED_PROGRESS = 1e-3
-_STALLED_STEPS = 10
+STALLED_PROGRESS = 1e-2
+"""Progress of a step, as a share of it, below which the arm hardly moves; it gives up after so many such steps."""
+STALLED_STEPS = 5
+_FURTHER = 1e-3
+"""Share of the whole path by which a retry must get further than another to be the better one."""
 
+_TRIED_STEPS = 10
 _PART = 0.25
 """Share of the progress that a remedy promises to first order, from which on the arm goes on with it."""
 _MORE = (1.0, 2.0, 4.0)
@@ -171,8 +175,8 @@ class _Attempt:
             if stop is not None:
                 self._come_to_rest()
                 return stop
-            stalled = stalled + 1 if step.progress < _STALLED_PROGRESS else 0
-            if stalled >= _STALLED_STEPS:
+            stalled = stalled + 1 if step.progress < STALLED_PROGRESS else 0
+            if stalled >= STALLED_STEPS:
                 return self._explain(aim, dt, step)
             if progress is not None:
                 progress(self.progress, step)
@@ -185,7 +189,7 @@ class _Attempt:
             return False
         aim, dt = plan.next_mark(value)
         enough = value + _PART * remedy.progress * (aim - value)
-        for _ in range(_STALLED_STEPS):
+        for _ in range(_TRIED_STEPS):
             step = resolver.follow(plan.path, value, aim, dt=dt)
             if step.left_path or not step.moved:
                 break
@@ -269,7 +273,7 @@ def _retry(
         found = attempt.run(progress)
         if found is None:
             return name, attempt, None
-        if attempt.progress > best[1].progress + _STALLED_PROGRESS:
+        if attempt.progress > best[1].progress + _FURTHER:
             best = (name, attempt, found)
     return best
 

@@ -128,8 +128,7 @@ class Advancer:
         """Return a step towards a `share` of a target with the limits `box`."""
         if share == 1.0:
             return self._try(state, target, dt, tracking=tracking)
-        end = target.start + share * (target.end - target.start)
-        piece = replace(target, end=end, lower=box[0], upper=box[1])
+        piece = replace(target.part(share), lower=box[0], upper=box[1])
         return self._try(state, piece, dt, share, tracking=tracking)
 
     def _try(

@@ -10,7 +10,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import EvaluationError, SolverError
-from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
+from vgtm_qp.qp.answer import Accuracy, Closed, Move
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
@@ -23,7 +23,11 @@ from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.target import QPInput, Target
 
-_MOST_QPS = 8
+_FREE_QPS = 3
+"""Greatest number of QPs that may each go as far along the piece of path as they can."""
+
+_MOST_QPS = 6
+"""Greatest number of QPs: the last ones start anew from the answer of the first, and go no further than it did."""
 
 _MOST_FRACTIONS = 8
 """Greatest number of times between two states for which a QP has rows."""
@@ -39,6 +43,9 @@ _DEVIATION = 0.1
 
 _SETTLING = 5e-3
 """Tip error after a QP, over the arm's length, above which another QP is solved."""
+
+_NOTHING = 1e-9
+"""Progress of a QP below which its corrections may go further than it did."""
 
 _FURTHER = 1e-6
 """Least gain in progress for which stations leave the curve."""
@@ -184,17 +191,22 @@ class Attempt:
         """Run the attempt from its first input; pairs too near at the start, `short`, are driven apart by `gain`, m."""
         phases, separation, target = self.phases, self.separation, asked.target
         q, fractions = state.q, list[float]()
-        solution: StepSolution | None = None
         rows: ClearanceRows | None = None
+        first: Move | None = None
         move: Move | None = None
+        covered = 1.0
 
         def blocked(
             reason: str, failure: FailedStepError | None = None, *, solver_failed: bool = False
         ) -> Step:
             kept = Step(StepStatus.BLOCKED, 0.0, state, reason, count, solver_failed)
-            return replace(kept, solution=solution, rows=rows, failure=failure)
+            return replace(kept, solution=first and first.solution, rows=rows, failure=failure)
 
         for count in range(1, _MOST_QPS + 1):
+            if count > _FREE_QPS and covered == 1.0 and first is not None and self._is_cut_short(first):
+                # Corrections that make for the end of the piece leave what the first QP allowed, and do not converge.
+                covered = first.progress
+                q, target, move = first.q, target.part(covered), first._replace(progress=1.0)
             if move is not None:
                 near = separation.rows(q, target.time, 0.0, reach, short, gain)
                 near = separation.with_rows_between(near, state, q, target.time, fractions)
@@ -213,8 +225,8 @@ class Attempt:
                 return blocked(str(error))
             finally:
                 phases.add("correction")
-            if solution is None:
-                solution, rows = move.solution, asked.rows
+            if first is None:
+                first, rows = move, asked.rows
             q = move.q
             is_finite = move.closed is not None or np.isfinite(q).all()
             if not move.furthest < _TOO_FAR * self._arm.height or not is_finite:
@@ -242,15 +254,20 @@ class Attempt:
                 return blocked(too_long)
             if report.certified:
                 then = state.next(self._arm, target.duration, closed, vertices, move.torsion, after)
-                status = StepStatus.REACHED if move.progress >= WHOLE else StepStatus.SLOWED
+                progress = covered * move.progress
+                status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
                 gave_way = tracking is None and self._tracking is not None
                 return Step(
-                    status, move.progress, then, "", count, gave_way=gave_way, solution=solution, rows=rows
+                    status, progress, then, "", count, gave_way=gave_way, solution=first.solution, rows=rows
                 )
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")
         return blocked("no convergence")
+
+    def _is_cut_short(self, move: Move) -> bool:
+        """Return whether the answer of a first QP covers a part of the piece, and not the whole of it."""
+        return self._setup.tip_mode == "scaled" and _NOTHING < move.progress < WHOLE
 
     def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
         """Return what is wrong with the configuration of a `move` from `state`, computed again; empty if nothing is."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +46,15 @@ class Target:
 
     def goal(self, progress: float) -> TipGoal:
         """Return the tip's goal at a progress of 0 to 1."""
-        return self.path.at(self.start + progress * (self.end - self.start))
+        return self.path.at(self.reached(progress))
+
+    def reached(self, progress: float) -> float:
+        """Return the path's value at a progress of 0 to 1."""
+        return self.start + progress * (self.end - self.start)
+
+    def part(self, share: float) -> Target:
+        """Return the target of the first `share` of the piece, in the same time and with the same limits."""
+        return replace(self, end=self.reached(share))
 
 
 class QPInput(NamedTuple):
