@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,6 +51,21 @@ def chain(links=5, *, prismatic=False, **arm):
     return {"joint": joints, "tip": [0.0, 0.0, 0.4], "link_radius": 0.03, **arm}
 
 
+def clothed(arm):
+    """The same arm with bodies of its own: on the base, beside its links, and two that touch at home."""
+    names = [joint["name"] for joint in arm["joint"]]
+    body = [
+        {"name": "foot", "points": [[0.0, 0.0, 0.0], [0.02, 0.0, 0.05]], "radius": 0.05},
+        *(
+            {"name": f"link {name}", "joint": name, "points": [[0.01, 0, 0], [0, 0.02, 0.35]], "radius": 0.03}
+            for name in names[1::2]
+        ),
+        {"name": "fin", "joint": names[1], "points": [[0.0, 0.0, 0.8]], "radius": 0.2},
+        {"name": "eye", "joint": names[-1], "points": [[0.0, 0.05, 0.1]], "radius": 0.02},
+    ]
+    return {**arm, "body": body, "tip_rotation_vector": [0.1, -0.2, 0.3]}
+
+
 def problem_of(name, **more):
     """A problem of an arm of that name that tracks a curve."""
     common = {"curve": {"control_vertices": 4}, **more}
@@ -73,6 +89,7 @@ SERIAL = {
     "serial": chain(),
     "serial with a slide": chain(4, prismatic=True),
     "serial, locked": chain(5, locked=["p2", "y4"]),
+    "serial with bodies": clothed(chain(4, prismatic=True)),
 }
 
 
@@ -531,6 +548,21 @@ def test_an_arm_that_cannot_be_moved_is_refused_by_the_key_that_is_to_blame(mist
     assert key in str(raised.value)
 
 
+def test_a_straight_home_is_refused_with_one_that_works():
+    problem = vq.load_problem("snake_past_a_cube")
+    data = problem.to_dict()
+    for one in data["arm"]["joint"]:
+        one["home"] = 0.0
+    with pytest.raises(vq.ProblemError) as raised:
+        vq.solve(Problem.from_dict(data))
+    values = re.search(r"it can with home values ([-\d., e]+)", str(raised.value))
+    for one, value in zip(data["arm"]["joint"], values[1].split(","), strict=True):
+        one["home"] = float(value)
+    resolver = vq.Resolver(Problem.from_dict(data))
+    for axis in np.eye(3):
+        assert resolver.step(position=resolver.tip()[0] - 0.01 * axis).progress > 0.9
+
+
 WIDE = chain(10, joint=[{**joint, "limits": [-2.5, 2.5]} for joint in chain(10)["joint"]])
 STOPS = {
     "its own links": (
@@ -629,3 +661,51 @@ def test_what_reads_trusses_alone_names_the_file_of_a_serial_arm(command, tmp_pa
     file = vq.solve(serial_problem(chain(), curve={"control_vertices": 4})).save(tmp_path / "arm.npz")
     assert main([command[0], str(file), *command[1:]]) == 2
     assert f"{file}: this is the result of a serial arm; expected that of a truss" in capsys.readouterr().err
+
+
+def test_bodies_that_touch_at_home_are_not_kept_apart_and_that_is_told():
+    maneuver = vq.solve(problem_of("serial with bodies"))
+    record = maneuver.manifest["arm"]
+    names = record["body_names"]
+    touching = {frozenset(names[k] for k in pair) for pair in record["touching"]}
+    assert touching
+    assert all("fin" in pair for pair in touching)
+    assert maneuver.status == "solved", str(maneuver.certificate)
+    apart = [names.index("foot"), names.index("eye")]
+    forged = {**maneuver.manifest, "arm": {**record, "touching": [*record["touching"], apart]}}
+    certificate = vq.verify(replace(maneuver, manifest=forged))
+    assert any("foot / eye do not touch at home" in line for line in certificate.contradictions)
+
+
+def test_the_attitude_of_the_tip_is_that_of_the_last_frame_turned():
+    arm = make_arm(problem_of("serial with bodies"))
+    frame = np.eye(3)
+    for joint in SERIAL["serial with bodies"]["joint"]:
+        turn = (
+            joint["home"] * np.array(joint["axis"]) / np.linalg.norm(joint["axis"])
+            if "home" in joint
+            else [0.0] * 3
+        )
+        placed = Rotation.from_rotvec(joint.get("rotation_vector", [0.0] * 3))
+        frame = frame @ placed.as_matrix() @ Rotation.from_rotvec(turn).as_matrix()
+    wanted = frame @ Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    np.testing.assert_allclose(evaluated(arm, arm.home_configuration).tip_rotation, wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda bodies: bodies[1].update(radius=0.04), "shape of body link y1"),
+        (lambda bodies: bodies[1].update(points=[[0, 0, 0], [0, 0, 0.3]]), "shape of body link y1"),
+        (lambda bodies: bodies[1].update(joint="p1"), "joint of body link y1"),
+        (lambda bodies: bodies[0].update(joint="p1"), "joint of body foot"),
+        (lambda bodies: bodies.pop(), "bodies of the arm record"),
+    ],
+)
+def test_bodies_of_another_problem_are_found(change, said):
+    problem = problem_of("serial with bodies")
+    maneuver = vq.solve(problem)
+    data = problem.to_dict()
+    change(data["arm"]["body"])
+    certificate = vq.verify(maneuver, problem=Problem.from_dict(data))
+    assert any(said in line for line in certificate.contradictions)

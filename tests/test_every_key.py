@@ -51,6 +51,20 @@ CSV = "t,x,y,z\n1.0,0.05,0.0,3.26\n2.0,0.1,0.0,3.25\n3.0,0.15,0.0,3.24\n"
 OBJ = "v 0 0 0\nv 0.2 0 0\nv 0 0.2 0\nv 0 0 0.2\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 
 
+def snake_urdf(length: float) -> str:
+    """Return the snake as a URDF file; its links are wedges from a package."""
+    mesh = '<collision><geometry><mesh filename="package://snake/wedge.obj"/></geometry></collision>'
+    parts = [f'<link name="l0">{mesh}</link>']
+    for k in range(6):
+        axis = ("1 0 0", "0 1 0")[k % 2]
+        parts.append(
+            f'<joint name="j{k}" type="continuous"><parent link="l{k}"/><child link="l{k + 1}"/>'
+            f'<origin xyz="0 0 {length}"/><axis xyz="{axis}"/></joint><link name="l{k + 1}">{mesh}</link>'
+        )
+    tool = f'<joint name="j" type="fixed"><parent link="l6"/><child link="tip"/><origin xyz="0 0 {length}"/></joint>'
+    return f'<robot name="snake">{"".join(parts)}{tool}<link name="tip"/></robot>'
+
+
 def graph() -> dict[str, Any]:
     """An octahedral bay between unequal triangles, and a tip of three nodes."""
     pairs = ["g1 m1", "g2 m1", "g2 m2", "g3 m2", "g3 m3", "g1 m3", "m1 m2", "m2 m3", "m3 m1"]
@@ -269,6 +283,18 @@ GRAPH_CASES: dict[str, tuple[Changes, Changes]] = {
     "truss.member.radius": ({}, members(8, radius=0.05)),
     "truss.member.offsets": ({}, members(0, offsets=[[0.0, 0.0, 0.05], [0.0, 0.0, 0.05]])),
 }
+FILE: Changes = {
+    "arm": {"urdf": "one.urdf", "home": [0.1] * 6, "package_path": ["one"]},
+    "maneuver.waypoint": [{"time": 3.0, "position": [0.2, -0.5, 1.8]}],
+}
+BODY = {"name": "fin", "joint": "j3", "points": [[0.0, 0.1, 0.0], [0.0, 0.1, 0.3]], "radius": 0.05}
+
+
+def body(**changes: Any) -> Changes:
+    """Change the one body of an arm."""
+    return {"arm.body": [{**BODY, **changes}]}
+
+
 ARM_CASES: dict[str, tuple[Changes, Changes]] = {
     "arm.base_motion.time": ({"arm.base_motion": MOVED}, {"arm.base_motion": [{**MOVED[0], "time": 2.0}]}),
     "arm.base_motion.position": (
@@ -293,6 +319,17 @@ ARM_CASES: dict[str, tuple[Changes, Changes]] = {
     "arm.joint.home": ({}, joints(home=0.2)),
     "arm.joint.rate": ({}, joints(rate=0.01)),
     "arm.joint.acceleration": ({}, joints(acceleration=0.01)),
+    "arm.urdf": (FILE, {"arm.urdf": "two.urdf"}),
+    "arm.package_path": (FILE, {"arm.package_path": ["two"]}),
+    "arm.base_link": (FILE, {"arm.base_link": "l1", "arm.home": [0.1] * 5}),
+    "arm.tip_link": (FILE, {"arm.tip_link": "l5", "arm.home": [0.1] * 5}),
+    "arm.home": (FILE, {"arm.home": [0.12] * 6}),
+    "arm.bodies": (FILE, {"arm.bodies": "hull"}),
+    "arm.tip_rotation_vector": ({}, {"arm.tip_rotation_vector": [0.1, 0.0, 0.0]}),
+    "arm.body.name": (body(), body(name="sail")),
+    "arm.body.joint": (body(), body(joint="j4")),
+    "arm.body.points": (body(), body(points=[[0.0, 0.2, 0.0]])),
+    "arm.body.radius": (body(), body(radius=0.08)),
 }
 
 
@@ -375,7 +412,12 @@ def folder(tmp_path, monkeypatch):
         "two.csv": CSV.replace("0.15", "0.2"),
         "one.obj": OBJ,
         "two.obj": OBJ.replace("0.2", "0.3"),
+        "one.urdf": snake_urdf(0.4),
+        "two.urdf": snake_urdf(0.45),
+        "one/snake/wedge.obj": OBJ.replace("0.2", "0.1"),
+        "two/snake/wedge.obj": OBJ.replace("0.2", "0.12"),
     }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
 
 

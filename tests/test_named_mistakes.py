@@ -124,9 +124,9 @@ def test_what_this_version_does_not_have_is_refused_before_keys_are_questioned()
         "maneuver.waypoint[0].wrong",
     ]
     assert mistakes_of({**base, "truss": {"module": "plate", "wrong": 1}})[0] == "truss.module"
-    joint = {"joint": [{"name": "a", "axis": [0, 0, 1], "wrong": 1}], "urdf": "a.urdf", "base_link": "b"}
+    joint = {"joint": [{"name": "a", "axis": [0, 0, 1], "wrong": 1}]}
     keys = mistakes_of({"arm": joint, "maneuver": {"kind": "goal", "wrong": 1}})
-    assert keys == ["arm.urdf", "maneuver.kind", 'arm.joint[0] ("a").wrong']
+    assert keys == ["maneuver.kind", 'arm.joint[0] ("a").wrong']
     assert "method.wrong" not in mistakes_of({**base, "method": {"name": "planner", "wrong": 1}})
 
 

@@ -199,7 +199,7 @@ WRONG = [
         'did you mean "actuator_rate"?',
     ),
     ("[clearance]", "[clearence]", "clearence", "a table of safe", 'did you mean "clearance"?'),
-    ("[curve]", "[arm]\nurdf = 3\n[curve]", "arm.urdf", "3", "a list of joints [[arm.joint]]"),
+    ("[curve]", "[arm]\nurdf = 3\n[curve]", "arm.urdf", "3", "the path of a file"),
     ("schema_version = 1", "schema_version = 2", "schema_version", "2", "1, the version"),
     ("schema_version = 1", "schema_version = true", "schema_version", "true", "1, the version"),
     ("schema_version = 1", "", "schema_version", "nothing", "1, the version"),

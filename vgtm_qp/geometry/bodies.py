@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.arrays import Array, Index
+from vgtm_qp.arrays import Array, Index, Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +26,8 @@ class Bodies:
     names : tuple of str
     kind : str
         Word for such a body in names, as in ``"member L3-2"``.
+    touching : (K, 2) int
+        Other pairs that may touch, too.
     """
 
     points: Index
@@ -33,9 +35,20 @@ class Bodies:
     joints: Index
     names: tuple[str, ...]
     kind: str
+    touching: Index = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def may_touch(self, first: Index, second: Index) -> Mask:
+        """Return (P,) which pairs of bodies are neighbours or :attr:`touching`."""
+        a, b = self.joints[first], self.joints[second]
+        allowed = (a[:, :, None] == b[:, None, :]).any(axis=(1, 2))
+        if len(self.touching):
+            count = len(self)
+            pairs = np.minimum(first, second) * count + np.maximum(first, second)
+            allowed |= np.isin(pairs, self.touching.min(axis=1) * count + self.touching.max(axis=1))
+        return np.asarray(allowed)
 
     def called(self, body: int) -> str:
         """Return kind and name of a body: ``"member L3-2"``."""

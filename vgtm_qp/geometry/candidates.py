@@ -269,7 +269,7 @@ def _near_pieces(X: Array, scene: Scene, time: float, horizon: float) -> tuple[I
 
 def _near_bodies(X: Array, bodies: Bodies, among: Index, horizon: float) -> tuple[Index, Index]:
     """Return pairs of some bodies that are not neighbours and that the plane between them does not separate."""
-    joints, radius = bodies.joints[among], bodies.radius[among]
+    radius = bodies.radius[among]
     middle, half, longest = _axes(X, bodies.points[among], radius)
     first, second = (
         cKDTree(middle).query_pairs(2.0 * longest + horizon, output_type="ndarray").astype(np.int64).T
@@ -279,10 +279,9 @@ def _near_bodies(X: Array, bodies: Bodies, among: Index, horizon: float) -> tupl
         np.einsum("kc,kc->k", apart, half[second])
     )
     near = _inseparable(apart, span, radius[first] + radius[second] + horizon)
-    first, second = first[near], second[near]
-    a, b = joints[first].T, joints[second].T
-    strangers = (a != b).all(axis=0) & (a != b[::-1]).all(axis=0)
-    return among[first[strangers]], among[second[strangers]]
+    first, second = among[first[near]], among[second[near]]
+    strangers = ~bodies.may_touch(first, second)
+    return first[strangers], second[strangers]
 
 
 def _axes(X: Array, points: Index, radius: Array) -> tuple[Array, Array, float]:

@@ -1,16 +1,21 @@
-"""``[arm]``: a serial arm in the place of a truss, from a list of joints."""
+"""``[arm]``: a serial arm in the place of a truss, from a URDF file or from a list of joints."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, model_validator
+from pydantic_core import InitErrorDetails
 
+from vgtm_qp.errors import ProblemError
 from vgtm_qp.problem.fields import (
     ORIGIN,
     Direction,
     Distance,
+    File,
+    Length,
     Limit,
     Name,
     Number,
@@ -18,9 +23,20 @@ from vgtm_qp.problem.fields import (
     Vector,
     count,
     exactly,
+    unexpected,
 )
 from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
 from vgtm_qp.problem.truss import BasePose, LockTable
+from vgtm_qp.problem.urdf import UrdfJoint, read_urdf
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+OF_URDF = ("urdf", "package_path", "base_link", "tip_link", "home", "bodies")
+"""Keys that say which arm is read from a URDF file, and how."""
+FROM_URDF = ("joint", "tip", "tip_rotation_vector", "body")
+"""Keys that are read from it."""
 
 
 class Joint(Table, called="a joint"):
@@ -66,16 +82,48 @@ class JointLock(LockTable, called="a locked joint"):
         return {"joint" if key == "member" else key: value for key, value in data.items()}
 
 
+class ArmBody(Table, called="a body"):
+    """A capsule, or a ball, that moves with a joint: what is kept clear of obstacles."""
+
+    name: Name = Field(description="name of the body")
+    joint: Name | None = Field(
+        default=None, description="the joint that it moves with; where absent, it is fixed to the base"
+    )
+    points: Annotated[tuple[Vector, ...], Field(min_length=1, max_length=2)] = Field(
+        description="both ends of its axis, or its centre, in the frame of that joint, m"
+    )
+    radius: Length = Field(description="m")
+
+
 class ArmTable(Table, called="an arm"):
     """A serial arm."""
 
-    later = dict.fromkeys(
-        ("urdf", "package_path", "base_link", "tip_link", "home", "bodies"),
-        "a list of joints [[arm.joint]]; URDF files are not read by this version",
+    urdf: File | None = Field(
+        default=None, description="URDF file, relative to the problem file: gives joints, tip and bodies"
     )
-
+    package_path: tuple[str, ...] = Field(
+        default=(), description="folders in which package:// files of the URDF are looked up too"
+    )
+    base_link: Name | None = Field(default=None, description="link of the URDF that the arm starts from")
+    tip_link: Name | None = Field(
+        default=None, description="link of the URDF whose frame is the end effector"
+    )
+    home: tuple[Number, ...] | None = Field(
+        default=None,
+        description="joint values of the home pose of a URDF, rad or m; 0 within the limits where absent",
+    )
+    bodies: Literal["capsule"] = Field(
+        default="capsule", description="what stands for the collision shapes of a URDF: enclosing capsules"
+    )
     joint: tuple[Joint, ...] = Field(default=(), description="the joints, base first")
     tip: Vector = Field(default=ORIGIN, description="position of the end effector in the last frame, m")
+    tip_rotation_vector: Vector | None = Field(
+        default=None,
+        description="attitude of the end effector in the last frame, rad; along the arm at home where absent",
+    )
+    body: tuple[ArmBody, ...] | None = Field(
+        default=None, description="what is kept clear; where absent, capsules between successive joints"
+    )
     link_radius: Distance = Field(
         default=0.03, description="radius of the capsules between successive joints, m"
     )
@@ -90,12 +138,105 @@ class ArmTable(Table, called="an arm"):
         default=(), description="poses of a moving base, in the order of time"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _from_urdf(cls, data: Any, info: ValidationInfo) -> Any:
+        """Read joints, tip and bodies from the URDF file, unless they were read before."""
+        if not isinstance(data, Mapping) or data.get("urdf") is None:
+            return data
+        if "joint" not in data:
+            return {**data, **_urdf_keys(data, info.context or {})}
+        if (info.context or {}).get("check_files"):
+            twice = [key for key in FROM_URDF if key in data]
+            raise _wrong([((key,), data[key], "no such key beside urdf, which gives it") for key in twice])
+        return data
+
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from increasing("base_motion", [pose.time for pose in self.base_motion])
         yield from unique("locked", "joint", [lock.joint for lock in self.locked])
         if not self.joint:
-            yield ("joint",), "a list of joints [[arm.joint]]"
+            yield ("joint",), "a list of joints [[arm.joint]], or a urdf in its place"
         yield from unique("joint", "name", [joint.name for joint in self.joint])
         names = {joint.name: joint for joint in self.joint}
+        for i, body in enumerate(self.body or ()):
+            if body.joint is not None:
+                yield from known_names(("body", i), (body.joint,), names, key="joint")
+        yield from unique("body", "name", [body.name for body in self.body or ()])
+        if self.urdf is None:
+            for key in OF_URDF[1:5]:
+                if getattr(self, key):
+                    yield (key,), "no such key without urdf; joints of a list have a home of their own"
         for i, lock in enumerate(self.locked):
             yield from known_names(("locked", i), (lock.joint,), names, key="joint")
+
+
+def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str, Any]:
+    """Return joints, tip and bodies of the URDF file that an ``[arm]`` table names, as keys of such a table."""
+    folder = Path(context.get("folder") or Path.cwd())
+    file, places = data["urdf"], data.get("package_path") or ()
+    links = {key: data.get(key) for key in ("base_link", "tip_link")}
+    if not isinstance(file, str) or not all(isinstance(name, str | None) for name in links.values()):
+        return {}
+    try:
+        if not (folder / Path(file).expanduser()).is_file():
+            return {}
+        found = [folder / Path(place).expanduser() for place in places]
+        arm = read_urdf(folder / Path(file).expanduser(), **links, package_path=found)
+    except ProblemError as error:
+        raise _wrong(
+            [(("urdf", wrong.key), wrong.value, wrong.expected) for wrong in error.mistakes]
+        ) from None
+    except (TypeError, ValueError, RuntimeError):
+        # What is wrong with the keys themselves is said of each by its own type.
+        return {}
+    home = data.get("home")
+    if home is None:
+        home = [_least_bent(joint.limits) for joint in arm.joints]
+    elif not isinstance(home, Sequence) or len(home) != len(arm.joints):
+        names = ", ".join(joint.name for joint in arm.joints)
+        raise _wrong([(("home",), home, f"{len(arm.joints)} joint values: {names}")])
+    joints = [_joint_keys(joint, value) for joint, value in zip(arm.joints, home, strict=True)]
+    bodies = [
+        {"name": body.name, "points": body.points.tolist(), "radius": body.radius}
+        | ({} if body.joint == 0 else {"joint": arm.joints[body.joint - 1].name})
+        for body in arm.bodies
+    ]
+    tip = {"tip": arm.tip.tolist(), "tip_rotation_vector": _vector(arm.tip_rotation)}
+    return {"joint": joints, **tip, "body": bodies}
+
+
+def _joint_keys(joint: UrdfJoint, home: Any) -> dict[str, Any]:
+    """Return a joint of a URDF as the keys of one in a list of joints."""
+    keys = {
+        "name": joint.name,
+        "kind": joint.kind,
+        "axis": joint.axis.tolist(),
+        "position": joint.position.tolist(),
+        "rotation_vector": _vector(joint.rotation),
+        "home": home,
+    }
+    limits = {"limits": joint.limits, "rate": joint.rate}
+    return keys | {key: value for key, value in limits.items() if value is not None}
+
+
+def _vector(rotation: NDArray[np.float64]) -> list[float]:
+    """Return the rotation vector, rad, of a (3, 3) rotation."""
+    from scipy.spatial.transform import Rotation
+
+    return [float(x) for x in Rotation.from_matrix(rotation).as_rotvec()]
+
+
+def _least_bent(limits: tuple[float, float] | None) -> float:
+    """Return 0 if it is within the limits, and else their middle."""
+    if limits is None or limits[0] <= 0.0 <= limits[1]:
+        return 0.0
+    return 0.5 * (limits[0] + limits[1])
+
+
+def _wrong(found: Sequence[tuple[Place, Any, str]]) -> ValidationError:
+    """Return the error of places, values and what was expected there."""
+    details = [
+        InitErrorDetails(type=unexpected(expected), loc=place, input=value)
+        for place, value, expected in found
+    ]
+    return ValidationError.from_exception_data("an arm", details)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Self
 from pydantic import Field, PrivateAttr, WithJsonSchema
 
 from vgtm_qp.errors import Mistake, ProblemError, VgtmError
-from vgtm_qp.problem.arm import ArmTable
+from vgtm_qp.problem.arm import FROM_URDF, OF_URDF, ArmTable
 from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
@@ -99,6 +99,8 @@ class Problem(Table, called="a problem"):
         exist or a value is wrong.
         """
         data = self.to_dict()
+        if any(f"arm.{key}" in changes for key in OF_URDF):
+            data["arm"] = {key: value for key, value in data["arm"].items() if key not in FROM_URDF}
         for key, value in changes.items():
             table = data
             *outer, last = key.split(".")
@@ -153,6 +155,8 @@ class Problem(Table, called="a problem"):
             yield ("method", "name"), '"qp": the pseudoinverse methods move trusses, not serial arms'
         elif self.arm is not None and self.method.tracking in ("recursive", "parallel"):
             yield ("method", "tracking"), '"coupled" or "none": the others go along the bays of a truss'
+        if self.arm is not None and self.arm.body is not None and self.clearance.minimum_angle:
+            yield ("clearance", "minimum_angle"), "0: bodies of their own do not meet in points"
         yield from unique("obstacle", "name", [obstacle.name for obstacle in self.obstacle])
         if isinstance(self.maneuver, WaypointManeuver):
             for i, waypoint in enumerate(self.maneuver.waypoint):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,12 @@ class RecordedChain:
     base : (1,) int
         The point that the problem places.
     links, members : (B, 2) int
-        The points of each link, counted from the base over the joints to the tip; and its ends, of which neighbours
-        have one in common.
+        The points of each link, counted from the base over the joints to the tip, then those of bodies; and its ends,
+        of which neighbours have one in common.
+    points, carriers : (P, 3), (P,) int
+        Points of bodies, m, in the frames of the joints that they move with, and the numbers of those joints.
+    touching : (K, 2) int
+        Pairs of links that are not kept apart.
     radius, length : (B,)
         Of the links, m.
     stretches : (B,) bool
@@ -58,7 +62,13 @@ class RecordedChain:
         self.radius = table.numbers("radius", (links,))
         steps = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
         self.size = float(steps[steps > 0.0].mean()) if steps.any() else 1.0
-        self.links = table.integers("links", (links, 2), joints + 2)
+        # Results of earlier versions have no points of bodies.
+        bodies = table.has("points")
+        self.points = table.numbers("points", (None, 3)) if bodies else np.zeros((0, 3))
+        none = np.zeros(0, dtype=np.int64)
+        self.carriers = table.integers("carriers", (len(self.points),), joints + 1) if bodies else none
+        self.touching = table.integers("touching", (None, 2), links) if bodies else none.reshape(0, 2)
+        self.links = table.integers("links", (links, 2), joints + 2 + len(self.points))
         self.members = table.integers("joined", (links, 2), 2 * links + joints + 2)
         self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
         self.stretches = np.zeros(links, dtype=np.bool_)
@@ -97,15 +107,44 @@ class RecordedChain:
                     found.append(f"the arm record's {key} of joint {name} differs from the problem's")
         if not same(self.tip, table.get("tip") or origin):
             found.append("the arm record's tip differs from the problem's")
+        attitude = table.get("tip_rotation_vector")
+        if attitude is not None and not same(
+            self._home_tip @ rotation_matrix(np.array(attitude, dtype=float)), self.tip_frame
+        ):
+            found.append("the arm record's attitude of the tip differs from the problem's")
+        if table.get("body") is not None:
+            return found + self._other_bodies(table["body"])
         if table.get("link_radius") is not None and not same(self.radius, table["link_radius"]):
             found.append("the arm record's link radius differs from the problem's")
         return found
 
+    def _other_bodies(self, table: Sequence[Mapping[str, Any]]) -> list[str]:
+        """Return where the bodies of the record differ from those of the problem's table."""
+        if tuple(str(body["name"]) for body in table) != self.member_names:
+            return ["the bodies of the arm record are not those of the problem"]
+        found, number = [], {name: k + 1 for k, name in enumerate(self.quantity_names)}
+        first = len(number) + 2
+        for k, body in enumerate(table):
+            ends, radius = np.array(body["points"], dtype=float), float(body["radius"])
+            own = self.links[k] - first
+            carrier = number.get(str(body.get("joint")), 0)
+            if own.min() < 0 or (self.carriers[own] != carrier).any():
+                found.append(f"the arm record's joint of body {body['name']} differs from the problem's")
+            # A ball is recorded as a capsule with a short axis.
+            elif self.radius[k] < radius or not np.allclose(
+                self.points[own], ends[[0, -1]], rtol=0.0, atol=max(1e-9, 1e-3 * radius)
+            ):
+                found.append(f"the arm record's shape of body {body['name']} differs from the problem's")
+        return found
+
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
-        """Return points (P, J + 2, 3), m, axes (P, J, 3) and last frames (P, 3, 3) at configurations (P, J + 6)."""
+        """Return points (Q, J + 2 + P, 3), m, axes (Q, J, 3) and last frames (Q, 3, 3) at configurations (Q, J + 6).
+
+        The points are the base, the joints, the tip, and those of bodies.
+        """
         count = len(self.quantity_names)
         at, frame = q[:, count : count + 3], rotations(q[:, count + 3 :])
-        points, axes = [at], []
+        points, axes, frames = [at], [], [(at, frame)]
         for j in range(count):
             at = at + frame @ self.position[j]
             frame = frame @ self.rotation[j]
@@ -115,7 +154,11 @@ class RecordedChain:
                 frame = frame @ rotations(q[:, j, None] * self.axis[j])
             else:
                 at = at + q[:, j, None] * axes[-1]
+            frames.append((at, frame))
         points.append(at + frame @ self.tip)
+        for point, carrier in zip(self.points, self.carriers.tolist(), strict=True):
+            origin, attitude = frames[carrier]
+            points.append(origin + attitude @ point)
         return np.stack(points, axis=1), np.stack(axes, axis=1), frame
 
     def ends(self, points: Array) -> Array:
@@ -132,7 +175,7 @@ class RecordedChain:
 
     def tip_position(self, q: Array) -> Array:
         """Return (T, 3) the end effector's position, m."""
-        return np.asarray(self.placed(q)[0][:, -1])
+        return np.asarray(self.placed(q)[0][:, len(self.quantity_names) + 1])
 
     def tip_rotations(self, q: Array) -> Array:
         """Return (T, 3, 3) the end effector's attitude at configurations (T, J + 6): that at home, turned."""
@@ -141,7 +184,8 @@ class RecordedChain:
     def singular_values(self, q: Array) -> tuple[float, float, float] | None:
         """Return 1, for joints are the configuration, and least and greatest singular value of the tip's Jacobian."""
         points, axes, _ = self.placed(q[None])
-        arms = np.cross(axes[0], points[0, -1] - points[0, 1:-1])
+        joints = points[0, 1 : len(axes[0]) + 1]
+        arms = np.cross(axes[0], points[0, len(joints) + 1] - joints)
         jacobian = np.where(self.revolute[:, None], arms, axes[0])[self.actuated]
         if not len(jacobian):
             return None
@@ -173,11 +217,20 @@ class RecordedChain:
         return np.full(len(link), turn @ (2.0 * earlier * self._reaches + beyond) + slide @ earlier)
 
     def _greatest_reaches(self) -> Array:
-        """Return (J + 1,) bounds of the distance from the base, and from each joint, to the tip, m."""
+        """Return (J + 1,) bounds of the distance from the base, and from each joint, to any point beyond it, m."""
         links = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
         slides = np.where(self.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
-        after = np.cumsum((links[1:] + slides)[::-1])[::-1]
-        return np.concatenate([[after[0] + links[0]], after])
+        around = [
+            np.linalg.norm(self.points[self.carriers == k], axis=1).max(initial=0.0)
+            for k in range(len(links))
+        ]
+        found, beyond = [], 0.0
+        # A joint reaches the points that move with it, and the next origin and what is beyond that.
+        for k in range(len(links) - 1, 0, -1):
+            beyond = slides[k - 1] + max(around[k], links[k] + beyond)
+            found.append(beyond)
+        found.append(max(around[0], links[0] + beyond))
+        return np.array(found[::-1])
 
 
 def same(recorded: ArrayLike, given: ArrayLike) -> bool:

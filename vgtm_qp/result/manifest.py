@@ -112,13 +112,14 @@ def problem_digests(
 ) -> dict[str, str | None]:
     """Return the SHA-256 that tie a result to its problem; None where there is no such file, or none any more.
 
-    They are of the canonical text of `problem` as the manifest holds it, of the problem's file `source` and of the file
-    `path` of its path. Those of meshes are in their records.
+    They are of the canonical text of `problem` as the manifest holds it, of the problem's file `source`, of the file
+    `path` of its path and of that of its URDF. Those of meshes are in their records.
     """
     return {
         "problem": hashlib.sha256(dump_manifest(problem).encode()).hexdigest(),
         "file": file_digest(source),
         "path": file_digest(path),
+        "urdf": file_digest((problem.get("arm") or {}).get("urdf")),
     }
 
 

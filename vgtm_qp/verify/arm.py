@@ -45,6 +45,7 @@ class RecordedArm:
     """
 
     unit, body, rigid_body = "m", "member", "fixed member"
+    touching: Index = np.zeros((0, 2), dtype=np.int64)
 
     def __init__(self, record: Mapping[str, Any], members: Index) -> None:
         count = len(members)

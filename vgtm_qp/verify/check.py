@@ -184,6 +184,7 @@ def _clearances(
     against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]
     at, between, clearance = _least_clearances(motion, against)
     self_at, self_between, self_clearance = _least_clearances(motion, members)
+    wrong = [*wrong, *members[0].contradictions()]
     recovered = manifest.get("recovered") or []
     if recovered:
         kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]

@@ -10,8 +10,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.verify.arm import Arm
@@ -265,7 +267,28 @@ class AgainstMembers(Encounters):
         names, nodes = self.motion.arm.member_names, self.motion.arm.members
         apart = [k for k, first in enumerate(names) if name.startswith(f"{first} / ")]
         found = [(a, b) for a in apart for b in range(len(names)) if self.name((a, b)) == name]
-        return [pair for a, b in found if not np.isin(nodes[a], nodes[b]).any() for pair in ((a, b), (b, a))]
+        kept = [
+            (a, b) for a, b in found if not np.isin(nodes[a], nodes[b]).any() and (a, b) not in self._touching
+        ]
+        return [pair for a, b in kept for pair in ((a, b), (b, a))]
+
+    def contradictions(self) -> list[str]:
+        """Return the pairs that the record allows to touch because they do so at home, but which do not."""
+        pairs = np.array(sorted(self._touching), dtype=np.int64).reshape(-1, 2)
+        ends = self.motion.arm.ends(self.motion.arm.home)
+        points = np.concatenate([ends[pairs[:, 0]], ends[pairs[:, 1]]], axis=1)
+        apart = self.separation(points, (pairs[:, 0], pairs[:, 1]))[0] > self.motion.resolution
+        return [f"{self.name((a, b))} do not touch at home" for a, b in pairs[apart].tolist() if a < b]
+
+    @cached_property
+    def _touching(self) -> frozenset[tuple[int, int]]:
+        """The pairs that are not kept apart, in either order."""
+        pairs = self.motion.arm.touching.tolist()
+        return frozenset(pair for a, b in pairs for pair in ((a, b), (b, a)))
+
+    def _may_touch(self, first: Index, second: Index) -> NDArray[np.bool_]:
+        pairs = zip(first.tolist(), second.tolist(), strict=True)
+        return np.array([pair in self._touching for pair in pairs], dtype=bool)
 
     def _near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:  # noqa: ARG002
         axis = int(np.argmax(high.max(axis=0) - low.min(axis=0)))
@@ -280,6 +303,8 @@ class AgainstMembers(Encounters):
         a, b = order[first], order[second]
         members = self.motion.arm.members
         shared = (members[a][:, :, None] == members[b][:, None, :]).any(axis=(1, 2))
+        if self._touching:
+            shared |= self._may_touch(a, b)
         a, b = a[~shared], b[~shared]
         gap = _box_gap(low[a], high[a], low[b], high[b]) - radius[a] - radius[b]
         return a[gap < limit], b[gap < limit]

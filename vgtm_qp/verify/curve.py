@@ -186,8 +186,9 @@ def curve_contradictions(maneuver: Result) -> Iterator[str]:
         count = truss["bays"] // (2 if truss["module"] == "longeron" and held else 1)
         if len(curve.nodes) != count:
             yield f"manifest.curve has {len(curve.nodes)} stations; this truss has {count}"
-    tip = maneuver.manifest["arm"]["tip"]
-    last = tip["nodes"] if isinstance(tip, Mapping) else [maneuver.nodes.shape[1] - 1]
+    arm = maneuver.manifest["arm"]
+    tip = arm["tip"]
+    last = tip["nodes"] if isinstance(tip, Mapping) else [len(arm["joint_names"]) + 1]
     track = (problem.get("end_effector") or {}).get("track") or ()
     if not np.array_equal(np.sort(curve.stations[-1]), np.sort(last)):
         if truss.get("module") != "graph":

@@ -23,7 +23,7 @@ _HOW_SOLVED: tuple[Place, ...] = (
     ("clearance", "distance"),
 )
 """Keys that say how a maneuver is solved, not what it has to keep."""
-_FILES = ("file", "path")
+_FILES = ("file", "path", "urdf")
 """Keys of files: their content is compared, by what reads it, not their place."""
 _MISSING = object()
 

@@ -12,9 +12,13 @@ from vgtm_qp.arm.arm import Stations, Tip, has_full_rank
 from vgtm_qp.arm.frames import frames_along
 from vgtm_qp.arm.joint_space import JointSpaceArm
 from vgtm_qp.arm.serial.chain import SerialChain
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.bodies import Bodies, capsules
+from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem.arm import ArmTable
+
+_BENDS = (0.1, 0.3, -0.3)
+"""Turns by which a home is bent where the tip cannot start in every direction, rad."""
 
 
 class SerialArm(JointSpaceArm):
@@ -39,8 +43,8 @@ class SerialArm(JointSpaceArm):
         self.functions, self.constants = self.chain.functions, self.chain.constants
         self.revolute, self.reaches = chain.revolute, self._reaches()
         self.actuator_units = tuple("rad" if turns else "m" for turns in self.revolute[self.actuated])
-        self._place_stations()
-        self.bodies = self._links(spec.link_radius)
+        self._place_stations(spec.tip_rotation_vector)
+        self.bodies = self._links(spec.link_radius) if spec.body is None else self._apart(self._carried(spec))
 
     def _every(self, chain: SerialChain) -> int:
         """Return the least spacing of stations, in joints, with which all can stay on the curve at once at home.
@@ -57,59 +61,120 @@ class SerialArm(JointSpaceArm):
         """Whether nodes with a Jacobian (K, 3, J) can be held in place independently."""
         return has_full_rank(jacobian[:, :, self.actuators].reshape(3 * len(jacobian), len(self.actuators)))
 
-    def _place_stations(self) -> None:
-        """Find nodes and stations at home; the stations' z-axes lie along the arm."""
+    def _place_stations(self, tip_turn: Sequence[float] | None) -> None:
+        """Find nodes and stations at home; the stations' z-axes lie along the arm.
+
+        So does that of the end effector, unless its attitude in the last frame, the rotation vector `tip_turn`, rad, is
+        given.
+        """
         count, tracked = len(self.chain), self.chain.tracked
         words = ["base", *(self.quantity_names[j] for j in tracked), "tip"]
         beside = tuple(f"{word} {axis}" for word in words for axis in "xy")
-        self.node_names = ("base", *self.quantity_names, "tip", *beside)
+        points = tuple(f"point {k}" for k in range(len(self.chain.points)))
+        self.node_names = ("base", *self.quantity_names, "tip", *points, *beside)
         self.home, jacobian = self.chain.at(self.home_configuration)
         self.height = float(np.linalg.norm(np.diff(self.home[: count + 2], axis=0), axis=1).sum())
         self.unit = self.chain.mean_length
         origins = np.array([0, *(1 + j for j in tracked), count + 1])
-        first = count + 2 + 2 * np.arange(len(origins))
+        first = count + 2 + len(points) + 2 * np.arange(len(origins))
         nodes = np.column_stack([origins, first, first + 1])
-        self.base = np.isin(np.arange(len(self.home)), [0, 1, *nodes[0]])
+        fixed = count + 2 + np.flatnonzero(self.chain.carriers == 0)
+        self.base = np.isin(np.arange(len(self.home)), [0, 1, *fixed, *nodes[0]])
         self.free = np.flatnonzero(~self.base)
         weights = np.tile([1.0, 0.0, 0.0], (len(nodes), 1))
         frames = frames_along(self.home[origins])
         trackable = ("position",) if self._can_hold(jacobian[origins[1:]]) else ()
         self.stations = Stations(nodes, weights, frames, trackable, word="joint")
-        self.end_effector = Tip(nodes[-1], weights[-1], frames[-1])
+        frame = frames[-1] if tip_turn is None else self.chain.attitude(self.home_quantities, tip_turn)
+        self.end_effector = Tip(nodes[-1], weights[-1], frame)
 
     def _reaches(self) -> Array:
         """Return (J + 1,) the :attr:`reaches`: all slides fully extended, all links in one line."""
         chain = self.chain
         slide = np.where(chain.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
-        beyond = np.cumsum((chain.lengths[1:] + slide)[::-1])[::-1] + np.sqrt(2.0) * chain.spread
-        return np.concatenate([[beyond[0] + chain.lengths[0]], beyond])
+        beside = np.full(len(chain) + 1, np.sqrt(2.0) * chain.spread)
+        np.maximum.at(beside, chain.carriers, np.linalg.norm(chain.points, axis=1))
+        reaches, beyond = np.empty(len(chain) + 1), np.sqrt(2.0) * chain.spread
+        # A joint reaches the points that move with it, and the next origin and what is beyond that.
+        for k in range(len(chain), 0, -1):
+            reaches[k] = beyond = slide[k - 1] + max(beside[k], chain.lengths[k] + beyond)
+        reaches[0] = max(beside[0], chain.lengths[0] + beyond)
+        return reaches
 
     def _links(self, radius: float) -> Bodies:
         """Return links between successive origins; those of joints in one place are joined as if they were one."""
-        chain, count = self.chain, len(self.chain)
-        apart = (chain.lengths[1:] > 0.0) | ~chain.revolute
-        place = np.arange(count + 2)
-        for node in range(count, 0, -1):
-            place[node] = node if apart[node - 1] else place[node + 1]
-        kept = np.flatnonzero(apart)
+        place = self._places()
+        kept = np.flatnonzero(self._have_length())
         points = np.stack([kept + 1, kept + 2], axis=1)
         names = [self.quantity_names[j] for j in kept]
         return capsules(points, radius, names, joints=place[points], kind="link")
+
+    def _have_length(self) -> Mask:
+        """Return (J,) where a joint and the origin after it may be apart."""
+        return (self.chain.lengths[1:] > 0.0) | ~self.chain.revolute
+
+    def _places(self) -> Index:
+        """Return (J + 2,) numbers of the origins, base first, the same for those that are always in one place."""
+        place, apart = np.arange(len(self.chain) + 2), self._have_length()
+        for node in range(len(self.chain), 0, -1):
+            place[node] = node if apart[node - 1] else place[node + 1]
+        return place
+
+    def _carried(self, spec: ArmTable) -> Bodies:
+        """Return the bodies of the table; those that move with one joint, or with successive ones, are neighbours."""
+        table, place = spec.body or (), self._places()
+        points = len(self.chain) + 2 + np.arange(2 * len(table)).reshape(-1, 2)
+        carrier = self.chain.carriers[::2]
+        joints = place[np.stack([carrier, carrier + 1], axis=1)]
+        radius, names = [body.radius for body in table], [body.name for body in table]
+        return capsules(points, radius, names, joints=joints, kind="link")
+
+    def _apart(self, bodies: Bodies) -> Bodies:
+        """Return the bodies without the pairs that touch at home: these are not kept apart."""
+        near = Clearance(bodies, safe=0.0, influence=0.0, watch=False, by_fcl=False).near(self.home)
+        touching = near.distance <= 0.0
+        pairs = np.stack([near.body[touching], near.other[touching]], axis=1)
+        return replace(bodies, touching=np.unique(np.sort(pairs, axis=1), axis=0))
+
+    def unreachable(self) -> tuple[str, ...]:
+        """See ``arm.Arm``: with a bent home that the tip can leave in every direction, if there is one."""
+        tip, turning = len(self.chain) + 1, self.revolute & self.actuated
+        for turn in _BENDS:
+            further = self.home_quantities + np.where(turning, turn, 0.0)
+            within = (further >= self.stroke[:, 0]) & (further <= self.stroke[:, 1])
+            q = self.home_configuration.copy()
+            q[:-6] = np.where(within, further, self.home_quantities)
+            if self._can_hold(self.chain.at(q)[1][[tip]]):
+                values = ", ".join(f"{value:.6g}" for value in q[:-6])
+                return (f"the axes of its joints leave a direction out; it can with home values {values}",)
+        return ()
+
+    def hollow(self) -> float:
+        """See ``arm.Arm``: from the tip to the axes of the bodies that move with it."""
+        last = len(self.chain) + 2 + np.flatnonzero(self.chain.carriers == len(self.chain))
+        if not len(self.chain.points):
+            return 0.0
+        gaps = np.linalg.norm(self.home[last] - self.end_effector.position(self.home), axis=1)
+        return float(gaps.min(initial=np.inf))
 
     def record(self) -> dict[str, Any]:
         """See ``arm.Arm``.
 
         Keys: ``kind``, ``joint_names``, ``revolute``, ``axis``, ``position``, ``rotation`` (in the frame of the one
         before), ``home``, ``tip`` in the last frame and ``tip_frame`` at home; of the bodies ``body_names``, ``links``
-        (their points: base, joints, tip) and ``joined`` (their ends; bodies with one in common are neighbours).
+        (their points: base, joints, tip, then those of bodies) and ``joined`` (their ends; bodies with one in common
+        are neighbours), ``points`` of bodies in the frames of their ``carriers``, numbers of joints that move them, and
+        ``touching`` pairs, which are not kept apart.
         """
         chain, bodies = self.chain, self.bodies
-        geometry = {key: getattr(chain, key) for key in ("revolute", "axis", "position", "rotation", "tip")}
+        keys = ("revolute", "axis", "position", "rotation", "tip", "points", "carriers")
+        geometry = {key: getattr(chain, key) for key in keys}
         arrays = {
             "home": self.home_quantities,
             "tip_frame": self.end_effector.frame,
             "links": bodies.points,
             "joined": bodies.joints,
+            "touching": bodies.touching,
             **geometry,
         }
         names = {"joint_names": list(self.quantity_names), "body_names": list(bodies.names)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,9 +10,12 @@ import casadi as ca
 import numpy as np
 
 from vgtm_qp.arm.symbols import rotated
-from vgtm_qp.arrays import Array, Mask
-from vgtm_qp.problem.arm import ArmTable
+from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.problem.arm import ArmBody, ArmTable
 from vgtm_qp.rotation import rotation_from_vector
+
+_LEAST_AXIS = 1e-3
+"""A ball is a capsule whose axis is that share of its radius: axes without a length have no direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +34,10 @@ class SerialChain:
         The end effector in the last frame, m.
     every : int
         Which joints are stations between the base and the tip.
+    points : (P, 3)
+        Points of bodies, in the frames that they move with, m.
+    carriers : (P,) int
+        Numbers of joints that move them: 0 in the base's frame.
     """
 
     revolute: Mask
@@ -38,11 +46,18 @@ class SerialChain:
     rotation: Array
     tip: Array
     every: int
+    points: Array
+    carriers: Index
 
     @classmethod
     def of(cls, spec: ArmTable) -> SerialChain:
         """Return the chain of an ``[arm]`` table; where that leaves it open, base and tip are its only stations."""
-        joints = spec.joint
+        joints, number = spec.joint, {joint.name: k + 1 for k, joint in enumerate(spec.joint)}
+        carried = [
+            (point, number[body.joint] if body.joint else 0)
+            for body in spec.body or ()
+            for point in ends_of(body)
+        ]
         axis = np.array([joint.axis for joint in joints], dtype=float)
         return cls(
             revolute=np.array([joint.kind == "revolute" for joint in joints]),
@@ -51,6 +66,8 @@ class SerialChain:
             rotation=np.stack([rotation_from_vector(joint.rotation_vector) for joint in joints]),
             tip=np.array(spec.tip, dtype=float),
             every=spec.every or len(joints),
+            points=np.array([point for point, _ in carried], dtype=float).reshape(-1, 3),
+            carriers=np.array([carrier for _, carrier in carried], dtype=np.int64),
         )
 
     def __len__(self) -> int:
@@ -64,7 +81,7 @@ class SerialChain:
     @property
     def node_count(self) -> int:
         """Number of nodes N, see :attr:`functions`."""
-        return len(self) + 2 + 2 * (len(self.tracked) + 2)
+        return len(self) + 2 + len(self.points) + 2 * (len(self.tracked) + 2)
 
     @cached_property
     def lengths(self) -> Array:
@@ -89,23 +106,26 @@ class SerialChain:
             "positions": self.position,
             "rotations": self.rotation.transpose(0, 2, 1).reshape(-1, 3),
             "tip": self.tip[None],
+            "points": self.points,
         }
 
     @cached_property
     def functions(self) -> tuple[ca.Function, ca.Function]:
-        """(q, axes (3, J), positions (3, J), rotations (3, 3 J), tip (3)) -> nodes (3, N); the same and their Jacobian.
+        """Return the nodes (3, N) and their Jacobian (3 N, J) as functions; the first gives the nodes alone.
+
+        Arguments: q, axes (3, J), positions (3, J), rotations (3, 3 J), tip (3), points (3, P).
 
         The configuration q (J + 6) holds the joints' values, then position, m, and rotation vector, rad, of the base. A
         node moves across the axis of each revolute joint before it, and along that of each prismatic one. The nodes are
-        the base, the joints and the tip, and two beside each station, along its x- and y-axes.
+        the base, the joints and the tip, the points of bodies, and two beside each station, along its x- and y-axes.
         """
         count = len(self)
         q, axes = ca.SX.sym("q", count + 6), ca.SX.sym("axes", 3, count)
         positions, rotations = ca.SX.sym("positions", 3, count), ca.SX.sym("rotations", 3, 3 * count)
-        tip = ca.SX.sym("tip", 3)
+        tip, points = ca.SX.sym("tip", 3), ca.SX.sym("points", 3, len(self.points))
         origin, frame = q[count : count + 3], rotated(q[count + 3 :])
         # Each node and station is paired with the number of joints that move it.
-        nodes, stations, joints = [(origin, 0)], [(origin, frame, 0)], []
+        nodes, stations, joints, frames = [(origin, 0)], [(origin, frame, 0)], [], [(origin, frame)]
         for j, turns in enumerate(self.revolute.tolist()):
             origin = origin + frame @ positions[:, j]
             frame = frame @ rotations[:, 3 * j : 3 * j + 3]
@@ -119,9 +139,13 @@ class SerialChain:
                 stations.append((origin, frame, j + 1 if turns else j))
             if not turns:
                 origin = origin + q[j] * axis
+            frames.append((origin, frame))
         end = origin + frame @ tip
         nodes.append((end, count))
         stations.append((end, frame, count))
+        for k, carrier in enumerate(self.carriers.tolist()):
+            at, attitude = frames[carrier]
+            nodes.append((at + attitude @ points[:, k], carrier))
         for place, attitude, moving in stations:
             nodes += [(place + self.spread * attitude[:, axis], moving) for axis in (0, 1)]
         rest = ca.SX.zeros(3)
@@ -134,11 +158,30 @@ class SerialChain:
             )
             for j, (axis, at, turns) in enumerate(joints)
         ]
-        arguments, places = [q, axes, positions, rotations, tip], ca.horzcat(*(node for node, _ in nodes))
+        arguments, places = (
+            [q, axes, positions, rotations, tip, points],
+            ca.horzcat(*(node for node, _ in nodes)),
+        )
         both = ca.Function("chain", arguments, [places, ca.densify(ca.horzcat(*columns))])
         return ca.Function("chain_nodes", arguments, [places]), both
+
+    def attitude(self, joints: Array, turn: Sequence[float]) -> Array:
+        """Return (3, 3) the attitude in the base's frame of what is turned by the vector `turn` in the last frame."""
+        frame = np.eye(3)
+        for value, axis, rotation, turns in zip(joints, self.axis, self.rotation, self.revolute, strict=True):
+            frame = frame @ rotation @ rotation_from_vector(value * axis if turns else np.zeros(3))
+        return np.asarray(frame @ rotation_from_vector(turn))
 
     def at(self, q: Array) -> tuple[Array, Array]:
         """Return nodes (N, 3), m, and Jacobian (N, 3, J) at a configuration."""
         nodes, jacobian = self.functions[1](q, *(value.T for value in self.constants.values()))
         return np.asarray(nodes, dtype=float).T, np.asarray(jacobian, dtype=float).reshape(-1, 3, len(self))
+
+
+def ends_of(body: ArmBody) -> Array:
+    """Return (2, 3) both ends of the axis of a body, m."""
+    ends = np.array(body.points, dtype=float)
+    least = _LEAST_AXIS * body.radius
+    if len(ends) == 2 and float(np.linalg.norm(ends[1] - ends[0])) >= least:
+        return ends
+    return np.asarray(ends.mean(axis=0) + 0.5 * least * np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))

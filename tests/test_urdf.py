@@ -1,0 +1,353 @@
+"""Serial arms from URDF files: kinematics, enclosing capsules, every kind of broken file, and whole problems."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from urdf_texts import ARM, BROKEN, placed
+
+import vgtm_qp as vq
+from vgtm_qp.arm.build import make_arm
+from vgtm_qp.problem.urdf import read_urdf
+from vgtm_qp.problem.urdf.shapes import enclosing_capsule
+
+PROBLEM = """schema_version = 1
+[arm]
+urdf = "arm.urdf"
+tip_link = "tool"
+home = [0.1, 0.4, 0.2]
+[curve]
+control_vertices = 3
+[maneuver]
+steps = 5
+waypoint = [{{ time = 5.0, position = [{}, {}, {}] }}]
+"""
+
+
+@pytest.fixture(autouse=True)
+def _without_a_compiler(monkeypatch):
+    monkeypatch.setenv("VGTM_CC", "none")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "arm.urdf").write_text(ARM)
+    (tmp_path / "empty.stl").write_text("solid a\nendsolid a\n")
+    trimesh.creation.box(extents=(0.1, 0.2, 0.3)).export(tmp_path / "wedge.stl")
+    return tmp_path
+
+
+def at(arm, values):
+    """Origins and attitudes of the base, after each joint, and of the tip."""
+    frames = [(np.zeros(3), np.eye(3))]
+    for joint, value in zip(arm.joints, values, strict=True):
+        origin, turn = frames[-1]
+        origin, turn = origin + turn @ joint.position, turn @ joint.rotation
+        if joint.kind == "prismatic":
+            origin = origin + value * turn @ joint.axis
+        else:
+            turn = turn @ Rotation.from_rotvec(value * joint.axis).as_matrix()
+        frames.append((origin, turn))
+    origin, turn = frames[-1]
+    return [*frames, (origin + turn @ arm.tip, turn @ arm.tip_rotation)]
+
+
+def test_the_small_arm_is_read_as_it_stands(folder):
+    arm = read_urdf(folder / "arm.urdf", tip_link="tool")
+    assert [(j.name, j.kind, j.limits, j.rate, j.effort) for j in arm.joints] == [
+        ("turn", "revolute", None, 1.5, 20.0),
+        ("lift", "revolute", (-1.0, 1.5), 0.8, 50.0),
+        ("slide", "prismatic", (0.1, 0.4), 0.2, 5.0),
+    ]
+    assert arm.joints[0].axis.tolist() == [0.0, 0.0, 1.0]
+    assert [(body.name, body.joint) for body in arm.bodies] == [
+        ("base", 0), ("column", 1), ("arm", 2), ("arm[2]", 2), ("camera", 2),
+    ]  # fmt: skip
+    assert arm.notes == ('what moves with joint "finger" is left out',)
+    assert arm.bodies[2].points.tolist() == [[0.0, 0.0, 0.0]]
+    assert arm.bodies[3].radius == 0.04
+    np.testing.assert_allclose(np.ptp(arm.bodies[3].points, axis=0)[0], 0.5, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=30)
+@given(values=st.tuples(*[st.floats(-3.0, 3.0)] * 3))
+def test_joints_and_tip_are_where_the_file_puts_them(tmp_path_factory, values):
+    file = tmp_path_factory.mktemp("urdf") / "arm.urdf"
+    file.write_text(ARM)
+    arm = read_urdf(file, tip_link="tool")
+    frames = placed(ARM, dict(zip(("turn", "lift", "slide"), values, strict=True)))
+    for (origin, turn), link in zip(at(arm, values), ("base", "column", "arm", "rod", "tool"), strict=True):
+        np.testing.assert_allclose(origin, frames[link][:3, 3], atol=1e-12)
+        np.testing.assert_allclose(turn, frames[link][:3, :3], atol=1e-12)
+
+
+numbers = st.floats(-1.0, 1.0).map(lambda x: round(x, 6))
+triples = st.tuples(numbers, numbers, numbers)
+
+
+@st.composite
+def chains(draw):
+    """A random chain of moving and fixed joints with a body on every link and a branch that is fixed to one."""
+    kinds = draw(
+        st.lists(st.sampled_from(["revolute", "prismatic", "fixed", "continuous"]), min_size=1, max_size=7)
+    )
+    kinds.append("revolute")
+    text = [link("l0")]
+    for k, kind in enumerate(kinds):
+        axis = draw(triples.filter(lambda axis: np.linalg.norm(axis) > 1e-3))
+        limit = (
+            '<limit lower="-1" upper="2" velocity="1" effort="1"/>'
+            if kind in ("revolute", "prismatic")
+            else ""
+        )
+        text.append(
+            joint(
+                f"j{k}",
+                kind,
+                f"l{k}",
+                f"l{k + 1}",
+                draw(triples),
+                draw(triples),
+                f'<axis xyz="{spaced(axis)}"/>{limit}',
+            )
+        )
+        text.append(link(f"l{k + 1}"))
+    text.append(
+        joint("side", "fixed", f"l{draw(st.integers(0, len(kinds)))}", "extra", draw(triples), draw(triples))
+    )
+    text.append(link("extra"))
+    names = [f"j{k}" for k, kind in enumerate(kinds) if kind != "fixed"]
+    values = draw(st.tuples(*[st.floats(-2.0, 2.0)] * len(names)))
+    return f'<robot name="r">{"".join(text)}</robot>', f"l{len(kinds)}", dict(zip(names, values, strict=True))
+
+
+def link(name):
+    return f'<link name="{name}"><collision><geometry><sphere radius="0.1"/></geometry></collision></link>'
+
+
+def joint(name, kind, parent, child, xyz, rpy, more=""):
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}<origin xyz="{spaced(xyz)}" rpy="{spaced(rpy)}"/>{more}</joint>'
+
+
+def spaced(values):
+    return " ".join(map(str, values))
+
+
+@pytest.mark.property
+@settings(deadline=None, max_examples=60)
+@given(chain=chains())
+def test_random_chains_and_what_is_fixed_to_them_are_where_the_file_puts_them(tmp_path_factory, chain):
+    text, tip, values = chain
+    file = tmp_path_factory.mktemp("urdf") / "chain.urdf"
+    file.write_text(text)
+    arm = read_urdf(file, tip_link=tip)
+    assert [j.name for j in arm.joints] == list(values)
+    frames, wanted = at(arm, values.values()), placed(text, values)
+    np.testing.assert_allclose(frames[-1][0], wanted[tip][:3, 3], atol=1e-11)
+    np.testing.assert_allclose(frames[-1][1], wanted[tip][:3, :3], atol=1e-11)
+    assert len(arm.bodies) == len(wanted)
+    for body in arm.bodies:
+        origin, turn = frames[body.joint]
+        np.testing.assert_allclose(origin + turn @ body.points[0], wanted[body.name][:3, 3], atol=1e-11)
+
+
+def test_joints_are_where_pinocchio_puts_them(folder):
+    pinocchio = pytest.importorskip("pinocchio")
+    for file, tip in ((folder / "arm.urdf", "tool"), (Path("problems/station_arm.urdf"), "tool")):
+        arm, model = read_urdf(file, tip_link=tip), pinocchio.buildModelFromUrdf(str(file))
+        data, rng = model.createData(), np.random.default_rng(3)
+        for _ in range(20):
+            values, q = rng.uniform(-1.0, 1.0, len(arm.joints)), pinocchio.neutral(model)
+            for one, value in zip(arm.joints, values, strict=True):
+                known = model.joints[model.getJointId(one.name)]
+                q[known.idx_q : known.idx_q + known.nq] = (
+                    value if known.nq == 1 else [np.cos(value), np.sin(value)]
+                )
+            pinocchio.framesForwardKinematics(model, data, q)
+            frame = data.oMf[model.getFrameId(tip)]
+            np.testing.assert_allclose(at(arm, values)[-1][0], frame.translation, atol=1e-12)
+            np.testing.assert_allclose(at(arm, values)[-1][1], frame.rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_file_has_one_clear_mistake(what, folder):
+    old, new, said = BROKEN[what]
+    assert old in ARM, "the file has no such part"
+    (folder / "arm.urdf").write_text(ARM.replace(old, new))
+    with pytest.raises(vq.ProblemError) as raised:
+        read_urdf(folder / "arm.urdf", tip_link="tool")
+    assert len(raised.value.mistakes) == 1, raised.value
+    assert said in str(raised.value)
+    assert re.search(r"line \d+", str(raised.value))
+
+
+def test_there_are_sixty_kinds_of_them():
+    assert len(BROKEN) >= 60
+
+
+@pytest.mark.parametrize(
+    ("links", "said"),
+    [
+        ({"tip_link": "tol"}, 'did you mean "tool"'),
+        ({"base_link": "bas"}, 'did you mean "base"'),
+        ({"base_link": "rod", "tip_link": "base"}, 'connect with the base, "rod"'),
+        ({"base_link": "rod", "tip_link": "tool"}, "joints that move"),
+        ({"base_link": "base", "tip_link": "base"}, "joints that move"),
+    ],
+)
+def test_links_that_make_no_arm_are_refused_by_name(links, said, folder):
+    with pytest.raises(vq.ProblemError, match=re.escape(said)) as raised:
+        read_urdf(folder / "arm.urdf", **links)
+    assert len(raised.value.mistakes) == 1
+
+
+def test_without_a_tip_the_end_behind_most_joints_is_taken_if_there_is_one(folder):
+    with pytest.raises(vq.ProblemError, match=r"mimic"):
+        read_urdf(folder / "arm.urdf")
+    one = ARM.replace('<joint name="finger" type="prismatic">', '<joint name="finger" type="fixed">')
+    (folder / "arm.urdf").write_text(one)
+    with pytest.raises(vq.ProblemError, match=r'one of "jaw", "tool"'):
+        read_urdf(folder / "arm.urdf")
+    (folder / "arm.urdf").write_text(
+        one.replace('<link name="jaw"/>', "").replace(
+            one[one.index('  <joint name="finger"') : one.index('  <link name="jaw"/>')], ""
+        )
+    )
+    assert read_urdf(folder / "arm.urdf").tip_link == "tool"
+
+
+@pytest.mark.property
+@settings(deadline=None, max_examples=60)
+@given(points=st.lists(triples, min_size=1, max_size=40), stretch=triples)
+def test_capsules_hold_the_points_they_are_made_for(points, stretch):
+    points = np.array(points) * (0.01 + np.abs(stretch)) * 10.0
+    ends, radius = enclosing_capsule(points)
+    along = ends[-1] - ends[0]
+    share = np.clip((points - ends[0]) @ along / max(along @ along, 1e-300), 0.0, 1.0)
+    assert np.linalg.norm(points - ends[0] - share[:, None] * along, axis=1).max() <= radius * (1.0 + 1e-15)
+
+
+@pytest.mark.parametrize(
+    "shape", ['<cylinder radius="0.2" length="0.3"/>', '<cylinder radius="0.05" length="2"/>']
+)
+def test_a_capsule_round_a_cylinder_holds_its_rims_and_little_more(shape, folder):
+    (folder / "arm.urdf").write_text(ARM.replace('<cylinder radius="0.05" length="0.4"/>', shape))
+    body = read_urdf(folder / "arm.urdf", tip_link="tool").bodies[1]
+    r, length = (float(x) for x in re.findall(r'"([\d.]+)"', shape))
+    angle = np.linspace(0.0, 2.0 * np.pi, 400)
+    rim = np.stack([r * np.cos(angle), r * np.sin(angle), np.zeros_like(angle)], axis=1)
+    for end in (-0.5, 0.5):
+        points = rim + np.array([0.0, 0.0, 0.2 + end * length])
+        share = np.clip((points[:, 2] - body.points[0, 2]) / np.ptp(body.points[:, 2]), 0.0, 1.0)
+        nearest = body.points[0] + share[:, None] * (body.points[1] - body.points[0])
+        assert np.linalg.norm(points - nearest, axis=1).max() <= body.radius
+    capsule = np.pi * body.radius**2 * (np.ptp(body.points[:, 2]) + 4.0 / 3.0 * body.radius)
+    assert capsule < 1.9 * np.pi * r * r * length
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("wedge.stl", "wedge.stl"),
+        ("file://wedge.stl", "wedge.stl"),
+        ("package://robot/wedge.stl", "robot/wedge.stl"),
+        ("package://robot/wedge.stl", "packages/robot/wedge.stl"),
+        ("package://robot/wedge.stl", "packages/wedge.stl"),
+        ("package://robot/a%20b.stl", "robot/a b.stl"),
+    ],
+)
+def test_meshes_are_found_and_enclosed(name, place, folder):
+    source, target = folder / "wedge.stl", folder / place
+    target.parent.mkdir(parents=True, exist_ok=True)
+    source.rename(target)
+    mesh = f'<mesh filename="{name}" scale="2 1 1"/>'
+    (folder / "arm.urdf").write_text(ARM.replace('<sphere radius="0.08"/>', mesh))
+    arm = read_urdf(folder / "arm.urdf", tip_link="tool", package_path=[folder / "packages"])
+    body = next(body for body in arm.bodies if body.name == "arm")
+    assert arm.files == (folder / "arm.urdf", target)
+    corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * [0.1, 0.1, 0.15]
+    along = body.points[1] - body.points[0]
+    share = np.clip((corners - body.points[0]) @ along / (along @ along), 0.0, 1.0)
+    assert np.linalg.norm(corners - body.points[0] - share[:, None] * along, axis=1).max() <= body.radius
+
+
+def problem_file(folder, offset=(0.0, 0.02, -0.02)):
+    arm = read_urdf(folder / "arm.urdf", tip_link="tool")
+    tip = at(arm, (0.1, 0.4, 0.2))[-1][0] + offset
+    file = folder / "problem.toml"
+    file.write_text(PROBLEM.format(*tip))
+    return file
+
+
+def test_a_problem_with_a_urdf_is_solved_and_its_result_stands_on_its_own(folder):
+    problem = vq.load_problem(problem_file(folder))
+    frames = placed(ARM, {"turn": 0.1, "lift": 0.4, "slide": 0.2})
+    resolver = vq.Resolver(problem)
+    position, rotation = resolver.tip()
+    np.testing.assert_allclose(position, frames["tool"][:3, 3], atol=1e-12)
+    np.testing.assert_allclose(rotation, frames["tool"][:3, :3], atol=1e-12)
+    maneuver = vq.solve(problem)
+    assert maneuver.status == "solved", str(maneuver.certificate)
+    assert maneuver.joint_names.tolist() == ["turn", "lift", "slide"]
+    maneuver.save(folder / "result.npz")
+    (folder / "arm.urdf").unlink()
+    assert vq.verify_file(folder / "result.npz").ok
+
+
+def test_another_arm_is_read_where_a_key_that_says_which_is_changed(folder):
+    problem = vq.load_problem(problem_file(folder))
+    other = problem.replace({"arm.home": [0.0, 0.2, 0.3]})
+    assert make_arm(other).home_quantities.tolist() == [0.0, 0.2, 0.3]
+    assert problem.replace({"maneuver.steps": 7}).arm == problem.arm
+    with pytest.raises(vq.ProblemError, match="3 joint values: turn, lift, slide"):
+        problem.replace({"arm.home": [0.0]})
+
+
+def test_a_result_is_held_against_the_urdf_of_another_problem(folder):
+    maneuver = vq.solve(vq.load_problem(problem_file(folder)))
+    (folder / "arm.urdf").write_text(
+        ARM.replace('xyz="0.5 0 0" rpy="0 0 0.3"', 'xyz="0.5 0 0.01" rpy="0 0 0.3"')
+    )
+    certificate = vq.verify(maneuver, problem=vq.load_problem(problem_file(folder)))
+    assert any("joint slide" in line or 'slide").position' in line for line in certificate.contradictions)
+
+
+@pytest.mark.parametrize(
+    ("line", "key", "said"),
+    [
+        ('urdf = "amr.urdf"', "arm.urdf", 'did you mean "arm.urdf"'),
+        ("urdf = 3", "arm.urdf", ""),
+        ('urdf = "arm.urdf"\njoint = []', "arm.joint", "no such key beside urdf"),
+        ('urdf = "arm.urdf"\nbodies = "hull"', "arm.bodies", "capsule"),
+        ('urdf = "arm.urdf"\nbase_link = 3', "arm.base_link", "a name"),
+    ],
+)
+def test_wrong_keys_of_an_arm_from_a_file_are_named(line, key, said, folder):
+    file = problem_file(folder)
+    file.write_text(file.read_text().replace('urdf = "arm.urdf"', line))
+    with pytest.raises(vq.ProblemError) as raised:
+        vq.load_problem(file)
+    assert any(mistake.key.startswith(key) for mistake in raised.value.mistakes), raised.value
+    assert said in str(raised.value)
+
+
+def test_mistakes_of_the_urdf_are_those_of_the_problem(folder):
+    file = problem_file(folder)
+    (folder / "arm.urdf").write_text(ARM.replace('lower="-1" upper="1.5"', 'lower="2" upper="1.5"'))
+    with pytest.raises(vq.ProblemError) as raised:
+        vq.load_problem(file)
+    (mistake,) = raised.value.mistakes
+    assert mistake.key == 'arm.urdf.line 17, joint "lift", <limit>'
+
+
+def test_keys_of_a_urdf_are_refused_without_one():
+    with pytest.raises(vq.ProblemError, match=r"arm\.home.*no such key without urdf"):
+        vq.load_problem("snake_past_a_cube").replace({"arm.home": [0.1] * 20})

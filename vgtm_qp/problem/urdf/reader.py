@@ -1,0 +1,407 @@
+"""From a URDF file to the chain of joints between two of its links."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.errors import nearest
+from vgtm_qp.problem.fields import quoted
+from vgtm_qp.problem.urdf.shapes import Shapes
+from vgtm_qp.problem.urdf.text import Element, Mistakes, read_xml
+
+Array = NDArray[np.float64]
+Frame = tuple[Array, Array]
+"""An origin (3,), m, and an attitude (3, 3)."""
+
+_MOVING = ("revolute", "continuous", "prismatic")
+_OTHER = ("fixed", "floating", "planar")
+_AT_REST: Frame = (np.zeros(3), np.eye(3))
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfJoint:
+    """A moving joint.
+
+    Attributes
+    ----------
+    name : str
+    kind : str
+        ``"revolute"`` or ``"prismatic"``.
+    axis : (3,)
+        Unit vector in its own frame.
+    position, rotation : (3,), (3, 3)
+        Its origin, m, and attitude at joint value 0, in the frame of the moving joint before it; of the base for the
+        first.
+    limits : (float, float) or None
+        rad or m; None for one that turns on and on.
+    rate, effort : float or None
+    """
+
+    name: str
+    kind: str
+    axis: Array
+    position: Array
+    rotation: Array
+    limits: tuple[float, float] | None
+    rate: float | None
+    effort: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfBody:
+    """A capsule that encloses one collision shape.
+
+    Attributes
+    ----------
+    name : str
+        That of its link; ``"link[2]"`` for the second shape of a link.
+    joint : int
+        Number of moving joints before it; 0 is fixed to the base.
+    points : (1 or 2, 3)
+        Centre or both ends of its axis, m, in the frame of the last of these joints.
+    radius : float
+        m.
+    """
+
+    name: str
+    joint: int
+    points: Array
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfArm:
+    """A chain of joints, base first.
+
+    Attributes
+    ----------
+    joints : tuple of UrdfJoint
+    tip, tip_rotation : (3,), (3, 3)
+        Frame of the tip's link in that of the last joint, m.
+    bodies : tuple of UrdfBody
+    base_link, tip_link : str
+    notes : tuple of str
+        What was left out.
+    files : tuple of Path
+        What was read: the URDF file, then meshes.
+    """
+
+    joints: tuple[UrdfJoint, ...]
+    tip: Array
+    tip_rotation: Array
+    bodies: tuple[UrdfBody, ...]
+    base_link: str
+    tip_link: str
+    notes: tuple[str, ...]
+    files: tuple[Path, ...]
+
+
+def read_urdf(
+    file: str | Path,
+    *,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    package_path: Sequence[str | Path] = (),
+) -> UrdfArm:
+    """Read the arm between two links of a URDF file.
+
+    Parameters
+    ----------
+    file
+        Links that are fixed to those of the arm belong to it; what moves beside it is cut off.
+    base_link, tip_link
+        By default the root, and the end with the most moving joints.
+    package_path
+        Folders in which files of ``package://`` are looked up, before those beside the file and above it.
+
+    Raises
+    ------
+    ProblemError
+        With one :class:`~vgtm_qp.errors.Mistake` per mistake, each with its line.
+    """
+    path = Path(file)
+    mistakes = Mistakes(path)
+    tree = _Tree(read_xml(path), mistakes)
+    base, tip = tree.ends(base_link, tip_link)
+    chain = tree.chain(base, tip)
+    joints, tip_frame = tree.moving(chain)
+    shapes = Shapes(path.absolute(), [Path(place).absolute() for place in package_path], mistakes)
+    bodies, notes = tree.bodies(chain, base, shapes)
+    mistakes.stop()
+    return UrdfArm(joints, *tip_frame, bodies, base, tip, notes, (path, *shapes.files))
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    name: str
+    kind: str
+    parent: str
+    child: str
+    element: Element
+
+    @property
+    def moves(self) -> bool:
+        return self.kind != "fixed"
+
+
+class _Tree:
+    """Links and joints of a file; ProblemError where they are no tree."""
+
+    def __init__(self, root: Element, mistakes: Mistakes) -> None:
+        self._root, self._mistakes = root, mistakes
+        if root.tag != "robot":
+            mistakes.add(root, "", f"<{root.tag}>", "<robot>, the root of a URDF file")
+            mistakes.stop()
+        self._refuse_xacro()
+        self._links = self._named("link")
+        mistakes.stop()
+        self._origins: dict[Element, Frame] = {}
+        self._joints = [self._joint(name, element) for name, element in self._named("joint").items()]
+        if not self._links:
+            mistakes.add(root, "<robot>", None, "links")
+        mistakes.stop()
+        self._above: dict[str, _Joint] = {}
+        for joint in self._joints:
+            if joint.child in self._above:
+                other = self._above[joint.child].name
+                expected = (
+                    f'a link that no other joint moves: "{other}" has it too, and closed loops are not served'
+                )
+                mistakes.add(joint.element, f'joint "{joint.name}", <child>', joint.child, expected)
+            self._above[joint.child] = joint
+        mistakes.stop()
+
+    def ends(self, base: str | None, tip: str | None) -> tuple[str, str]:
+        """Return the first and the last link of the arm, where they are given or not."""
+        roots = [name for name in self._links if name not in self._above]
+        for key, name in (("base_link", base), ("tip_link", tip)):
+            if name is not None and name not in self._links:
+                names = quoted(list(self._links)[:12])
+                self._wrong(f"{key} of the problem", name, f"one of {names}{nearest(name, self._links)}")
+        if base is None and len(roots) != 1:
+            if roots:
+                said = f"base_link in the problem: one of {quoted(roots)}, since several links have no parent"
+            else:
+                said = "a link without a parent: closed loops are not served"
+            self._wrong("<robot>", None, said)
+        self._mistakes.stop()
+        base = base or roots[0]
+        if tip is None:
+            tip = self._longest(base)
+        return base, tip
+
+    def _longest(self, base: str) -> str:
+        """Return the link without children that is behind the most moving joints."""
+        parents = {joint.parent for joint in self._joints}
+        found: dict[str, int] = {}
+        for name in self._links:
+            if name in parents or name == base:
+                continue
+            joints = self._upwards(name, base)
+            if joints is not None:
+                found[name] = sum(joint.moves for joint in joints)
+        most = max(found.values(), default=0)
+        ends = [name for name, count in found.items() if count == most]
+        if len(ends) != 1:
+            said = f"tip_link in the problem: one of {quoted(ends)}" if ends else "a link behind a joint"
+            self._wrong("<robot>", None, said)
+            self._mistakes.stop()
+        return ends[0]
+
+    def _upwards(self, tip: str, base: str) -> list[_Joint] | None:
+        """Return the joints from the tip down to the base, None if they do not lead there."""
+        joints, link, seen = [], tip, {tip}
+        while link != base:
+            joint = self._above.get(link)
+            if joint is None or joint.parent in seen:
+                return None
+            joints.append(joint)
+            link = joint.parent
+            seen.add(link)
+        return joints
+
+    def chain(self, base: str, tip: str) -> list[_Joint]:
+        """Return the joints from the base to the tip; ProblemError where there are none or they cannot be served."""
+        joints = self._upwards(tip, base)
+        if joints is None:
+            self._wrong("tip_link", tip, f'a link that joints connect with the base, "{base}"')
+        self._mistakes.stop()
+        assert joints is not None
+        for joint in joints:
+            if joint.kind not in (*_MOVING, "fixed"):
+                expected = "a joint of the arm that turns or slides about one axis, or none"
+                self._mistakes.add(joint.element, f'joint "{joint.name}", type', joint.kind, expected)
+            mimic = joint.element.first("mimic")
+            if mimic is not None:
+                other = mimic.attributes.get("joint")
+                expected = "joints of the arm that move on their own: mimic is not served there"
+                self._mistakes.add(mimic, f'joint "{joint.name}", <mimic> joint', other, expected)
+        if not any(joint.moves for joint in joints):
+            self._wrong("<robot>", None, f'joints that move between "{base}" and "{tip}"')
+        self._mistakes.stop()
+        return joints[::-1]
+
+    def moving(self, chain: Sequence[_Joint]) -> tuple[tuple[UrdfJoint, ...], Frame]:
+        """Return the moving joints of the chain, each in the frame of the one before, and the tip in the last."""
+        found, frame = [], _AT_REST
+        for joint in chain:
+            frame = _after(frame, self._origin(joint.element, f'joint "{joint.name}"'))
+            if joint.moves:
+                found.append(self._moving(joint, frame))
+                frame = _AT_REST
+        return tuple(found), frame
+
+    def bodies(
+        self, chain: Sequence[_Joint], base: str, shapes: Shapes
+    ) -> tuple[tuple[UrdfBody, ...], tuple[str, ...]]:
+        """Return the bodies of the links of the chain and of those that are fixed to them, and what is left out."""
+        places, number, frame, link = {base: (0, _AT_REST)}, 0, _AT_REST, base
+        for joint in chain:
+            frame = _after(frame, self._origin(joint.element, f'joint "{joint.name}"'))
+            if joint.moves:
+                number, frame = number + 1, _AT_REST
+            link = joint.child
+            places[link] = (number, frame)
+        on_chain, notes = {joint.name for joint in chain}, []
+        waiting = list(places)
+        while waiting:
+            link = waiting.pop(0)
+            for joint in self._joints:
+                if joint.parent != link or joint.name in on_chain:
+                    continue
+                if joint.moves:
+                    notes.append(f'what moves with joint "{joint.name}" is left out')
+                else:
+                    number, frame = places[link]
+                    origin = self._origin(joint.element, f'joint "{joint.name}"')
+                    places[joint.child] = number, _after(frame, origin)
+                    waiting.append(joint.child)
+        bodies: list[UrdfBody] = []
+        for link, (number, frame) in places.items():
+            element = self._links[link]
+            if not element.all("collision") and element.all("visual"):
+                notes.append(f'link "{link}" has no collision shape')
+            bodies += self._enclosed(link, number, frame, shapes)
+        bodies.sort(key=lambda body: body.joint)
+        return tuple(bodies), tuple(notes)
+
+    def _enclosed(self, link: str, number: int, frame: Frame, shapes: Shapes) -> list[UrdfBody]:
+        found = []
+        for k, collision in enumerate(self._links[link].all("collision"), start=1):
+            what = f'link "{link}", <collision>'
+            origin, turn = _after(frame, self._origin(collision, what))
+            capsule = shapes.enclosing(collision, what)
+            if capsule is not None:
+                ends, radius = capsule
+                name = link if k == 1 else f"{link}[{k}]"
+                found.append(UrdfBody(name, number, origin + ends @ turn.T, radius))
+        return found
+
+    def _moving(self, joint: _Joint, frame: Frame) -> UrdfJoint:
+        """Return a joint of the chain with its axis and limits."""
+        element, what, mistakes = joint.element, f'joint "{joint.name}"', self._mistakes
+        given = element.first("axis")
+        axis = (1.0, 0.0, 0.0) if given is None else mistakes.numbers(given, what, "xyz", 3, (1.0, 0.0, 0.0))
+        length = 1.0 if axis is None else math.hypot(*axis)
+        if given is not None and not length > 1e-9:
+            mistakes.add(given, f"{what}, <axis> xyz", given.attributes["xyz"], "an axis that is not zero")
+            length = 1.0
+        direction = np.array(axis or (1.0, 0.0, 0.0)) / length
+        limits, rate, effort = self._limits(joint, what)
+        kind = "prismatic" if joint.kind == "prismatic" else "revolute"
+        return UrdfJoint(joint.name, kind, direction, *frame, limits, rate, effort)
+
+    def _limits(
+        self, joint: _Joint, what: str
+    ) -> tuple[tuple[float, float] | None, float | None, float | None]:
+        """Return limits, rate and effort of a joint; a rate or an effort of 0 is none."""
+        mistakes, limit = self._mistakes, joint.element.first("limit")
+        if limit is None:
+            if joint.kind != "continuous":
+                mistakes.add(joint.element, f"{what}, <limit>", None, "limits, lower and upper")
+            return None, None, None
+        most = []
+        for key in ("velocity", "effort"):
+            value = mistakes.numbers(limit, what, key, 1, (0.0,)) or (0.0,)
+            if value[0] < 0.0:
+                mistakes.add(limit, f"{what}, <limit> {key}", limit.attributes[key], "0 or more")
+            most.append(value[0] if value[0] > 0.0 else None)
+        if joint.kind == "continuous":
+            return None, most[0], most[1]
+        least, greatest = (mistakes.numbers(limit, what, key, 1, (0.0,)) for key in ("lower", "upper"))
+        if least is not None and greatest is not None and not least[0] < greatest[0]:
+            found = f"lower {least[0]:g}, upper {greatest[0]:g}"
+            mistakes.add(limit, f"{what}, <limit>", found, "a lower limit below the upper one")
+        return ((least or (-1.0,))[0], (greatest or (1.0,))[0]), most[0], most[1]
+
+    def _origin(self, element: Element, what: str) -> Frame:
+        """Return the <origin> of an element: xyz, m, and roll, pitch and yaw about fixed axes, rad."""
+        origin = element.first("origin")
+        if origin is None:
+            return _AT_REST
+        if origin not in self._origins:
+            self._origins[origin] = self._placed(origin, what)
+        return self._origins[origin]
+
+    def _placed(self, origin: Element, what: str) -> Frame:
+        zero = (0.0, 0.0, 0.0)
+        at = self._mistakes.numbers(origin, what, "xyz", 3, zero) or zero
+        turn = self._mistakes.numbers(origin, what, "rpy", 3, zero) or zero
+        (sr, sp, sy), (cr, cp, cy) = np.sin(turn), np.cos(turn)
+        roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+        return np.array(at), yaw @ pitch @ roll
+
+    def _named(self, tag: str) -> dict[str, Element]:
+        """Return the links or joints by name."""
+        found: dict[str, Element] = {}
+        for element in self._root.all(tag):
+            name = element.attributes.get("name", "").strip()
+            if not name:
+                self._mistakes.add(element, f"<{tag}> name", None, "a name")
+            elif name in found:
+                self._mistakes.add(element, f"<{tag}> name", name, f"a name that no other {tag} has")
+            else:
+                found[name] = element
+        return found
+
+    def _joint(self, name: str, element: Element) -> _Joint:
+        what, kind = f'joint "{name}"', element.attributes.get("type")
+        kinds, links = (*_MOVING, *_OTHER), list[str]()
+        if kind not in kinds:
+            self._mistakes.add(
+                element, f"{what}, type", kind, f"one of {quoted(kinds)}{nearest(kind or '', kinds)}"
+            )
+        for tag in ("parent", "child"):
+            inner = element.first(tag)
+            link = None if inner is None else inner.attributes.get("link", "").strip()
+            if link not in self._links:
+                names = f"the name of a link{nearest(link or '', self._links)}"
+                self._mistakes.add(inner or element, f"{what}, <{tag}>", link, names)
+            links.append(link or "")
+        if links[0] == links[1] and links[0] in self._links:
+            self._mistakes.add(element, f"{what}, <child>", links[1], "another link than its parent")
+        return _Joint(name, kind or "fixed", links[0], links[1], element)
+
+    def _refuse_xacro(self) -> None:
+        """Stop at the first trace of the language that URDF files are often generated from."""
+        for element in self._root.walk():
+            if element.tag.startswith("xacro:") or any("${" in text for text in element.attributes.values()):
+                expected = "plain URDF: xacro has to be expanded first (xacro FILE > robot.urdf)"
+                self._mistakes.add(element, "", f"<{element.tag}>", expected)
+                self._mistakes.stop()
+
+    def _wrong(self, what: str, value: str | None, expected: str) -> None:
+        self._mistakes.add(self._root, what, value, expected)
+
+
+def _after(frame: Frame, inner: Frame) -> Frame:
+    """Return a frame that is given in another one."""
+    return frame[0] + frame[1] @ inner[0], frame[1] @ inner[1]
