@@ -151,12 +151,13 @@ def test_the_python_runs(folder: Path):
     assert (folder / "frames.png").is_file()
 
 
-def test_the_problem_file_is_solved(folder: Path):
-    (block,) = blocks("toml")
-    file = folder / "own.toml"
-    file.write_text(block, encoding="utf-8")
-    assert isinstance(load_problem(file), Problem)
-    assert main(["solve", "own.toml"]) == 0
+def test_the_problem_files_are_solved(folder: Path):
+    assert len(blocks("toml")) == 2
+    for block in blocks("toml"):
+        file = folder / "own.toml"
+        file.write_text(block, encoding="utf-8")
+        assert isinstance(load_problem(file), Problem)
+        assert main(["solve", "own.toml"]) == 0
 
 
 @pytest.mark.parametrize("name", TABLES)
