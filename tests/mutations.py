@@ -2,7 +2,7 @@
 
     python tests/mutations.py 500 [--seed 7]    500 files of each kind, and the exit codes by command
 
-Problem files, result files (manifest and arrays), path files and mesh files are mutated. Every command that takes the
+Problem files, result files (manifest and arrays), path files, mesh files and URDF files are mutated. Every command that takes the
 file ends with exit code 0, 2, 3 or 4, says what is wrong where it refuses, and shows no traceback.
 """
 
@@ -30,6 +30,7 @@ from unittest.mock import patch
 
 import numpy as np
 from problem_texts import ARM, GRAPH, VALID
+from urdf_texts import ARM as SMALL
 
 from vgtm_qp.cli import main
 from vgtm_qp.export import FORMATS
@@ -154,7 +155,16 @@ center = [1.2, 0.0, 0.8]
 [method]
 retries = false
 """
+ROBOT = """schema_version = 1
+name = "robot"
+arm = {{ urdf = "{file}", tip_link = "tool" }}
+curve = {{ control_vertices = 3 }}
+obstacle = [{{ name = "ball", shape = "sphere", center = [0.5, 0.5, 0.5], radius = 0.1 }}]
+maneuver = {{ steps = 2, waypoint = [{{ time = 2.0, position = [0.82, 0.1, 0.3] }}] }}
+method = {{ retries = false }}
+"""
 ROWS = "t,x,y,z\n0,0.0,0.0,1.6\n0.2,0.01,0.0,1.6\n0.4,0.02,0.0,1.59\n"
+URDF = SMALL.replace('<sphere radius="0.08"/>', '<mesh filename="part.stl" scale="0.3 0.3 0.3"/>')
 CORNERS = np.array([[x, y, z] for x in (0.0, 0.3) for y in (0.0, 0.3) for z in (0.0, 0.3)])
 FACES = [
     [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
@@ -307,7 +317,9 @@ class Bench:
         (folder / "path.csv").write_text(ROWS)
         for suffix, raw in meshes().items():
             (folder / f"part{suffix}").write_bytes(raw)
+        (folder / "small.urdf").write_text(URDF)
         texts = {"scene": SCENE, "snake": SNAKE, "along": ALONG, "among": AMONG.format(suffix=".stl")}
+        texts["robot"] = ROBOT.format(file="small.urdf")
         for name, text in texts.items():
             (folder / f"{name}.toml").write_text(text)
             code, said = self.run("sound", "solve", f"{name}.toml", "-o", f"{name}.npz")
@@ -455,6 +467,27 @@ class Bench:
             self.run("mesh", "export", "among_wrong.npz", "--to", "mjcf", "-o", "x.xml")
             self.glance("mesh", "among_wrong.npz")
 
+    def urdf(self, rng: Rng) -> None:
+        """Mutate a URDF file."""
+        chosen = rng.random()
+        if chosen < 0.4:
+            # Words of XML are between quotation marks.
+            parts = URDF.split('"')
+            for _ in range(rng.choice([1, 1, 2])):
+                k = 1 + 2 * int(rng.integers(len(parts) // 2))
+                parts[k] = str(rng.choice([str(VALUES[rng.integers(len(VALUES))])[:60], *parts[1::2]]))
+            text = '"'.join(parts).encode()
+        else:
+            text = edited(URDF, rng).encode() if chosen < 0.7 else damaged(URDF.encode(), rng)
+        (self.folder / "wrong.urdf").write_bytes(text)
+        (self.folder / "robot_wrong.toml").write_text(ROBOT.format(file="wrong.urdf"))
+        self.run("urdf", "check", "robot_wrong.toml")
+        code, _ = self.run("urdf", "solve", "robot_wrong.toml", "-o", "robot_wrong.npz")
+        if code != 2:
+            self.run("urdf", "verify", "robot_wrong.npz")
+        if rng.random() < 0.2:
+            self.run("urdf", "verify", "robot.npz", "--problem", "robot_wrong.toml")
+
     def glance(self, kind: str, name: str) -> None:
         """Open the live page of a file, play it a little, and close it."""
         from vgtm_qp.live.page import Page
@@ -486,7 +519,7 @@ class Hang(BaseException):
     """A command that takes too long; no command may catch it."""
 
 
-KINDS = ("problem", "manifest", "path", "mesh")
+KINDS = ("problem", "manifest", "path", "mesh", "urdf")
 
 
 def main_script(tokens: Sequence[str] | None = None) -> int:

@@ -351,3 +351,9 @@ def test_mistakes_of_the_urdf_are_those_of_the_problem(folder):
 def test_keys_of_a_urdf_are_refused_without_one():
     with pytest.raises(vq.ProblemError, match=r"arm\.home.*no such key without urdf"):
         vq.load_problem("snake_past_a_cube").replace({"arm.home": [0.1] * 20})
+
+
+def test_a_tip_without_a_body_of_its_own_may_come_to_an_obstacle(folder):
+    problem = vq.load_problem(problem_file(folder))
+    ball = {"name": "ball", "shape": "sphere", "center": [0.9, 0.3, 0.3], "radius": 0.05}
+    assert vq.solve(problem.replace({"obstacle": [ball]})).status == "solved"

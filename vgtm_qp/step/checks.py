@@ -156,11 +156,11 @@ def _out_of_reach(problem: Problem, setup: Setup) -> Iterator[Mistake]:
 def _inside_obstacles(problem: Problem, setup: Setup, hollow: float) -> Iterator[Mistake]:
     """Yield the targets nearer to an obstacle at rest than clearance and radius of the tip less `hollow`."""
     obstacles = [obstacle for obstacle in setup.monitor.obstacles if not np.any(obstacle.velocity)]
-    if len(setup.task.axes) < 3 or not obstacles:
-        return
     arm, safe = setup.arm, problem.clearance.safe
-    point_size = _POINT * arm.unit
     at_tip = np.isin(arm.bodies.joints, arm.end_effector.nodes).any(axis=1)
+    if len(setup.task.axes) < 3 or not obstacles or not at_tip.any():
+        return
+    point_size = _POINT * arm.unit
     needed = safe + float(arm.bodies.radius[at_tip].min())
     spot = capsules([[0, 1]], 0.0)
     point = Clearance(spot, obstacles, safe=safe, influence=needed, self_collision=False, by_fcl=False)
