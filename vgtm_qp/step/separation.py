@@ -107,19 +107,21 @@ class Separation:
             floors = floor - self._rounding, max(self_floor - self._rounding, 0.0)
             return between(points(start), points(end), start_time, end_time, *floors)
         deviation = self.deviation(start, end)
-        # In k pieces, the deviation from the chords is 1 / k^2 of the whole.
+        # In k pieces, the deviation from the chords is 1 / k^2 of the whole. Most motions need one piece alone.
         is_far = deviation >= self._arm.unit
         needed = 1 if is_far else math.ceil(math.sqrt(max(deviation / self._between, 1.0)))
-        pieces, lowest = min(needed, _MOST_PIECES), np.inf
-        spare = deviation / pieces**2 - self._between
-        floors = floor + spare, max(self_floor + spare, 0.0)
-        for k in range(pieces):
-            here, there = (points(start + share * (end - start)) for share in (k / pieces, (k + 1) / pieces))
-            lapse = (end_time - start_time) / pieces
-            since = start_time + k * lapse
-            report = between(here, there, since, since + lapse, *floors)
-            lowest = min(lowest, report.clearance)
-            if not report.certified:
+        for pieces in sorted({1, min(needed, _MOST_PIECES)}):
+            spare, lowest = deviation / pieces**2 - self._between, np.inf
+            floors = floor + spare, max(self_floor + spare, 0.0)
+            lapse, there = (end_time - start_time) / pieces, points(start)
+            for k in range(pieces):
+                here, there = there, points(start + (k + 1) / pieces * (end - start))
+                since = start_time + k * lapse
+                report = between(here, there, since, since + lapse, *floors)
+                lowest = min(lowest, report.clearance)
+                if not report.certified:
+                    break
+            if report.certified:
                 break
         return replace(report, clearance=lowest, fraction=(k + report.fraction) / pieces)
 
