@@ -2,8 +2,8 @@
 
     python tests/mutations.py 500 [--seed 7]    500 files of each kind, and the exit codes by command
 
-Problem files, result files (manifest and arrays), path files, mesh files and URDF files are mutated. Every command that takes the
-file ends with exit code 0, 2, 3 or 4, says what is wrong where it refuses, and shows no traceback.
+Problem files, result files (manifest and arrays), path files, mesh files and URDF files are mutated. Every command that
+takes the file ends with exit code 0, 2, 3 or 4, says what is wrong where it refuses, and shows no traceback.
 """
 
 from __future__ import annotations
