@@ -345,7 +345,8 @@ def test_mistakes_of_the_urdf_are_those_of_the_problem(folder):
     with pytest.raises(vq.ProblemError) as raised:
         vq.load_problem(file)
     (mistake,) = raised.value.mistakes
-    assert mistake.key == 'arm.urdf.line 17, joint "lift", <limit>'
+    assert mistake.value == '"lower 2, upper 1.5"'
+    assert mistake.key == 'arm.urdf, line 17, joint "lift", <limit>'
 
 
 def test_keys_of_a_urdf_are_refused_without_one():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, ValidationError, ValidationInfo, model_validator
 from pydantic_core import InitErrorDetails
 
-from vgtm_qp.errors import ProblemError
+from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem.fields import (
     ORIGIN,
     Direction,
@@ -183,9 +183,7 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
         found = [folder / Path(place).expanduser() for place in places]
         arm = read_urdf(folder / Path(file).expanduser(), **links, package_path=found)
     except ProblemError as error:
-        raise _wrong(
-            [(("urdf", wrong.key), wrong.value, wrong.expected) for wrong in error.mistakes]
-        ) from None
+        raise _wrong([_of_file(mistake) for mistake in error.mistakes]) from None
     except (TypeError, ValueError, RuntimeError):
         # What is wrong with the keys themselves is said of each by its own type.
         return {}
@@ -203,6 +201,12 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
     ]
     tip = {"tip": arm.tip.tolist(), "tip_rotation_vector": _vector(arm.tip_rotation)}
     return {"joint": joints, **tip, "body": bodies}
+
+
+def _of_file(mistake: Mistake) -> tuple[Place, str | None, str]:
+    """Return place, value and expectation of a mistake in a URDF file."""
+    value = None if mistake.value == "nothing" else mistake.value.strip('"')
+    return (f"urdf, {mistake.key}",), value, mistake.expected
 
 
 def _joint_keys(joint: UrdfJoint, home: Any) -> dict[str, Any]:

@@ -216,7 +216,7 @@ def key_path(data: Any, place: Place) -> str:
             continue
         else:
             data = entry(data, part)
-            path += ("." if path else "") + _line(part, 60)
+            path += ("." if path else "") + _line(part, 120)
     return path or "problem"
 
 
