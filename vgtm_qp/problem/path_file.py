@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _COLUMNS = ("t", "x", "y", "z")
 _TURNS = ("rx", "ry", "rz")
 _GREATEST_BYTES = 200_000_000
-_GREATEST_MISTAKES = 100
+GREATEST_MISTAKES = 100
 _NUMBER = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
 
 
@@ -42,12 +42,12 @@ def read_path(file: str | Path) -> PathTable:
     """
     import numpy as np
 
-    header, rows = _read(Path(file))
+    header, rows = read_rows(Path(file))
     mistakes: list[Mistake] = []
     _check_header(header, mistakes)
     if mistakes:
         raise ProblemError(str(file), mistakes)
-    values = [_numbers(header, line, cells, mistakes) for line, cells in rows]
+    values = [read_numbers(header, line, cells, mistakes) for line, cells in rows]
     before = -math.inf
     for (line, _), row in zip(rows, values, strict=True):
         time = row.get("t", math.nan)
@@ -64,14 +64,14 @@ def read_path(file: str | Path) -> PathTable:
     if not rows:
         mistakes.append(Mistake("line 2", "nothing", "at least one row of numbers below the header"))
     if mistakes:
-        raise ProblemError(str(file), mistakes[:_GREATEST_MISTAKES])
+        raise ProblemError(str(file), mistakes[:GREATEST_MISTAKES])
     columns = {name: np.array([row[name] for row in values]) for name in header}
     turns = np.column_stack([columns[name] for name in _TURNS]) if "rx" in columns else None
     return PathTable(columns["t"], np.column_stack([columns[name] for name in "xyz"]), turns)
 
 
-def _read(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header and the rows that are not empty, with their line numbers."""
+def read_rows(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the header and the rows that are not empty, with their line numbers; ProblemError where it is no CSV."""
     try:
         if not file.is_file():
             raise ProblemError.at(file, "file", "nothing", "a CSV file")
@@ -108,7 +108,8 @@ def _check_header(header: list[str], mistakes: list[Mistake]) -> None:
         )
 
 
-def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mistake]) -> dict[str, float]:
+def read_numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mistake]) -> dict[str, float]:
+    """Return the numbers of a row by column, without those that are none: `mistakes` has these."""
     if len(cells) != len(header):
         mistakes.append(
             Mistake(f"line {line}", f"{len(cells)} cells", f"{len(header)} cells, as the header has")

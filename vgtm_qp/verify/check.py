@@ -142,13 +142,7 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
     for k, since in locks:
         rows = np.flatnonzero(time >= since - _INSTANT)
         held[rows, k] = np.maximum(held[rows, k], np.abs(lengths[rows, k] - lengths[rows[:1], k]))
-    durations = np.diff(time)[:, None]
-    between = 0.5 * (durations[1:] + durations[:-1])
-    rates = np.diff(lengths, axis=0) / durations
-    accelerations = np.diff(rates, axis=0) / between
-    size = float(np.abs(maneuver.nodes).max())
-    rounding = _ROUNDING * (size + np.abs(rates) * np.abs(time[1:, None])) / durations
-    its_rounding = (rounding[1:] + rounding[:-1]) / between
+    rates, accelerations, rounding, its_rounding = changes(time, lengths, float(np.abs(maneuver.nodes).max()))
     for k, since in locks:
         accelerations[np.abs(time[1:-1] - since) <= _INSTANT, k] = 0.0
     poses = base_poses(maneuver.manifest["problem"], time)
@@ -167,6 +161,19 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
             np.abs(accelerations) - its_rounding - arm.acceleration, f"{per}/s^2"
         ),
     }
+
+
+def changes(time: Array, values: Array, size: float) -> tuple[Array, Array, Array, Array]:
+    """Return rates (T - 1, M) and accelerations (T - 2, M) of values (T, M) at times (T,), s, and what rounding makes.
+
+    That is what the rounding of values as large as `size` and of times makes of a rate and of an acceleration.
+    """
+    durations = np.diff(time)[:, None]
+    between = 0.5 * (durations[1:] + durations[:-1])
+    rates = np.diff(values, axis=0) / durations
+    accelerations = np.diff(rates, axis=0) / between
+    rounding = _ROUNDING * (size + np.abs(rates) * np.abs(time[1:, None])) / durations
+    return rates, accelerations, rounding, (rounding[1:] + rounding[:-1]) / between
 
 
 def _clearances(

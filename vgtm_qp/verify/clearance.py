@@ -221,14 +221,14 @@ class AgainstBody(Encounters):
         reach = limit + self.motion.arm.radius
         shift = self._centers[start : stop + 1]
         low, high = low - shift.max(axis=0), high - shift.min(axis=0)
-        whole = _box_gap(low, high, self._low.min(axis=0), self._high.max(axis=0))
+        whole = box_gap(low, high, self._low.min(axis=0), self._high.max(axis=0))
         member = np.flatnonzero(whole < reach)
         if len(self._low) == 1 or not len(member):
             return member, np.zeros_like(member)
         limits = low[member].min(axis=0), high[member].max(axis=0)
-        piece = np.flatnonzero(_box_gap(self._low, self._high, *limits) < reach[member].max())
+        piece = np.flatnonzero(box_gap(self._low, self._high, *limits) < reach[member].max())
         near = [
-            piece[_box_gap(low[m], high[m], self._low[piece], self._high[piece]) < reach[m]] for m in member
+            piece[box_gap(low[m], high[m], self._low[piece], self._high[piece]) < reach[m]] for m in member
         ]
         return np.repeat(member, [len(found) for found in near]), np.concatenate(near)
 
@@ -306,7 +306,7 @@ class AgainstMembers(Encounters):
         if self._touching:
             shared |= self._may_touch(a, b)
         a, b = a[~shared], b[~shared]
-        gap = _box_gap(low[a], high[a], low[b], high[b]) - radius[a] - radius[b]
+        gap = box_gap(low[a], high[a], low[b], high[b]) - radius[a] - radius[b]
         return a[gap < limit], b[gap < limit]
 
     def _points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:  # noqa: ARG002
@@ -332,7 +332,7 @@ class AgainstMembers(Encounters):
         return np.asarray(self.motion.arm.radius[pair[0]] + self.motion.arm.radius[pair[1]])
 
 
-def _box_gap(low: Array, high: Array, other_low: Array, other_high: Array) -> Array:
+def box_gap(low: Array, high: Array, other_low: Array, other_high: Array) -> Array:
     """Return the distances between axis-aligned boxes, m."""
     apart = np.maximum(np.maximum(other_low - high, low - other_high), 0.0)
     return np.asarray(np.linalg.norm(apart, axis=-1))

@@ -127,12 +127,12 @@ class Body:
 
 
 def read_obstacles(
-    problem: Mapping[str, Any], meshes: Mapping[str, Any], directory: Path
+    problem: Mapping[str, Any], meshes: Mapping[str, Any] | None, directory: Path
 ) -> tuple[list[Body], list[str], list[str]]:
     """Return the obstacles of `problem`, as JSON data, what contradicts the problem, and what could not be checked.
 
-    The result recorded SHA-256 and triangle count of mesh files in `meshes`, by obstacle. Relative paths of those files
-    start in `directory`.
+    The result recorded SHA-256 and triangle count of mesh files in `meshes`, by obstacle; None without a result.
+    Relative paths of those files start in `directory`.
     """
     bodies: list[Body] = []
     contradictions: list[str] = []
@@ -149,7 +149,7 @@ def read_obstacles(
         elif kind == "cylinder":
             shape = cylinder(float(entry["radius"]), float(entry["height"]) / 2)
         elif kind == "mesh":
-            shape, complaint = _read_mesh(name, entry, meshes.get(name), directory)
+            shape, complaint = _read_mesh(name, entry, meshes, directory)
         else:
             complaint = f"obstacle {name} has the unknown shape {kind!r}"
         if complaint:
@@ -162,7 +162,7 @@ def read_obstacles(
 
 
 def _read_mesh(
-    name: str, entry: Mapping[str, Any], record: Mapping[str, Any] | None, directory: Path
+    name: str, entry: Mapping[str, Any], meshes: Mapping[str, Any] | None, directory: Path
 ) -> tuple[Shape | None, str]:
     """Return the mesh, and what is wrong with its file."""
     import trimesh
@@ -179,7 +179,10 @@ def _read_mesh(
             raise ValueError("its triangles are not wound alike, which leaves open what is inside")
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         return None, f"mesh {name}: {path} cannot be read, so its clearance is unknown: {error}"
-    if record is None:
+    record = None if meshes is None else meshes.get(name)
+    if meshes is None:
+        complaint = ""
+    elif record is None:
         complaint = f"mesh {name}: the result does not record its file"
     elif record.get("sha256") != digest:
         complaint = f"mesh {name}: {path} is not the file that the result was made with"
