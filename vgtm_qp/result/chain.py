@@ -204,22 +204,21 @@ class RecordedChain:
     def bend(self, before: Array, after: Array, link: Index) -> Array:
         """Return (..., P) bounds, m, of |d2 r / d share2| of points of links (P,) as the configuration moves straight.
 
-        Configurations are (..., J + 6). A point is the sum of vectors p that each turn with a frame at a speed w, which
-        is at most the sum of the speeds of the joints before it, and as these turn one another's axes, |w'| is at most
-        the sum of the products of two of them. A slide changes its vector at a constant speed v along itself. So
-        |p''| <= (w^2 + |w'|) |p| + 2 w v. The base's rotation vector counts twice, as its axis turns too.
+        Configurations are (..., J + 6). A point is the sum of vectors p that are turned by the joints before them at
+        speeds w, one after the other. The product of these turns has a second derivative of at most the square of the
+        sum of w. A slide changes its vector at a constant speed v along itself. So |p''| <= (sum w)^2 |p| + 2 v sum w.
+        The base's rotation vector counts twice, as its axis turns too.
         """
         count, revolute = len(self.quantity_names), self.revolute
         moved = np.abs(after - before)
         base = 2.0 * np.linalg.norm(moved[..., -3:], axis=-1)[..., None]
         turns = np.concatenate([base, np.where(revolute, moved[..., :count], 0.0)], axis=-1)
         speed = np.cumsum(turns, axis=-1)
-        squares = np.cumsum(turns * turns, axis=-1)
         slides = np.where(revolute, 0.0, np.maximum(np.abs(before), np.abs(after))[..., :count])
         slid = np.where(revolute, 0.0, moved[..., :count])
         none = np.zeros_like(base)
         lengths = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
-        turning = 0.5 * (3.0 * speed * speed - squares)
+        turning = speed * speed
         sliding = turning * np.concatenate([none, slides], axis=-1)
         sliding += 2.0 * speed * np.concatenate([none, slid], axis=-1)
         origins = np.concatenate([none, np.cumsum(turning * lengths + sliding, axis=-1)], axis=-1)
