@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -358,3 +361,23 @@ def test_a_tip_without_a_body_of_its_own_may_come_to_an_obstacle(folder):
     problem = vq.load_problem(problem_file(folder))
     ball = {"name": "ball", "shape": "sphere", "center": [0.9, 0.3, 0.3], "radius": 0.05}
     assert vq.solve(problem.replace({"obstacle": [ball]})).status == "solved"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_no_file_is_read_that_a_result_names(folder):
+    maneuver = vq.solve(vq.load_problem(problem_file(folder)))
+    data = json.loads(json.dumps(maneuver.manifest))
+    # Nobody writes into this pipe: reading it would never end.
+    os.mkfifo(folder / "pipe.urdf")
+    data["problem"]["arm"]["urdf"] = str(folder / "pipe.urdf")
+    assert any("was altered" in line for line in vq.verify(replace(maneuver, manifest=data)).contradictions)
+    (folder / "arm.urdf").write_text("no robot")
+    data["problem"]["arm"]["urdf"] = str(folder / "arm.urdf")
+    del data["problem"]["arm"]["joint"]
+    altered = vq.verify(replace(maneuver, manifest=data)).contradictions
+    assert any("joints of the arm record" in line for line in altered)
+
+
+def test_what_is_no_problem_is_refused_before_anything_is_certified():
+    with pytest.raises(vq.ProblemError, match="load_problem"):
+        vq.certify("arm.toml", [0.0], [[0.0]])

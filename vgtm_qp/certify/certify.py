@@ -15,6 +15,7 @@ from vgtm_qp.certify.trajectory import read_trajectory
 from vgtm_qp.certify.verdict import Finding, Verdict
 from vgtm_qp.errors import Mistake, ProblemError
 from vgtm_qp.problem.fields import GREATEST_LENGTH
+from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.problem.table import shown
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.poses import base_poses
@@ -69,6 +70,7 @@ class Certifier:
         from vgtm_qp.arm.build import make_arm
         from vgtm_qp.verify.obstacles import read_obstacles
 
+        check_is_problem(problem)
         if problem.arm is None:
             expected = "a serial arm, [arm]: certify takes serial arms in this version"
             raise problem.error([Mistake("truss", "a truss", expected)])
