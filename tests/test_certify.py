@@ -304,6 +304,20 @@ def test_the_command_says_what_it_proves(folder, capsys):
         assert entry["value"] < entry["bound"]
 
 
+def test_what_is_exported_is_certified(folder, capsys):
+    assert main(["solve", "arm.toml"]) == 0
+    assert main(["export", "arm.npz", "--to", "csv", "-o", "made.csv"]) == 0
+    assert (folder / "made.csv").read_text().startswith("time [s],lift [rad],")
+    assert main(["certify", "arm.toml", "made.csv"]) == 0
+    assert "certified" in capsys.readouterr().out
+    (folder / "made.csv").write_text((folder / "made.csv").read_text().replace("lift [rad]", "lit [rad]", 1))
+    assert main(["certify", "arm.toml", "made.csv"]) == 2
+    assert capsys.readouterr().err.count("expected") == 1
+    (folder / "made.csv").write_text("time [s],turn [rad],roll [rad],d lift/dt [rad/s]\n0,0,0,0\n")
+    assert main(["certify", "arm.toml", "made.csv"]) == 2
+    assert 'no column "lift"' in capsys.readouterr().err
+
+
 BROKEN = {
     "no file": (None, "a CSV file"),
     "empty": ("", "line 1: found nothing"),

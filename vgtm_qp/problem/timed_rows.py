@@ -23,6 +23,7 @@ def read_timed_rows(
     check_header: Callable[[list[str], Mistakes], None],
     shortest: float = 0.0,
     longest: float = math.inf,
+    named: Callable[[list[str]], list[str]] = list,
 ) -> tuple[list[str], list[dict[str, float]]]:
     """Return the header, and the numbers of each row by column; times increase, from 0 or later.
 
@@ -34,6 +35,8 @@ def read_timed_rows(
         Adds what is wrong with the columns to the mistakes that it is given.
     shortest, longest
         Least and greatest time from one row to the next, s; for the first row, from 0 if it is later.
+    named
+        Returns the names of the columns for a header that has others.
 
     Raises
     ------
@@ -41,7 +44,7 @@ def read_timed_rows(
         The file is missing, is not text, or has wrong columns or cells: each is named by line and column.
     """
     header, rows = _rows(file)
-    mistakes: Mistakes = []
+    header, mistakes = named(header), list[Mistake]()
     check_header(header, mistakes)
     if not mistakes:
         values = [_numbers(header, line, cells, mistakes) for line, cells in rows]
