@@ -48,7 +48,7 @@ class Way:
         if len(time) == 1:
             time, states = np.repeat(time, 2), np.repeat(states, 2, axis=0)
         self.motion, self.chain = RecordedMotion(chain, time, states), chain
-        self.bends = chain.bends(states[:-1], states[1:])
+        self.bends = chain.bend(states[:-1], states[1:], np.arange(len(chain.links)))
         """(S, B) bounds, m, of |d2 r / d x2| of the links."""
         self.rounding = 64.0 * float(np.finfo(float).eps) * float(np.abs(self.motion.ends).max())
         worst = self.bends.max(axis=1) / (8.0 * _COARSE * chain.size)

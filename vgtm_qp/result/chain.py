@@ -224,10 +224,6 @@ class RecordedChain:
         points = np.concatenate([origins, own], axis=-1)
         return np.asarray(points[..., self.links[link]].max(axis=-1))
 
-    def bends(self, before: Array, after: Array) -> Array:
-        """Return (S, B) the bounds of :meth:`bend` for all links, between configurations (S, J + 6)."""
-        return self.bend(before, after, np.arange(len(self.links)))
-
 
 def _are_ends(recorded: Array, ends: Array, radius: float) -> bool:
     """Whether both points (2, 3) of a recorded capsule are the `ends` (1 or 2, 3) of its axis, m.
