@@ -31,7 +31,9 @@ _FURTHEST = 0.4
 _PATIENCE = 25
 """Steps after which another goal is set at the latest."""
 _GLIDES = 0.5
-"""Share of goals that move there, and are not set at once."""
+"""Share of goals that move there, and are not set at once; all of those of a tip that may not be late do."""
+_STRIDE = (1e-4, 1e-2)
+"""How far goals move in a step, as a share of the arm's height."""
 
 
 def tasks(short: bool, *, scenes: int | None = None, seed: int = SEED, steps: int = 250) -> list[Task]:
@@ -109,10 +111,15 @@ class _Goals:
         self._left = int(random.integers(1, _PATIENCE + 1))
         way = random.normal(size=3)
         way *= _FURTHEST * arm.height * random.random() / np.linalg.norm(way)
-        self._start, self._end = self._resolver.tip()[0], self._home + way
+        self._start = self._resolver.tip()[0]
+        way += self._home - self._start
+        self._shares = np.ones(self._left)
+        if self._resolver.setup.tip_mode == "hard" or random.random() < _GLIDES:
+            stride = arm.height * np.exp(random.uniform(*np.log(_STRIDE)))
+            way *= min(1.0, self._left * stride / float(np.linalg.norm(way)))
+            self._shares = np.arange(1, self._left + 1) / self._left
+        self._end = self._start + way
         self._pointing = self._rotation[:, 2] + 0.3 * random.normal(size=3)
-        glides = random.random() < _GLIDES
-        self._shares = np.arange(1, self._left + 1) / self._left if glides else np.ones(self._left)
 
     def note(self, step: Step) -> bool:
         """Take note of a step, and return whether a goal is met with it."""
