@@ -142,7 +142,7 @@ def test_a_loop_counts_its_steps_and_what_breaks_is_found(monkeypatch: pytest.Mo
     along = loops._along
 
     def stricter(problem: Any, targets: Any) -> Any:
-        return along(problem, targets).replace({"clearance.self_safe": 0.4, "clearance.self_collision": True})
+        return along(problem, targets).replace({"clearance.safe": 2.5, "clearance.influence": 3.0})
 
     monkeypatch.setattr(loops, "_along", stricter)
     assert "clearance" in " ".join(loops.run(7, 5, 20)["failures"])
