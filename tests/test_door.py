@@ -617,7 +617,7 @@ def test_stations_of_joints_in_one_place_have_an_attitude():
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("name", "pseudoinverse"), ("name", "curve-pseudoinverse"), ("tracking", "parallel")]
+    ("key", "value"), [("name", "curve-pseudoinverse"), ("tracking", "parallel"), ("tracking", "recursive")]
 )
 def test_a_method_that_moves_trusses_alone_is_refused_by_its_key(key, value):
     with pytest.raises(vq.ProblemError, match=rf'method\.{key}: found "{value}"'):
