@@ -498,7 +498,11 @@ def test_a_recorded_chain_bends_no_more_than_its_bound(rng):
             points = chain.placed(ways)[0]
             np.testing.assert_allclose(points[0], arm.nodes(before)[: points.shape[1]], atol=1e-12)
             second = np.linalg.norm(np.diff(points, n=2, axis=0), axis=2) * 200.0**2
-            assert second.max() <= chain.bend(before, after, np.zeros(1, dtype=int))[0] * (1.0 + 1e-6)
+            of_links = second.max(axis=0)[chain.links].max(axis=1)
+            bounds = chain.bend(before, after, np.arange(len(chain.links)))
+            assert (of_links <= bounds * (1.0 + 1e-6) + 1e-7).all()
+            # Of few joints the bound is that of few joints.
+            assert bounds[0] < 0.5 * bounds[-1]
 
 
 @pytest.mark.parametrize("form", ["png", "html", "csv", "mcap", "ros"])

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from vgtm_qp.arm.truss.build import build_truss
     from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.arm.truss.truss import Truss
+    from vgtm_qp.certify.certify import certify
+    from vgtm_qp.certify.verdict import Finding, Verdict
     from vgtm_qp.comparison.compare import Report, compare
     from vgtm_qp.export import export_maneuver
     from vgtm_qp.maneuver.maneuver import Maneuver, load_result
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
     from vgtm_qp.verify import verify, verify_file
 
 _HOMES = {
+    "vgtm_qp.certify.certify": ("certify",),
+    "vgtm_qp.certify.verdict": ("Finding", "Verdict"),
     "vgtm_qp.export": ("export_maneuver",),
     "vgtm_qp.result.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),
@@ -54,6 +58,7 @@ __all__ = [
     "Certificate",
     "CurveError",
     "ExportError",
+    "Finding",
     "GoalError",
     "Maneuver",
     "Measure",
@@ -69,9 +74,11 @@ __all__ = [
     "StepStatus",
     "Truss",
     "TrussError",
+    "Verdict",
     "VgtmError",
     "build_truss",
     "bundled_problems",
+    "certify",
     "compare",
     "describe",
     "export_maneuver",

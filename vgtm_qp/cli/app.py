@@ -14,6 +14,7 @@ from typing import Any
 
 from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError, UnusedCliTokensError
 
+from vgtm_qp.cli.certify import certify
 from vgtm_qp.cli.doctor import doctor
 from vgtm_qp.cli.experiments import bench, compare, study
 from vgtm_qp.cli.output import ExitCode, asked_to_end, document, note
@@ -53,6 +54,7 @@ app = App(
 _COMMANDS: dict[str, Callable[..., int | None]] = {
     "solve": solve,
     "verify": verify,
+    "certify": certify,
     "compare": compare,
     "study": study,
     "check": check,

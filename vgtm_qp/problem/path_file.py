@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _COLUMNS = ("t", "x", "y", "z")
 _TURNS = ("rx", "ry", "rz")
 _GREATEST_BYTES = 200_000_000
-_GREATEST_MISTAKES = 100
+GREATEST_MISTAKES = 100
 _NUMBER = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
 
 
@@ -42,36 +42,49 @@ def read_path(file: str | Path) -> PathTable:
     """
     import numpy as np
 
-    header, rows = _read(Path(file))
+    header, rows = read_rows(Path(file))
     mistakes: list[Mistake] = []
     _check_header(header, mistakes)
     if mistakes:
         raise ProblemError(str(file), mistakes)
-    values = [_numbers(header, line, cells, mistakes) for line, cells in rows]
+    values = [read_numbers(header, line, cells, mistakes) for line, cells in rows]
     before = -math.inf
     for (line, _), row in zip(rows, values, strict=True):
         time = row.get("t", math.nan)
-        if time < 0:
-            mistakes.append(Mistake(f"line {line}, column t", f"{time:g}", "a time in seconds, 0 or more"))
-        elif time <= before:
-            expected = f"a time after that of the row before, {before:g} s"
-            mistakes.append(Mistake(f"line {line}, column t", f"{time:g}", expected))
-        elif time > 0 and not SHORTEST_STEP <= time - max(before, 0.0) <= LONGEST_STEP:
-            expected = f"a step of {SHORTEST_STEP:g} to {LONGEST_STEP:g} s"
-            mistakes.append(Mistake(f"line {line}, column t", f"{time - max(before, 0.0):g} s", expected))
+        place = f"line {line}, column t"
+        mistake = time_mistake(place, time, before)
+        if mistake is None and time > 0 and before < 0:
+            mistake = step_mistake(place, time)
+        mistakes += [mistake] if mistake else []
         if math.isfinite(time):
             before = time
     if not rows:
         mistakes.append(Mistake("line 2", "nothing", "at least one row of numbers below the header"))
     if mistakes:
-        raise ProblemError(str(file), mistakes[:_GREATEST_MISTAKES])
+        raise ProblemError(str(file), mistakes[:GREATEST_MISTAKES])
     columns = {name: np.array([row[name] for row in values]) for name in header}
     turns = np.column_stack([columns[name] for name in _TURNS]) if "rx" in columns else None
     return PathTable(columns["t"], np.column_stack([columns[name] for name in "xyz"]), turns)
 
 
-def _read(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header and the rows that are not empty, with their line numbers."""
+def time_mistake(place: str, time: float, before: float) -> Mistake | None:
+    """Return what is wrong with the time of a row after one `before`, s, which is -inf for the first; NaN passes."""
+    if time < 0:
+        return Mistake(place, f"{time:g}", "a time in seconds, 0 or more")
+    if time <= before:
+        return Mistake(place, f"{time:.9g}", f"a time after that of the row before, {before:.9g} s")
+    return step_mistake(place, time - before) if math.isfinite(time - before) else None
+
+
+def step_mistake(place: str, duration: float) -> Mistake | None:
+    """Return what is wrong with the duration of a step, s."""
+    if SHORTEST_STEP <= duration <= LONGEST_STEP:
+        return None
+    return Mistake(place, f"{duration:g} s", f"a step of {SHORTEST_STEP:g} to {LONGEST_STEP:g} s")
+
+
+def read_rows(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the header and the rows that are not empty, with their line numbers; ProblemError where it is no CSV."""
     try:
         if not file.is_file():
             raise ProblemError.at(file, "file", "nothing", "a CSV file")
@@ -108,7 +121,8 @@ def _check_header(header: list[str], mistakes: list[Mistake]) -> None:
         )
 
 
-def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mistake]) -> dict[str, float]:
+def read_numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mistake]) -> dict[str, float]:
+    """Return the numbers of a row by column, without those that are none: `mistakes` has these."""
     if len(cells) != len(header):
         mistakes.append(
             Mistake(f"line {line}", f"{len(cells)} cells", f"{len(header)} cells, as the header has")
@@ -117,7 +131,8 @@ def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mist
     row: dict[str, float] = {}
     for name, cell in zip(header, cells, strict=True):
         try:
-            number = float(cell)
+            # Python reads 1_000 too.
+            number = math.nan if "_" in cell else float(cell)
         except ValueError:
             number = math.nan
         # NaN fails this comparison too.

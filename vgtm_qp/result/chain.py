@@ -76,7 +76,6 @@ class RecordedChain:
         points, _, frames = self.placed(home)
         self.home, self._home_tip = points[0], frames[0]
         self.length = self.lengths(self.home)
-        self._reaches = self._greatest_reaches()
 
     def contradictions(self, problem: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[str]:
         """Return where the record disagrees with the arrays of the result file or with the problem."""
@@ -144,15 +143,15 @@ class RecordedChain:
         """
         count = len(self.quantity_names)
         at, frame = q[:, count : count + 3], rotations(q[:, count + 3 :])
+        turns = np.where(self.revolute, q[:, :count], 0.0)[..., None] * self.axis
+        turned = self.rotation @ rotations(turns.reshape(-1, 3)).reshape(-1, count, 3, 3)
         points, axes, frames = [at], [], [(at, frame)]
         for j in range(count):
             at = at + frame @ self.position[j]
-            frame = frame @ self.rotation[j]
+            frame = frame @ turned[:, j]
             axes.append(frame @ self.axis[j])
             points.append(at)
-            if self.revolute[j]:
-                frame = frame @ rotations(q[:, j, None] * self.axis[j])
-            else:
+            if not self.revolute[j]:
                 at = at + q[:, j, None] * axes[-1]
             frames.append((at, frame))
         points.append(at + frame @ self.tip)
@@ -203,34 +202,29 @@ class RecordedChain:
         return np.asarray(points[which[:, None], self.links[link]])
 
     def bend(self, before: Array, after: Array, link: Index) -> Array:
-        """Return (P,) a bound, m, of |d2 r / d share2| of any point of the links as the configuration moves straight.
+        """Return (..., P) a bound, m, of |d2 r / d share2| of any point of links (P,) as configurations move straight.
 
-        A point's velocity is a sum over the joints before it of w a x (r - o) and v a. The axes a turn with the joints
-        before them, and r - o changes only by the joints from there on.
+        The configurations are (..., J + 6). A point is the sum of vectors p, each of which turns with a frame. That has
+        a speed w, at most the sum of the speeds of the joints before it; as these turn one another's axes, |w'| is at
+        most the sum of the products of every two of them. A slide changes its vector at a constant speed v, along
+        itself. So |p''| <= (w^2 + |w'|) |p| + 2 w v. The base's rotation vector counts twice, as its axis turns too.
         """
-        joints = np.abs(after - before)[: len(self.quantity_names)]
-        turn, slide = np.where(self.revolute, joints, 0.0), np.where(self.revolute, 0.0, joints)
-        base = 2.0 * float(np.linalg.norm(after[-3:] - before[-3:]))
-        turn, slide = np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
-        earlier = np.cumsum(turn) - turn
-        beyond = np.cumsum((turn * self._reaches + slide)[::-1])[::-1]
-        return np.full(len(link), turn @ (2.0 * earlier * self._reaches + beyond) + slide @ earlier)
-
-    def _greatest_reaches(self) -> Array:
-        """Return (J + 1,) bounds of the distance from the base, and from each joint, to any point beyond it, m."""
-        links = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
-        slides = np.where(self.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
-        around = [
-            np.linalg.norm(self.points[self.carriers == k], axis=1).max(initial=0.0)
-            for k in range(len(links))
-        ]
-        found, beyond = [], 0.0
-        # A joint reaches the points that move with it, and the next origin and what is beyond that.
-        for k in range(len(links) - 1, 0, -1):
-            beyond = slides[k - 1] + max(around[k], links[k] + beyond)
-            found.append(beyond)
-        found.append(max(around[0], links[0] + beyond))
-        return np.array(found[::-1])
+        count, moved = len(self.quantity_names), np.abs(after - before)
+        zero = np.zeros((*moved.shape[:-1], 1))
+        base = 2.0 * np.linalg.norm(moved[..., -3:], axis=-1, keepdims=True)
+        turns = np.concatenate([base, np.where(self.revolute, moved[..., :count], 0.0)], axis=-1)
+        slides = np.where(self.revolute, 0.0, np.maximum(np.abs(before), np.abs(after))[..., :count])
+        slid = np.where(self.revolute, 0.0, moved[..., :count])
+        # Of each frame, that of the base first.
+        speed = np.cumsum(turns, axis=-1)
+        turning = 0.5 * (3.0 * speed * speed - np.cumsum(turns * turns, axis=-1))
+        slide = turning * np.concatenate([zero, slides], axis=-1)
+        slide += 2.0 * speed * np.concatenate([zero, slid], axis=-1)
+        steps = slide + turning * np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
+        origins = np.concatenate([zero, np.cumsum(steps, axis=-1)], axis=-1)
+        around = slide[..., self.carriers] + turning[..., self.carriers] * np.linalg.norm(self.points, axis=1)
+        bends = np.concatenate([origins, origins[..., self.carriers] + around], axis=-1)
+        return np.asarray(bends[..., self.links[link]].max(axis=-1))
 
 
 def same(recorded: ArrayLike, given: ArrayLike) -> bool:

@@ -125,23 +125,23 @@ class RecordedArm:
         return np.asarray(origin + offset[..., :1] * x + offset[..., 1:2] * y + offset[..., 2:] * z)
 
     def bend(self, before: Array, after: Array, member: Index) -> Array:
-        """Return (P,) an upper bound, m, of |d2 r / d share2| of members' ends between node positions (N, 3).
+        """Return (..., P) an upper bound, m, of |d2 r / d share2| of members' ends between node positions (..., N, 3).
 
         Zero for pin joints. The joint frame's axes are unit vectors of polynomials w of the share, and
         |(w/|w|)''| <= |w''|/|w| + 3 (|w'|/|w|)^2, with |w| bounded below from its ends; inf where that fails.
         """
         if self.has_pin_joints:
-            return np.zeros(len(member))
+            return np.zeros((*before.shape[:-2], len(member)))
         corner = self.corners[member]
-        first = [nodes[corner[..., 1]] - nodes[corner[..., 0]] for nodes in (before, after)]
-        second = [nodes[corner[..., 2]] - nodes[corner[..., 0]] for nodes in (before, after)]
+        first = [nodes[..., corner[..., 1], :] - nodes[..., corner[..., 0], :] for nodes in (before, after)]
+        second = [nodes[..., corner[..., 2], :] - nodes[..., corner[..., 0], :] for nodes in (before, after)]
         x_rate, x_bend = _bisector_bounds(first, second)
         z_rate, z_bend = _normal_bounds(first, second)
         offset = np.abs(self.offset[member])
         y_bend = z_bend + 2.0 * z_rate * x_rate + x_bend
         with np.errstate(invalid="ignore"):
             bound = offset[..., 0] * x_bend + offset[..., 1] * y_bend + offset[..., 2] * z_bend
-        return np.asarray(np.where(np.isnan(bound), 0.0, bound).max(axis=1))
+        return np.asarray(np.where(np.isnan(bound), 0.0, bound).max(axis=-1))
 
     def lengths(self, nodes: Array) -> Array:
         """Return (..., M) member lengths, m, at node positions (..., N, 3)."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -49,7 +49,7 @@ _SAFE = 0.05
 """Default of ``clearance.safe``, m."""
 _SELF_SHARE = 0.25
 """Default of ``clearance.self_safe``, as a share of ``safe``."""
-_INSTANT = 1e-9
+INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 _ROUNDING = 4.0 * float(np.finfo(float).eps)
 """Relative rounding of a length and of the duration between two times of a large clock."""
@@ -137,20 +137,16 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
     """
     time, unit, names = maneuver.time, arm.unit, arm.quantity_names
     per = f"({unit})" if " " in unit else unit
-    locks = [(names.index(name), since) for name, since in _locks(maneuver) if name in names]
+    locks = [
+        (names.index(name), since) for name, since in locks_of(maneuver.manifest["problem"]) if name in names
+    ]
     held = np.where(arm.actuated, 0.0, np.abs(lengths - arm.home_quantities))
     for k, since in locks:
-        rows = np.flatnonzero(time >= since - _INSTANT)
+        rows = np.flatnonzero(time >= since - INSTANT)
         held[rows, k] = np.maximum(held[rows, k], np.abs(lengths[rows, k] - lengths[rows[:1], k]))
-    durations = np.diff(time)[:, None]
-    between = 0.5 * (durations[1:] + durations[:-1])
-    rates = np.diff(lengths, axis=0) / durations
-    accelerations = np.diff(rates, axis=0) / between
-    size = float(np.abs(maneuver.nodes).max())
-    rounding = _ROUNDING * (size + np.abs(rates) * np.abs(time[1:, None])) / durations
-    its_rounding = (rounding[1:] + rounding[:-1]) / between
+    rates, accelerations, rounding, its_rounding = changes(time, lengths, float(np.abs(maneuver.nodes).max()))
     for k, since in locks:
-        accelerations[np.abs(time[1:-1] - since) <= _INSTANT, k] = 0.0
+        accelerations[np.abs(time[1:-1] - since) <= INSTANT, k] = 0.0
     poses = base_poses(maneuver.manifest["problem"], time)
     placed = arm.home[arm.base] @ np.swapaxes(rotations(poses[:, 3:]), 1, 2) + poses[:, None, :3]
     moved = np.linalg.norm(maneuver.nodes[:, arm.base] - placed, axis=2)
@@ -167,6 +163,19 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
             np.abs(accelerations) - its_rounding - arm.acceleration, f"{per}/s^2"
         ),
     }
+
+
+def changes(time: Array, values: Array, size: float) -> tuple[Array, Array, Array, Array]:
+    """Return rates (T - 1, M) and accelerations (T - 2, M) of values (T, M) at times (T,), s, and what rounding makes.
+
+    That is what the rounding of values as large as `size` and of times makes of a rate and of an acceleration.
+    """
+    durations = np.diff(time)[:, None]
+    between = 0.5 * (durations[1:] + durations[:-1])
+    rates = np.diff(values, axis=0) / durations
+    accelerations = np.diff(rates, axis=0) / between
+    rounding = _ROUNDING * (size + np.abs(rates) * np.abs(time[1:, None])) / durations
+    return rates, accelerations, rounding, (rounding[1:] + rounding[:-1]) / between
 
 
 def _clearances(
@@ -228,9 +237,8 @@ def _difference(stored: Array, found: Array) -> Array:
         return np.asarray(np.where(stored == found, 0.0, np.abs(stored - found)))
 
 
-def _locks(maneuver: Result) -> list[tuple[str, float]]:
-    """Return name and time, s, of the actuators that the problem locks."""
-    problem = maneuver.manifest["problem"]
+def locks_of(problem: Mapping[str, Any]) -> list[tuple[str, float]]:
+    """Return name and time, s, of the actuators that a problem, as JSON data, locks."""
     entries = (problem.get("truss") or problem.get("arm") or {}).get("locked") or ()
     tables = ({"member": entry} if isinstance(entry, str) else entry for entry in entries)
     return [(table.get("joint") or table["member"], float(table.get("time", 0.0))) for table in tables]
@@ -240,8 +248,8 @@ def _jams_between_rows(maneuver: Result) -> list[str]:
     """Return the members that lock between two rows, so that the length at which they locked is unknown."""
     return [
         f"{name} locks at {since:g} s, where there is no state"
-        for name, since in _locks(maneuver)
-        if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > _INSTANT
+        for name, since in locks_of(maneuver.manifest["problem"])
+        if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > INSTANT
     ]
 
 

@@ -1,0 +1,1 @@
+"""A proof, or a refutation, for a trajectory that anybody made."""

@@ -1,0 +1,267 @@
+"""Whether bodies keep their clearances all along a motion: proven, refuted, or neither.
+
+The proof is that of ``verify.clearance``: a plane that separates two bodies at both ends of an interval separates them
+through it, but for how far their ways bend. It is held against what the bodies have to keep, for all segments of the
+motion at once, and an interval is halved only until that is decided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vgtm_qp.arrays import Array, Index
+from vgtm_qp.certify.motion import GivenMotion
+from vgtm_qp.certify.pairs import Kept, Near
+from vgtm_qp.certify.verdict import Finding
+from vgtm_qp.verify.clearance import CLEARANCE_TOLERANCE, Pairs
+
+_GREATEST_DEPTH = 30
+_GREATEST_COUNT = 200_000
+"""Numbers of halvings, and of intervals at a time, from which on nothing more is decided."""
+_NEAR_ENOUGH = 1e-3
+_REPORT_DEPTH = 10
+"""How near a bound is brought to the least clearance, over the mean link, and with how many halvings at most."""
+_CHUNK = 500_000
+
+
+@dataclass
+class Decision:
+    """What is decided of pairs: a proven lower bound of their clearances, m, and what is wrong or in doubt."""
+
+    bound: float = np.inf
+    violations: list[Finding] = field(default_factory=list)
+    undecided: list[Finding] = field(default_factory=list)
+
+
+def decide(motion: GivenMotion, kept: Sequence[Kept]) -> dict[str, Decision]:
+    """Return by kind what is decided of the pairs of `kept`, of which those of one kind have one floor."""
+    found = {pairs.kind: Decision() for pairs in kept}
+    for kind, decision in found.items():
+        Bisection(motion, [pairs for pairs in kept if pairs.kind == kind]).run(decision)
+    return found
+
+
+@dataclass
+class _Edge:
+    """Pairs (P,) at instants: points (P, 4, 3), distances (P,), m, normals (P, 3), and the gaps of their planes, m."""
+
+    points: Array
+    distance: Array
+    normal: Array
+    held: Array
+
+    @staticmethod
+    def none() -> _Edge:
+        return _Edge(np.zeros((0, 4, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+
+    @staticmethod
+    def joined(parts: Sequence[_Edge]) -> _Edge:
+        """Return the rows of all parts, one part after another."""
+        return _Edge(*(np.concatenate(each) for each in zip(*map(_Edge.arrays, parts), strict=True)))
+
+    @staticmethod
+    def interleaved(first: _Edge, second: _Edge) -> _Edge:
+        """Return the rows of two, one of each in turn."""
+        both = zip(first.arrays(), second.arrays(), strict=True)
+        return _Edge(*(np.stack(pair, axis=1).reshape(-1, *pair[0].shape[1:]) for pair in both))
+
+    def at(self, rows: Index) -> _Edge:
+        """Return some of the rows."""
+        return _Edge(*(array[rows] for array in self.arrays()))
+
+    def arrays(self) -> tuple[Array, ...]:
+        """Return all four."""
+        return self.points, self.distance, self.normal, self.held
+
+
+class Bisection:
+    """Pairs of one kind that may come too near, each in one segment, and the intervals of these that are open.
+
+    Pairs are in the order of the `kept` that they belong to, and intervals in that of their pairs.
+    """
+
+    def __init__(self, motion: GivenMotion, kept: Sequence[Kept]) -> None:
+        self.motion, self.kept = motion, kept
+        floor = kept[0].floor - CLEARANCE_TOLERANCE
+        self.least, self.most = floor - motion.rounding, floor + motion.rounding
+        self.close = _NEAR_ENOUGH * motion.arm.size
+        near, self.rest = self._candidates()
+        sizes = [len(pairs.gap) for pairs in near]
+        self.starts = np.cumsum([0, *sizes])
+        self.segment = np.concatenate([pairs.segment for pairs in near])
+        self.first, self.second = (np.concatenate([pairs.pair[k] for pairs in near]) for k in (0, 1))
+        everything = np.arange(len(self.segment))
+        groups = list(self._groups(everything))
+        self.bend = np.concatenate(
+            [np.zeros(0)]
+            + [own.bend(self.segment[rows], self._pair(everything[rows])) for own, rows in groups]
+        )
+        self.depth = np.concatenate(
+            [np.zeros(0)] + [own.depth(self._pair(everything[rows])) for own, rows in groups]
+        )
+        self.found = np.full(len(everything), np.inf)
+        self.proven = np.full(len(everything), np.inf)
+        # Times, s: of the least distance found, and the first and the last at which it is too small.
+        self.at, self.since, self.until = np.full((3, len(everything)), np.nan)
+        self.left: list[tuple[Index, Array, Array, Array]] = []
+        """Intervals that are in doubt: pairs, where they start and how wide they are, and what is proven, m."""
+
+    def _candidates(self) -> tuple[list[Near], float]:
+        """Return the pairs that may come too near, or the nearest, and a bound of the clearances of the others."""
+        nearest = np.inf
+        for own in self.kept:
+            one = own.nearest()
+            if len(one.gap) and one.gap[0] < nearest:
+                ends, time = self.motion.ends[one.segment], self.motion.time[one.segment]
+                edge = _edge_of(own, one.pair, ends, time, np.zeros(1, dtype=np.int64))
+                nearest = min(nearest, float(edge.distance[0]))
+        found = [own.near(max(self.kept[0].floor, nearest)) for own in self.kept]
+        return [near for near, _ in found], min((rest for _, rest in found), default=np.inf)
+
+    def run(self, decision: Decision) -> None:
+        """Halve intervals until each is decided, and note what came out."""
+        pair = np.arange(len(self.segment))
+        edges = [self._edge(pair, np.full(len(pair), share)) for share in (0.0, 1.0)]
+        start, width = np.zeros(len(pair)), 1.0
+        first, last = edges
+        proven = self._across(pair, first, last)
+        for depth in range(_GREATEST_DEPTH + 1):
+            proven = np.maximum(proven - self.bend[pair] * width**2 / 8.0, -self.depth[pair])
+            open_ = self._open(pair, proven, depth)
+            np.minimum.at(self.proven, pair[~open_], proven[~open_])
+            self._note_undecided(pair, start, width, proven, ~open_)
+            if not open_.any():
+                break
+            rows = np.flatnonzero(open_)
+            pair, start, first, last = pair[rows], start[rows], first.at(rows), last.at(rows)
+            width /= 2.0
+            middle = self._edge(pair, start + width)
+            first, last = _Edge.interleaved(first, middle), _Edge.interleaved(middle, last)
+            start = np.stack([start, start + width], axis=1).reshape(-1)
+            pair = np.repeat(pair, 2)
+            proven = self._across(pair, first, last)
+        self._tell(decision)
+
+    def _open(self, pair: Index, proven: Array, depth: int) -> NDArray[np.bool_]:
+        """Return (I,) which intervals are halved."""
+        found = self.found[pair]
+        broken, doubtful = found < self.least, proven < self.most
+        wanted = np.where(broken, found, min(float(self.found.min(initial=np.inf)), self.rest)) - self.close
+        coarse = (proven < wanted) & (depth < _REPORT_DEPTH)
+        open_ = np.where(broken, coarse, doubtful | coarse) & np.isfinite(self.bend[pair])
+        if open_.sum() > _GREATEST_COUNT:
+            open_ &= doubtful & ~broken
+        if depth == _GREATEST_DEPTH or open_.sum() > _GREATEST_COUNT:
+            open_[:] = False
+        return np.asarray(open_)
+
+    def _note_undecided(
+        self, pair: Index, start: Array, width: float, proven: Array, closed: NDArray[np.bool_]
+    ) -> None:
+        left = closed & (proven < self.most) & (self.found[pair] >= self.least) & np.isfinite(self.bend[pair])
+        if left.any():
+            self.left.append((pair[left], start[left], np.full(int(left.sum()), width), proven[left]))
+
+    def _across(self, pair: Index, first: _Edge, last: _Edge) -> Array:
+        """Return (I,) the gap, m, that one of the planes of both edges holds at both."""
+        others = self._apart(
+            np.repeat(pair, 2),
+            np.stack([last.points, first.points], axis=1).reshape(-1, 4, 3),
+            np.stack([first.normal, last.normal], axis=1).reshape(-1, 3),
+        )
+        held = np.minimum(np.stack([first.held, last.held], axis=1), others.reshape(-1, 2))
+        return np.asarray(held.max(axis=1))
+
+    def _edge(self, pair: Index, share: Array) -> _Edge:
+        """Return pairs (P,) at shares (P,) of their segments, and keep what is the least so far."""
+        x = self.segment[pair] + share
+        instants, which = np.unique(x, return_inverse=True)
+        if len(instants) > 1 and len(instants) * len(self.motion.arm.radius) > _CHUNK:
+            half = len(pair) // 2
+            return _Edge.joined(
+                [self._edge(pair[:half], share[:half]), self._edge(pair[half:], share[half:])]
+            )
+        segment = np.minimum(instants.astype(np.int64), len(self.motion.time) - 2)
+        ends = self.motion.ends_at(segment, instants - segment)
+        time = self.motion.times_at(segment, instants - segment)
+        parts = [_Edge.none()]
+        for own, rows in self._groups(pair):
+            parts.append(_edge_of(own, self._pair(pair[rows]), ends, time, which[rows]))
+        edge = _Edge.joined(parts)
+        self._keep(pair, edge.distance, time[which])
+        return edge
+
+    def _keep(self, pair: Index, distance: Array, time: Array) -> None:
+        """Keep the least distance of each pair, its time, and the first and last time at which it is too small."""
+        np.minimum.at(self.found, pair, distance)
+        least = distance <= self.found[pair]
+        self.at[pair[least]] = time[least]
+        near = distance < self.least
+        np.fmin.at(self.since, pair[near], time[near])
+        np.fmax.at(self.until, pair[near], time[near])
+
+    def _pair(self, rows: Index) -> Pairs:
+        return self.first[rows], self.second[rows]
+
+    def _groups(self, pair: Index) -> Iterator[tuple[Kept, slice]]:
+        """Yield what pairs (P,), in order, belong to, and which of them do."""
+        edges = np.searchsorted(pair, self.starts)
+        for own, first, last in zip(self.kept, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            if last > first:
+                yield own, slice(first, last)
+
+    def _apart(self, pair: Index, points: Array, normal: Array) -> Array:
+        """Return (P,) the gaps, m, that planes across the normals (P, 3) leave between pairs (P,) at points."""
+        return np.concatenate(
+            [np.zeros(0)]
+            + [
+                own.apart(points[rows], normal[rows], self._pair(pair[rows]))
+                for own, rows in self._groups(pair)
+            ]
+        )
+
+    def _tell(self, decision: Decision) -> None:
+        """Note what came out; what is found of the same bodies in successive segments is one finding."""
+        decision.bound = min(self.rest, float(self.proven.min(initial=np.inf)))
+        floor, kind, time = self.kept[0].floor, self.kept[0].kind, self.motion.time
+        broken = np.flatnonzero(self.found < self.least)
+        for names, run in self._runs(broken):
+            worst = run[int(np.argmin(self.found[run]))]
+            start, end = float(self.since[run].min()), float(self.until[run].max())
+            value, at = float(self.found[worst]), float(self.at[worst])
+            decision.violations.append(Finding(start, end, kind, names, value, floor, at))
+        if not self.left:
+            return
+        pair, start, width, proven = (np.concatenate(parts) for parts in zip(*self.left, strict=True))
+        doubt = self.found[pair] >= self.least
+        pair, start, width, proven = pair[doubt], start[doubt], width[doubt], proven[doubt]
+        for names, run in self._runs(np.unique(pair)):
+            own = np.isin(pair, run)
+            segment, low, high = self.segment[pair[own]], start[own], start[own] + width[own]
+            begin = float(((1.0 - low) * time[segment] + low * time[segment + 1]).min())
+            end = float(((1.0 - high) * time[segment] + high * time[segment + 1]).max())
+            value = float(proven[own].min())
+            decision.undecided.append(Finding(begin, end, kind, names, value, floor))
+
+    def _runs(self, pair: Index) -> Iterator[tuple[tuple[str, str], Index]]:
+        """Yield the names of pairs, and those of them (R,) that are in one segment or in successive ones."""
+        named: dict[tuple[str, str], list[int]] = {}
+        for own, rows in self._groups(pair):
+            for k in pair[rows].tolist():
+                named.setdefault(own.names((int(self.first[k]), int(self.second[k]))), []).append(k)
+        for names, found in named.items():
+            each = np.array(found)
+            each = each[np.argsort(self.segment[each], kind="stable")]
+            for run in np.split(each, np.flatnonzero(np.diff(self.segment[each]) > 1) + 1):
+                yield names, run
+
+
+def _edge_of(own: Kept, pair: Pairs, ends: Array, time: Array, which: Index) -> _Edge:
+    """Return pairs (P,) at instants `which` (P,) of those of `ends` (U, B, 2, 3), m, and `time` (U,), s."""
+    points = own.points(pair, lambda member: ends[which, member], time[which])
+    distance, normal = own.separation(points, pair)
+    return _Edge(points, distance, normal, own.apart(points, normal, pair))

@@ -1,0 +1,285 @@
+"""A trajectory as it is given: arrays, a CSV file, a ROS 2 bag or a JointTrajectory message."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vgtm_qp.arrays import Array
+from vgtm_qp.errors import Mistake, ProblemError, nearest
+from vgtm_qp.problem.fields import GREATEST_LENGTH
+from vgtm_qp.problem.path_file import GREATEST_MISTAKES, read_numbers, read_rows, time_mistake
+from vgtm_qp.problem.table import shown
+from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.verify.arm import Arm
+
+if TYPE_CHECKING:
+    from vgtm_qp.problem import Problem
+
+_RATE = re.compile(r"d .+/dt \[.+\]")
+"""Columns that ``vgtm export --to csv`` adds to values: they follow from them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """What a trajectory gives: the values of joints, or the lengths of a truss's actuators.
+
+    Attributes
+    ----------
+    names, units : tuple of str
+    quantities : (K,) int
+        Which of the arm's quantities they are.
+    needed : (K,) bool
+        False for those that are locked from the start.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    quantities: NDArray[np.int64]
+    needed: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, arm: Arm, problem: Problem) -> Columns:
+        """Return the columns of an arm's trajectories."""
+        stuck: set[str] = set()
+        if problem.truss is not None:
+            stuck = {lock.member for lock in problem.truss.locked}
+        chosen = [
+            k
+            for k, name in enumerate(arm.quantity_names)
+            if isinstance(arm, RecordedChain) or arm.actuated[k] or name in stuck
+        ]
+        turns = (
+            arm.revolute if isinstance(arm, RecordedChain) else np.zeros(len(arm.quantity_names), dtype=bool)
+        )
+        index = np.array(chosen, dtype=np.int64)
+        return cls(
+            tuple(arm.quantity_names[k] for k in chosen),
+            tuple("rad" if turns[k] else "m" for k in chosen),
+            index,
+            np.asarray(arm.actuated[index]),
+        )
+
+    def needed_names(self) -> tuple[str, ...]:
+        """Return the names that a trajectory has to have."""
+        return tuple(name for name, needed in zip(self.names, self.needed, strict=True) if needed)
+
+    def expected(self) -> str:
+        """Return in words what names there are."""
+        known = self.names
+        more = f" and {len(known) - 8} more" if len(known) > 8 else ""
+        return f"{', '.join(known[:8])}{more}"
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Times (T,), s, increasing, and values (T, K) of the quantities (K,) of an arm, rad or m."""
+
+    time: Array
+    values: Array
+    quantities: NDArray[np.int64]
+
+    def filled(self, home: Array) -> Array:
+        """Return (T, M) all quantities of the arm: those that are not given are those of `home` (M,)."""
+        found = np.tile(home, (len(self.time), 1))
+        found[:, self.quantities] = self.values
+        return found
+
+
+def read_trajectory(file: str | Path, columns: Columns) -> Trajectory:
+    """Read a trajectory from a CSV file, a ROS 2 bag (``.mcap``) or a JointTrajectory message (``.yaml``).
+
+    The CSV file has a header, ``t`` in seconds and the names of `columns`, in any order, and a row for each instant;
+    what ``vgtm export`` writes is read too.
+
+    Raises
+    ------
+    ProblemError
+        With one mistake per mistake, each with its line and column.
+    MissingExtraError
+        The package that reads bags, or YAML, is not installed.
+    """
+    from vgtm_qp.certify import messages
+
+    kind = Path(file).suffix.lower()
+    if kind == ".mcap":
+        return _from_points(file, *messages.read_bag(Path(file)), columns)
+    if kind in (".yaml", ".yml"):
+        return _from_points(file, *messages.read_message(Path(file)), columns)
+    return _read_csv(file, columns)
+
+
+def _read_csv(file: str | Path, columns: Columns) -> Trajectory:
+    cells, rows = read_rows(Path(file))
+    mistakes: list[Mistake] = []
+    header = _header(cells, columns, mistakes)
+    if mistakes:
+        raise ProblemError(str(file), mistakes[:GREATEST_MISTAKES])
+    found = [read_numbers(header, line, row, mistakes) for line, row in rows]
+    before = -math.inf
+    for (line, _), row in zip(rows, found, strict=True):
+        time = row.get("t", math.nan)
+        mistake = time_mistake(f"line {line}, column t", time, before)
+        mistakes += [mistake] if mistake else []
+        before = time if math.isfinite(time) else before
+    if not rows:
+        mistakes.append(Mistake("line 2", "nothing", "at least one row of numbers below the header"))
+    if mistakes:
+        raise ProblemError(str(file), sorted(mistakes, key=_line)[:GREATEST_MISTAKES])
+    given = [k for k, name in enumerate(columns.names) if name in header]
+    values = np.array([[row[columns.names[k]] for k in given] for row in found]).reshape(
+        len(found), len(given)
+    )
+    return Trajectory(np.array([row["t"] for row in found]), values, columns.quantities[given])
+
+
+def _line(mistake: Mistake) -> int:
+    return int(re.search(r"\d+", mistake.key)[0])  # type: ignore[index]
+
+
+def _header(cells: Sequence[str], columns: Columns, mistakes: list[Mistake]) -> list[str]:
+    """Return the name of each column; `mistakes` has those that are wrong."""
+    expected = f"t and the names {columns.expected()}"
+    if not cells:
+        mistakes.append(Mistake("line 1", "nothing", f"a header with {expected}"))
+        return []
+    if len(cells) == 1 and re.search(r"[;\t|]", cells[0]):
+        mistakes.append(Mistake("line 1", shown(cells[0]), "names with commas between them"))
+        return []
+    names = {"t": "t", "time [s]": "t"} | {
+        spelling: name
+        for name, unit in zip(columns.names, columns.units, strict=True)
+        for spelling in ((name, f"{name} [{unit}]") if name != "t" else (f"{name} [{unit}]",))
+    }
+    header: list[str] = []
+    for number, cell in enumerate(cells, start=1):
+        name = names.get(cell, cell)
+        place = f"line 1, column {number}"
+        if cell not in names and not _RATE.fullmatch(cell):
+            mistakes.append(
+                Mistake(place, shown(cell or None), expected + nearest(cell, ("t", *columns.names)))
+            )
+        elif name in header:
+            mistakes.append(Mistake(place, shown(cell), f'each column once; "{name}" stands before it'))
+        header.append(name)
+    absent = [name for name in ("t", *columns.needed_names()) if name not in header]
+    # A name that is misspelt is told as such, not as missing too.
+    unknown = [cell for cell in cells if cell not in names]
+    for name in absent:
+        if not nearest(name, unknown):
+            mistakes.append(Mistake("line 1", f'no column "{name}"', f"a column for each of {expected}"))
+    return header
+
+
+def _from_points(
+    file: str | Path,
+    names: Sequence[str],
+    points: Sequence[tuple[str, float, Sequence[Any]]],
+    columns: Columns,
+) -> Trajectory:
+    """Return the trajectory of points of joints `names`: the place of each in words, its time, s, and its positions."""
+    mistakes = list(_wrong_names(names, columns))
+    before = -math.inf
+    for place, time, positions in points:
+        if len(positions) != len(names):
+            found = f"{len(positions)} positions"
+            mistakes.append(Mistake(f"{place}, positions", found, f"{len(names)}, one for each joint name"))
+        for name, value in zip(names, positions, strict=False):
+            if not _is_number(value):
+                mistakes.append(Mistake(f"{place}, {name}", shown(value), _NUMBER))
+        mistake = time_mistake(f"{place}, time", time, before)
+        mistakes += [mistake] if mistake else []
+        before = time
+    if not points:
+        mistakes.append(Mistake("points", "nothing", "at least one point"))
+    if mistakes:
+        raise ProblemError(str(file), mistakes[:GREATEST_MISTAKES])
+    given = [k for k, name in enumerate(columns.names) if name in names]
+    order = [list(names).index(columns.names[k]) for k in given]
+    values = np.array([positions for _, _, positions in points], dtype=np.float64)
+    return Trajectory(np.array([time for _, time, _ in points]), values[:, order], columns.quantities[given])
+
+
+_NUMBER = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= GREATEST_LENGTH
+
+
+def _wrong_names(names: Sequence[str], columns: Columns) -> Iterator[Mistake]:
+    expected = f"the names {columns.expected()}"
+    for k, name in enumerate(names):
+        if name not in columns.names:
+            yield Mistake(f"joint_names[{k}]", shown(name), expected + nearest(name, columns.names))
+        elif name in names[:k]:
+            yield Mistake(f"joint_names[{k}]", shown(name), "each name once")
+    unknown = [name for name in names if name not in columns.names]
+    for name in columns.needed_names():
+        if name not in names and not nearest(name, unknown):
+            yield Mistake("joint_names", f'no "{name}"', f"each of {expected}")
+
+
+def given_trajectory(
+    times: ArrayLike, joints: ArrayLike | Mapping[str, ArrayLike], columns: Columns
+) -> Trajectory:
+    """Return the trajectory of arrays: (T,) and (T, K), or (T,) by name; ProblemError where they are none."""
+    mistakes: list[Mistake] = []
+    time = _array("times", times, mistakes)
+    if isinstance(joints, Mapping):
+        names = [str(name) for name in joints]
+        mistakes += _wrong_names(names, columns)
+        arrays = [_array(f'joints["{name}"]', value, mistakes) for name, value in joints.items()]
+        if not mistakes:
+            wrong = [(name, a) for name, a in zip(names, arrays, strict=True) if a.shape != time.shape]
+            mistakes += [Mistake(f'joints["{n}"]', _shape(a), f"{len(time)} values") for n, a in wrong]
+        chosen = [columns.names.index(name) for name in names] if not mistakes else []
+        values = np.stack(arrays, axis=1) if arrays and not mistakes else np.zeros((len(time), 0))
+    else:
+        values = _array("joints", joints, mistakes)
+        chosen = list(range(len(columns.names)))
+        if values.ndim == 2 and values.shape[1] == columns.needed.sum() < len(chosen):
+            chosen = np.flatnonzero(columns.needed).tolist()
+        if not mistakes and values.shape != (*time.shape, len(chosen)):
+            expected = (
+                f"values ({len(time)}, {len(columns.names)}): a row a time, columns {columns.expected()}"
+            )
+            mistakes.append(Mistake("joints", _shape(values), expected))
+    if not mistakes:
+        mistakes = list(_wrong_values(time, values))
+    if mistakes:
+        raise ProblemError("certify", mistakes[:GREATEST_MISTAKES])
+    return Trajectory(time, values, columns.quantities[chosen])
+
+
+def _shape(array: Array) -> str:
+    return f"an array of shape {array.shape}"
+
+
+def _array(name: str, given: Any, mistakes: list[Mistake]) -> Array:
+    try:
+        array = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        mistakes.append(Mistake(name, shown(type(given).__name__), "an array of numbers"))
+        return np.zeros(1)
+    if name == "times" and (array.ndim != 1 or not len(array)):
+        mistakes.append(Mistake(name, _shape(array), "times (T,), at least one"))
+        return np.zeros(1)
+    return array
+
+
+def _wrong_values(time: Array, values: Array) -> Iterator[Mistake]:
+    for name, array in (("times", time), ("joints", values)):
+        for place in np.argwhere(~(np.abs(array) <= GREATEST_LENGTH))[:1]:
+            index = ", ".join(map(str, place.tolist()))
+            yield Mistake(f"{name}[{index}]", shown(float(array[tuple(place)])), _NUMBER)
+    steps = zip(time.tolist(), [-math.inf, *time[:-1].tolist()], strict=True)
+    found = (time_mistake(f"times[{k}]", at, before) for k, (at, before) in enumerate(steps))
+    yield from [mistake for mistake in found if mistake][:1]

@@ -1,0 +1,31 @@
+"""``vgtm certify``: a proof for anybody's trajectory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from vgtm_qp.cli.output import ExitCode, Json, ProblemName, answer
+
+
+def certify(
+    problem: ProblemName,
+    trajectory: Annotated[Path, Parameter(name="TRAJECTORY", help="CSV file: t and the names of the joints")],
+    /,
+    *,
+    json: Json = False,
+) -> int:
+    """Prove or refute a trajectory for a problem's arm and obstacles, over the whole time and not at its rows alone.
+
+    Joints move linearly between the rows. Proven are limits, rates, accelerations and clearances: exit code 0; 4 if
+    one is violated or cannot be decided.
+    """
+    from vgtm_qp.certify.certify import Certifier
+    from vgtm_qp.problem import load_problem
+
+    verdict = Certifier(load_problem(problem)).certify_file(trajectory)
+    found = {"trajectory": str(trajectory), **verdict.to_dict()}
+    answer(found, f"{trajectory}: {verdict}", as_json=json)
+    return ExitCode.SOLVED if verdict.certified else ExitCode.UNVERIFIED
