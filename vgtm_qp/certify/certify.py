@@ -99,7 +99,7 @@ class Certifier:
         )
 
     def _motion(self, instants: Array, values: Array) -> tuple[GivenMotion, list[Finding]]:
-        """Return the motion through the rows and what is not known of it; a row where the base's motion has a corner."""
+        """Return the motion through the rows, and those where the base changes its, and what is not known of it."""
         from vgtm_qp.certify.motion import JointMotion
 
         table = self._table.get("truss") or self._table.get("arm") or {}
