@@ -75,30 +75,30 @@ class Certifier:
         return self._prove(read_trajectory(file, self.columns))
 
     def _prove(self, trajectory: Trajectory) -> Verdict:
-        from vgtm_qp.certify.decide import Decision, decide
+        from vgtm_qp.certify.decide import decide
         from vgtm_qp.certify.limits import beyond_limits
 
         began = time.perf_counter()
         values = trajectory.filled(self.arm.home_quantities)
         wrong = list(beyond_limits(self.arm, self._table, trajectory.time, values))
         motion, doubt = self._motion(trajectory.time, values)
-        kept = self._kept(motion)
-        decided = decide(motion, kept)
-        angles = Decision()
-        for decision in (*decided.values(), angles):
+        decided = {} if motion is None else decide(motion, self._kept(motion))
+        for decision in decided.values():
             wrong += decision.violations
             doubt += decision.undecided
-        bounds = {kind: decision.bound for kind, decision in decided.items()}
+        # What is not known of the motion may be anywhere.
+        least = -np.inf if any(finding.kind == "motion" for finding in doubt) else np.inf
+        bounds = {kind: min(decision.bound, least) for kind, decision in decided.items()}
         return Verdict(
-            clearance=bounds.get("clearance", np.inf),
-            self_clearance=bounds.get("self-clearance", np.inf),
+            clearance=bounds.get("clearance", least),
+            self_clearance=bounds.get("self-clearance", least),
             violations=tuple(sorted(wrong, key=_order)),
             undecided=tuple(sorted(doubt, key=_order)),
             time=time.perf_counter() - began,
             notes=tuple(self._notes),
         )
 
-    def _motion(self, instants: Array, values: Array) -> tuple[GivenMotion, list[Finding]]:
+    def _motion(self, instants: Array, values: Array) -> tuple[GivenMotion | None, list[Finding]]:
         """Return the motion through the rows, and those where the base changes its, and what is not known of it."""
         from vgtm_qp.certify.motion import JointMotion
 
