@@ -75,17 +75,23 @@ class Certifier:
         return self._prove(read_trajectory(file, self.columns))
 
     def _prove(self, trajectory: Trajectory) -> Verdict:
+        from vgtm_qp.certify.angles import keep_angles
         from vgtm_qp.certify.decide import decide
         from vgtm_qp.certify.limits import beyond_limits
+        from vgtm_qp.certify.truss_motion import TrussMotion
 
         began = time.perf_counter()
         values = trajectory.filled(self.arm.home_quantities)
         wrong = list(beyond_limits(self.arm, self._table, trajectory.time, values))
         motion, doubt = self._motion(trajectory.time, values)
         decided = {} if motion is None else decide(motion, self._kept(motion))
+        if motion is not None and self._rules.minimum_angle > 0.0:
+            decided["angle"] = keep_angles(motion, self._rules.minimum_angle)
         for decision in decided.values():
             wrong += decision.violations
             doubt += decision.undecided
+        if isinstance(motion, TrussMotion):
+            doubt += motion.doubts()
         # What is not known of the motion may be anywhere.
         least = -np.inf if any(finding.kind == "motion" for finding in doubt) else np.inf
         bounds = {kind: min(decision.bound, least) for kind, decision in decided.items()}

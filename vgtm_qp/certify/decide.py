@@ -227,25 +227,36 @@ class Bisection:
     def _tell(self, decision: Decision) -> None:
         """Note what came out; what is found of the same bodies in successive segments is one finding."""
         decision.bound = min(self.rest, float(self.proven.min(initial=np.inf)))
-        floor, kind, time = self.kept[0].floor, self.kept[0].kind, self.motion.time
+        floor, kind = self.kept[0].floor, self.kept[0].kind
         broken = np.flatnonzero(self.found < self.least)
         for names, run in self._runs(broken):
             worst = run[int(np.argmin(self.found[run]))]
             start, end = float(self.since[run].min()), float(self.until[run].max())
             value, at = float(self.found[worst]), float(self.at[worst])
             decision.violations.append(Finding(start, end, kind, names, value, floor, at))
+        decision.violations += self._enclosed(decision)
         if not self.left:
             return
-        pair, start, width, proven = (np.concatenate(parts) for parts in zip(*self.left, strict=True))
-        doubt = self.found[pair] >= self.least
-        pair, start, width, proven = pair[doubt], start[doubt], width[doubt], proven[doubt]
-        for names, run in self._runs(np.unique(pair)):
+        pair, begin, width, proven = (np.concatenate(parts) for parts in zip(*self.left, strict=True))
+        for names, run in self._runs(np.unique(pair[self.found[pair] >= self.least])):
             own = np.isin(pair, run)
-            segment, low, high = self.segment[pair[own]], start[own], start[own] + width[own]
-            begin = float(((1.0 - low) * time[segment] + low * time[segment + 1]).min())
-            end = float(((1.0 - high) * time[segment] + high * time[segment + 1]).max())
-            value = float(proven[own].min())
-            decision.undecided.append(Finding(begin, end, kind, names, value, floor))
+            segment = self.segment[pair[own]]
+            low, high = (self.motion.times_at(segment, x[own]) for x in (begin, begin + width))
+            found = float(low.min()), float(high.max()), kind, names, float(proven[own].min()), floor
+            decision.undecided.append(Finding(*found))
+
+    def _enclosed(self, decision: Decision) -> Iterator[Finding]:
+        """Yield the bodies that are within a surface, from the first to the last state at which they are."""
+        floor, kind, time = self.kept[0].floor, self.kept[0].kind, self.motion.time
+        for own in self.kept:
+            states: dict[tuple[int, int], list[int]] = {}
+            for state, pair in own.enclosed():
+                states.setdefault(pair, []).append(state)
+            for (first, second), found in states.items():
+                depth = -float(own.depth((np.array([first]), np.array([second])))[0])
+                decision.bound = min(decision.bound, depth)
+                start, end = float(time[found[0]]), float(time[found[-1]])
+                yield Finding(start, end, kind, own.names((first, second)), depth, floor, start)
 
     def _runs(self, pair: Index) -> Iterator[tuple[tuple[str, str], Index]]:
         """Yield the names of pairs, and those of them (R,) that are in one segment or in successive ones."""

@@ -62,7 +62,7 @@ def _crossing(time: Array, excess: Array, row: int, step: int) -> float:
 def _moved(arm: Arm, locks: list[tuple[int, float]], time: Array, values: Array) -> Iterator[Finding]:
     """Yield what is locked and moves, or is not at home where it is locked from the start."""
     # What is not actuated is locked from the start.
-    kept = [(k, -np.inf, float(arm.home_quantities[k])) for k in np.flatnonzero(~arm.actuated)]
+    kept = [(k, -np.inf, float(arm.home_quantities[k])) for k in np.flatnonzero(~arm.actuated).tolist()]
     kept += [(k, t, float(np.interp(t, time, values[:, k]))) for k, t in locks if arm.actuated[k]]
     for k, since, value in kept:
         moved = np.abs(values[:, k] - value) * (time >= since - INSTANT)

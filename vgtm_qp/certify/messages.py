@@ -49,7 +49,7 @@ def read_bag(file: Path) -> tuple[list[str], Points]:
         raise ProblemError.at(file, "file", several, "one JointTrajectory message")
     if found[_TRAJECTORY]:
         topic, message = found[_TRAJECTORY][0]
-        points = [
+        points: Points = [
             (f"{topic}, point {k}", _seconds(point.time_from_start), list(point.positions))
             for k, point in enumerate(message.points)
         ]
@@ -109,13 +109,14 @@ def read_message(file: Path) -> tuple[list[str], Points]:
     for k, point in enumerate(entries):
         place = f"points[{k}]"
         start = point.get("time_from_start") if isinstance(point, Mapping) else None
-        parts = [start.get(key, 0) if isinstance(start, Mapping) else None for key in ("sec", "nanosec")]
-        positions = _entry(file, point, "positions", place)
-        if not all(type(part) is int for part in parts):
+        stamp = start if isinstance(start, Mapping) else {"sec": None}
+        whole, rest = stamp.get("sec", 0), stamp.get("nanosec", 0)
+        if type(whole) is not int or type(rest) is not int:
             raise ProblemError.at(
                 file, f"{place}, time_from_start", shown(start), "sec and nanosec, integers"
             )
-        points.append((place, parts[0] + 1e-9 * parts[1], positions))
+        positions = _entry(file, point, "positions", place)
+        points.append((place, float(whole) + 1e-9 * float(rest), positions))
     return list(names), points
 
 

@@ -24,6 +24,13 @@ class Near(NamedTuple):
     pair: Pairs
     gap: Array
 
+    @classmethod
+    def joined(cls, parts: Sequence[Near]) -> Near:
+        """Return the pairs of all parts."""
+        segment = np.concatenate([part.segment for part in parts])
+        first, second = (np.concatenate([part.pair[k] for part in parts]) for k in (0, 1))
+        return cls(segment, (first, second), np.concatenate([part.gap for part in parts]))
+
 
 class Kept(ABC):
     """Pairs that keep at least `floor`, m, from surface to surface; `kind` is what a finding calls their clearance."""
@@ -70,6 +77,10 @@ class Kept(ABC):
     def names(self, pair: tuple[int, int]) -> tuple[str, str]:
         """Return the names of the two bodies."""
 
+    def enclosed(self) -> Iterator[tuple[int, tuple[int, int]]]:
+        """Yield each state and pair whose first body is within a surface that it may be far from."""
+        yield from ()
+
     def near(self, limit: float) -> tuple[Near, float]:
         """Return the pairs that may come nearer than `limit`, m, and a bound of the distances of all the others."""
         found, rest = [], np.inf
@@ -78,10 +89,7 @@ class Kept(ABC):
             rest = min(rest, float(gaps[~near].min(initial=np.inf)))
             row, column = np.nonzero(near)
             found.append(self._near(row + first, column, gaps[row, column], limit))
-        segment, first, second, gap = (
-            np.concatenate(parts) for parts in zip(*((f.segment, *f.pair, f.gap) for f in found), strict=True)
-        )
-        return Near(segment, (first, second), gap), min(rest, limit) if self._divides else rest
+        return Near.joined(found), min(rest, limit) if self._divides else rest
 
     def nearest(self) -> Near:
         """Return one pair whose bound is the least of all, or no pair where there is none."""
@@ -163,10 +171,7 @@ class KeptBodies(Kept):
                 near, piece = np.nonzero(gaps < limit)
                 pair = member[row[near]], own[piece]
                 found.append(Near(segment[row[near]], pair, gaps[near, piece]))
-        segments, first, second, gap = (
-            np.concatenate(parts) for parts in zip(*((f.segment, *f.pair, f.gap) for f in found), strict=True)
-        )
-        return Near(segments, (first, second), gap)
+        return Near.joined(found)
 
     def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
         """See ``Kept``: the ends of the body in the piece's own frame, twice."""
@@ -195,6 +200,15 @@ class KeptBodies(Kept):
     def names(self, pair: tuple[int, int]) -> tuple[str, str]:
         """Return the names of the body and of the obstacle."""
         return self.motion.arm.member_names[pair[0]], self.bodies[self._owner[pair[1]]].name
+
+    def enclosed(self) -> Iterator[tuple[int, tuple[int, int]]]:
+        """See ``Kept``: inside a closed mesh."""
+        for body, first in zip(self.bodies, self._first.tolist(), strict=False):
+            if body.shape.closed:
+                ends = self.motion.ends - body.at(self.motion.time)[:, None, None]
+                inside = body.encloses(ends.reshape(-1, 3)).reshape(ends.shape[:3]).any(axis=2)
+                for state, member in np.argwhere(inside).tolist():
+                    yield state, (member, first)
 
 
 class KeptMembers(Kept):

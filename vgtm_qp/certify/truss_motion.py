@@ -1,14 +1,14 @@
 """The motion of a truss whose actuators change their lengths linearly, followed from home on with a proof.
 
-The nodes x solve l(x) = L(s). From a known state, with the inverse A of the length Jacobian there, their velocities obey
+The nodes x solve l(x) = L(s). From a known state, with the inverse A of the length Jacobian there, they move with
 x' = A (L' - e), where e holds for each member the change of its direction times the relative velocity w of its ends.
-If bounds of |w| reproduce themselves, the motion exists, is the only one near that state, and keeps to them; and
-l x'' = -(|w|^2 - l'^2) along each member then bounds how far nodes leave their chords.
+If bounds of |w| reproduce themselves, the motion exists, is the only one near that state, and keeps to them. Each
+length's l'' = 0 then bounds x'', and so how far nodes leave their chords.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,7 +52,7 @@ class TrussSolver:
         return found[:, :, :-1].reshape(len(nodes), len(index), -1)
 
     def solve(self, nodes: Array, lengths: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return nodes (U, N, 3) of given lengths (U, M) by Newton steps from `nodes`, and where these came to an end."""
+        """Return nodes (U, N, 3) of lengths (U, M), m, by Newton steps from `nodes`, and which of them were found."""
         nodes, free = nodes.copy(), self.arm.free
         tolerance = 64.0 * float(np.finfo(float).eps) * self.size
         open_ = np.arange(len(nodes))
@@ -111,7 +111,7 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     """Return what is proven from states (U, N, 3) of lengths `start` (U, M) that change by `change` (U, M), m."""
     arm, count = solver.arm, len(nodes)
     inverse = solver.inverse(nodes)
-    singular = ~np.isfinite(inverse).all(axis=(1, 2, 3))
+    singular = np.array([not np.isfinite(each).all() for each in inverse], dtype=np.bool_)
     every = np.zeros((count, len(arm.home), 3, len(arm.members)))
     every[:, arm.free] = np.where(singular[:, None, None, None], 0.0, inverse)
     relative = every[:, arm.members[:, 1]] - every[:, arm.members[:, 0]]
@@ -177,7 +177,6 @@ class TrussMotion(GivenMotion):
         self._bends, first, last = bends, *solver.arm.members.T
         self.bends = np.maximum(bends[:, first], bends[:, last])
         self.lost: set[int] = set()
-        """Segments in which positions were not found where they are proven to be."""
 
     def ends_at(self, segment: Index, share: Array) -> Array:
         """Return the ends of the members; the nodes are found from their lengths, next to the chords of their ways."""
@@ -189,6 +188,12 @@ class TrussMotion(GivenMotion):
         away = np.linalg.norm(nodes - chord, axis=2) - self._bends[segment] / 8.0
         self.lost |= set(segment[~solved | (away > 1e-9 * self._solver.size).any(axis=1)].tolist())
         return self.arm.states_ends(self._placed(nodes, self.times_at(segment, share[:, 0])))
+
+    def doubts(self) -> Iterator[Finding]:
+        """Yield the segments in which positions were not found where they are proven to be."""
+        for k in sorted(self.lost):
+            reason = "its nodes were not found to the last digits"
+            yield _doubt(float(self.time[k]), float(self.time[k + 1]), reason)
 
     def _placed(self, nodes: Array, time: Array) -> Array:
         """Return nodes (U, N, 3) with the base where it is at times (U,)."""
@@ -202,28 +207,27 @@ def truss_motion(
 ) -> tuple[TrussMotion | None, list[Finding]]:
     """Return the motion of a truss through rows of lengths (T, M) at times (T,), s, and what is not known of it.
 
-    It goes on from home in a straight line of lengths to the first row. It ends where it can no longer be followed; it is
-    None where that is before the first row.
+    It goes on from home in a straight line of lengths to the first row. It ends where it can no longer be followed, and
+    is None where that is before the first row.
     """
-
-    def doubt(since: float, reason: str) -> list[Finding]:
-        return [Finding(since, float(time[-1]), "motion", ("truss",), np.nan, np.nan, reason=reason)]
-
+    start, end = float(time[0]), float(time[-1])
     if not arm.has_pin_joints:
-        return None, doubt(float(time[0]), "where offset joints are between rows is not bounded")
-    solver = TrussSolver(arm)
-    rows = _rows(solver, np.concatenate([arm.length[None], lengths]))
-    followed = _Followed(solver, rows, np.concatenate([arm.length[None], lengths]), time)
+        return None, [_doubt(start, end, "where offset joints are between rows is not bounded")]
+    solver, lengths = TrussSolver(arm), np.concatenate([arm.length[None], lengths])
+    followed = _Followed(solver, _rows(solver, lengths), lengths, time)
     known = followed.follow()
     if known == 0:
-        return None, doubt(
-            float(time[0]), "its first row cannot be reached from home in a straight line of lengths"
-        )
+        reason = "its first row was not reached from home in a straight line of lengths"
+        return None, [_doubt(start, end, reason)]
     doubts = []
     if known < len(time):
         reason = "it comes too near to a singular pose to be followed from here on"
-        doubts = doubt(float(time[known - 1]), reason)
+        doubts = [_doubt(float(time[known - 1]), end, reason)]
     return followed.motion(known, problem), doubts
+
+
+def _doubt(start: float, end: float, reason: str) -> Finding:
+    return Finding(start, end, "motion", ("truss",), np.nan, np.nan, reason=reason)
 
 
 def _rows(solver: TrussSolver, lengths: Array) -> Array:
@@ -287,7 +291,7 @@ class _Followed:
         members = self.solver.arm.members
         moved = last - first
         apart = np.linalg.norm(moved[:, members[:, 1]] - moved[:, members[:, 0]], axis=2)
-        closed = found.closed & (apart <= found.apart).all(axis=1)
+        closed = np.asarray(found.closed & (apart <= found.apart).all(axis=1))
         self.parts.append(
             (
                 segment[closed],

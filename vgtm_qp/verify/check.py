@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.result import Result
@@ -255,12 +255,7 @@ def _jams_between_rows(maneuver: Result) -> list[str]:
 
 def _member_angle(motion: RecordedMotion) -> Least:
     """Return the least angle at any state between two members that share a node, rad."""
-    members = motion.arm.members
-    node = members.reshape(-1)
-    order = np.argsort(node, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(node[order])) + 1)
-    corners = [np.stack(np.triu_indices(len(group), 1), axis=1) for group in groups]
-    pairs = np.concatenate([group[pair] for group, pair in zip(groups, corners, strict=True)])
+    pairs = joined_ends(motion.arm.members)
     least = Least()
     for state, ends in enumerate(motion.ends):
         along = ends[:, 1] - ends[:, 0]
@@ -270,6 +265,15 @@ def _member_angle(motion: RecordedMotion) -> Least:
             names = " / ".join(motion.arm.member_names[k // 2] for k in pairs[int(np.argmin(between))])
             least = Least(float(between.min()), f"state {state}: {names}")
     return least
+
+
+def joined_ends(members: Index) -> Index:
+    """Return (P, 2) each two ends of members (M, 2) that are in one node: end e of member m is 2 m + e."""
+    node = members.reshape(-1)
+    order = np.argsort(node, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(node[order])) + 1)
+    corners = [np.stack(np.triu_indices(len(group), 1), axis=1) for group in groups]
+    return np.concatenate([group[pair] for group, pair in zip(groups, corners, strict=True)])
 
 
 def _singular_values(arm: Arm, nodes: Array) -> Array:

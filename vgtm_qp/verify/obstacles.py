@@ -139,8 +139,8 @@ def read_obstacles(
 ) -> tuple[list[Body], list[str], list[str]]:
     """Return the obstacles of `problem`, as JSON data, what contradicts the problem, and what could not be checked.
 
-    The result recorded SHA-256 and triangle count of mesh files in `meshes`, by obstacle; None without a result. Relative
-    paths of those files start in `directory`.
+    The result recorded SHA-256 and triangle count of mesh files in `meshes`, by obstacle; None without a result. Paths
+    of those files start in `directory`.
     """
     bodies: list[Body] = []
     contradictions: list[str] = []
