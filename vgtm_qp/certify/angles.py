@@ -31,10 +31,10 @@ def keep_angles(motion: GivenMotion, least: float) -> Decision:
         first, last = (_leaving(motion, segment, pairs[corner], start + share) for share in (0.0, width))
         found = [angles(edge[:, 0], edge[:, 1]) for edge in (first, last)]
         for share, values in zip((0.0, width), found, strict=True):
-            low = np.flatnonzero(values < floor)
-            times = motion.times_at(segment[low], start[low] + share)
+            near = np.flatnonzero(values < floor)
+            times = motion.times_at(segment[near], start[near] + share)
             for k, value, time in zip(
-                corner[low].tolist(), values[low].tolist(), times.tolist(), strict=True
+                corner[near].tolist(), values[near].tolist(), times.tolist(), strict=True
             ):
                 before = worst.get(k, (time, time, np.inf, time))
                 at = time if value < before[2] else before[3]

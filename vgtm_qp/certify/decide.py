@@ -25,6 +25,8 @@ _GREATEST_COUNT = 200_000
 _NEAR_ENOUGH = 1e-3
 _REPORT_DEPTH = 10
 """How near a bound is brought to the least clearance, over the mean link, and with how many halvings at most."""
+_INSTANTS = 17
+"""Instants of a segment at which a pair that is too near there is looked at."""
 _CHUNK = 500_000
 
 
@@ -144,6 +146,7 @@ class Bisection:
             start = np.stack([start, start + width], axis=1).reshape(-1)
             pair = np.repeat(pair, 2)
             proven = self._across(pair, first, last)
+        self._look_closer()
         self._tell(decision)
 
     def _open(self, pair: Index, proven: Array, depth: int) -> NDArray[np.bool_]:
@@ -223,6 +226,12 @@ class Bisection:
                 for own, rows in self._groups(pair)
             ]
         )
+
+    def _look_closer(self) -> None:
+        """Look at pairs that are too near at some more instants, for when they are and how near."""
+        broken = np.flatnonzero(self.found < self.least)[:_GREATEST_COUNT]
+        share = np.linspace(0.0, 1.0, _INSTANTS)
+        self._edge(np.repeat(broken, len(share)), np.tile(share, len(broken)))
 
     def _tell(self, decision: Decision) -> None:
         """Note what came out; what is found of the same bodies in successive segments is one finding."""
