@@ -1,0 +1,208 @@
+"""Trajectories of trusses: the motion is followed with a proof, and what is certified is so at every instant."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+import pytest
+from arms import arm_problem
+from numpy.typing import NDArray
+
+import vgtm_qp as vq
+from vgtm_qp.arm.build import make_arm
+from vgtm_qp.certify.truss_motion import TrussSolver, truss_motion, tube
+from vgtm_qp.verify.arm import RecordedArm
+
+Array = NDArray[np.float64]
+MODULES = ("octahedral", "double-octahedral", "hexapod", "longeron", "tetrahedral")
+
+
+def recorded(problem: vq.Problem) -> RecordedArm:
+    arm = make_arm(problem)
+    return RecordedArm(arm.record(), arm.bodies.joints)
+
+
+def two_bays(module: str = "octahedral", **more: Any) -> vq.Problem:
+    return arm_problem(
+        truss={"module": module, "actuated": [1, 2, 3] if module == "tetrahedral" else None}, **more
+    )
+
+
+def actuator_rows(rng: np.random.Generator, arm: RecordedArm, rows: int, step: float) -> Array:
+    """(T, M) lengths that start at home, whose actuators walk at random."""
+    walk = np.zeros((rows, len(arm.length)))
+    walk[1:, arm.actuated] = step * rng.normal(size=(rows - 1, int(arm.actuated.sum())))
+    return arm.length + np.cumsum(walk, axis=0)
+
+
+def followed(solver: TrussSolver, start: Array, lengths: Array, steps: int) -> Array:
+    """(steps + 1, N, 3) nodes as the lengths go in a straight line, by many small Newton steps."""
+    nodes, found = start, [start]
+    before = solver.arm.lengths(start)
+    for k in range(1, steps + 1):
+        nodes = solver.solve(nodes[None], (before + k / steps * (lengths - before))[None])[0][0]
+        found.append(nodes)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_tube_holds_the_motion_and_its_bends(module: str, rng: np.random.Generator) -> None:
+    arm = recorded(two_bays(module))
+    solver = TrussSolver(arm)
+    closed = 0
+    for step in (0.002, 0.01, 0.04):
+        start, end = actuator_rows(rng, arm, 3, step)[1:]
+        first, solved = solver.solve(arm.home[None], start[None])
+        assert solved[0]
+        found = tube(solver, first, start[None], (end - start)[None])
+        if not found.closed[0]:
+            continue
+        closed += 1
+        ways = followed(solver, first[0], end, 100)
+        moved = ways - ways[0]
+        apart = np.linalg.norm(moved[:, arm.members[:, 1]] - moved[:, arm.members[:, 0]], axis=2)
+        assert (apart.max(axis=0) <= found.apart[0] + 1e-12).all()
+        speed = np.linalg.norm(np.diff(ways, axis=0), axis=2).max(axis=0) * 100
+        assert (speed <= found.speed[0] * (1.0 + 1e-6) + 1e-9).all()
+        bend = np.linalg.norm(np.diff(ways, n=2, axis=0), axis=2).max(axis=0) * 100**2
+        assert (bend <= found.bend[0] * (1.0 + 1e-6) + 1e-8).all()
+        # The bounds are of use: within a factor of the greatest that there is.
+        assert found.bend[0].max() <= 30.0 * bend.max() + 1e-6
+    assert closed
+
+
+def test_a_tube_does_not_close_at_a_singular_pose() -> None:
+    # Three members in a plane hold a node that can leave it.
+    nodes = [
+        {"name": name, "position": position, "fixed": name != "top"}
+        for name, position in {"a": [1, 0, 0], "b": [-1, 1, 0], "c": [-1, -1, 0], "top": [0, 0, 0.02]}.items()
+    ]
+    members = [
+        {"name": f"{name}-top", "nodes": [name, "top"], "actuated": True, "stroke": [0.5, 3.0]}
+        for name in "abc"
+    ]
+    truss = {"module": "graph", "node": nodes, "member": members, "tip": ["top"], "member_radius": 0.01}
+    problem = vq.Problem.from_dict(
+        {
+            "truss": truss,
+            "maneuver": {"waypoint": [{"time": 1.0, "position": [0.0, 0.0, 0.1]}]},
+            "method": {"tracking": "none"},
+            "clearance": {"safe": 0.01, "influence": 0.1, "self_collision": False},
+        }
+    )
+    arm = recorded(problem)
+    shorter = arm.length - 0.001
+    (finding,) = vq.certify(problem, [0.0, 1.0], [arm.length, shorter]).undecided
+    assert finding.kind == "motion"
+    assert (finding.start, finding.end) == (0.0, 1.0)
+    assert "singular" in finding.reason
+    assert vq.certify(problem, [0.0, 1.0], [arm.length, arm.length + 0.05]).certified
+    # Where it cannot be reached from home, nothing is said of it.
+    far = vq.certify(problem, [0.0], [shorter])
+    assert far.answer == "undecided"
+    assert far.clearance == -np.inf
+    assert far.to_dict()["clearance"] is None
+    assert "home" in far.undecided[0].reason
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_what_sampling_finds_is_above_what_is_proven(module: str, rng: np.random.Generator) -> None:
+    answers = set()
+    for size in (0.1, 0.2, 0.3):
+        problem = two_bays(module)
+        arm = recorded(problem)
+        rows = actuator_rows(rng, arm, 4, 0.02)
+        solver = TrussSolver(arm)
+        tops = followed(solver, arm.home, rows[-1], 20)[-1]
+        middle = 0.5 * (tops[arm.tip].mean(axis=0) + arm.home[arm.tip].mean(axis=0))
+        away = np.append(rng.normal(size=2), 0.3)
+        center = middle + 0.7 * away / np.linalg.norm(away)
+        ball = {"name": "ball", "shape": "sphere", "center": center.tolist(), "radius": size}
+        scene = problem.replace(
+            {"obstacle": [ball], "clearance.safe": 0.02, "clearance.self_collision": False}
+        )
+        times = np.arange(4.0)
+        certifier = importlib.import_module("vgtm_qp.certify.certify").Certifier(scene)
+        verdict = certifier.certify(times, rows[:, certifier.columns.quantities])
+        ways, nodes = [], arm.home
+        for row in rows[1:]:
+            ways.append(followed(solver, nodes, row, 300))
+            nodes = ways[-1][-1]
+        ends = arm.ends(np.concatenate(ways))
+        along = np.linspace(0, 1, 41)[:, None]
+        points = ends[:, :, None, 0] + along * (ends[:, :, None, 1] - ends[:, :, None, 0])
+        apart = np.maximum(np.linalg.norm(points - center, axis=-1).min(axis=(0, 2)) - size, 0.0) - arm.radius
+        assert verdict.clearance <= apart.min() + 1e-9
+        clear = [found for found in (*verdict.violations, *verdict.undecided) if found.kind == "clearance"]
+        assert clear or apart.min() >= 0.02 - 1e-9
+        answers.add(verdict.answer)
+    assert answers <= {"certified", "violated"}
+
+
+def test_what_our_own_solver_made_is_certified() -> None:
+    problem = two_bays(steps=6)
+    maneuver = vq.solve(problem)
+    lengths = maneuver.member_lengths[:, maneuver.member_actuated]
+    verdict = vq.certify(problem, maneuver.time, lengths)
+    assert verdict.certified, str(verdict)
+    # Chords of long steps are not the arcs that the nodes take.
+    assert verdict.self_clearance == pytest.approx(
+        maneuver.certificate.self_clearance_between.value, abs=5e-3
+    )
+    named = dict(zip(maneuver.actuator_names, lengths.T, strict=True))
+    assert vq.certify(problem, maneuver.time, named).self_clearance == verdict.self_clearance
+    too_long = lengths.copy()
+    too_long[-1, 0] = 1.6
+    found = vq.certify(problem, maneuver.time, too_long)
+    assert "limit" in {finding.kind for finding in found.violations}
+
+
+def test_a_truss_is_certified_on_a_base_that_moves() -> None:
+    problem = vq.load_problem("moving_base").replace({"maneuver.steps": 10})
+    maneuver = vq.solve(problem)
+    lengths = maneuver.member_lengths[:, maneuver.member_actuated]
+    verdict = vq.certify(problem, maneuver.time, lengths)
+    assert verdict.clearance <= maneuver.clearance.min() + 1e-9
+    assert not verdict.undecided
+    still = problem.replace({"truss.base_motion": []})
+    # On a base that stays the same lengths lead elsewhere.
+    assert vq.certify(still, maneuver.time, lengths).clearance != pytest.approx(verdict.clearance, abs=1e-3)
+
+
+def test_what_is_locked_keeps_its_length() -> None:
+    problem = two_bays(steps=3)
+    arm = recorded(problem)
+    actuated = np.flatnonzero(arm.actuated)
+    name = arm.member_names[int(actuated[0])]
+    stuck = problem.replace({"truss.locked": [name]})
+    home = arm.length[actuated]
+    rest = {arm.member_names[k]: [arm.length[k], arm.length[k] + 0.01] for k in actuated[1:].tolist()}
+    assert vq.certify(stuck, [0.0, 1.0], rest).certified
+    (finding,) = vq.certify(stuck, [0.0, 1.0], rest | {name: [home[0], home[0] + 0.01]}).violations
+    assert (finding.kind, finding.names) == ("lock", (name,))
+
+
+def test_offset_joints_leave_it_undecided_but_limits_are_still_checked() -> None:
+    problem = two_bays().replace({"truss.joint_offset": 0.05})
+    arm = recorded(problem)
+    home = arm.length[arm.actuated]
+    verdict = vq.certify(problem, [0.0, 1.0], [home, home + 0.001])
+    assert verdict.answer == "undecided"
+    assert verdict.clearance == -np.inf
+    assert "offset joints" in verdict.undecided[0].reason
+    assert vq.certify(problem, [0.0, 1.0], [home, home + 5.0]).answer == "violated"
+
+
+def test_a_motion_that_cannot_be_followed_to_its_end_is_certified_to_where_it_can(monkeypatch: Any) -> None:
+    module = importlib.import_module("vgtm_qp.certify.truss_motion")
+    monkeypatch.setattr(module, "_GREATEST_DEPTH", 1)
+    problem = two_bays()
+    arm = recorded(problem)
+    lengths = np.tile(arm.length, (3, 1))
+    lengths[2, arm.actuated] += np.linspace(0.0, 0.4, int(arm.actuated.sum()))
+    motion, doubts = truss_motion(arm, np.array([0.0, 1.0, 2.0]), lengths, problem.to_dict())
+    assert motion is not None
+    assert motion.time[-1] == 1.0
+    assert [(doubt.start, doubt.end) for doubt in doubts] == [(1.0, 2.0)]
