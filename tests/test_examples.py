@@ -16,11 +16,12 @@ SAYS = {
     "control_loop": ("75 cycles at 25 Hz", "the tip is 0.000 mm from its goal"),
     "compare_methods": ("curve-pseudoinverse", "pseudoinverse", "qp"),
     "jammed_actuator": ("it moved by 0.000000000 m", "verified: True"),
+    "certify_a_spline": ("at the waypoints: certified", "between them: violated", "with a bent elbow: certified"),
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
 }
 
 
-def test_there_are_six_and_each_is_tried():
+def test_there_are_seven_and_each_is_tried():
     assert {example.stem for example in EXAMPLES} == set(SAYS)
 
 

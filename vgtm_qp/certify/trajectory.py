@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import Mistake, ProblemError, nearest
-from vgtm_qp.problem.fields import GREATEST_LENGTH
+from vgtm_qp.problem.fields import GREATEST_LENGTH, quoted
 from vgtm_qp.problem.path_file import GREATEST_MISTAKES, read_numbers, read_rows, time_mistake
 from vgtm_qp.problem.table import shown
 from vgtm_qp.result.chain import RecordedChain
@@ -66,6 +67,12 @@ class Columns:
             index,
             np.asarray(arm.actuated[index]),
         )
+
+    @cached_property
+    def keys(self) -> tuple[str, ...]:
+        """What the columns of a table are called: their names, but for a joint that is called as the time is."""
+        named = zip(self.names, self.units, strict=True)
+        return tuple(f"{name} [{unit}]" if name == "t" else name for name, unit in named)
 
     def needed_names(self) -> tuple[str, ...]:
         """Return the names that a trajectory has to have."""
@@ -133,11 +140,9 @@ def _read_csv(file: str | Path, columns: Columns) -> Trajectory:
         mistakes.append(Mistake("line 2", "nothing", "at least one row of numbers below the header"))
     if mistakes:
         raise ProblemError(str(file), sorted(mistakes, key=_line)[:GREATEST_MISTAKES])
-    given = [k for k, name in enumerate(columns.names) if name in header]
-    values = np.array([[row[columns.names[k]] for k in given] for row in found]).reshape(
-        len(found), len(given)
-    )
-    return Trajectory(np.array([row["t"] for row in found]), values, columns.quantities[given])
+    given = [k for k, key in enumerate(columns.keys) if key in header]
+    values = [[row[columns.keys[k]] for k in given] for row in found]
+    return Trajectory(np.array([row["t"] for row in found]), np.array(values).reshape(len(found), -1), columns.quantities[given])
 
 
 def _line(mistake: Mistake) -> int:
@@ -145,37 +150,44 @@ def _line(mistake: Mistake) -> int:
 
 
 def _header(cells: Sequence[str], columns: Columns, mistakes: list[Mistake]) -> list[str]:
-    """Return the name of each column; `mistakes` has those that are wrong."""
+    """Return the key of each column, "t" or one of `columns.keys`; `mistakes` has those that are wrong."""
     expected = f"t and the names {columns.expected()}"
-    if not cells:
-        mistakes.append(Mistake("line 1", "nothing", f"a header with {expected}"))
-        return []
+    spellings = {"t": "t", "time [s]": "t"}
+    for name, unit, key in zip(columns.names, columns.units, columns.keys, strict=True):
+        spellings |= {key: key, f"{name} [{unit}]": key}
     if len(cells) == 1 and re.search(r"[;\t|]", cells[0]):
         mistakes.append(Mistake("line 1", shown(cells[0]), "names with commas between them"))
         return []
-    names = {"t": "t", "time [s]": "t"} | {
-        spelling: name
-        for name, unit in zip(columns.names, columns.units, strict=True)
-        for spelling in ((name, f"{name} [{unit}]") if name != "t" else (f"{name} [{unit}]",))
-    }
-    header: list[str] = []
-    for number, cell in enumerate(cells, start=1):
-        name = names.get(cell, cell)
+    header = [spellings.get(cell, cell) for cell in cells]
+    unknown = [cell for cell in cells if cell not in spellings and not _RATE.fullmatch(cell)]
+    if len(unknown) == len(cells) and not any(_meant(cell, spellings) for cell in cells):
+        mistakes.append(Mistake("line 1", shown(",".join(cells) or None), f"a header with {expected}"))
+        return []
+    for number, (cell, key) in enumerate(zip(cells, header, strict=True), start=1):
         place = f"line 1, column {number}"
-        if cell not in names and not _RATE.fullmatch(cell):
+        if "\n" in cell:
+            mistakes.append(Mistake(place, shown(cell), "a name on one line; its quotation mark stays open"))
+        elif cell in unknown:
             mistakes.append(
-                Mistake(place, shown(cell or None), expected + nearest(cell, ("t", *columns.names)))
+                Mistake(place, shown(cell or None), expected + _meant(cell, ("t", *columns.names)))
             )
-        elif name in header:
-            mistakes.append(Mistake(place, shown(cell), f'each column once; "{name}" stands before it'))
-        header.append(name)
-    absent = [name for name in ("t", *columns.needed_names()) if name not in header]
-    # A name that is misspelt is told as such, not as missing too.
-    unknown = [cell for cell in cells if cell not in names]
-    for name in absent:
-        if not nearest(name, unknown):
-            mistakes.append(Mistake("line 1", f'no column "{name}"', f"a column for each of {expected}"))
+        elif key in header[: number - 1]:
+            mistakes.append(Mistake(place, shown(cell), f'each column once; "{key}" stands before it'))
+    needed = ("t", *(key for key, wanted in zip(columns.keys, columns.needed, strict=True) if wanted))
+    # What is misspelt is told as such, not as missing too.
+    absent = [
+        key for key in needed if key not in header and not any(_meant(cell, (key,)) for cell in unknown)
+    ]
+    if absent and not any("\n" in cell for cell in cells):
+        mistakes.append(Mistake("line 1", f"no column {quoted(absent)}", f"a column for each of {expected}"))
     return header
+
+
+def _meant(cell: str, names: Iterable[str]) -> str:
+    """Return in words which of `names` a cell is meant for, whatever its case and its unit; empty if none."""
+    bare, names = re.sub(r" *\[.*\]$", "", cell), list(names)
+    same = [name for name in names if name.lower() == bare.lower()]
+    return f'; did you mean "{same[0]}"?' if same else nearest(bare, names)
 
 
 def _from_points(
@@ -221,10 +233,12 @@ def _wrong_names(names: Sequence[str], columns: Columns) -> Iterator[Mistake]:
             yield Mistake(f"joint_names[{k}]", shown(name), expected + nearest(name, columns.names))
         elif name in names[:k]:
             yield Mistake(f"joint_names[{k}]", shown(name), "each name once")
-    unknown = [name for name in names if name not in columns.names]
+    unknown, absent = [name for name in names if name not in columns.names], []
     for name in columns.needed_names():
         if name not in names and not nearest(name, unknown):
-            yield Mistake("joint_names", f'no "{name}"', f"each of {expected}")
+            absent.append(name)
+    if absent:
+        yield Mistake("joint_names", f"no {quoted(absent)}", f"each of {expected}")
 
 
 def given_trajectory(
