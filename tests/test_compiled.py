@@ -277,7 +277,8 @@ x = ca.SX.sym("x")
 kernel = Kernel(ca.Function("square", [x], [x * x]))
 time.sleep(300.0)
 """
-SOLVE = "from vgtm_qp.cli import main; raise SystemExit(main(['solve', 'five_bay_free']))"
+LONG = "from vgtm_qp.cli import main; raise SystemExit(main(['solve', 'five_bay_free', '--steps', '5000']))"
+"""A maneuver that is not over before its kernels are compiled."""
 
 
 def _hanging(folder: Path) -> Path:
@@ -321,13 +322,11 @@ def test_a_compiler_that_hangs_is_ended_with_its_children_and_not_asked_again(tm
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
-@pytest.mark.parametrize(
-    "command", [LOADED, "from vgtm_qp.cli import main; raise SystemExit(main(['solve', 'five_bay_free']))"]
-)
+@pytest.mark.parametrize("command", [LOADED, LONG])
 def test_an_interrupt_ends_a_compiler_that_hangs_with_its_children(tmp_path, command):
     environment = {**os.environ, "VGTM_CACHE": str(tmp_path / "cache"), "VGTM_CC": str(_hanging(tmp_path))}
     with subprocess.Popen(
-        [sys.executable, "-c", command], env=environment, cwd=Path.cwd(), stderr=subprocess.PIPE
+        [sys.executable, "-c", command], env=environment, cwd=tmp_path, stderr=subprocess.PIPE
     ) as process:
         _wait((tmp_path / "child").exists)
         child = int((tmp_path / "child").read_text())

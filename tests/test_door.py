@@ -497,12 +497,9 @@ def test_a_recorded_chain_bends_no_more_than_its_bound(rng):
             ways = before + np.linspace(0.0, 1.0, 201)[:, None] * (after - before)
             points = chain.placed(ways)[0]
             np.testing.assert_allclose(points[0], arm.nodes(before)[: points.shape[1]], atol=1e-12)
-            second = np.linalg.norm(np.diff(points, n=2, axis=0), axis=2) * 200.0**2
-            of_links = second.max(axis=0)[chain.links].max(axis=1)
-            bounds = chain.bend(before, after, np.arange(len(chain.links)))
-            assert (of_links <= bounds * (1.0 + 1e-6) + 1e-7).all()
-            # Of few joints the bound is that of few joints.
-            assert bounds[0] < 0.5 * bounds[-1]
+            second = np.linalg.norm(np.diff(points, n=2, axis=0), axis=2).max(axis=0) * 200.0**2
+            bound = chain.bend(before, after, np.arange(len(chain.links)))
+            assert (second[chain.links].max(axis=1) <= bound * (1.0 + 1e-6) + 1e-9).all()
 
 
 @pytest.mark.parametrize("form", ["png", "html", "csv", "mcap", "ros"])

@@ -31,13 +31,12 @@ def beyond_limits(arm: Arm, problem: Mapping[str, Any], time: Array, values: Arr
     for k, run in _runs(faster):
         worst = run[int(np.argmax(np.abs(rates[run, k])))]
         span, at = (time[run[0]], time[run[-1] + 1]), time[worst]
-        yield _finding(span, "rate", names[k], rates[worst, k], np.copysign(arm.rate[k], rates[worst, k]), at)
+        yield _finding(span, "rate", names[k], abs(rates[worst, k]), arm.rate[k], at)
     faster = free & (np.abs(accelerations) - its_rounding > arm.acceleration + LIMIT_TOLERANCE)
     for k, run in _runs(faster):
         worst = run[int(np.argmax(np.abs(accelerations[run, k])))]
-        span, found = (time[run[0]], time[run[-1] + 2]), accelerations[worst, k]
-        bound = np.copysign(arm.acceleration[k], found)
-        yield _finding(span, "acceleration", names[k], found, bound, time[worst + 1])
+        span, found = (time[run[0]], time[run[-1] + 2]), abs(accelerations[worst, k])
+        yield _finding(span, "acceleration", names[k], found, arm.acceleration[k], time[worst + 1])
     yield from _moved(arm, locks, time, values)
 
 
@@ -68,9 +67,9 @@ def _moved(arm: Arm, locks: list[tuple[int, float]], time: Array, values: Array)
         moved = np.abs(values[:, k] - value) * (time >= since - INSTANT)
         for _, run in _runs((moved > MEMBER_TOLERANCE)[:, None]):
             worst = run[int(np.argmax(moved[run]))]
-            begin = max(float(time[max(run[0] - 1, 0)]), since) if run[0] else float(time[0])
-            name = arm.quantity_names[k]
-            yield _finding((begin, time[run[-1]]), "lock", name, values[worst, k], value, time[worst])
+            span = _crossing(time, moved, run[0], -1), _crossing(time, moved, run[-1], 1)
+            span = max(span[0], min(since, span[1])), span[1]
+            yield _finding(span, "lock", arm.quantity_names[k], values[worst, k], value, time[worst])
 
 
 def _runs(wrong: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[np.int64]]]:

@@ -217,7 +217,8 @@ class KeptMembers(Kept):
     def __init__(self, motion: GivenMotion, floor: float) -> None:
         super().__init__(motion, "self-clearance", floor)
         self._against = AgainstMembers(motion)
-        self._pair = self._against.near(self._low[0], self._high[0], 0, 0, np.inf)
+        pairs = np.sort(self._against.near(self._low[0], self._high[0], 0, 0, np.inf), axis=0)
+        self._pair = pairs[0], pairs[1]
         self._columns = len(self._pair[0])
 
     def _gaps(self, segments: slice) -> Array:

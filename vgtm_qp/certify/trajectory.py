@@ -142,7 +142,11 @@ def _read_csv(file: str | Path, columns: Columns) -> Trajectory:
         raise ProblemError(str(file), sorted(mistakes, key=_line)[:GREATEST_MISTAKES])
     given = [k for k, key in enumerate(columns.keys) if key in header]
     values = [[row[columns.keys[k]] for k in given] for row in found]
-    return Trajectory(np.array([row["t"] for row in found]), np.array(values).reshape(len(found), -1), columns.quantities[given])
+    return Trajectory(
+        np.array([row["t"] for row in found]),
+        np.array(values).reshape(len(found), -1),
+        columns.quantities[given],
+    )
 
 
 def _line(mistake: Mistake) -> int:

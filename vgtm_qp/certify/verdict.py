@@ -119,11 +119,10 @@ class Verdict:
             for what, value in (("clearance", self.clearance), ("self-clearance", self.self_clearance))
             if math.isfinite(value)
         ]
+        head = "certified" if self.certified else f"NOT CERTIFIED, {self.answer}"
         lines = [f"violated, {finding}" for finding in self.violations]
         lines += [f"undecided, {finding}" for finding in self.undecided]
-        return "\n".join(
-            [", ".join([self.answer, *bounds]), *(f"  {line}" for line in (*lines, *self.notes))]
-        )
+        return "\n".join([", ".join([head, *bounds]), *(f"  {line}" for line in (*lines, *self.notes))])
 
 
 def _finite(value: float) -> float | None:

@@ -50,17 +50,20 @@ class DeadEnd:
 
 
 def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]]:
-    """Yield name and changed problem of each retry that applies; nothing if retries are off."""
+    """Yield name and changed problem of each retry that applies; nothing if retries are off.
+
+    If elastic tracking on demand was not enough, tracking is elastic from the start. All other retries are then those
+    of that problem, from where it stops: so no path is lost that elastic tracking finds. Hard tracking and a solver by
+    bays have no elastic tracking.
+    """
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
-    # If elastic tracking on demand was not enough, tracking is elastic from the start, in all later retries too.
-    # Hard tracking and a solver by bays have no elastic tracking.
-    elastic = {"method.tracking_mode": "elastic"} if problem.method.gives_way else {}
-    if elastic:
-        yield "elastic tracking", problem.replace(elastic)
+    if problem.method.gives_way:
+        yield "elastic tracking", problem.replace({"method.tracking_mode": "elastic"})
+        return
     for name, changes in _changes(problem, dead_end):
         with suppress(ProblemError):
-            yield name, problem.replace(elastic | changes)
+            yield name, problem.replace(changes)
 
 
 def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[str, Any]]]:

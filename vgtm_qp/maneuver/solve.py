@@ -271,6 +271,9 @@ def _retry(
             break
         attempt = _Attempt(other, resolver)
         found = attempt.run(progress)
+        if problem.method.gives_way and found is not None:
+            way, attempt, found = _retry(other, attempt, found, progress)
+            name = way or name
         if found is None:
             return name, attempt, None
         if attempt.progress > best[1].progress + _FURTHER:

@@ -202,29 +202,34 @@ class RecordedChain:
         return np.asarray(points[which[:, None], self.links[link]])
 
     def bend(self, before: Array, after: Array, link: Index) -> Array:
-        """Return (..., P) a bound, m, of |d2 r / d share2| of any point of links (P,) as configurations move straight.
+        """Return (..., P) bounds, m, of |d2 r / d share2| of points of links (P,) as the configuration moves straight.
 
-        The configurations are (..., J + 6). A point is the sum of vectors p, each of which turns with a frame. That has
-        a speed w, at most the sum of the speeds of the joints before it; as these turn one another's axes, |w'| is at
-        most the sum of the products of every two of them. A slide changes its vector at a constant speed v, along
-        itself. So |p''| <= (w^2 + |w'|) |p| + 2 w v. The base's rotation vector counts twice, as its axis turns too.
+        Configurations are (..., J + 6). A point is the sum of vectors p that are turned by the joints before them at
+        speeds w, one after the other. The product of these turns has a second derivative of at most the square of the
+        sum of w. A slide changes its vector at a constant speed v along itself. So |p''| <= (sum w)^2 |p| + 2 v sum w.
+        The base's rotation vector counts twice, as its axis turns too.
         """
-        count, moved = len(self.quantity_names), np.abs(after - before)
-        zero = np.zeros((*moved.shape[:-1], 1))
-        base = 2.0 * np.linalg.norm(moved[..., -3:], axis=-1, keepdims=True)
-        turns = np.concatenate([base, np.where(self.revolute, moved[..., :count], 0.0)], axis=-1)
-        slides = np.where(self.revolute, 0.0, np.maximum(np.abs(before), np.abs(after))[..., :count])
-        slid = np.where(self.revolute, 0.0, moved[..., :count])
-        # Of each frame, that of the base first.
+        count, revolute = len(self.quantity_names), self.revolute
+        moved = np.abs(after - before)
+        base = 2.0 * np.linalg.norm(moved[..., -3:], axis=-1)[..., None]
+        turns = np.concatenate([base, np.where(revolute, moved[..., :count], 0.0)], axis=-1)
         speed = np.cumsum(turns, axis=-1)
-        turning = 0.5 * (3.0 * speed * speed - np.cumsum(turns * turns, axis=-1))
-        slide = turning * np.concatenate([zero, slides], axis=-1)
-        slide += 2.0 * speed * np.concatenate([zero, slid], axis=-1)
-        steps = slide + turning * np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
-        origins = np.concatenate([zero, np.cumsum(steps, axis=-1)], axis=-1)
-        around = slide[..., self.carriers] + turning[..., self.carriers] * np.linalg.norm(self.points, axis=1)
-        bends = np.concatenate([origins, origins[..., self.carriers] + around], axis=-1)
-        return np.asarray(bends[..., self.links[link]].max(axis=-1))
+        slides = np.where(revolute, 0.0, np.maximum(np.abs(before), np.abs(after))[..., :count])
+        slid = np.where(revolute, 0.0, moved[..., :count])
+        none = np.zeros_like(base)
+        lengths = np.linalg.norm(np.vstack([self.position, self.tip]), axis=1)
+        turning = speed * speed
+        sliding = turning * np.concatenate([none, slides], axis=-1)
+        sliding += 2.0 * speed * np.concatenate([none, slid], axis=-1)
+        origins = np.concatenate([none, np.cumsum(turning * lengths + sliding, axis=-1)], axis=-1)
+        own = (origins[..., :-1] + sliding)[..., self.carriers]
+        own = own + turning[..., self.carriers] * np.linalg.norm(self.points, axis=1)
+        points = np.concatenate([origins, own], axis=-1)
+        return np.asarray(points[..., self.links[link]].max(axis=-1))
+
+    def bends(self, before: Array, after: Array) -> Array:
+        """Return (S, B) the bounds of :meth:`bend` for all links, between configurations (S, J + 6)."""
+        return self.bend(before, after, np.arange(len(self.links)))
 
 
 def same(recorded: ArrayLike, given: ArrayLike) -> bool:
