@@ -132,21 +132,18 @@ def _read_csv(file: str | Path, columns: Columns) -> Trajectory:
     found = [read_numbers(header, line, row, mistakes) for line, row in rows]
     before = -math.inf
     for (line, _), row in zip(rows, found, strict=True):
-        time = row.get("t", math.nan)
-        mistake = time_mistake(f"line {line}, column t", time, before)
+        at = row.get("t", math.nan)
+        mistake = time_mistake(f"line {line}, column t", at, before)
         mistakes += [mistake] if mistake else []
-        before = time if math.isfinite(time) else before
+        before = at if math.isfinite(at) else before
     if not rows:
         mistakes.append(Mistake("line 2", "nothing", "at least one row of numbers below the header"))
     if mistakes:
         raise ProblemError(str(file), sorted(mistakes, key=_line)[:GREATEST_MISTAKES])
     given = [k for k, key in enumerate(columns.keys) if key in header]
-    values = [[row[columns.keys[k]] for k in given] for row in found]
-    return Trajectory(
-        np.array([row["t"] for row in found]),
-        np.array(values).reshape(len(found), -1),
-        columns.quantities[given],
-    )
+    time = np.array([row["t"] for row in found])
+    values = np.array([[row[columns.keys[k]] for k in given] for row in found])
+    return Trajectory(time, values.reshape(len(time), -1), columns.quantities[given])
 
 
 def _line(mistake: Mistake) -> int:
