@@ -267,7 +267,7 @@ def test_an_arm_without_faces_is_not_moved_along_them(tracking):
 
 
 def test_where_exact_tracking_is_stuck_its_ways_out_are_those_of_elastic_tracking():
-    problem = random_scene(1991, 41, steps=30).problem
+    problem = random_scene(1991, 241, steps=30).problem
     exact, elastic = (
         vq.solve(problem.replace({"method.tracking_mode": mode})) for mode in ("exact", "elastic")
     )
