@@ -264,7 +264,7 @@ def test_list_and_schema_and_doctor(capsys):
     assert code == 0
     assert found["ok"]
     assert "daqp" in found["solvers"]["says"]
-    assert set(found["extras"]) == {"view", "export", "mujoco", "cluster", "test"}
+    assert set(found["extras"]) == {"view", "export", "mujoco", "cluster", "dae", "test"}
 
 
 def test_doctor_says_what_fails(capsys, monkeypatch):

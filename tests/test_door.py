@@ -697,6 +697,9 @@ def test_the_attitude_of_the_tip_is_that_of_the_last_frame_turned():
     ("change", "said"),
     [
         (lambda bodies: bodies[1].update(radius=0.04), "shape of body link y1"),
+        (lambda bodies: bodies[1].update(radius=0.0299), "shape of body link y1"),
+        (lambda bodies: bodies[1].update(points=[[0.01, 0, 0], [0, 0.02, 0.35001]]), "shape of body link y1"),
+        (lambda bodies: bodies[-1].update(points=[[0.0, 0.05, 0.1001]]), "shape of body eye"),
         (lambda bodies: bodies[1].update(points=[[0, 0, 0], [0, 0, 0.3]]), "shape of body link y1"),
         (lambda bodies: bodies[1].update(joint="p1"), "joint of body link y1"),
         (lambda bodies: bodies[0].update(joint="p1"), "joint of body foot"),

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -358,3 +361,102 @@ def test_a_tip_without_a_body_of_its_own_may_come_to_an_obstacle(folder):
     problem = vq.load_problem(problem_file(folder))
     ball = {"name": "ball", "shape": "sphere", "center": [0.9, 0.3, 0.3], "radius": 0.05}
     assert vq.solve(problem.replace({"obstacle": [ball]})).status == "solved"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_no_file_is_read_that_a_result_names(folder):
+    maneuver = vq.solve(vq.load_problem(problem_file(folder)))
+    data = json.loads(json.dumps(maneuver.manifest))
+    # Nobody writes into this pipe: reading it would never end.
+    os.mkfifo(folder / "pipe.urdf")
+    data["problem"]["arm"]["urdf"] = str(folder / "pipe.urdf")
+    assert any("was altered" in line for line in vq.verify(replace(maneuver, manifest=data)).contradictions)
+    (folder / "arm.urdf").write_text("no robot")
+    data["problem"]["arm"]["urdf"] = str(folder / "arm.urdf")
+    del data["problem"]["arm"]["joint"]
+    altered = vq.verify(replace(maneuver, manifest=data)).contradictions
+    assert any("joints of the arm record" in line for line in altered)
+
+
+def test_what_is_no_problem_is_refused_before_anything_is_certified():
+    with pytest.raises(vq.ProblemError, match="load_problem"):
+        vq.certify("arm.toml", [0.0], [[0.0]])
+
+
+def test_what_is_fixed_to_the_base_from_above_belongs_to_the_arm(folder):
+    table = """<link name="table"><collision><geometry><box size="1 1 0.1"/></geometry></collision></link>
+      <joint name="legs" type="fixed"><parent link="table"/><child link="base"/>
+        <origin xyz="0.2 0 0.3" rpy="0 0 0.4"/></joint>
+      <link name="lamp"><collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+      <joint name="clamp" type="fixed"><parent link="table"/><child link="lamp"/><origin xyz="0 0.4 0.5"/></joint>
+      <link name="rail"/>
+      <joint name="trolley" type="prismatic"><parent link="rail"/><child link="table"/>
+        <limit lower="0" upper="1"/></joint></robot>"""
+    text = ARM.replace("</robot>", table)
+    (folder / "arm.urdf").write_text(text)
+    arm = read_urdf(folder / "arm.urdf", base_link="base", tip_link="tool")
+    frames = placed(text, {})
+    lamp = np.linalg.solve(frames["base"], frames["lamp"])[:3, 3]
+    found = {body.name: body for body in arm.bodies}
+    assert found["table"].joint == found["lamp"].joint == 0
+    np.testing.assert_allclose(found["lamp"].points[0], lamp, atol=1e-12)
+    assert 'what carries joint "trolley" is left out' in arm.notes
+
+
+def test_thousands_of_mistakes_are_told_in_a_hundred(folder):
+    links = "".join(f'<link name="l{k}"/>' for k in range(2001))
+    joints = "".join(
+        f'<joint name="j{k}" type="fixed"><parent link="m{k}"/><child link="l{k + 1}"/></joint>'
+        for k in range(2000)
+    )
+    (folder / "arm.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    with pytest.raises(vq.ProblemError) as raised:
+        read_urdf(folder / "arm.urdf")
+    assert len(raised.value.mistakes) == 100
+
+
+COLLADA = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="{unit}" name="u"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="s"><float_array id="a" count="12">0 0 0 1 0 0 0 1 0 0 0 1</float_array><technique_common>
+<accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#s"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2 0 1 3 0 2 3 1 2 3</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="c"><node id="n"><instance_geometry url="#g"/>{more}</node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#c"/></scene></COLLADA>"""
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.0254, 100.0])
+def test_collada_is_read_in_its_unit(unit, folder):
+    pytest.importorskip("collada")
+    (folder / "part.dae").write_text(COLLADA.format(unit=unit, more=""))
+    (folder / "arm.urdf").write_text(ARM.replace('<sphere radius="0.08"/>', '<mesh filename="part.dae"/>'))
+    body = read_urdf(folder / "arm.urdf", tip_link="tool").bodies[2]
+    corners = unit * np.vstack([np.zeros(3), np.eye(3)])
+    along = body.points[-1] - body.points[0]
+    share = np.clip((corners - body.points[0]) @ along / max(along @ along, 1e-300), 0.0, 1.0)
+    assert np.linalg.norm(corners - body.points[0] - share[:, None] * along, axis=1).max() <= body.radius
+    assert body.radius < unit
+
+
+@pytest.mark.parametrize(
+    ("unit", "more"), [("1", '<instance_geometry url="#gone"/>'), ("0", ""), ("-1", ""), ("much", "")]
+)
+def test_collada_of_which_a_part_or_the_unit_is_missing_is_refused(unit, more, folder):
+    pytest.importorskip("collada")
+    (folder / "part.dae").write_text(COLLADA.format(unit=unit, more=more))
+    (folder / "arm.urdf").write_text(ARM.replace('<sphere radius="0.08"/>', '<mesh filename="part.dae"/>'))
+    with pytest.raises(vq.ProblemError, match=r"STL, OBJ or DAE") as raised:
+        read_urdf(folder / "arm.urdf", tip_link="tool")
+    assert len(raised.value.mistakes) == 1
+
+
+def test_collada_names_what_it_takes(folder, monkeypatch):
+    monkeypatch.setattr("vgtm_qp.problem.urdf.shapes.find_spec", lambda _: None)
+    (folder / "part.dae").write_text(COLLADA.format(unit=1, more=""))
+    (folder / "arm.urdf").write_text(ARM.replace('<sphere radius="0.08"/>', '<mesh filename="part.dae"/>'))
+    with pytest.raises(vq.ProblemError, match=r"pip install 'vgtm-qp\[dae\]'"):
+        read_urdf(folder / "arm.urdf", tip_link="tool")

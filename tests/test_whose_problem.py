@@ -56,7 +56,7 @@ def edited(maneuver: Maneuver, edit: Callable[[dict[str, Any]], Any], *, cover: 
     manifest = copy.deepcopy(maneuver.manifest)
     edit(manifest)
     if cover:
-        fitting = problem_digests(manifest["problem"], None, None)["problem"]
+        fitting = problem_digests(manifest["problem"])["problem"]
         manifest["problem_digests"]["problem"] = fitting
     return replace(maneuver, manifest=manifest)
 

@@ -122,6 +122,31 @@ BROKEN: dict[str, tuple[str, str, str]] = {
     "scale of zero": ('<sphere radius="0.08"/>', '<mesh filename="wedge.stl" scale="1 0 1"/>', "<mesh> scale"),
     "scale of two": ('<sphere radius="0.08"/>', '<mesh filename="wedge.stl" scale="1 1"/>', "<mesh> scale"),
     "mimic on the arm": ('<limit lower="-1"', '<mimic joint="turn"/><limit lower="-1"', "<mimic> joint"),
+    "misspelt link": ('<link name="rod"/>', '<lnk name="rod"/>', "<lnk>"),
+    "misspelt collision": (
+        '<collision><geometry><sphere radius="0.08"/></geometry></collision>',
+        '<colision><geometry><sphere radius="0.08"/></geometry></colision>',
+        'link "arm": found "<colision>"',
+    ),
+    "misspelt axis": ('<axis xyz="0 0 2"/>', '<axes xyz="0 0 2"/>', 'joint "turn": found "<axes>"'),
+    "misspelt limit": ('<limit lower="-1" upper', '<limt lower="-1" upper', 'found "<limt>"'),
+    "misspelt upper": ('upper="1.5"', 'uper="1.5"', 'joint "lift", <limit>: found "uper"'),
+    "misspelt xyz": ('xyz="0 0.02 0.4"', 'xzy="0 0.02 0.4"', '<origin>: found "xzy"'),
+    "misspelt radius": ('<sphere radius="0.08"/>', '<sphere radus="0.08"/>', '<sphere>: found "radus"'),
+    "two origins": ('<origin xyz="0 0 0.1" rpy', '<origin/><origin xyz="0 0 0.1" rpy', "one <origin> in a <joint>"),
+    "two limits": ('<axis xyz="1 0 0"/>', '<axis xyz="1 0 0"/><limit lower="0" upper="1"/>', "one <limit>"),
+    "two axes": ('<axis xyz="1 0 0"/>', '<axis xyz="1 0 0"/><axis xyz="0 1 0"/>', "one <axis>"),
+    "digits with marks": ('xyz="0 0.02 0.4"', 'xyz="0 0.02 1_0"', "<origin> xyz"),
+    "digits of others": ('xyz="0 0.02 0.4"', 'xyz="0 0.02 ١"', "<origin> xyz"),
+    "no radius to speak of": ('<sphere radius="0.08"/>', '<sphere radius="1e-300"/>', "greater than 0"),
+    "a loop beside the arm": (
+        '<link name="tool"/>',
+        '<link name="tool"/><link name="c"/><link name="d"/>'
+        '<joint name="k" type="fixed"><parent link="c"/><child link="d"/></joint>'
+        '<joint name="l" type="fixed"><parent link="d"/><child link="c"/></joint>',
+        'joint "k", <child>: found "d"; expected joints that lead on',
+    ),
+    "package without a name": ('<sphere radius="0.08"/>', '<mesh filename="package:///a.stl"/>', "name of a package"),
 }  # fmt: skip
 """By name: what of the file is replaced, by what, and a part of what is said."""
 

@@ -85,10 +85,12 @@ class MissingExtraError(VgtmError):
         return type(self), (self.extra, self.package)
 
 
-def closest(name: str, choices: Iterable[str]) -> str | None:
-    """Return the one of `choices` that `name` is probably meant for, or None."""
-    # Of names as short as "box" one wrong letter more is already a large part.
-    return next(iter(difflib.get_close_matches(name, list(choices), n=1, cutoff=0.55)), None)
+def closest(name: str, choices: Iterable[str], *, alike: float = 0.55) -> str | None:
+    """Return the one of `choices` that `name` is probably meant for, or None.
+
+    They have to be `alike` by so much, 0 to 1; in names as short as "box" one wrong letter is already a large part.
+    """
+    return next(iter(difflib.get_close_matches(name, list(choices), n=1, cutoff=alike)), None)
 
 
 def nearest(name: str, choices: Iterable[str]) -> str:

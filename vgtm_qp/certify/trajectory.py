@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,16 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import Mistake, ProblemError, nearest
 from vgtm_qp.problem.fields import GREATEST_LENGTH, quoted
-from vgtm_qp.problem.path_file import GREATEST_MISTAKES, read_numbers, read_rows, time_mistake
 from vgtm_qp.problem.table import shown
+from vgtm_qp.problem.timed_rows import GREATEST_MISTAKES, NUMBER, read_timed_rows, time_mistakes
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.verify.arm import Arm
 
 if TYPE_CHECKING:
     from vgtm_qp.problem import Problem
-
-_RATE = re.compile(r"d .+/dt \[.+\]")
-"""Columns that ``vgtm export --to csv`` adds to values: they follow from them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +70,15 @@ class Columns:
         """What the columns of a table are called: their names, but for a joint that is called as the time is."""
         named = zip(self.names, self.units, strict=True)
         return tuple(f"{name} [{unit}]" if name == "t" else name for name, unit in named)
+
+    @cached_property
+    def spellings(self) -> dict[str, str]:
+        """The keys of the columns of a table, by what may stand in its header; rates are as exports name them."""
+        found = {"t": "t", "time [s]": "t"}
+        for name, unit, key in zip(self.names, self.units, self.keys, strict=True):
+            rate = f"d {name}/dt [{unit}/s]"
+            found |= {key: key, f"{name} [{unit}]": key, rate: rate}
+        return found
 
     def needed_names(self) -> tuple[str, ...]:
         """Return the names that a trajectory has to have."""
@@ -124,43 +130,23 @@ def read_trajectory(file: str | Path, columns: Columns) -> Trajectory:
 
 
 def _read_csv(file: str | Path, columns: Columns) -> Trajectory:
-    cells, rows = read_rows(Path(file))
-    mistakes: list[Mistake] = []
-    header = _header(cells, columns, mistakes)
-    if mistakes:
-        raise ProblemError(str(file), mistakes[:GREATEST_MISTAKES])
-    found = [read_numbers(header, line, row, mistakes) for line, row in rows]
-    before = -math.inf
-    for (line, _), row in zip(rows, found, strict=True):
-        at = row.get("t", math.nan)
-        mistake = time_mistake(f"line {line}, column t", at, before)
-        mistakes += [mistake] if mistake else []
-        before = at if math.isfinite(at) else before
-    if not rows:
-        mistakes.append(Mistake("line 2", "nothing", "at least one row of numbers below the header"))
-    if mistakes:
-        raise ProblemError(str(file), sorted(mistakes, key=_line)[:GREATEST_MISTAKES])
+    header, rows = read_timed_rows(Path(file), partial(_read_header, columns))
     given = [k for k, key in enumerate(columns.keys) if key in header]
-    time = np.array([row["t"] for row in found])
-    values = np.array([[row[columns.keys[k]] for k in given] for row in found])
-    return Trajectory(time, values.reshape(len(time), -1), columns.quantities[given])
+    values = np.array([[row[columns.keys[k]] for k in given] for row in rows])
+    return Trajectory(
+        np.array([row["t"] for row in rows]), values.reshape(len(rows), -1), columns.quantities[given]
+    )
 
 
-def _line(mistake: Mistake) -> int:
-    return int(re.search(r"\d+", mistake.key)[0])  # type: ignore[index]
-
-
-def _header(cells: Sequence[str], columns: Columns, mistakes: list[Mistake]) -> list[str]:
-    """Return the key of each column, "t" or one of `columns.keys`; `mistakes` has those that are wrong."""
+def _read_header(columns: Columns, cells: list[str], mistakes: list[Mistake]) -> list[str]:
+    """Return the key of each column: "t", one of `columns.keys`, or an exported rate's; `mistakes` has the others."""
     expected = f"t and the names {columns.expected()}"
-    spellings = {"t": "t", "time [s]": "t"}
-    for name, unit, key in zip(columns.names, columns.units, columns.keys, strict=True):
-        spellings |= {key: key, f"{name} [{unit}]": key}
+    spellings = columns.spellings
     if len(cells) == 1 and re.search(r"[;\t|]", cells[0]):
         mistakes.append(Mistake("line 1", shown(cells[0]), "names with commas between them"))
         return []
     header = [spellings.get(cell, cell) for cell in cells]
-    unknown = [cell for cell in cells if cell not in spellings and not _RATE.fullmatch(cell)]
+    unknown = [cell for cell in cells if cell not in spellings]
     if len(unknown) == len(cells) and not any(_meant(cell, spellings) for cell in cells):
         mistakes.append(Mistake("line 1", shown(",".join(cells) or None), f"a header with {expected}"))
         return []
@@ -169,9 +155,8 @@ def _header(cells: Sequence[str], columns: Columns, mistakes: list[Mistake]) -> 
         if "\n" in cell:
             mistakes.append(Mistake(place, shown(cell), "a name on one line; its quotation mark stays open"))
         elif cell in unknown:
-            mistakes.append(
-                Mistake(place, shown(cell or None), expected + _meant(cell, ("t", *columns.names)))
-            )
+            told = expected + _meant(cell, ("t", *columns.names))
+            mistakes.append(Mistake(place, shown(cell or None), told))
         elif key in header[: number - 1]:
             mistakes.append(Mistake(place, shown(cell), f'each column once; "{key}" stands before it'))
     needed = ("t", *(key for key, wanted in zip(columns.keys, columns.needed, strict=True) if wanted))
@@ -206,9 +191,8 @@ def _from_points(
             mistakes.append(Mistake(f"{place}, positions", found, f"{len(names)}, one for each joint name"))
         for name, value in zip(names, positions, strict=False):
             if not _is_number(value):
-                mistakes.append(Mistake(f"{place}, {name}", shown(value), _NUMBER))
-        mistake = time_mistake(f"{place}, time", time, before)
-        mistakes += [mistake] if mistake else []
+                mistakes.append(Mistake(f"{place}, {name}", shown(value), NUMBER))
+        mistakes += time_mistakes(f"{place}, time", time, before)
         before = time
     if not points:
         mistakes.append(Mistake("points", "nothing", "at least one point"))
@@ -218,9 +202,6 @@ def _from_points(
     order = [list(names).index(columns.names[k]) for k in given]
     values = np.array([positions for _, _, positions in points], dtype=np.float64)
     return Trajectory(np.array([time for _, time, _ in points]), values[:, order], columns.quantities[given])
-
-
-_NUMBER = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
 
 
 def _is_number(value: Any) -> bool:
@@ -294,7 +275,7 @@ def _wrong_values(time: Array, values: Array) -> Iterator[Mistake]:
     for name, array in (("times", time), ("joints", values)):
         for place in np.argwhere(~(np.abs(array) <= GREATEST_LENGTH))[:1]:
             index = ", ".join(map(str, place.tolist()))
-            yield Mistake(f"{name}[{index}]", shown(float(array[tuple(place)])), _NUMBER)
+            yield Mistake(f"{name}[{index}]", shown(float(array[tuple(place)])), NUMBER)
     steps = zip(time.tolist(), [-math.inf, *time[:-1].tolist()], strict=True)
-    found = (time_mistake(f"times[{k}]", at, before) for k, (at, before) in enumerate(steps))
-    yield from [mistake for mistake in found if mistake][:1]
+    found = (time_mistakes(f"times[{k}]", at, before) for k, (at, before) in enumerate(steps))
+    yield from next(filter(None, found), [])

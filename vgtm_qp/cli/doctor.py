@@ -18,6 +18,7 @@ _EXTRAS = {
     "export": ("viser", "mcap", "mcap-ros2-support", "imageio-ffmpeg", "pillow", "pyyaml"),
     "mujoco": ("mujoco",),
     "cluster": ("dask", "distributed"),
+    "dae": ("pycollada",),
     "test": (
         "hypothesis",
         "import-linter",

@@ -65,7 +65,10 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     check_is_problem(problem)
     started = perf_counter()
     # The files as they are when they are read, not as they may be at the end.
-    digests = problem_digests(problem.to_dict(), problem.source, getattr(problem.maneuver, "path", None))
+    files = {"file": problem.source, "path": getattr(problem.maneuver, "path", None)}
+    digests = problem_digests(
+        problem.to_dict(), **files, urdf=None if problem.arm is None else problem.arm.urdf
+    )
     resolver = Resolver(problem)
     mistakes = check_problem(problem, resolver.setup)
     if mistakes:

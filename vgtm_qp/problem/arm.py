@@ -142,11 +142,13 @@ class ArmTable(Table, called="an arm"):
     @classmethod
     def _from_urdf(cls, data: Any, info: ValidationInfo) -> Any:
         """Read joints, tip and bodies from the URDF file, unless they were read before."""
-        if not isinstance(data, Mapping) or data.get("urdf") is None:
+        context = info.context or {}
+        # What a result names is not read: it may be any file.
+        if not isinstance(data, Mapping) or data.get("urdf") is None or context.get("of_result"):
             return data
         if "joint" not in data:
-            return {**data, **_urdf_keys(data, info.context or {})}
-        if (info.context or {}).get("check_files"):
+            return {**data, **_urdf_keys(data, context)}
+        if context.get("check_files"):
             twice = [key for key in FROM_URDF if key in data]
             raise _wrong([((key,), data[key], "no such key beside urdf, which gives it") for key in twice])
         return data

@@ -20,7 +20,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from vgtm_qp.errors import nearest
+from vgtm_qp.errors import ProblemError, nearest
 
 # Beyond these a square overflows the tolerances of the certificate; no arm is that long or that fine.
 LEAST_LENGTH = 1e-6
@@ -154,6 +154,16 @@ def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
     if math.hypot(*value) < 1e-9:
         raise unexpected("a direction: three numbers [x, y, z] that are not all zero")
     return value
+
+
+def read_bytes(file: Path, greatest: int) -> bytes:
+    """Return the content of a file of at most `greatest` bytes; ProblemError where it is larger or cannot be read."""
+    try:
+        if file.stat().st_size > greatest:
+            raise ProblemError.at(file, "file", "a huge file", f"less than {greatest // 1_000_000} MB")
+        return file.read_bytes()
+    except OSError as error:
+        raise ProblemError.at(file, "file", error.strerror or "", "a readable file") from None
 
 
 def _file(value: str, info: ValidationInfo) -> str:

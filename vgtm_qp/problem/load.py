@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vgtm_qp.errors import Mistake, ProblemError, nearest
-from vgtm_qp.problem.fields import entry, quoted
+from vgtm_qp.problem.fields import entry, quoted, read_bytes
 from vgtm_qp.problem.path_file import read_path
 from vgtm_qp.problem.problem import SCHEMA_VERSION, Problem
 from vgtm_qp.problem.table import shown
@@ -84,12 +84,7 @@ def _find(path: str | Path) -> Path:
 
 
 def _read(file: Path) -> str:
-    try:
-        if file.stat().st_size > _GREATEST_BYTES:
-            raise ProblemError.at(file, "file", "a huge file", f"less than {_GREATEST_BYTES // 1_000_000} MB")
-        raw = file.read_bytes()
-    except OSError as error:
-        raise ProblemError.at(file, "file", error.strerror or "", "a readable file") from None
+    raw = read_bytes(file, _GREATEST_BYTES)
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -129,10 +129,7 @@ class RecordedChain:
             carrier = number.get(str(body.get("joint")), 0)
             if own.min() < 0 or (self.carriers[own] != carrier).any():
                 found.append(f"the arm record's joint of body {body['name']} differs from the problem's")
-            # A ball is recorded as a capsule with a short axis.
-            elif self.radius[k] < radius or not np.allclose(
-                self.points[own], ends[[0, -1]], rtol=0.0, atol=max(1e-9, 1e-3 * radius)
-            ):
+            elif not same(self.radius[k], radius) or not _are_ends(self.points[own], ends, radius):
                 found.append(f"the arm record's shape of body {body['name']} differs from the problem's")
         return found
 
@@ -227,9 +224,17 @@ class RecordedChain:
         points = np.concatenate([origins, own], axis=-1)
         return np.asarray(points[..., self.links[link]].max(axis=-1))
 
-    def bends(self, before: Array, after: Array) -> Array:
-        """Return (S, B) the bounds of :meth:`bend` for all links, between configurations (S, J + 6)."""
-        return self.bend(before, after, np.arange(len(self.links)))
+
+def _are_ends(recorded: Array, ends: Array, radius: float) -> bool:
+    """Whether both points (2, 3) of a recorded capsule are the `ends` (1 or 2, 3) of its axis, m.
+
+    A ball, or what is nearly one, is recorded as a capsule with a short axis through its centre.
+    """
+    if float(np.linalg.norm(ends[-1] - ends[0])) >= 1e-3 * radius:
+        return same(recorded, ends)
+    return same(recorded.mean(axis=0), ends.mean(axis=0)) and bool(
+        np.linalg.norm(recorded - ends.mean(axis=0), axis=1).max() <= 1e-3 * radius
+    )
 
 
 def same(recorded: ArrayLike, given: ArrayLike) -> bool:

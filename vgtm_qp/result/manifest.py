@@ -107,20 +107,14 @@ def mesh_record(path: str | Path, triangles: int) -> dict[str, Any]:
     return {"sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(), "triangles": int(triangles)}
 
 
-def problem_digests(
-    problem: Mapping[str, Any], source: str | Path | None, path: str | Path | None
-) -> dict[str, str | None]:
+def problem_digests(problem: Mapping[str, Any], **files: str | Path | None) -> dict[str, str | None]:
     """Return the SHA-256 that tie a result to its problem; None where there is no such file, or none any more.
 
-    They are of the canonical text of `problem` as the manifest holds it, of the problem's file `source`, of the file
-    `path` of its path and of that of its URDF. Those of meshes are in their records.
+    They are of the canonical text of `problem` as the manifest holds it, and of `files` by name: ``file``, that of the
+    problem, ``path`` and ``urdf``. Those of meshes are in their records. No file is read that is not given here.
     """
-    return {
-        "problem": hashlib.sha256(dump_manifest(problem).encode()).hexdigest(),
-        "file": file_digest(source),
-        "path": file_digest(path),
-        "urdf": file_digest((problem.get("arm") or {}).get("urdf")),
-    }
+    text = hashlib.sha256(dump_manifest(problem).encode()).hexdigest()
+    return {"problem": text, **{name: file_digest(path) for name, path in files.items()}}
 
 
 def file_digest(path: str | Path | None) -> str | None:

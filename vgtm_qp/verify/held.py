@@ -37,7 +37,7 @@ def held_against(maneuver: Result, problem: Problem | None) -> tuple[Result, lis
     recorded = manifest.get("problem_digests") or {}
     wrong: list[str] = []
     notes: list[str] = []
-    if recorded and problem_digests(manifest["problem"], None, None)["problem"] != recorded.get("problem"):
+    if recorded and problem_digests(manifest["problem"])["problem"] != recorded.get("problem"):
         wrong.append("the problem in the result was altered: its SHA-256 is not the recorded one")
     if problem is None:
         return maneuver, wrong, []
@@ -63,7 +63,7 @@ def describe_problem(maneuver: Result, problem: Problem | None) -> dict[str, Any
     """
     solved_from = (maneuver.manifest.get("problem_digests") or {}).get("file")
     if problem is None:
-        digest = problem_digests(maneuver.manifest["problem"], None, None)["problem"]
+        digest = problem_digests(maneuver.manifest["problem"])["problem"]
         return {"problem": None, "sha256": digest, "solved_from": solved_from}
     return {
         "problem": str(problem.source or problem.name),

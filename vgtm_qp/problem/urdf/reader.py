@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +114,7 @@ def read_urdf(
     Parameters
     ----------
     file
-        Links that are fixed to those of the arm belong to it; what moves beside it is cut off.
+        Links that are fixed to those of the arm belong to it; what moves beside it, or carries it, is cut off.
     base_link, tip_link
         By default the root, and the end with the most moving joints.
     package_path
@@ -159,6 +159,13 @@ class _Tree:
             mistakes.add(root, "", f"<{root.tag}>", "<robot>, the root of a URDF file")
             mistakes.stop()
         self._refuse_xacro()
+        for element in root.children:
+            if element.tag in ("link", "joint"):
+                mistakes.spelling(element, f'{element.tag} "{element.attributes.get("name", "")}"')
+        mistakes.spelling(
+            replace(root, children=[replace(child, children=[]) for child in root.children]), "<robot>"
+        )
+        mistakes.stop()
         self._links = self._named("link")
         mistakes.stop()
         self._origins: dict[Element, Frame] = {}
@@ -176,6 +183,11 @@ class _Tree:
                 mistakes.add(joint.element, f'joint "{joint.name}", <child>', joint.child, expected)
             self._above[joint.child] = joint
         mistakes.stop()
+        self._below: dict[str, list[_Joint]] = {name: [] for name in self._links}
+        for joint in self._joints:
+            self._below[joint.parent].append(joint)
+        self._refuse_loops()
+        mistakes.stop()
 
     def ends(self, base: str | None, tip: str | None) -> tuple[str, str]:
         """Return the first and the last link of the arm, where they are given or not."""
@@ -185,10 +197,9 @@ class _Tree:
                 names = quoted(list(self._links)[:12])
                 self._wrong(f"{key} of the problem", name, f"one of {names}{nearest(name, self._links)}")
         if base is None and len(roots) != 1:
-            if roots:
-                said = f"base_link in the problem: one of {quoted(roots)}, since several links have no parent"
-            else:
-                said = "a link without a parent: closed loops are not served"
+            said = (
+                f"base_link in the problem: one of {quoted(roots[:12])}, since several links have no parent"
+            )
             self._wrong("<robot>", None, said)
         self._mistakes.stop()
         base = base or roots[0]
@@ -268,20 +279,21 @@ class _Tree:
                 number, frame = number + 1, _AT_REST
             link = joint.child
             places[link] = (number, frame)
-        on_chain, notes = {joint.name for joint in chain}, []
-        waiting = list(places)
+        on_chain, notes, waiting = {joint.name for joint in chain}, [], list(places)
         while waiting:
             link = waiting.pop(0)
-            for joint in self._joints:
-                if joint.parent != link or joint.name in on_chain:
+            number, frame = places[link]
+            for joint in self._beside(link):
+                other = joint.child if joint.parent == link else joint.parent
+                if joint.name in on_chain or other in places:
                     continue
                 if joint.moves:
-                    notes.append(f'what moves with joint "{joint.name}" is left out')
-                else:
-                    number, frame = places[link]
-                    origin = self._origin(joint.element, f'joint "{joint.name}"')
-                    places[joint.child] = number, _after(frame, origin)
-                    waiting.append(joint.child)
+                    what = "moves with" if other == joint.child else "carries"
+                    notes.append(f'what {what} joint "{joint.name}" is left out')
+                    continue
+                origin = self._origin(joint.element, f'joint "{joint.name}"')
+                places[other] = number, _after(frame, origin if other == joint.child else _inverse(origin))
+                waiting.append(other)
         bodies: list[UrdfBody] = []
         for link, (number, frame) in places.items():
             element = self._links[link]
@@ -290,6 +302,11 @@ class _Tree:
             bodies += self._enclosed(link, number, frame, shapes)
         bodies.sort(key=lambda body: body.joint)
         return tuple(bodies), tuple(notes)
+
+    def _beside(self, link: str) -> list[_Joint]:
+        """Return the joints of a link: those to its children, and that to its parent."""
+        above = self._above.get(link)
+        return self._below[link] + ([] if above is None else [above])
 
     def _enclosed(self, link: str, number: int, frame: Frame, shapes: Shapes) -> list[UrdfBody]:
         found = []
@@ -398,6 +415,18 @@ class _Tree:
                 self._mistakes.add(element, "", f"<{element.tag}>", expected)
                 self._mistakes.stop()
 
+    def _refuse_loops(self) -> None:
+        """Add the first joint of a closed loop: no link without a parent leads to it. No link has two parents here."""
+        reached = [name for name in self._links if name not in self._above]
+        for link in reached:
+            reached += [joint.child for joint in self._below[link]]
+        known = set(reached)
+        for joint in self._joints:
+            if joint.child not in known:
+                expected = "joints that lead on from a link without a parent: closed loops are not served"
+                self._mistakes.add(joint.element, f'joint "{joint.name}", <child>', joint.child, expected)
+                return
+
     def _wrong(self, what: str, value: str | None, expected: str) -> None:
         self._mistakes.add(self._root, what, value, expected)
 
@@ -405,3 +434,8 @@ class _Tree:
 def _after(frame: Frame, inner: Frame) -> Frame:
     """Return a frame that is given in another one."""
     return frame[0] + frame[1] @ inner[0], frame[1] @ inner[1]
+
+
+def _inverse(frame: Frame) -> Frame:
+    """Return the frame that another one is given in, in that other one."""
+    return -frame[1].T @ frame[0], frame[1].T

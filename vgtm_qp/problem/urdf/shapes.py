@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.errors import ProblemError
+from vgtm_qp.errors import MissingExtraError, ProblemError
 from vgtm_qp.problem.urdf.text import Element, Mistakes
 
 Array = NDArray[np.float64]
@@ -19,8 +21,10 @@ Capsule = tuple[Array, float]
 _ROUNDING = 1e-12
 _RADII = np.linspace(1.0, 1.6, 61)
 """Radii that are tried, over the least one: a thicker capsule may be shorter."""
-_STEPS = 400
+_STEPS = 100
 _GREATEST_POINTS = 2_000_000
+_HEAD = 1_000_000
+"""Bytes at the beginning of a COLLADA file, among which its unit is."""
 _KINDS = "box, cylinder, sphere, capsule, mesh"
 
 
@@ -64,11 +68,15 @@ class Shapes:
 
     def _mesh(self, shape: Element, what: str) -> Array | None:
         """Return points (K, 3) whose convex hull holds a mesh, m."""
-        name, what = shape.attributes.get("filename"), f"{what}, <mesh>"
+        name, link, what = shape.attributes.get("filename"), what, f"{what}, <mesh>"
         if not name:
             self._mistakes.add(shape, f"{what} filename", name, "the path of an STL, OBJ or DAE file")
             return None
-        scale = self._mistakes.numbers(shape, what, "scale", 3, (1.0, 1.0, 1.0))
+        if name.startswith("package:///"):
+            expected = "package://, the name of a package, and the path in it"
+            self._mistakes.add(shape, f"{what} filename", name, expected)
+            return None
+        scale = self._mistakes.numbers(shape, link, "scale", 3, (1.0, 1.0, 1.0))
         if scale is None:
             return None
         if not all(scale):
@@ -177,8 +185,14 @@ def _read_mesh(file: Path) -> Array:
     """Return points (K, 3) whose hull is that of a mesh file."""
     import trimesh
 
+    if file.suffix.lower() == ".dae" and find_spec("collada") is None:
+        expected = f"an STL or OBJ file; for COLLADA {MissingExtraError('dae', 'pycollada')}"
+        raise ProblemError.at(file, "file", "", expected)
     try:
-        mesh = trimesh.load(file, force="mesh")
+        # Of COLLADA a part would be left out in silence that refers to what is not there.
+        how = {".dae": {"ignore_broken": False}, ".obj": {"skip_materials": True}}
+        mesh = trimesh.load(file, force="mesh", **how.get(file.suffix.lower(), {}))
+        mesh.apply_scale(_unit(file))
         points = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise ProblemError.at(file, "file", "", f"an STL, OBJ or DAE file; {str(error)[:200]}") from None
@@ -188,6 +202,18 @@ def _read_mesh(file: Path) -> Array:
         return np.asarray(mesh.convex_hull.vertices, dtype=float)
     except Exception:  # a flat mesh has no hull with a volume
         return points
+
+
+def _unit(file: Path) -> float:
+    """Return the length that a mesh file is given in, m: COLLADA says it, and trimesh does not apply it."""
+    if file.suffix.lower() != ".dae":
+        return 1.0
+    with file.open("rb") as stream:
+        found = re.search(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']([^\"']*)[\"']", stream.read(_HEAD))
+    unit = 1.0 if found is None else float(found[1])
+    if not 0.0 < unit < np.inf:
+        raise ValueError(f"its unit is {unit:g} m")
+    return unit
 
 
 def _is_file(path: Path) -> bool:

@@ -3,17 +3,57 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from vgtm_qp.errors import Mistake, ProblemError
-from vgtm_qp.problem.fields import GREATEST_LENGTH
+from vgtm_qp.errors import Mistake, ProblemError, closest
+from vgtm_qp.problem.fields import GREATEST_LENGTH, LEAST_LENGTH, read_bytes
 from vgtm_qp.problem.table import shown
 
 _GREATEST_BYTES = 50_000_000
 _DEEPEST = 100
+_GREATEST_MISTAKES = 100
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+_KNOWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "robot": (("link", "joint", "material"), ("name", "version")),
+    "link": (("inertial", "visual", "collision"), ("name", "type")),
+    "joint": (
+        (
+            "origin",
+            "parent",
+            "child",
+            "axis",
+            "calibration",
+            "dynamics",
+            "limit",
+            "mimic",
+            "safety_controller",
+        ),
+        ("name", "type"),
+    ),
+    "collision": (("origin", "geometry"), ("name",)),
+    "origin": ((), ("xyz", "rpy")),
+    "axis": ((), ("xyz",)),
+    "limit": ((), ("lower", "upper", "velocity", "effort", "acceleration", "deceleration", "jerk")),
+    "parent": ((), ("link",)),
+    "child": ((), ("link",)),
+    "mimic": ((), ("joint", "multiplier", "offset")),
+    "geometry": (("box", "cylinder", "sphere", "capsule", "mesh"), ()),
+    "box": ((), ("size",)),
+    "cylinder": ((), ("radius", "length")),
+    "sphere": ((), ("radius",)),
+    "capsule": ((), ("radius", "length")),
+    "mesh": ((), ("filename", "scale")),
+}
+"""By element, the elements inside it and its attributes. Others are left to those who read them."""
+_ALIKE = 0.65
+"""How much a misspelt name is like the right one at least: "xzy" is, but not "kinematic", which is used, "inertial"."""
+_ONCE = ("origin", "parent", "child", "axis", "limit", "mimic", "geometry")
+"""Elements of which there is one inside another at most."""
 
 
 @dataclass(eq=False)
@@ -44,12 +84,7 @@ class Element:
 
 def read_xml(file: Path) -> Element:
     """Return the root element of a file; ProblemError where it cannot be read."""
-    try:
-        if file.stat().st_size > _GREATEST_BYTES:
-            raise ProblemError.at(file, "file", "a huge file", f"less than {_GREATEST_BYTES // 1_000_000} MB")
-        text = file.read_bytes()
-    except OSError as error:
-        raise ProblemError.at(file, "file", error.strerror or "", "a readable file") from None
+    text = read_bytes(file, _GREATEST_BYTES)
     root = Element("", {}, 0)
     opened = [root]
     parser = expat.ParserCreate()
@@ -79,7 +114,7 @@ def read_xml(file: Path) -> Element:
 
 
 class Mistakes:
-    """The mistakes of one file, gathered so that they are told together."""
+    """The mistakes of one file, gathered so that they are told together; ProblemError at once where they are many."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -89,11 +124,31 @@ class Mistakes:
         """Add a mistake at an element; `what` says of which link or joint, and which part of it, the value is."""
         where = f"line {place.line}" + (f", {what}" if what else "")
         self._found.append(Mistake(where, shown(value), expected))
+        if len(self._found) == _GREATEST_MISTAKES:
+            self.stop()
 
     def stop(self) -> None:
         """Raise ProblemError if there are mistakes."""
         if self._found:
             raise ProblemError(str(self.file), self._found)
+
+    def spelling(self, element: Element, what: str) -> None:
+        """Add elements and attributes that are probably meant for known ones, and what stands twice, at any depth.
+
+        What is misspelt would be left out in silence: a body, or a limit.
+        """
+        for inner in element.walk():
+            elements, attributes = _KNOWN.get(inner.tag, ((), ()))
+            tags = [child.tag for child in inner.children]
+            for child, tag in zip(inner.children, tags, strict=True):
+                if (meant := _misspelt(tag, elements)) is not None:
+                    self.add(child, what, f"<{tag}>", f"<{meant}>, or another name than one so like it")
+                elif tag in _ONCE and inner.tag in _KNOWN and child is not inner.children[tags.index(tag)]:
+                    self.add(child, what, f"<{tag}>", f"one <{tag}> in a <{inner.tag}>")
+            for name in inner.attributes:
+                if (meant := _misspelt(name, attributes)) is not None:
+                    where = what if inner is element else f"{what}, <{inner.tag}>"
+                    self.add(inner, where, name, f"{meant}, or another name than one so like it")
 
     def numbers(
         self, element: Element, what: str, key: str, count: int, default: tuple[float, ...] | None = None
@@ -106,10 +161,8 @@ class Mistakes:
             if default is None:
                 self.add(element, what, None, expected)
             return default
-        try:
-            values = tuple(float(part) for part in text.split())
-        except ValueError:
-            values = ()
+        parts = text.split()
+        values = tuple(map(float, parts)) if all(map(_NUMBER.fullmatch, parts)) else ()
         if len(values) != count or not all(math.isfinite(x) and abs(x) <= GREATEST_LENGTH for x in values):
             self.add(element, what, text, f"{expected}, none beyond {GREATEST_LENGTH:g}")
             return None
@@ -122,7 +175,7 @@ class Mistakes:
     def lengths(self, element: Element, what: str, key: str, count: int) -> tuple[float, ...]:
         """Return `count` lengths of an attribute, m, greater than 0; ones where they are wrong."""
         values = self.numbers(element, what, key, count)
-        if values is not None and min(values) > 0.0:
+        if values is not None and min(values) >= LEAST_LENGTH:
             return values
         if values is not None:
             said = "a length" if count == 1 else "lengths"
@@ -130,6 +183,12 @@ class Mistakes:
                 element,
                 f"{what}, <{element.tag}> {key}",
                 element.attributes[key],
-                f"{said} greater than 0, m",
+                f"{said} greater than 0, m: {LEAST_LENGTH:g} or more",
             )
         return (1.0,) * count
+
+
+def _misspelt(name: str, known: tuple[str, ...]) -> str | None:
+    """Return the known name that an unknown one is probably meant for: as long, or by one letter longer or shorter."""
+    meant = None if name in known else closest(name, known, alike=_ALIKE)
+    return meant if meant is not None and abs(len(meant) - len(name)) <= 1 else None
