@@ -40,7 +40,7 @@ def keep_angles(motion: GivenMotion, least: float) -> Decision:
                 at = time if value < before[2] else before[3]
                 worst[k] = min(before[0], time), max(before[1], time), min(before[2], value), at
         proven = 0.5 * (found[0] + found[1] - _turned(motion, segment, pairs[corner], first, last, width))
-        open_ = (proven < floor) & ~np.isin(corner, list(worst))
+        open_ = ~(proven >= floor) & ~np.isin(corner, list(worst))
         if not open_.any():
             break
         if depth == _GREATEST_DEPTH - 1 or 2 * open_.sum() > _GREATEST_COUNT:

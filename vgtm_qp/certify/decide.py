@@ -89,7 +89,8 @@ class Bisection:
     def __init__(self, motion: GivenMotion, kept: Sequence[Kept]) -> None:
         self.motion, self.kept = motion, kept
         floor = kept[0].floor - CLEARANCE_TOLERANCE
-        self.least, self.most = floor - motion.rounding, floor + motion.rounding
+        rounding = max(pairs.rounding for pairs in kept)
+        self.least, self.most = floor - rounding, floor + rounding
         self.close = _NEAR_ENOUGH * motion.arm.size
         near, self.rest = self._candidates()
         sizes = [len(pairs.gap) for pairs in near]
@@ -121,7 +122,7 @@ class Bisection:
                 ends, time = self.motion.ends[one.segment], self.motion.time[one.segment]
                 edge = _edge_of(own, one.pair, ends, time, np.zeros(1, dtype=np.int64))
                 nearest = min(nearest, float(edge.distance[0]))
-        found = [own.near(max(self.kept[0].floor, nearest)) for own in self.kept]
+        found = [own.near(max(own.floor, nearest) + own.rounding) for own in self.kept]
         return [near for near, _ in found], min((rest for _, rest in found), default=np.inf)
 
     def run(self, decision: Decision) -> None:
@@ -152,7 +153,7 @@ class Bisection:
     def _open(self, pair: Index, proven: Array, depth: int) -> NDArray[np.bool_]:
         """Return (I,) which intervals are halved."""
         found = self.found[pair]
-        broken, doubtful = found < self.least, proven < self.most
+        broken, doubtful = found < self.least, ~self._are_proven(proven)
         wanted = np.where(broken, found, min(float(self.found.min(initial=np.inf)), self.rest)) - self.close
         coarse = (proven < wanted) & (depth < _REPORT_DEPTH)
         open_ = np.where(broken, coarse, doubtful | coarse) & np.isfinite(self.bend[pair])
@@ -162,10 +163,14 @@ class Bisection:
             open_[:] = False
         return np.asarray(open_)
 
+    def _are_proven(self, proven: Array) -> NDArray[np.bool_]:
+        """Return (I,) where bounds, m, are such that a pair keeps clear; never where one is no number."""
+        return np.asarray(proven >= self.most)
+
     def _note_undecided(
         self, pair: Index, start: Array, width: float, proven: Array, closed: NDArray[np.bool_]
     ) -> None:
-        left = closed & (proven < self.most) & (self.found[pair] >= self.least) & np.isfinite(self.bend[pair])
+        left = closed & ~self._are_proven(proven) & ~(self.found[pair] < self.least)
         if left.any():
             self.left.append((pair[left], start[left], np.full(int(left.sum()), width), proven[left]))
 
@@ -235,7 +240,7 @@ class Bisection:
 
     def _tell(self, decision: Decision) -> None:
         """Note what came out; what is found of the same bodies in successive segments is one finding."""
-        decision.bound = min(self.rest, float(self.proven.min(initial=np.inf)))
+        decision.bound = float(np.minimum(self.rest, self.proven.min(initial=np.inf)))
         floor, kind = self.kept[0].floor, self.kept[0].kind
         broken = np.flatnonzero(self.found < self.least)
         for names, run in self._runs(broken):
@@ -247,7 +252,7 @@ class Bisection:
         if not self.left:
             return
         pair, begin, width, proven = (np.concatenate(parts) for parts in zip(*self.left, strict=True))
-        for names, run in self._runs(np.unique(pair[self.found[pair] >= self.least])):
+        for names, run in self._runs(np.unique(pair[~(self.found[pair] < self.least)])):
             own = np.isin(pair, run)
             segment = self.segment[pair[own]]
             low, high = (self.motion.times_at(segment, x[own]) for x in (begin, begin + width))

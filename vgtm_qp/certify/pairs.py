@@ -33,10 +33,13 @@ class Near(NamedTuple):
 
 
 class Kept(ABC):
-    """Pairs that keep at least `floor`, m, from surface to surface; `kind` is what a finding calls their clearance."""
+    """Pairs that keep at least `floor`, m, from surface to surface; `kind` is what a finding calls their clearance.
+
+    `rounding` is what rounding may make of their distances, m.
+    """
 
     def __init__(self, motion: GivenMotion, kind: str, floor: float) -> None:
-        self.motion, self.kind, self.floor = motion, kind, floor
+        self.motion, self.kind, self.floor, self.rounding = motion, kind, floor, motion.rounding
         slack = motion.bends[:, :, None] / 8.0
         ends = motion.ends
         self._low = np.minimum(ends[:-1], ends[1:]).min(axis=2) - slack
@@ -133,6 +136,9 @@ class KeptBodies(Kept):
         )
         self._sizes = np.concatenate([body.shape.sizes for body in bodies])
         corners = np.concatenate([body.corners() for body in bodies])
+        # A large clock puts an obstacle that moves no better than its own rounding does.
+        away = max(float(np.abs(body.at(motion.time)).max()) for body in bodies)
+        self.rounding += 64.0 * float(np.finfo(float).eps) * away
         self._piece_low, self._piece_high = corners.min(axis=1), corners.max(axis=1)
         self._shape = bodies[0].shape
         self._columns = len(bodies) * len(motion.arm.radius)

@@ -2,8 +2,8 @@
 
 The nodes x solve l(x) = L(s). From a known state, with the inverse A of the length Jacobian there, they move with
 x' = A (L' - e), where e holds for each member the change of its direction times the relative velocity w of its ends.
-If bounds of |w| reproduce themselves, the motion exists, is the only one near that state, and keeps to them. Each
-length's l'' = 0 then bounds x'', and so how far nodes leave their chords.
+If bounds of |w| reproduce themselves, the motion exists and keeps to them, and no other nodes within them have its
+lengths. Each length's l'' = 0 then bounds x'', and so how far nodes leave their chords.
 """
 
 from __future__ import annotations
@@ -73,6 +73,11 @@ class TrussSolver:
             nodes[open_[:, None], free] += step.reshape(len(open_), -1, 3)
         return nodes, before <= tolerance
 
+    def apart(self, moved: Array) -> Array:
+        """Return (U, M) how far the vectors between members' ends change where nodes are moved by (U, N, 3), m."""
+        first, last = self.arm.members.T
+        return np.asarray(np.linalg.norm(moved[:, last] - moved[:, first], axis=2))
+
     def inverse(self, nodes: Array) -> Array:
         """Return (U, F, 3, M) the derivatives of the free nodes by the lengths; NaN where they are singular."""
         found = np.full((len(nodes), 3 * len(self.arm.free), len(self.arm.members)), np.nan)
@@ -97,7 +102,7 @@ class Tube:
     speed, bend : (U, N)
         Bounds of |x'| and |x''| of the nodes, m.
     sensitivity : (U,)
-        How far at most a node moves for an error of one metre in each length.
+        How far at most a node moves for an error in each length, anywhere within the bounds, m/m.
     """
 
     closed: NDArray[np.bool_]
@@ -117,7 +122,7 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     relative = every[:, arm.members[:, 1]] - every[:, arm.members[:, 0]]
     of_nodes, of_members = np.linalg.norm(every, axis=2), np.linalg.norm(relative, axis=2)
     velocity = np.einsum("unck,uk->unc", every, change)
-    first = np.linalg.norm(velocity[:, arm.members[:, 1]] - velocity[:, arm.members[:, 0]], axis=2)
+    first = solver.apart(velocity)
     first = first * _INFLATED + 1e-9 * (first.max(axis=1, keepdims=True) + 1e-9 * solver.size)
     eye = np.eye(len(arm.members))
     wider = (1.0 + _SLACK) * first + _SLACK**2 * first.max(axis=1, keepdims=True)
@@ -143,7 +148,9 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     bends = np.where(closed[:, None], np.maximum(bends, 0.0) * _INFLATED + largest, 0.0)
     speed = np.linalg.norm(velocity, axis=2) + np.einsum("unm,um->un", of_nodes, turned * apart)
     bend = np.einsum("unm,um->un", of_nodes, curved + turned * bends) * _INFLATED
-    return Tube(closed, apart, speed * _INFLATED, bend, of_nodes.sum(axis=2).max(axis=1))
+    wrong = 1.0 + turned * _solved(system, of_members.sum(axis=2))
+    sensitivity = np.einsum("unm,um->un", of_nodes, wrong).max(axis=1)
+    return Tube(closed, apart, speed * _INFLATED, bend, sensitivity)
 
 
 def _turned(apart: Array, length: Array) -> Array:
@@ -169,12 +176,18 @@ class TrussMotion(GivenMotion):
     """A truss along intervals in each of which a `tube` proves where it is."""
 
     def __init__(
-        self, solver: TrussSolver, time: Array, nodes: Array, bends: Array, problem: Mapping[str, Any]
+        self,
+        solver: TrussSolver,
+        time: Array,
+        nodes: Array,
+        bends: Array,
+        apart: Array,
+        problem: Mapping[str, Any],
     ) -> None:
-        self._solver, self._nodes, self._problem = solver, nodes, problem
+        self._solver, self._nodes, self._apart, self._problem = solver, nodes, apart, problem
         self._lengths = solver.arm.lengths(nodes)
         super().__init__(solver.arm, time, self._placed(nodes, time))
-        self._bends, first, last = bends, *solver.arm.members.T
+        first, last = solver.arm.members.T
         self.bends = np.maximum(bends[:, first], bends[:, last])
         self.lost: set[int] = set()
 
@@ -185,8 +198,8 @@ class TrussMotion(GivenMotion):
         chord = before + share[..., None] * (after - before)
         lengths = self._lengths[segment] + share * (self._lengths[segment + 1] - self._lengths[segment])
         nodes, solved = self._solver.solve(chord, lengths)
-        away = np.linalg.norm(nodes - chord, axis=2) - self._bends[segment] / 8.0
-        self.lost |= set(segment[~solved | (away > 1e-9 * self._solver.size).any(axis=1)].tolist())
+        beyond = self._solver.apart(nodes - before) - self._apart[segment]
+        self.lost |= set(segment[~solved | (beyond > 1e-9 * self._solver.size).any(axis=1)].tolist())
         return self.arm.states_ends(self._placed(nodes, self.times_at(segment, share[:, 0])))
 
     def doubts(self) -> Iterator[Finding]:
@@ -246,7 +259,7 @@ class _Followed:
 
     def __init__(self, solver: TrussSolver, rows: Array, lengths: Array, time: Array) -> None:
         self.solver, self.rows, self.lengths, self.time = solver, rows, lengths, time
-        self.parts: list[tuple[Index, Array, Array, Array, Array, Array]] = []
+        self.parts: list[tuple[Index, Array, Array, Array, Array, Array, Array]] = []
         self.error = 0.0
 
     def follow(self) -> int:
@@ -288,10 +301,7 @@ class _Followed:
         """Return in which intervals (P,) the motion from `first` is proven to lead to `last`, and keep these."""
         begin, end = (self._lengths_at(segment, start + step) for step in (0.0, width))
         found = tube(self.solver, first, begin, end - begin)
-        members = self.solver.arm.members
-        moved = last - first
-        apart = np.linalg.norm(moved[:, members[:, 1]] - moved[:, members[:, 0]], axis=2)
-        closed = np.asarray(found.closed & (apart <= found.apart).all(axis=1))
+        closed = np.asarray(found.closed & (self.solver.apart(last - first) <= found.apart).all(axis=1))
         self.parts.append(
             (
                 segment[closed],
@@ -300,6 +310,7 @@ class _Followed:
                 last[closed],
                 found.speed[closed],
                 found.bend[closed],
+                found.apart[closed],
             )
         )
         self.error = max(self.error, float(found.sensitivity[closed].max(initial=0.0)))
@@ -308,7 +319,7 @@ class _Followed:
     def motion(self, known: int, problem: Mapping[str, Any]) -> TrussMotion:
         """Return the motion through the first `known` rows."""
         arm = self.solver.arm
-        segment, start, first, last, speed, bend = (
+        segment, start, first, last, speed, bend, apart = (
             np.concatenate(parts) for parts in zip(*self.parts, strict=True)
         )
         # The first segment leads from home to the first row.
@@ -316,8 +327,8 @@ class _Followed:
         order = order[(segment[order] >= 1) & (segment[order] < known)]
         if not len(order):
             row, time = self.rows[1], np.repeat(self.time[:1], 2)
-            none = np.zeros((1, len(arm.home)))
-            return self._with_rounding(TrussMotion(self.solver, time, np.stack([row, row]), none, problem))
+            still = np.zeros((1, len(arm.home))), np.zeros((1, len(arm.members)))
+            return self._with_rounding(TrussMotion(self.solver, time, np.stack([row, row]), *still, problem))
         segment, start = segment[order], start[order]
         nodes = np.concatenate([first[order], last[order[-1:]]])
         before, after = self.time[segment - 1], self.time[segment]
@@ -327,7 +338,7 @@ class _Followed:
         reach = np.linalg.norm(nodes, axis=2)
         reach = np.maximum(reach[:-1], reach[1:]) + bend[order] / 8.0
         bends = bend[order] + turn * (2.0 * speed[order] + turn * reach)
-        return self._with_rounding(TrussMotion(self.solver, time, nodes, bends, problem))
+        return self._with_rounding(TrussMotion(self.solver, time, nodes, bends, apart[order], problem))
 
     def _with_rounding(self, motion: TrussMotion) -> TrussMotion:
         """Return the motion with what the lengths' rounding makes of positions."""

@@ -12,14 +12,20 @@ from vgtm_qp.cli.output import ExitCode, Json, ProblemName, answer
 
 def certify(
     problem: ProblemName,
-    trajectory: Annotated[Path, Parameter(name="TRAJECTORY", help="CSV file: t and the names of the joints")],
+    trajectory: Annotated[
+        Path,
+        Parameter(
+            name="TRAJECTORY",
+            help="CSV file: t and the names of joints or actuators; or a ROS 2 bag, or a JointTrajectory in YAML",
+        ),
+    ],
     /,
     *,
     json: Json = False,
 ) -> int:
     """Prove or refute a trajectory for a problem's arm and obstacles, over the whole time and not at its rows alone.
 
-    Joints move linearly between the rows. Proven are limits, rates, accelerations and clearances: exit code 0; 4 if
+    Joints and actuators move linearly between the rows. Proven are limits, rates, accelerations and clearances: exit code 0; 4 if
     one is violated or cannot be decided.
     """
     from vgtm_qp.certify.certify import Certifier
