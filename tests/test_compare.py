@@ -11,13 +11,14 @@ import types
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import vgtm_qp as vq
 from vgtm_qp.cli import main
 from vgtm_qp.errors import GoalError
-from vgtm_qp.methods import PRESETS, with_method
+from vgtm_qp.methods import PRESETS, method_name, with_method
 from vgtm_qp.study.study import STUDIES, Study
 
 METHODS = ["qp", "pseudoinverse", "pseudoinverse-corrected", "curve-pseudoinverse-plain"]
@@ -209,3 +210,18 @@ def test_a_full_disk_is_told_with_exit_code_1_and_leaves_no_half_file(
     assert "the system refuses" in said
     assert "Traceback" not in said
     assert [path.name for path in tmp_path.iterdir()] == ["arm.npz"]
+
+
+def test_osqp_stands_beside_daqp_and_another_solver_keeps_its_name() -> None:
+    problem = vq.load_problem("five_bay_free").replace({"maneuver.steps": 5})
+    report = vq.compare(problem, methods=["qp", "qp-osqp"])
+    assert [row.solved for row in report.rows] == [True, True]
+    ours, other = (report.maneuvers[problem.name, name] for name in ("qp", "qp-osqp"))
+    assert other.manifest["problem"]["method"]["solver"] == "osqp"
+    assert np.allclose(ours.nodes, other.nodes, rtol=0.0, atol=1e-7)
+    assert not np.array_equal(ours.nodes, other.nodes)
+    assert method_name(problem) == "qp"
+    assert method_name(with_method(problem, "qp-osqp")) == "qp-osqp"
+    piqp = problem.replace({"method.solver": "piqp"})
+    assert method_name(with_method(piqp, "qp")) == "qp"
+    assert with_method(piqp, "qp").method.solver == "piqp"

@@ -140,7 +140,7 @@ def test_the_hand_changes_between_all_methods_and_back(session: Session):
 
 
 def test_a_serial_arm_is_offered_what_can_move_it():
-    assert list(methods_for(vq.load_problem("snake_past_a_cube"))) == ["qp", "qp-none"]
+    assert list(methods_for(vq.load_problem("snake_past_a_cube"))) == ["qp", "qp-osqp", "qp-none"]
 
 
 def test_a_changed_setting_keeps_the_state_and_a_wrong_one_changes_nothing(session: Session):

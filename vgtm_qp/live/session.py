@@ -143,7 +143,7 @@ class Session:
         self._waiting, self._held_by = 0, ()
 
     def use_method(self, name: str) -> None:
-        """Change to the method called `name`, with the weights and gains of the problem that was given.
+        """Change to the method called `name`, with the weights, gains and solver of the problem that was given.
 
         VgtmError, and no change, where it cannot move this arm.
         """
@@ -151,7 +151,7 @@ class Session:
             key: getattr(getattr(self._given.method, key.split(".")[1]), key.split(".")[2])
             for key in _WEIGHTS
         }
-        self.change({**own, **PRESETS[name]})
+        self.change({**own, "method.solver": self._given.method.solver, **PRESETS[name]})
 
     def advance(self, dt: float) -> bool:
         """Make one step of duration `dt`, s, towards what is wanted; return whether the arm moved.

@@ -37,6 +37,7 @@ _CURVE_OBSTACLES = {
 
 _CHANGES: dict[str, dict[str, Any]] = {
     "qp": {"method.name": "qp", "method.tracking": "coupled"},
+    "qp-osqp": {"method.name": "qp", "method.tracking": "coupled", "method.solver": "osqp"},
     "qp-none": {"method.name": "qp", "method.tracking": "none"},
     "qp-recursive": {"method.name": "qp", "method.tracking": "recursive"},
     "qp-parallel": {"method.name": "qp", "method.tracking": "parallel"},
@@ -63,10 +64,13 @@ _PLAIN = {
 }
 
 PRESETS = MappingProxyType({name: {**_PLAIN, **changes} for name, changes in _CHANGES.items()})
-"""What each name changes. ``-plain`` has no null-space vector; ``-corrected`` and ``-obstacles`` correct the drift."""
+"""What each name changes. ``-plain`` has no null-space vector; ``-corrected`` and ``-obstacles`` correct the drift.
+
+All solve their QPs by the problem's own solver, ``-osqp`` excepted."""
 
 DEFAULT_METHODS = (
     "qp",
+    "qp-osqp",
     "qp-none",
     "qp-recursive",
     "pseudoinverse",
@@ -107,7 +111,7 @@ def method_name(problem: Problem) -> str:
     """Return the name of a problem's method; that of ``method.name`` if its keys are those of no other name."""
     own = problem.method
     same = [name for name, other in methods_for(problem).items() if other.method == own]
-    return next(iter(same), own.name)
+    return next(reversed(same), own.name)
 
 
 def check_methods(names: Sequence[str]) -> None:
