@@ -23,6 +23,8 @@ from hypothesis import strategies as st
 
 import vgtm_qp as vq
 from vgtm_qp.certify.certify import Certifier
+from vgtm_qp.certify.decide import decide
+from vgtm_qp.certify.motion import JointMotion
 from vgtm_qp.cli import main
 
 seeds = st.integers(0, 2**32 - 1)
@@ -45,6 +47,27 @@ def planar(**tables: Any) -> vq.Problem:
 
 def post(x: float, y: float, radius: float = 0.1, **more: Any) -> dict[str, Any]:
     return {"name": "post", "shape": "sphere", "center": [x, y, 0.0], "radius": radius, **more}
+
+
+def test_what_bends_without_a_bound_is_not_certified() -> None:
+    certifier = Certifier(planar(obstacle=[post(1.0, 0.6)]))
+    motion = JointMotion(certifier.arm, np.array([0.0, 1.0]), np.zeros((2, 2)), certifier._table)
+    assert not decide(motion, certifier._kept(motion))["clearance"].undecided
+    motion.bends[:] = np.inf
+    assert decide(motion, certifier._kept(motion))["clearance"].undecided
+
+
+def test_an_obstacle_is_known_no_better_than_its_clock() -> None:
+    away = post(-1e6 + 1.0, 0.17, velocity=[1.0, 0.0, 0.0])
+    near = Certifier(planar(obstacle=[post(1.0, 0.17, velocity=[1.0, 0.0, 0.0])]))
+    far = Certifier(planar(obstacle=[away]))
+    kept = []
+    for certifier, start in ((near, 0.0), (far, 1e6)):
+        motion = JointMotion(certifier.arm, start + np.array([0.0, 0.5]), np.zeros((2, 2)), certifier._table)
+        kept += certifier._kept(motion)[:1]
+    assert kept[0].rounding < 1e-12
+    # Its centre and its way cancel.
+    assert kept[1].rounding >= 64.0 * 2e6 * np.finfo(float).eps
 
 
 @pytest.mark.smoke

@@ -50,6 +50,12 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "misspelt": ("t,shoulder,elbw,slide\n0,1,2,0\n", "line 1, column 3", 'did you mean "elbow"'),
     "another case": ("T,shoulder,elbow,slide\n0,1,2,0\n", "line 1", "t and the names"),
     "unknown": ("t,shoulder,elbow,slide,wrist\n0,1,2,0,0\n", "line 1, column 5", "t and the names"),
+    "another arm's": ("time [s],B1-1 [m],B1-2 [m]\n0,1,1\n", "line 1", "a header with"),
+    "a rate of nothing": (
+        "t,shoulder,elbow,slide,d wrist/dt [rad/s]\n0,1,2,0,0\n",
+        "line 1, column 5",
+        "t and the names",
+    ),
     "missing": ("t,shoulder,slide\n0,1,0\n", "line 1", "elbow"),
     "no time": ("shoulder,elbow,slide\n1,2,0\n", "line 1", 'no column "t"'),
     "twice": ("t,shoulder,elbow,slide,elbow\n0,1,2,0,2\n", "line 1, column 5", "once"),

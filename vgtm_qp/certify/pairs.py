@@ -88,7 +88,8 @@ class Kept(ABC):
         """Return the pairs that may come nearer than `limit`, m, and a bound of the distances of all the others."""
         found, rest = [], np.inf
         for first, gaps in self._chunks():
-            near = gaps < limit
+            # What is no number may be anywhere.
+            near = ~(gaps >= limit)
             rest = min(rest, float(gaps[~near].min(initial=np.inf)))
             row, column = np.nonzero(near)
             found.append(self._near(row + first, column, gaps[row, column], limit))
@@ -136,9 +137,9 @@ class KeptBodies(Kept):
         )
         self._sizes = np.concatenate([body.shape.sizes for body in bodies])
         corners = np.concatenate([body.corners() for body in bodies])
-        # A large clock puts an obstacle that moves no better than its own rounding does.
-        away = max(float(np.abs(body.at(motion.time)).max()) for body in bodies)
-        self.rounding += 64.0 * float(np.finfo(float).eps) * away
+        # Where an obstacle starts and how far it goes may cancel, but not their rounding.
+        gone = np.abs(self._center) + np.abs(self._velocity) * float(motion.time[-1])
+        self.rounding += 64.0 * float(np.finfo(float).eps) * float(gone.max())
         self._piece_low, self._piece_high = corners.min(axis=1), corners.max(axis=1)
         self._shape = bodies[0].shape
         self._columns = len(bodies) * len(motion.arm.radius)

@@ -145,16 +145,20 @@ def _read_header(columns: Columns, cells: list[str], mistakes: list[Mistake]) ->
     if len(cells) == 1 and re.search(r"[;\t|]", cells[0]):
         mistakes.append(Mistake("line 1", shown(cells[0]), "names with commas between them"))
         return []
+    for number, cell in enumerate(cells, start=1):
+        if "\n" in cell:
+            told = "a name on one line; its quotation mark stays open"
+            mistakes.append(Mistake(f"line 1, column {number}", shown(cell), told))
+            return []
     header = [spellings.get(cell, cell) for cell in cells]
     unknown = [cell for cell in cells if cell not in spellings]
-    if len(unknown) == len(cells) and not any(_meant(cell, spellings) for cell in cells):
+    known = set(header) & set(columns.keys)
+    if (unknown or not cells) and not known and not any(_meant(cell, spellings) for cell in unknown):
         mistakes.append(Mistake("line 1", shown(",".join(cells) or None), f"a header with {expected}"))
         return []
     for number, (cell, key) in enumerate(zip(cells, header, strict=True), start=1):
         place = f"line 1, column {number}"
-        if "\n" in cell:
-            mistakes.append(Mistake(place, shown(cell), "a name on one line; its quotation mark stays open"))
-        elif cell in unknown:
+        if cell in unknown:
             told = expected + _meant(cell, ("t", *columns.names))
             mistakes.append(Mistake(place, shown(cell or None), told))
         elif key in header[: number - 1]:
@@ -164,7 +168,7 @@ def _read_header(columns: Columns, cells: list[str], mistakes: list[Mistake]) ->
     absent = [
         key for key in needed if key not in header and not any(_meant(cell, (key,)) for cell in unknown)
     ]
-    if absent and not any("\n" in cell for cell in cells):
+    if absent:
         mistakes.append(Mistake("line 1", f"no column {quoted(absent)}", f"a column for each of {expected}"))
     return header
 
