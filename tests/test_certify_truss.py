@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import vgtm_qp as vq
 from vgtm_qp.arm.build import make_arm
+from vgtm_qp.certify.certify import Certifier
 from vgtm_qp.certify.truss_motion import TrussSolver, truss_motion, tube
 from vgtm_qp.verify.arm import RecordedArm
 
@@ -97,6 +98,17 @@ def tripod() -> vq.Problem:
     )
 
 
+@pytest.mark.parametrize("size", [1e200, np.inf, np.nan])
+def test_numbers_that_overflow_prove_nothing(size: float) -> None:
+    arm = recorded(tripod())
+    solver = TrussSolver(arm)
+    inverse = solver.inverse
+    solver.inverse = lambda nodes: inverse(nodes) * size  # type: ignore[method-assign]
+    assert not tube(solver, arm.home[None], arm.length[None], np.full((1, 3), 1e-3)).closed.any()
+    solver.inverse = lambda nodes: inverse(nodes) * 1e160 * size  # type: ignore[method-assign]
+    assert not tube(solver, arm.home[None], arm.length[None], np.full((1, 3), 1e-3)).closed.any()
+
+
 def test_nodes_of_the_same_lengths_elsewhere_are_not_taken_for_the_motion() -> None:
     arm = recorded(tripod())
     lengths = arm.length + np.array([[0.0], [0.05]])
@@ -150,7 +162,7 @@ def test_what_sampling_finds_is_above_what_is_proven(module: str, rng: np.random
             {"obstacle": [ball], "clearance.safe": 0.02, "clearance.self_collision": False}
         )
         times = np.arange(4.0)
-        certifier = importlib.import_module("vgtm_qp.certify.certify").Certifier(scene)
+        certifier = Certifier(scene)
         verdict = certifier.certify(times, rows[:, certifier.columns.quantities])
         ways, nodes = [], arm.home
         for row in rows[1:]:
@@ -165,6 +177,58 @@ def test_what_sampling_finds_is_above_what_is_proven(module: str, rng: np.random
         assert clear or apart.min() >= 0.02 - 1e-9
         answers.add(verdict.answer)
     assert answers <= {"certified", "violated"}
+
+
+def two_tripods() -> vq.Problem:
+    feet = {
+        f"{x}{k}": [1.5 * x + 0.6 * np.cos(w), 0.6 * np.sin(w), 0.0]
+        for x in (0, 1)
+        for k, w in enumerate((0, 2, 4))
+    }
+    nodes = [{"name": name, "position": place, "fixed": True} for name, place in feet.items()]
+    nodes += [{"name": f"top{x}", "position": [1.5 * x, 0.0, 0.8]} for x in (0, 1)]
+    members = [
+        {"name": f"m{foot}", "nodes": [foot, f"top{foot[0]}"], "actuated": True, "stroke": [0.1, 5.0]}
+        for foot in feet
+    ]
+    truss = {"module": "graph", "node": nodes, "member": members, "tip": ["top0"], "member_radius": 0.01}
+    return vq.Problem.from_dict(
+        {
+            "truss": truss,
+            "maneuver": {"waypoint": [{"time": 1.0, "position": [0.0, 0.0, 0.9]}]},
+            "method": {"tracking": "none"},
+            "clearance": {"safe": 0.1, "influence": 5.0},
+        }
+    )
+
+
+def test_members_that_pass_one_another_between_rows_are_found(rng: np.random.Generator) -> None:
+    problem = two_tripods()
+    arm = recorded(problem)
+    for _ in range(4):
+        aside, rows = np.array([0.0, 0.35, 0.0]) + rng.uniform(-0.1, 0.1, 3), []
+        for side in (-1.0, 1.0):
+            nodes = arm.home.copy()
+            nodes[arm.free] += np.array([[0.7, 0.0, 0.0], [-0.7, 0.0, 0.1]]) + side * np.array(
+                [aside, -aside]
+            )
+            rows.append(arm.lengths(nodes))
+        solver = TrussSolver(arm)
+        start = followed(solver, arm.home, rows[0], 50)[-1]
+        ends = arm.ends(followed(solver, start, rows[1], 200))
+        along = np.linspace(0.0, 1.0, 31)[:, None]
+        points = ends[:, :, None, 0] + along * (ends[:, :, None, 1] - ends[:, :, None, 0])
+        apart = np.linalg.norm(points[:, :3, None, :, None] - points[:, None, 3:, None], axis=-1)
+        at_rows, least = apart[[0, -1]].min() - 0.02, apart.min() - 0.02
+        assert 0.01 < least < at_rows - 0.05
+        nearer = Certifier(problem.replace({"clearance.self_safe": float(least + 1e-3)})).certify(
+            [0.0, 1.0], rows
+        )
+        assert {each.kind for each in nearer.violations} == {"self-clearance"}
+        assert nearer.self_clearance <= least + 1e-9
+        assert vq.certify(
+            problem.replace({"clearance.self_safe": float(least - 0.01)}), [0.0, 1.0], rows
+        ).certified
 
 
 def test_what_our_own_solver_made_is_certified() -> None:

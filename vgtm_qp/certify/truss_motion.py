@@ -112,6 +112,8 @@ class Tube:
     sensitivity: Array
 
 
+# Near singular states numbers overflow, and then prove nothing.
+@np.errstate(all="ignore")
 def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube:
     """Return what is proven from states (U, N, 3) of lengths `start` (U, M) that change by `change` (U, M), m."""
     arm, count = solver.arm, len(nodes)
@@ -129,8 +131,7 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     apart = wider
     for _ in range(_ROUNDS):
         system = eye - of_members * _turned(apart, start)[:, None, :]
-        with np.errstate(all="ignore"):
-            apart = _solved(system, wider)
+        apart = _solved(system, wider)
         # Once bounds are useless they stay so.
         apart = np.where((apart >= wider) & (apart < start), apart, 0.999 * start)
     turned = _turned(apart, start)
@@ -139,12 +140,10 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     least = np.minimum(start, start + change)
     curved = np.maximum(apart * apart - change * change, 0.0) / np.maximum(least, 1e-300)
     system = eye - of_members * turned[:, None, :]
-    with np.errstate(all="ignore"):
-        bends = _solved(system, np.einsum("umk,uk->um", of_members, curved))
+    bends = _solved(system, np.einsum("umk,uk->um", of_members, curved))
     # Rounding leaves small numbers, of either sign, where there are zeros.
     largest = 1e-9 * np.abs(bends).max(axis=1, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        closed &= np.isfinite(bends).all(axis=1) & (bends >= -largest).all(axis=1) & (least > 0.0).all(axis=1)
+    closed &= np.isfinite(bends).all(axis=1) & (bends >= -largest).all(axis=1) & (least > 0.0).all(axis=1)
     bends = np.where(closed[:, None], np.maximum(bends, 0.0) * _INFLATED + largest, 0.0)
     speed = np.linalg.norm(velocity, axis=2) + np.einsum("unm,um->un", of_nodes, turned * apart)
     bend = np.einsum("unm,um->un", of_nodes, curved + turned * bends) * _INFLATED
