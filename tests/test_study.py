@@ -13,7 +13,7 @@ import study_tasks
 
 from vgtm_qp.comparison.tables import exponent, wilson_interval
 from vgtm_qp.errors import GoalError
-from vgtm_qp.study import STUDIES, Study, clutter, run_study
+from vgtm_qp.study import STUDIES, Study, clutter, loops, run_study
 from vgtm_qp.study import study as study_module
 from vgtm_qp.study.workers import run_dask, run_here, run_processes
 
@@ -132,3 +132,17 @@ def test_wilson_intervals_and_exponents() -> None:
     assert wilson_interval(0, 0) == (0.0, 1.0)
     sizes = np.array([2.0, 5.0, 30.0])
     assert exponent(sizes, 3.0 * sizes**1.7) == pytest.approx(1.7)
+
+
+def test_a_loop_counts_its_steps_and_what_breaks_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = loops.run(7, 5, 20)
+    assert row["reached"] + row["slowed"] + row["blocked"] == 20
+    assert row["reached"]
+    assert not row["failures"]
+    along = loops._along
+
+    def stricter(problem: Any, targets: Any) -> Any:
+        return along(problem, targets).replace({"clearance.safe": 2.5, "clearance.influence": 3.0})
+
+    monkeypatch.setattr(loops, "_along", stricter)
+    assert "clearance" in " ".join(loops.run(7, 5, 20)["failures"])

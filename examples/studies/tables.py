@@ -31,7 +31,11 @@ LARGE = 0.2
 UNITS = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 NUMBER = re.compile(r"(?<![\w.])([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?: (us|ms|s)\b)?")
 
-OPTIONS = {"robustness": "--scenes 300 --seed 1991", "tracking": "--scenes 120 --seed 1991"}
+OPTIONS = {
+    "robustness": "--scenes 300 --seed 20261129",
+    "tracking": "--scenes 120 --seed 1991",
+    "loops": "--scenes 40 --seed 1991",
+}
 """Of the studies that take any."""
 COMMANDS = {
     **{name: f"vgtm study {name} {OPTIONS.get(name, '')}".strip() for name in STUDIES},

@@ -93,7 +93,8 @@ def study(
         list[str],
         Parameter(
             name="NAME",
-            help="figure3, figure4, figure7, figure8, figure9, redundancy, joints, clutter, robustness, or all",
+            help="figure3, figure4, figure7, figure8, figure9, redundancy, joints, clutter, tracking, robustness, "
+            "loops, or all",
         ),
     ],
     /,
@@ -102,10 +103,10 @@ def study(
     dask: Annotated[str | None, Parameter(help="address of a dask.distributed scheduler")] = None,
     short: Annotated[bool, Switch(help="a quick look: fewer and smaller runs")] = False,
     scenes: Annotated[
-        int | None, Parameter(help="number of random scenes, of robustness and tracking")
+        int | None, Parameter(help="number of random scenes, of tracking, robustness and loops")
     ] = None,
     seed: Annotated[
-        int | None, Parameter(help="seed of the random scenes, of robustness and tracking")
+        int | None, Parameter(help="seed of the random scenes, of tracking, robustness and loops")
     ] = None,
     output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
     json: Json = False,

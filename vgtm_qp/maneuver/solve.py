@@ -5,23 +5,21 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
 from vgtm_qp.compiled import finish_compiling
 from vgtm_qp.machine import THREADS, environment
+from vgtm_qp.maneuver.log import Log
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.retries import DeadEnd, retries
 from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
-from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, problem_digests, recorded_versions
+from vgtm_qp.result.manifest import problem_digests
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.remedies import Remedy
 from vgtm_qp.step.state import State
@@ -85,7 +83,9 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
                 stop = None if stop is None else replace(stop, remedies=_tried(attempt, stop))
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
-    maneuver = _assemble(problem, resolver, attempt, stop, setup_time, way, digests)
+    maneuver = attempt.log.maneuver(
+        problem, stop, problem_digests=digests, way_out=way, setup_time=setup_time
+    )
     return maneuver.with_certificate(check(maneuver)) if verify else maneuver
 
 
@@ -142,15 +142,12 @@ def compile_steps(problem: Problem) -> None:
 
 
 class _Attempt:
-    """A resolver on its way along the path of a problem, and the rows of the result, grown step by step."""
+    """A resolver on its way along the path of a problem, and the log of its states."""
 
     def __init__(self, problem: Problem, resolver: Resolver) -> None:
         self.resolver, self.plan = resolver, make_plan(problem, *resolver.tip())
         self.value = self.plan.path.start
-        self.rows: dict[str, list[Any]] = {}
-        self._seconds, self._phases = 0.0, [0.0] * len(resolver.phases)
-        self.clearance_rows = {"fcl": 0, "exact": 0}
-        self._add_row()
+        self.log = Log(resolver, self.plan.path.pose(self.value))
 
     @property
     def progress(self) -> float:
@@ -166,7 +163,7 @@ class _Attempt:
         while self.value < last:
             aim, dt = plan.next_mark(self.value, keeps_moving=keeps_moving)
             before = resolver.state
-            with self._clock():
+            with self.log.clock():
                 step = resolver.follow(plan.path, self.value, aim, dt=dt)
             if step.status is StepStatus.BLOCKED:
                 return self._explain(aim, dt, step)
@@ -216,49 +213,17 @@ class _Attempt:
         """Do the steps in which the arm comes to rest on its path."""
         path = self.plan.path
         while self.value < path.end:
-            with self._clock():
+            with self.log.clock():
                 step = self.resolver.brake(path, self.value, path.end)
             if step is None or step.left_path:
                 return
             self._advance(path.end, step)
 
-    @contextmanager
-    def _clock(self) -> Iterator[None]:
-        """Record the time of the step in this context, as a whole and by phase."""
-        known, started = dict(self.resolver.phases), perf_counter()
-        yield
-        self._seconds = perf_counter() - started
-        self._phases = [total - known[name] for name, total in self.resolver.phases.items()]
-
     def _advance(self, aim: float, step: Step) -> None:
         """Record a step towards `aim`."""
         reached = step.status is StepStatus.REACHED
         self.value = aim if reached else self.value + step.progress * (aim - self.value)
-        self.clearance_rows["fcl"] += step.fcl_rows
-        self.clearance_rows["exact"] += step.exact_rows
-        self._add_row()
-
-    def _add_row(self) -> None:
-        resolver, state, setup = self.resolver, self.resolver.state, self.resolver.setup
-        position, rotation = resolver.tip()
-        target = self.plan.path.at(self.value)
-        row = {
-            "time": state.time,
-            "configuration": state.q,
-            "quantities": state.quantities,
-            "control_vertices": state.control_vertices,
-            "tip_position": position,
-            "tip_rotation": rotation,
-            "tip_target_position": target.position,
-            "tip_target_rotation": target.rotation,
-            "clearance": setup.least_clearance(state.q, state.time, "obstacles"),
-            "self_clearance": setup.least_clearance(state.q, state.time, "members"),
-            "progress": self.progress,
-            "step_time": self._seconds,
-            "phase_time": self._phases,
-        }
-        for name, value in row.items():
-            self.rows.setdefault(name, []).append(value)
+        self.log.add(step, self.plan.path.pose(self.value), self.progress)
 
 
 def _retry(
@@ -288,67 +253,3 @@ def _tried(attempt: _Attempt, stop: Stop) -> tuple[Remedy, ...]:
     """Return the remedies of a stop with which the arm goes on, by as much as it takes."""
     enough = (next(filter(attempt.goes_on, map(remedy.times, _MORE)), None) for remedy in stop.remedies)
     return tuple(remedy for remedy in enough if remedy is not None)
-
-
-def _assemble(
-    problem: Problem,
-    resolver: Resolver,
-    attempt: _Attempt,
-    stop: Stop | None,
-    setup_time: float,
-    way: str,
-    digests: dict[str, str | None],
-) -> Maneuver:
-    setup = resolver.setup
-    meshes = {
-        obstacle.name: mesh_record(obstacle.file, len(pieces.pieces))
-        for obstacle, pieces in zip(problem.obstacle, setup.monitor.obstacles, strict=True)
-        if obstacle.shape == "mesh"
-    }
-    manifest = {
-        "schema_version": SCHEMA_VERSION,
-        "problem": problem.to_dict(),
-        "problem_digests": digests,
-        "arm": setup.arm.record(),
-        "curve": attempt.resolver.setup.layout.record(),
-        "status": "solved" if stop is None else "blocked",
-        # That of the last whole row: an interrupt may have come before the next.
-        "reached": float(attempt.rows["progress"][-1]),
-        "blocked_by": [] if stop is None else list(stop.names),
-        "stop": None if stop is None else stop.to_dict(),
-        "way_out": way,
-        "recovered": [
-            {"pair": pair, "distance": apart} for pair, apart in sorted(_too_near(resolver).items())
-        ],
-        "method": problem.method.name,
-        "solver": resolver.solver,
-        "setup_time": setup_time,
-        "directory": str((problem.source.parent if problem.source else Path.cwd()).resolve()),
-        "meshes": meshes,
-        "versions": recorded_versions(),
-        "certificate": None,
-        # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank.
-        "jacobian_rank": resolver.rank,
-        "clearance_rows": attempt.clearance_rows,
-    }
-    arrays: dict[str, Any] = {name: np.asarray(rows, dtype=float) for name, rows in attempt.rows.items()}
-    rotation = arrays.pop("tip_target_rotation")
-    arrays |= setup.arm.recorded(arrays.pop("configuration"), arrays.pop("quantities"))
-    arrays["control_vertices"] = arrays["control_vertices"].reshape(len(rotation), -1, 3)
-    return Maneuver(
-        **arrays,
-        phase_names=np.array(list(resolver.phases)),
-        manifest=manifest,
-        tip_target_rotation=rotation if setup.task.turns == "orientation" else None,
-        tip_target_pointing=rotation[:, :, 2] if setup.task.turns == "pointing" else None,
-    )
-
-
-def _too_near(resolver: Resolver) -> dict[str, float]:
-    """Return the pairs below their clearance in the home pose that the method drives apart, and their distances, m."""
-    names, kind = resolver.setup.monitor.names, resolver.setup.arm.bodies.kind
-    found: dict[str, float] = {}
-    for pair, distance in resolver.too_near(resolver.setup.home_state()).items():
-        name = names.clearance(pair).removeprefix(f"clearance: {kind} ").replace(f"/ {kind} ", "/ ")
-        found[name] = min(found.get(name, np.inf), distance)
-    return found

@@ -44,6 +44,7 @@ STUDIES = {
     "clutter": Study("vgtm_qp.study.clutter", "Clutter: success over random scenes"),
     "tracking": Study("vgtm_qp.study.tracking", "Tracking as an equality, and how it gives way"),
     "robustness": Study("vgtm_qp.study.robustness", "Robustness: random scenes of every module"),
+    "loops": Study("vgtm_qp.study.loops", "Control loops: random goals among obstacles that move"),
 }
 
 
@@ -100,7 +101,7 @@ def run_study(
     progress
         Called with the numbers of tasks done and in all.
     options
-        Of the study: ``scenes`` and ``seed`` of robustness.
+        Of the study: ``scenes`` and ``seed`` of tracking, robustness and loops.
 
     Raises
     ------

@@ -1,0 +1,132 @@
+"""The rows of a result, grown state by state, and the maneuver that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from vgtm_qp.arm.arm import Pose
+from vgtm_qp.maneuver.maneuver import Maneuver
+from vgtm_qp.methods import Resolver
+from vgtm_qp.problem import Problem
+from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, recorded_versions
+from vgtm_qp.step.step import Step
+from vgtm_qp.step.stops import Stop
+
+
+class Log:
+    """The states of a resolver from now on, each with the pose that its tip was to have.
+
+    Attributes
+    ----------
+    progress : float
+        Share of the path covered at the last state, 0 to 1.
+    """
+
+    def __init__(self, resolver: Resolver, target: Pose) -> None:
+        self.progress = 0.0
+        self._resolver = resolver
+        self._rows: dict[str, list[Any]] = {}
+        self._clearance_rows = {"fcl": 0, "exact": 0}
+        self._seconds, self._phases = 0.0, [0.0] * len(resolver.phases)
+        self._add_row(target)
+
+    @contextmanager
+    def clock(self) -> Iterator[None]:
+        """Record the time of the step in this context, as a whole and by phase."""
+        resolver = self._resolver
+        known, started = dict(resolver.phases), perf_counter()
+        yield
+        self._seconds = perf_counter() - started
+        self._phases = [total - known[name] for name, total in resolver.phases.items()]
+
+    def add(self, step: Step, target: Pose, progress: float) -> None:
+        """Add the state after a step that was to bring the tip to `target`."""
+        self._clearance_rows["fcl"] += step.fcl_rows
+        self._clearance_rows["exact"] += step.exact_rows
+        self.progress = progress
+        self._add_row(target)
+
+    def _add_row(self, target: Pose) -> None:
+        resolver, state, setup = self._resolver, self._resolver.state, self._resolver.setup
+        position, rotation = resolver.tip()
+        row = {
+            "time": state.time,
+            "configuration": state.q,
+            "quantities": state.quantities,
+            "control_vertices": state.control_vertices,
+            "tip_position": position,
+            "tip_rotation": rotation,
+            "tip_target_position": target.position,
+            "tip_target_rotation": target.rotation,
+            "clearance": setup.least_clearance(state.q, state.time, "obstacles"),
+            "self_clearance": setup.least_clearance(state.q, state.time, "members"),
+            "progress": self.progress,
+            "step_time": self._seconds,
+            "phase_time": self._phases,
+        }
+        for name, value in row.items():
+            self._rows.setdefault(name, []).append(value)
+
+    def maneuver(self, problem: Problem, stop: Stop | None = None, **told: Any) -> Maneuver:
+        """Return the maneuver of a problem that these rows are, not certified yet.
+
+        `told` is what the manifest holds besides, see ``result.manifest``: of the problem's files, the way out and the
+        set-up.
+        """
+        resolver, setup = self._resolver, self._resolver.setup
+        meshes = {
+            obstacle.name: mesh_record(obstacle.file, len(pieces.pieces))
+            for obstacle, pieces in zip(problem.obstacle, setup.monitor.obstacles, strict=True)
+            if obstacle.shape == "mesh"
+        }
+        manifest = {
+            "schema_version": SCHEMA_VERSION,
+            "problem": problem.to_dict(),
+            "arm": setup.arm.record(),
+            "curve": setup.layout.record(),
+            "status": "solved" if stop is None else "blocked",
+            # That of the last whole row: an interrupt may have come before the next.
+            "reached": float(self._rows["progress"][-1]),
+            "blocked_by": [] if stop is None else list(stop.names),
+            "stop": None if stop is None else stop.to_dict(),
+            "recovered": [
+                {"pair": pair, "distance": apart} for pair, apart in sorted(_too_near(resolver).items())
+            ],
+            "method": problem.method.name,
+            "solver": resolver.solver,
+            "directory": str((problem.source.parent if problem.source else Path.cwd()).resolve()),
+            "meshes": meshes,
+            "versions": recorded_versions(),
+            "certificate": None,
+            # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank.
+            "jacobian_rank": resolver.rank,
+            "clearance_rows": self._clearance_rows,
+            **told,
+        }
+        arrays: dict[str, Any] = {name: np.asarray(rows, dtype=float) for name, rows in self._rows.items()}
+        rotation = arrays.pop("tip_target_rotation")
+        arrays |= setup.arm.recorded(arrays.pop("configuration"), arrays.pop("quantities"))
+        arrays["control_vertices"] = arrays["control_vertices"].reshape(len(rotation), -1, 3)
+        return Maneuver(
+            **arrays,
+            phase_names=np.array(list(resolver.phases)),
+            manifest=manifest,
+            tip_target_rotation=rotation if setup.task.turns == "orientation" else None,
+            tip_target_pointing=rotation[:, :, 2] if setup.task.turns == "pointing" else None,
+        )
+
+
+def _too_near(resolver: Resolver) -> dict[str, float]:
+    """Return the pairs below their clearance in the home pose that the method drives apart, and their distances, m."""
+    names, kind = resolver.setup.monitor.names, resolver.setup.arm.bodies.kind
+    found: dict[str, float] = {}
+    for pair, distance in resolver.too_near(resolver.setup.home_state()).items():
+        name = names.clearance(pair).removeprefix(f"clearance: {kind} ").replace(f"/ {kind} ", "/ ")
+        found[name] = min(found.get(name, np.inf), distance)
+    return found
