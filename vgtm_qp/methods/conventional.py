@@ -1,4 +1,4 @@
-"""The conventional solution, section 3.4: the whole truss at once, without limits or clearance."""
+"""The conventional solution, section 3.4: the whole arm at once, without limits or clearance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods.objectives import DEFAULT_TERMS, Terms, TrussObjective
+from vgtm_qp.methods.objectives import DEFAULT_TERMS, NamedTerms, Terms
 from vgtm_qp.methods.pseudoinverse import (
     RANK_TOLERANCE,
     Objective,
@@ -41,16 +41,42 @@ _LOWER = np.tril_indices(3)
 
 
 class Linear(NamedTuple):
-    """J d = x for the nodes' displacements, at one configuration.
+    """J d = x for displacements of the arm, at one configuration.
 
-    J is made of the member lengths' ``gradient`` (M, Q, 3) and J_u of eq. (16) at the tip's nodes (n_e, 3 K_tip); x of
-    the displacement ``x_e`` (n_e,) of the end effector and the changes ``x_g`` (n_l,) of the fixed lengths.
+    J is made of a ``gradient`` and of J_u of eq. (16) at the ``tip``'s nodes (n_e, 3 K_tip); x of the displacement
+    ``x_e`` (n_e,) of the end effector and the changes ``x_g`` (n_l,) of the fixed quantities. For a truss d are those
+    of its nodes, and the gradient (M, Q, 3) is that of its members' lengths; for an arm without fixed quantities d are
+    those of its actuators, and the gradient K (3 (N - N_c), n_a) is that of its nodes.
     """
 
     gradient: Array
     tip: Array
     x_e: Array
     x_g: Array
+
+
+class Resolved(NamedTuple):
+    """Displacements (n,), and the rank of their Jacobian."""
+
+    displacement: Array
+    rank: int
+
+
+def resolved(J: Array, x: Array, objective: Objective, method: Method) -> Resolved:
+    """Return J^+ x + (1 - J^+ J) v with the null-space vector v of `objective`, by the method's variant."""
+    if method.variant in ("moore-penrose", "truncated"):
+        truncation = method.truncation if method.variant == "truncated" else RANK_TOLERANCE
+        inverse = moore_penrose(J, truncation=truncation)
+    else:
+        inverse = weighted(
+            J, objective.hessian, damping=method.damping if method.variant == "damped" else 0.0
+        )
+    start, N = inverse.matrix @ x, projector(inverse, J)
+    if method.variant in ("weighted", "damped"):
+        start = start - N @ np.linalg.solve(objective.hessian, objective.gradient)
+    elif method.null_space != ():
+        start = start + N @ null_space_vector(N, start, objective)
+    return Resolved(np.asarray(start), inverse.rank)
 
 
 class DenseSolution:
@@ -69,7 +95,6 @@ class DenseSolution:
 
     def displacement(self, system: Linear, terms: Terms) -> Array:
         """Return the node displacements (3 (N - N_c),), m: eq. (28) with the null-space vector of `terms`."""
-        method = self._method
         J, actuated = self.jacobians(system.gradient, system.tip)
         hessian = terms.actuator * actuated.T @ actuated
         hessian[np.diag_indices_from(hessian)] += terms.node
@@ -77,19 +102,9 @@ class DenseSolution:
         by_node = hessian.reshape(count, 3, count, 3)
         by_node[np.arange(count), :, np.arange(count)] += terms.blocks
         objective = Objective(hessian, actuated.T @ terms.actuator_gradient + terms.node_gradient)
-        if method.variant in ("moore-penrose", "truncated"):
-            truncation = method.truncation if method.variant == "truncated" else RANK_TOLERANCE
-            inverse = moore_penrose(J, truncation=truncation)
-        else:
-            inverse = weighted(J, hessian, damping=method.damping if method.variant == "damped" else 0.0)
-        self.rank = inverse.rank
-        start = inverse.matrix @ np.concatenate([system.x_e, system.x_g])
-        N = projector(inverse, J)
-        if method.variant in ("weighted", "damped"):
-            return np.asarray(start - N @ np.linalg.solve(hessian, objective.gradient))
-        if method.null_space == ():
-            return np.asarray(start)
-        return np.asarray(start + N @ null_space_vector(N, start, objective))
+        found = resolved(J, np.concatenate([system.x_e, system.x_g]), objective, self._method)
+        self.rank = found.rank
+        return found.displacement
 
     def jacobians(self, gradient: Array, tip: Array) -> tuple[Array, Array]:
         """Return J (n_e + n_l, 3 (N - N_c)), eq. (26), of tip and fixed lengths, and the rows of actuated lengths."""
@@ -99,6 +114,32 @@ class DenseSolution:
         J[: len(tip), self._tip] = tip[:, self._present]
         J[len(tip) :] = lengths[self._fixed]
         return J, lengths[truss.actuators]
+
+
+class JointSolution:
+    """The solution in the actuators of an arm without fixed quantities, with dense matrices."""
+
+    def __init__(self, layout: Layout, method: Method) -> None:
+        self._method, self._levers = method, layout.arm.levers
+        self._free = np.ones(len(self._levers), dtype=bool)
+        self._tip, self._present = _tip_columns(layout)
+        self.rank: int | None = None
+
+    def hold(self, members: Index, held: Mask) -> None:  # noqa: ARG002
+        """See :meth:`DenseSolution.hold`."""
+        self._free = ~held
+
+    def displacement(self, system: Linear, terms: Terms) -> Array:
+        """Return the displacements of the actuators (n_a,), rad or m."""
+        K, free = system.gradient[:, self._free], self._free
+        by_node = K.reshape(-1, 3, K.shape[1])
+        hessian = terms.node * K.T @ K + np.einsum("nai,nab,nbj->ij", by_node, terms.blocks, by_node)
+        hessian[np.diag_indices_from(hessian)] += terms.actuator * self._levers[free] ** 2
+        objective = Objective(hessian, terms.actuator_gradient[free] + K.T @ terms.node_gradient)
+        J = system.tip[:, self._present] @ K[self._tip]
+        moved = np.zeros(len(free))
+        moved[free], self.rank = resolved(J, system.x_e, objective, self._method)
+        return moved
 
 
 class SparseSolution:
@@ -216,76 +257,104 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
     def __init__(self, problem: Problem) -> None:
         method = problem.method
         super().__init__(arm_without_curve(problem))
-        self._fixed = truss_of(self.setup.arm).fixed
+        arm, layout = self.setup.arm, self.setup.layout
+        self._has_bays = arm.bays is not None
+        self._solution: DenseSolution | SparseSolution | JointSolution
+        if not self._has_bays:
+            self._solution = JointSolution(layout, method)
+        elif method.algebra == "sparse":
+            self._solution = SparseSolution(layout, method)
+        else:
+            self._solution = DenseSolution(layout, method)
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
-        self._objective = TrussObjective(names, method.weights, self.setup)
-        solution = SparseSolution if method.algebra == "sparse" else DenseSolution
-        self._solution = solution(self.setup.layout, method)
+        self._terms = NamedTerms(names, method.weights, self.setup)
         self._correct = method.correct
-        self._lengths = self.setup.arm.home_quantities[self._fixed]
+        self._given = self._fixed = truss_of(arm).fixed if self._has_bays else np.zeros(0, dtype=np.int64)
+        self._lengths = arm.home_quantities[self._fixed]
 
     def lock(self, name: str) -> None:
-        """See :class:`Resolver`: a locked actuator is a fixed member from then on."""
+        """See :class:`Resolver`: a locked actuator is a fixed quantity from then on."""
         super().lock(name)
         held = np.isin(self._actuation.names, list(self._actuation.locked))
         members = self.setup.arm.actuators[held]
         self._solution.hold(members, held)
-        fixed = truss_of(self.setup.arm).fixed
+        if not self._has_bays:
+            return
         kept = dict(zip(self._fixed.tolist(), self._lengths.tolist(), strict=True))
-        self._fixed = np.concatenate([fixed, members])
+        self._fixed = np.concatenate([self._given, members])
         now = self.state.quantities
         self._lengths = np.array([kept.get(k, float(now[k])) for k in self._fixed.tolist()])
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
-        setup, state = self.setup, self.state
-        kinematics, truss = setup.kinematics, truss_of(setup.arm)
-        X = np.array(state.nodes)
-        system = self._linear(X, displacement_to(path.at(end), path.at(start)))
-        gradient, x_g = system.gradient, system.x_g
+        setup, state, arm = self.setup, self.state, self.setup.arm
+        q = state.q
+        system = self._linear(q, displacement_to(path.at(end), path.at(start)))
         if setup.base_motion is not None:
-            motion = setup.arm.based(X, setup.base_motion.pose(state.after(dt)[0])) - X
-            x_g = x_g - truss.scatter.base_rate(gradient, motion)[self._fixed]
-            X += motion
-        terms = self._objective.at(X, kinematics.quantities, state.time)
+            q = arm.based(q, setup.base_motion.pose(state.after(dt)[0]))
+            system = self._carried(system, state.nodes, arm.nodes(q))
+        terms = self._terms.at(q, setup.kinematics.quantities, state.time)
         self._clock.add("kinematics")
-        X[truss.free] += self._solution.displacement(system._replace(x_g=x_g), terms).reshape(-1, 3)
+        q = self._displaced(q, self._solution.displacement(system, terms))
         self.rank = self._solution.rank
         self._clock.add("solve")
         if self._correct:
-            self._newton(X, path.at(end))
+            q = self._newton(q, path.at(end))
             self._clock.add("correction")
-        return Moved(X, state.control_vertices, state.torsion)
+        return Moved(q, state.control_vertices, state.torsion)
 
-    def _linear(self, X: Array, goal: TipGoal) -> Linear:
-        """Return the system at nodes `X` (N, 3) whose base rests, J d = x, eqs. (25) and (27).
+    def _carried(self, system: Linear, before: Array, after: Array) -> Linear:
+        """Return the system of what is left to do when the base has moved, and with it nodes (N, 3), m."""
+        motion = after - before
+        if self._has_bays:
+            base_rate = truss_of(self.setup.arm).scatter.base_rate(system.gradient, motion)
+            return system._replace(x_g=system.x_g - base_rate[self._fixed])
+        return system._replace(
+            x_e=system.x_e - system.tip @ motion[self.setup.arm.end_effector.nodes].ravel()
+        )
 
-        The right-hand side is the `goal`'s rates over the step, and zero for fixed lengths; with corrections, the
-        errors of lengths and tip against the goal.
+    def _displaced(self, q: Array, moved: Array) -> Array:
+        """Return the configuration after displacements of its nodes, or of its actuators."""
+        arm = self.setup.arm
+        if not self._has_bays:
+            return arm.advanced(q, np.zeros(0), moved)
+        q = np.array(q)
+        q[arm.free] += moved.reshape(-1, 3)
+        return q
+
+    def _linear(self, q: Array, goal: TipGoal) -> Linear:
+        """Return the system at a configuration whose base rests, J d = x, eqs. (25) and (27).
+
+        The right-hand side is the `goal`'s rates over the step, and zero for fixed quantities; with corrections, the
+        errors of these and of the tip against the goal.
         """
-        setup = self.setup
-        setup.kinematics.evaluate(X)
-        tip = setup.task.rows(X, setup.kinematics, goal)
-        missing = self._lengths - setup.kinematics.quantities[self._fixed]
+        setup, kinematics = self.setup, self.setup.kinematics
+        kinematics.evaluate(q)
+        tip = setup.task.rows(setup.arm.nodes(q), kinematics, goal)
+        gradient = kinematics.gradient if self._has_bays else kinematics.motion().response()[0]
+        missing = self._lengths - kinematics.quantities[self._fixed]
         if self._correct:
-            return Linear(setup.kinematics.gradient, tip.jacobian, tip.error, missing)
-        return Linear(setup.kinematics.gradient, tip.jacobian, tip.rate, np.zeros_like(missing))
+            return Linear(gradient, tip.jacobian, tip.error, missing)
+        return Linear(gradient, tip.jacobian, tip.rate, np.zeros_like(missing))
 
-    def _newton(self, X: Array, goal: TipGoal) -> None:
-        """Correct fixed members and tip in place: Newton's method by the same pseudoinverse, without gradients."""
-        terms = self._objective.without_gradients()
+    def _newton(self, q: Array, goal: TipGoal) -> Array:
+        """Return `q` with fixed quantities and tip corrected.
+
+        By Newton's method with the same pseudoinverse, without gradients.
+        """
+        terms = self._terms.without_gradients()
         for _ in range(MAX_CORRECTIONS):
-            system = self._linear(X, goal)
+            system = self._linear(q, goal)
             worst = float(np.max(np.abs(system.x_g), initial=0.0))
             if worst <= LENGTH_TOLERANCE and float(np.max(np.abs(system.x_e))) <= TIP_TOLERANCE:
-                return
+                return q
             if not worst < 1e3:
                 break
-            X[self.setup.arm.free] += self._solution.displacement(system, terms).reshape(-1, 3)
+            q = self._displaced(q, self._solution.displacement(system, terms))
         raise SolverError("Newton's method on lengths and tip does not converge")
 
 
 def _tip_columns(layout: Layout) -> tuple[Index, NDArray[np.bool_]]:
     """Return the columns of the tip's free nodes, and which columns of the tip's Jacobian those are."""
-    first = layout.node_column[truss_of(layout.arm).tip]
+    first = layout.node_column[layout.arm.end_effector.nodes]
     present = np.repeat(first >= 0, 3)
     return (first[:, None] + np.arange(3)).reshape(-1)[present], present

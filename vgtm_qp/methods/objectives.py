@@ -1,4 +1,4 @@
-"""The named null-space terms of the truss as one quadratic objective: the same terms and weights as the QP's."""
+"""The named null-space terms of an arm as one quadratic objective: the same terms and weights as the QP's."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.step.setup import Setup
@@ -20,9 +19,10 @@ _NEAREST = 0.05
 
 
 class Terms(NamedTuple):
-    """1/2 node |d|^2 + 1/2 actuator |a|^2 + actuator_gradient . a + node_gradient . d + 1/2 d' blocks d, a = J_a d.
+    """1/2 node |d|^2 + 1/2 actuator |a|^2 + actuator_gradient . a + node_gradient . d + 1/2 d' blocks d.
 
-    ``blocks`` (N - N_c, 3, 3) couple the coordinates of one node.
+    The displacements d of the free nodes, m, and those of the actuators, a, rad or m, depend on each other; |a| counts
+    angles times ``Arm.unit``. ``blocks`` (N - N_c, 3, 3) couple the coordinates of one node.
     """
 
     node: float
@@ -32,7 +32,7 @@ class Terms(NamedTuple):
     blocks: Array
 
 
-class TrussObjective:
+class NamedTerms:
     """Named terms of the null-space vector, of ``problem.method.TRUSS_TERMS``."""
 
     def __init__(self, names: tuple[str, ...], weights: Weights, setup: Setup) -> None:
@@ -47,27 +47,27 @@ class TrussObjective:
         self._node = node or (_TRACE * actuator if actuator else 1.0)
         self._actuator = actuator
 
-    def at(self, X: Array, lengths: Array, time: float) -> Terms:
-        """Return the terms at node positions `X` (N, 3) with member `lengths` (M,)."""
+    def at(self, q: Array, quantities: Array, time: float) -> Terms:
+        """Return the terms at a configuration with its quantities (M,)."""
         setup, arm = self._setup, self._setup.arm
         actuators, free = arm.actuators, arm.free
-        centring = self._centring * (lengths[actuators] - arm.home_quantities[actuators])
+        centring = self._centring * arm.levers**2 * (quantities[actuators] - arm.home_quantities[actuators])
         terms = self.without_gradients()._replace(actuator_gradient=centring)
         if not self._potential:
             return terms
-        field, blocks = potential_field(setup, X, time)
+        field, blocks = potential_field(setup, q, time)
         gradient = self._potential * field[free].reshape(-1)
         return terms._replace(node_gradient=gradient, blocks=self._potential * blocks[free])
 
     def without_gradients(self) -> Terms:
         """Return the terms that are squares of displacements alone."""
-        truss = truss_of(self._setup.arm)
+        arm = self._setup.arm
         return Terms(
             self._node,
             self._actuator,
-            np.zeros(len(truss.actuators)),
-            np.zeros(3 * len(truss.free)),
-            np.zeros((len(truss.free), 3, 3)),
+            np.zeros(len(arm.actuators)),
+            np.zeros(3 * len(arm.free)),
+            np.zeros((len(arm.free), 3, 3)),
         )
 
 
@@ -84,24 +84,20 @@ def potential_curvature(distance: Array, influence: float) -> Array:
     return np.asarray(np.where(distance < influence, (3.0 * ratio - 2.0) * ratio / d**2, 0.0))
 
 
-def potential_field(setup: Setup, X: Array, time: float) -> tuple[Array, Array]:
+def potential_field(setup: Setup, q: Array, time: float) -> tuple[Array, Array]:
     """Return the potential's gradient (N, 3), 1/m, by the nodes, and blocks (N, 3, 3), 1/m^2, above its Hessian.
 
     By the gradient alone, steps grow without bound as a distance shrinks. With the curvature along the normals, the
     step of each pair is a share of its own distance. One block per node bounds the Hessian: the square of a mean of two
     displacements is at most the mean of their squares, and that of a difference at most twice their sum.
     """
-    influence, joints = setup.influence, setup.monitor.bodies.joints
-    pairs = setup.monitor.near(setup.arm.points(X), time, influence)
-    gradient, blocks = np.zeros_like(X), np.zeros((len(X), 3, 3))
-    slope = potential_slope(pairs.distance, influence)
+    influence, count = setup.influence, len(setup.arm.node_names)
+    pairs = setup.monitor.near(setup.arm.points(q), time, influence)
+    nodes, rows = setup.arm.over_nodes(q, pairs.points, pairs.weights[:, :, None] * pairs.normal[:, None])
+    gradient, blocks = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    np.add.at(gradient, nodes, potential_slope(pairs.distance, influence)[:, None, None] * rows)
     curvature = potential_curvature(pairs.distance, influence) * np.where(pairs.is_self, 2.0, 1.0)
-    outer = curvature[:, None, None] * pairs.normal[:, :, None] * pairs.normal[:, None, :]
-    force = slope[:, None] * pairs.normal
-    own = np.flatnonzero(pairs.is_self)
-    for rows, nodes, first in ((slice(None), joints[pairs.body], 0), (own, joints[pairs.other[own]], 2)):
-        for end in (0, 1):
-            weight = pairs.weights[rows, first + end]
-            np.add.at(gradient, nodes[:, end], weight[:, None] * force[rows])
-            np.add.at(blocks, nodes[:, end], np.abs(weight)[:, None, None] * outer[rows])
+    size = np.maximum(np.linalg.norm(rows, axis=2), np.finfo(float).tiny)
+    outer = rows[:, :, :, None] * (rows / size[:, :, None])[:, :, None]
+    np.add.at(blocks, nodes, curvature[:, None, None, None] * outer)
     return gradient, blocks

@@ -29,9 +29,9 @@ MAX_CORRECTIONS = 30
 
 
 class Moved(NamedTuple):
-    """Where a step leads: nodes (N, 3), control vertices (V, 3), m, and torsion (T,), rad."""
+    """Where a step leads: the configuration, control vertices (V, 3), m, and torsion (T,), rad."""
 
-    nodes: Array
+    q: Array
     control_vertices: Array
     torsion: Array
 
@@ -55,23 +55,24 @@ class MethodResolver(Resolver, ABC):
         self._clock.start()
         try:
             moved = self._move(path, start, end, dt)
-            self._refuse_breakdown(moved.nodes, path, start, end)
+            nodes = self.setup.arm.nodes(moved.q)
+            self._refuse_breakdown(nodes, path, start, end)
         except (SolverError, CurveError, np.linalg.LinAlgError) as error:
             return Step(StepStatus.BLOCKED, 0.0, self.state, f"step {self._steps}: {error}", 0)
         kinematics, before = self.setup.kinematics, self.state
-        kinematics.evaluate(moved.nodes)
-        lengths = frozen(kinematics.quantities)
+        kinematics.evaluate(moved.q)
+        quantities = frozen(kinematics.quantities)
         time, late = before.after(dt)
         self.state = State(
             time=time,
             late=late,
-            q=(q := frozen(moved.nodes)),
-            nodes=q,
+            q=(q := frozen(moved.q)),
+            nodes=frozen(nodes),
             control_vertices=frozen(moved.control_vertices),
             torsion=frozen(moved.torsion),
-            quantities=lengths,
-            rates=frozen((lengths - before.quantities) / dt),
-            motion=frozen(q - before.nodes),
+            quantities=quantities,
+            rates=frozen((quantities - before.quantities) / dt),
+            motion=frozen(q - before.q),
             duration=dt,
         )
         self._clock.add("kinematics")
@@ -82,19 +83,26 @@ class MethodResolver(Resolver, ABC):
         """Return where the step leads, or raise SolverError."""
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
-        truss, lengths = truss_of(self.setup.arm), self.setup.arm.home_quantities
+        """Raise SolverError where nodes (N, 3) are so far away, m, that the linear step means nothing."""
+        arm, members = (
+            self.setup.arm,
+            None if self.setup.arm.bays is None else truss_of(self.setup.arm).members,
+        )
+        shortest = arm.unit if members is None else float(arm.home_quantities.min())
         if too_long := self.setup.too_long(nodes - self.state.nodes):
             raise SolverError(too_long)
         asked = float(np.linalg.norm(path.at(end).position - path.at(start).position))
-        limit = 0.5 * float(lengths.min()) + 3.0 * asked
+        limit = 0.5 * shortest + 3.0 * asked
         moved = float(np.max(np.abs(nodes - self.state.nodes)))
         if not moved <= limit:
             raise SolverError(
                 f"a node would move by {moved:.3g} m, more than {limit:.3g} m: the pose is nearly singular"
             )
-        ratio = np.linalg.norm(nodes[truss.members[:, 0]] - nodes[truss.members[:, 1]], axis=1) / lengths
+        if members is None:
+            return
+        ratio = np.linalg.norm(nodes[members[:, 0]] - nodes[members[:, 1]], axis=1) / arm.home_quantities
         if float(ratio.min()) < _COLLAPSED:
-            raise SolverError(f"member {truss.member_names[int(np.argmin(ratio))]} collapsed to a point")
+            raise SolverError(f"member {arm.quantity_names[int(np.argmin(ratio))]} collapsed to a point")
 
 
 def arm_without_curve(problem: Problem) -> Setup:

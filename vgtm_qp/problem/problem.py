@@ -151,8 +151,11 @@ class Problem(Table, called="a problem"):
             yield ("truss",), "a table [truss], or a table [arm] in its place"
         if self.truss is not None and self.arm is not None:
             yield ("arm",), "a truss or an arm, not both"
-        if self.arm is not None and self.method.name != "qp":
-            yield ("method", "name"), '"qp": the pseudoinverse methods move trusses, not serial arms'
+        if self.arm is not None and self.method.name == "curve-pseudoinverse":
+            yield (
+                ("method", "name"),
+                '"qp" or "pseudoinverse": the curve first and then bays moves trusses alone',
+            )
         elif self.arm is not None and self.method.tracking in ("recursive", "parallel"):
             yield ("method", "tracking"), '"coupled" or "none": the others go along the bays of a truss'
         if self.arm is not None and self.arm.body is not None and self.clearance.minimum_angle:
