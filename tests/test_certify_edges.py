@@ -193,14 +193,13 @@ def test_a_moving_base_counts_and_its_poses_need_no_rows():
     assert vq.certify(planar([at_tip(0.11)]), [0.0, 1.0], SWEEP).certified
 
 
-def test_a_base_that_turns_about_changing_axes_is_not_decided():
+def test_a_base_that_turns_about_changing_axes_is_decided():
     poses = [
         {"time": 0.5, "rotation_vector": [0.3, 0.0, 0.0]},
         {"time": 1.0, "rotation_vector": [0.0, 0.4, 0.0]},
     ]
     verdict = vq.certify(planar(base_motion=poses), [0.0, 1.0], SWEEP)
-    assert kinds(verdict.undecided) == [("base", ("base",))]
-    assert not verdict.certified
+    assert verdict.certified
 
 
 def test_links_keep_apart_and_need_not_where_the_problem_says_so():
@@ -225,7 +224,7 @@ def test_limits_rates_and_accelerations():
     assert [(each.kind, each.names, each.value, each.bound) for each in high] == [
         ("limit", ("two",), 2.001, 2.0)
     ]
-    assert (high[0].start, high[0].end) == (3.0, 3.0)
+    assert (high[0].start, high[0].end) == (2.0, 3.0)
     fast = verdict(0.0, 1.0, -0.5, 0.0).violations
     assert [(each.kind, each.names, each.start, each.end) for each in fast] == [("rate", ("two",), 1.0, 2.0)]
     assert fast[0].value == pytest.approx(1.5)

@@ -1,302 +1,292 @@
-"""Whether pairs of bodies keep a distance all along a motion: proven, refuted, or neither.
+"""Whether bodies keep their clearances all along a motion: proven, refuted, or neither.
 
-The proof is that of ``verify.clearance``: a plane that separates two bodies at instants of an interval separates them
-through it, but for what turning joints bend. Here it is held against one floor, for all steps of the motion at once,
-and a pair is left as soon as its floor is proven or broken.
+The proof is that of ``verify.clearance``: a plane that separates two bodies at both ends of an interval separates them
+through it, but for how far their ways bend. It is held against what the bodies have to keep, for all segments of the
+motion at once, and an interval is halved only until that is decided.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
-from vgtm_qp.result.chain import RecordedChain
-from vgtm_qp.verify.clearance import (
-    CLEARANCE_TOLERANCE,
-    AgainstBody,
-    AgainstMembers,
-    Encounters,
-    Pairs,
-    RecordedMotion,
-    box_gap,
-)
-from vgtm_qp.verify.obstacles import Body
+from vgtm_qp.certify.motion import GivenMotion
+from vgtm_qp.certify.pairs import Kept, Near
+from vgtm_qp.certify.verdict import Finding
+from vgtm_qp.verify.clearance import CLEARANCE_TOLERANCE, Pairs
 
-_COARSE = 0.1
-"""How far a joint may bend a link's way in one interval of the first look, over the mean length of links."""
-_GREATEST_SPLIT = 8
-_GREATEST_DEPTH = 24
+_GREATEST_DEPTH = 30
 _GREATEST_COUNT = 200_000
-"""Halvings at first and in all, and number of open intervals, from which on nothing more is decided."""
-_CHUNK = 1_000_000
-_SAMPLES = 17
-"""Instants of a step at which a pair that comes too near is looked at."""
-
-
-class Way:
-    """The motion of a chain through its states, in intervals short enough for a first look.
-
-    An instant is a number x from 0 to the number of steps S: its whole part is the step, the rest the share of it.
-    """
-
-    def __init__(self, chain: RecordedChain, time: Array, states: Array) -> None:
-        if len(time) == 1:
-            time, states = np.repeat(time, 2), np.repeat(states, 2, axis=0)
-        self.motion, self.chain = RecordedMotion(chain, time, states), chain
-        self.bends = chain.bend(states[:-1], states[1:], np.arange(len(chain.links)))
-        """(S, B) bounds, m, of |d2 r / d x2| of the links."""
-        self.rounding = 64.0 * float(np.finfo(float).eps) * float(np.abs(self.motion.ends).max())
-        worst = self.bends.max(axis=1) / (8.0 * _COARSE * chain.size)
-        halvings = np.clip(np.ceil(0.5 * np.log2(np.maximum(worst, 1.0))), 0, _GREATEST_SPLIT).astype(int)
-        self.width = np.repeat(0.5**halvings, 2**halvings)
-        edges = np.append(np.cumsum(self.width) - self.width, len(halvings))
-        self.start, self.step = edges[:-1], edges[:-1].astype(np.int64)
-        ends = self.ends(edges)
-        slack = (self.bends[self.step] * self.width[:, None] ** 2 / 8.0)[:, :, None]
-        self.low = np.minimum(ends[:-1], ends[1:]).min(axis=2) - slack
-        self.high = np.maximum(ends[:-1], ends[1:]).max(axis=2) + slack
-
-    def _parts(self, x: Array) -> tuple[Index, Array]:
-        step = np.minimum(x.astype(np.int64), len(self.bends) - 1)
-        return step, x - step
-
-    def time(self, x: Array) -> Array:
-        """Return (P,) the times, s, of instants (P,)."""
-        (step, share), time = self._parts(x), self.motion.time
-        return np.asarray(time[step] + share * (time[step + 1] - time[step]))
-
-    def ends(self, x: Array) -> Array:
-        """Return (P, B, 2, 3) the ends of the links, m, at instants (P,)."""
-        (step, share), states = self._parts(x), self.motion.states
-        return self.chain.states_ends(states[step] + share[:, None] * (states[step + 1] - states[step]))
+"""Numbers of halvings, and of intervals at a time, from which on nothing more is decided."""
+_NEAR_ENOUGH = 1e-3
+_REPORT_DEPTH = 10
+"""How near a bound is brought to the least clearance, over the mean link, and with how many halvings at most."""
+_INSTANTS = 17
+"""Instants of a segment at which a pair that is too near there is looked at."""
+_CHUNK = 500_000
 
 
 @dataclass
 class Decision:
-    """What came out for the pairs of one kind: a proven bound of their distances, m, and where it is not enough.
-
-    Those are the intervals (from, to, names, value): instants, and the least distance found or, in `undecided`, proven.
-    """
+    """What is decided of pairs: a proven lower bound of their clearances, m, and what is wrong or in doubt."""
 
     bound: float = np.inf
-    violated: list[tuple[float, float, tuple[str, str], float]] = field(default_factory=list)
-    undecided: list[tuple[float, float, tuple[str, str], float]] = field(default_factory=list)
+    violations: list[Finding] = field(default_factory=list)
+    undecided: list[Finding] = field(default_factory=list)
 
 
-class _Seen(NamedTuple):
-    """Pairs (P,), (P,) that were found too near at instants (P,) of steps (P,)."""
+def decide(motion: GivenMotion, kept: Sequence[Kept]) -> dict[str, Decision]:
+    """Return by kind what is decided of the pairs of `kept`, of which those of one kind have one floor."""
+    found = {pairs.kind: Decision() for pairs in kept}
+    for kind, decision in found.items():
+        Bisection(motion, [pairs for pairs in kept if pairs.kind == kind]).run(decision)
+    return found
 
-    x: Array
-    step: Index
-    first: Index
-    second: Index
+
+@dataclass
+class _Edge:
+    """Pairs (P,) at instants: points (P, 4, 3), distances (P,), m, normals (P, 3), and the gaps of their planes, m."""
+
+    points: Array
+    distance: Array
+    normal: Array
+    held: Array
+
+    @staticmethod
+    def none() -> _Edge:
+        return _Edge(np.zeros((0, 4, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+
+    @staticmethod
+    def joined(parts: Sequence[_Edge]) -> _Edge:
+        """Return the rows of all parts, one part after another."""
+        return _Edge(*(np.concatenate(each) for each in zip(*map(_Edge.arrays, parts), strict=True)))
+
+    @staticmethod
+    def interleaved(first: _Edge, second: _Edge) -> _Edge:
+        """Return the rows of two, one of each in turn."""
+        both = zip(first.arrays(), second.arrays(), strict=True)
+        return _Edge(*(np.stack(pair, axis=1).reshape(-1, *pair[0].shape[1:]) for pair in both))
+
+    def at(self, rows: Index) -> _Edge:
+        """Return some of the rows."""
+        return _Edge(*(array[rows] for array in self.arrays()))
+
+    def arrays(self) -> tuple[Array, ...]:
+        """Return all four."""
+        return self.points, self.distance, self.normal, self.held
 
 
-class Decided(Encounters):
-    """Encounters along a way that are held against a floor."""
+class Bisection:
+    """Pairs of one kind that may come too near, each in one segment, and the intervals of these that are open.
 
-    way: Way
-    others: int
-    """How many bodies the second ones of the pairs are taken from."""
+    Pairs are in the order of the `kept` that they belong to, and intervals in that of their pairs.
+    """
 
-    @abstractmethod
-    def names(self, pair: tuple[int, int]) -> tuple[str, str]:
-        """Return the names of the two bodies."""
+    def __init__(self, motion: GivenMotion, kept: Sequence[Kept]) -> None:
+        self.motion, self.kept = motion, kept
+        floor = kept[0].floor - CLEARANCE_TOLERANCE
+        rounding = max(pairs.rounding for pairs in kept)
+        self.least, self.most = floor - rounding, floor + rounding
+        self.close = _NEAR_ENOUGH * motion.arm.size
+        near, self.rest = self._candidates()
+        sizes = [len(pairs.gap) for pairs in near]
+        self.starts = np.cumsum([0, *sizes])
+        self.segment = np.concatenate([pairs.segment for pairs in near])
+        self.first, self.second = (np.concatenate([pairs.pair[k] for pairs in near]) for k in (0, 1))
+        everything = np.arange(len(self.segment))
+        groups = list(self._groups(everything))
+        self.bend = np.concatenate(
+            [np.zeros(0)]
+            + [own.bend(self.segment[rows], self._pair(everything[rows])) for own, rows in groups]
+        )
+        self.depth = np.concatenate(
+            [np.zeros(0)] + [own.depth(self._pair(everything[rows])) for own, rows in groups]
+        )
+        self.found = np.full(len(everything), np.inf)
+        self.proven = np.full(len(everything), np.inf)
+        # Times, s: of the least distance found, and the first and the last at which it is too small.
+        self.at, self.since, self.until = np.full((3, len(everything)), np.nan)
+        self.left: list[tuple[Index, Array, Array, Array]] = []
+        """Intervals that are in doubt: pairs, where they start and how wide they are, and what is proven, m."""
 
-    @abstractmethod
-    def _gaps(self, pair: Pairs, chosen: slice) -> Array:
-        """Return (K, P) lower bounds, m, of the distances of pairs in the `chosen` K intervals of the way."""
+    def _candidates(self) -> tuple[list[Near], float]:
+        """Return the pairs that may come too near, or the nearest, and a bound of the clearances of the others."""
+        nearest = np.inf
+        for own in self.kept:
+            one = own.nearest()
+            if len(one.gap) and one.gap[0] < nearest:
+                ends, time = self.motion.ends[one.segment], self.motion.time[one.segment]
+                edge = _edge_of(own, one.pair, ends, time, np.zeros(1, dtype=np.int64))
+                nearest = min(nearest, float(edge.distance[0]))
+        found = [own.near(max(own.floor, nearest) + own.rounding) for own in self.kept]
+        return [near for near, _ in found], min((rest for _, rest in found), default=np.inf)
 
-    def _first_look(self, floor: float, decision: Decision) -> tuple[Index, Pairs]:
-        """Return the intervals (P,) and pairs (P,), (P,) that may be nearer than `floor`; notes what the rest keeps."""
-        intervals, rows, columns = len(self.way.start), [], []
-        pair = self._near(self.way.low[0], self.way.high[0], 0, 0, np.inf)
-        size = max(1, _CHUNK // max(1, len(pair[0])))
-        for first in range(0, intervals, size):
-            gaps = self._gaps(pair, slice(first, first + size))
-            row, column = np.nonzero(gaps < floor)
-            decision.bound = min(decision.bound, float(gaps[gaps >= floor].min(initial=np.inf)))
-            rows.append(row + first)
-            columns.append(column)
-        column = np.concatenate(columns)
-        return np.concatenate(rows), (pair[0][column], pair[1][column])
-
-    def decide(self, floor: float) -> Decision:
-        """Return whether all pairs keep `floor`, m, along the whole way."""
-        decision, way = Decision(), self.way
-        interval, pair = self._first_look(floor, decision)
-        start, width, step = way.start[interval], way.width[interval], way.step[interval]
-        bend = self._bends(step, pair)
-        least, most = floor - CLEARANCE_TOLERANCE - way.rounding, floor - CLEARANCE_TOLERANCE + way.rounding
-        seen = [self._seen_at_rows(start, start + width, step, pair, least)]
-        for depth in range(_GREATEST_DEPTH):
-            if not len(start):
+    def run(self, decision: Decision) -> None:
+        """Halve intervals until each is decided, and note what came out."""
+        pair = np.arange(len(self.segment))
+        edges = [self._edge(pair, np.full(len(pair), share)) for share in (0.0, 1.0)]
+        start, width = np.zeros(len(pair)), 1.0
+        first, last = edges
+        proven = self._across(pair, first, last)
+        for depth in range(_GREATEST_DEPTH + 1):
+            proven = np.maximum(proven - self.bend[pair] * width**2 / 8.0, -self.depth[pair])
+            open_ = self._open(pair, proven, depth)
+            np.minimum.at(self.proven, pair[~open_], proven[~open_])
+            self._note_undecided(pair, start, width, proven, ~open_)
+            if not open_.any():
                 break
-            distance, held = self._held(start, width, pair)
-            proven = np.maximum(held - bend * width**2 / 32.0, -self._depths(pair))
-            broken = distance < least
-            seen.append(
-                _Seen(start[broken] + 0.5 * width[broken], step[broken], pair[0][broken], pair[1][broken])
-            )
-            dropped = self._among(seen, step, pair)
-            open_ = (proven < most) & ~dropped
-            if depth == _GREATEST_DEPTH - 1 or open_.sum() > _GREATEST_COUNT:
-                self._doubt(decision, start, width, pair, proven, open_)
-                open_[:] = False
-            decision.bound = min(decision.bound, float(proven[~open_].min(initial=np.inf)))
-            width = np.tile(0.5 * width[open_], 2)
-            start = np.tile(start[open_], 2) + np.repeat([0.0, 1.0], open_.sum()) * width
-            step, bend = np.tile(step[open_], 2), np.tile(bend[open_], 2)
-            pair = (np.tile(pair[0][open_], 2), np.tile(pair[1][open_], 2))
-        self._tell(decision, seen, least)
-        return decision
+            rows = np.flatnonzero(open_)
+            pair, start, first, last = pair[rows], start[rows], first.at(rows), last.at(rows)
+            width /= 2.0
+            middle = self._edge(pair, start + width)
+            first, last = _Edge.interleaved(first, middle), _Edge.interleaved(middle, last)
+            start = np.stack([start, start + width], axis=1).reshape(-1)
+            pair = np.repeat(pair, 2)
+            proven = self._across(pair, first, last)
+        self._look_closer()
+        self._tell(decision)
 
-    def _bends(self, step: Index, pair: Pairs) -> Array:
-        """Return (P,) bounds, m, of the second derivative of pairs' distances across a plane in steps (P,)."""
-        return np.asarray(self.way.bends[step, pair[0]])
+    def _open(self, pair: Index, proven: Array, depth: int) -> NDArray[np.bool_]:
+        """Return (I,) which intervals are halved."""
+        found = self.found[pair]
+        broken, doubtful = found < self.least, ~self._are_proven(proven)
+        wanted = np.where(broken, found, min(float(self.found.min(initial=np.inf)), self.rest)) - self.close
+        coarse = (proven < wanted) & (depth < _REPORT_DEPTH)
+        open_ = np.where(broken, coarse, doubtful | coarse) & np.isfinite(self.bend[pair])
+        if open_.sum() > _GREATEST_COUNT:
+            open_ &= doubtful & ~broken
+        if depth == _GREATEST_DEPTH or open_.sum() > _GREATEST_COUNT:
+            open_[:] = False
+        return np.asarray(open_)
 
-    @abstractmethod
-    def _depths(self, pair: Pairs) -> Array:
-        """Return (P,) how deep pairs can be in one another by this measure, m."""
+    def _are_proven(self, proven: Array) -> NDArray[np.bool_]:
+        """Return (I,) where bounds, m, are such that a pair keeps clear; never where one is no number."""
+        return np.asarray(proven >= self.most)
 
-    def _points_at(self, x: Array, pair: Pairs) -> Array:
-        instants, which = np.unique(x, return_inverse=True)
-        ends = self.way.ends(instants)
-        return self._points(pair, lambda member: ends[which, member], self.way.time(x))
-
-    def _held(self, start: Array, width: Array, pair: Pairs) -> tuple[Array, Array]:
-        """Return distances (P,) at the middles of intervals, and the least gap across their planes anywhere."""
-        at = np.concatenate([start + 0.5 * width, start, start + width])
-        points = self._points_at(at, (np.tile(pair[0], 3), np.tile(pair[1], 3)))
-        middle, first, last = np.split(points, 3)
-        distance, normal = self.separation(middle, pair)
-        gaps = [self._apart(edge, normal, pair) for edge in (middle, first, last)]
-        return distance, np.min(gaps, axis=0)
-
-    def _seen_at_rows(self, start: Array, end: Array, step: Index, pair: Pairs, least: float) -> _Seen:
-        """Return the pairs that are nearer than `least` where their intervals begin, or where the way ends."""
-        last = np.flatnonzero(end == len(self.way.bends))
-        x = np.concatenate([start, end[last]])
-        first, second = (np.concatenate([side, side[last]]) for side in pair)
-        broken = self.separation(self._points_at(x, (first, second)), (first, second))[0] < least
-        return _Seen(x[broken], np.concatenate([step, step[last]])[broken], first[broken], second[broken])
-
-    def _among(self, seen: list[_Seen], step: Index, pair: Pairs) -> NDArray[np.bool_]:
-        """Return (P,) whether these pairs were seen too near in these steps."""
-        count = self.way.bends.shape[1]
-
-        def key(step: Index, first: Index, second: Index) -> Index:
-            return np.asarray((step * count + first) * self.others + second)
-
-        known = np.concatenate([key(each.step, each.first, each.second) for each in seen])
-        return np.isin(key(step, *pair), known)
-
-    def _doubt(
-        self,
-        decision: Decision,
-        start: Array,
-        width: Array,
-        pair: Pairs,
-        proven: Array,
-        chosen: NDArray[np.bool_],
+    def _note_undecided(
+        self, pair: Index, start: Array, width: float, proven: Array, closed: NDArray[np.bool_]
     ) -> None:
-        """Note the chosen intervals as undecided, those of the same bodies in the same step as one."""
-        found: dict[tuple[int, tuple[str, str]], tuple[float, float, float]] = {}
-        for k in np.flatnonzero(chosen).tolist():
-            key = int(start[k]), self.names((int(pair[0][k]), int(pair[1][k])))
-            low, high, value = found.get(key, (np.inf, -np.inf, np.inf))
-            found[key] = min(low, start[k]), max(high, start[k] + width[k]), min(value, proven[k])
-        decision.undecided += [(low, high, key[1], value) for key, (low, high, value) in found.items()]
+        left = closed & ~self._are_proven(proven) & ~(self.found[pair] < self.least)
+        if left.any():
+            self.left.append((pair[left], start[left], np.full(int(left.sum()), width), proven[left]))
 
-    def _tell(self, decision: Decision, seen: list[_Seen], least: float) -> None:
-        """Note when pairs that come too near do so, and how near; steps that follow one another are one finding."""
-        x, step, first, second = (np.concatenate(side) for side in zip(*seen, strict=True))
-        for a, b in sorted(set(zip(first.tolist(), second.tolist(), strict=True))):
-            its = (first == a) & (second == b)
-            steps = np.unique(step[its])
-            for run in np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1):
-                own = x[its & (step >= run[0]) & (step <= run[-1])]
-                looked = np.concatenate([own, (run[:, None] + np.linspace(0.0, 1.0, _SAMPLES)).reshape(-1)])
-                pair = np.full(len(looked), a), np.full(len(looked), b)
-                distance = self.separation(self._points_at(looked, pair), pair)[0]
-                near = looked[distance < least]
-                worst = float(distance.min())
-                decision.violated.append((float(near.min()), float(near.max()), self.names((a, b)), worst))
+    def _across(self, pair: Index, first: _Edge, last: _Edge) -> Array:
+        """Return (I,) the gap, m, that one of the planes of both edges holds at both."""
+        others = self._apart(
+            np.repeat(pair, 2),
+            np.stack([last.points, first.points], axis=1).reshape(-1, 4, 3),
+            np.stack([first.normal, last.normal], axis=1).reshape(-1, 3),
+        )
+        held = np.minimum(np.stack([first.held, last.held], axis=1), others.reshape(-1, 2))
+        return np.asarray(held.max(axis=1))
 
+    def _edge(self, pair: Index, share: Array) -> _Edge:
+        """Return pairs (P,) at shares (P,) of their segments, and keep what is the least so far."""
+        x = self.segment[pair] + share
+        instants, which = np.unique(x, return_inverse=True)
+        if len(instants) > 1 and len(instants) * len(self.motion.arm.radius) > _CHUNK:
+            half = len(pair) // 2
+            return _Edge.joined(
+                [self._edge(pair[:half], share[:half]), self._edge(pair[half:], share[half:])]
+            )
+        segment = np.minimum(instants.astype(np.int64), len(self.motion.time) - 2)
+        ends = self.motion.ends_at(segment, instants - segment)
+        time = self.motion.times_at(segment, instants - segment)
+        parts = [_Edge.none()]
+        for own, rows in self._groups(pair):
+            parts.append(_edge_of(own, self._pair(pair[rows]), ends, time, which[rows]))
+        edge = _Edge.joined(parts)
+        self._keep(pair, edge.distance, time[which])
+        return edge
 
-class DecidedBody(Decided, AgainstBody):
-    """Links against one obstacle, with a floor."""
+    def _keep(self, pair: Index, distance: Array, time: Array) -> None:
+        """Keep the least distance of each pair, its time, and the first and last time at which it is too small."""
+        np.minimum.at(self.found, pair, distance)
+        least = distance <= self.found[pair]
+        self.at[pair[least]] = time[least]
+        near = distance < self.least
+        np.fmin.at(self.since, pair[near], time[near])
+        np.fmax.at(self.until, pair[near], time[near])
 
-    def __init__(self, way: Way, body: Body) -> None:
-        AgainstBody.__init__(self, way.motion, body)
-        self.way, self.others = way, len(self._low)
+    def _pair(self, rows: Index) -> Pairs:
+        return self.first[rows], self.second[rows]
 
-    def names(self, pair: tuple[int, int]) -> tuple[str, str]:
-        """Return link and obstacle."""
-        return self.way.chain.member_names[pair[0]], self.body.name
+    def _groups(self, pair: Index) -> Iterator[tuple[Kept, slice]]:
+        """Yield what pairs (P,), in order, belong to, and which of them do."""
+        edges = np.searchsorted(pair, self.starts)
+        for own, first, last in zip(self.kept, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            if last > first:
+                yield own, slice(first, last)
 
-    def decide(self, floor: float) -> Decision:
-        """Return whether all links keep `floor`, m, along the whole way; one that is inside a closed mesh does not.
-
-        A link that is outside somewhere, and that nowhere comes near the surface, is outside everywhere.
-        """
-        decision, radius = super().decide(floor), self.way.chain.radius
-        if self.body.shape.closed:
-            for row, ends in enumerate(self.motion.ends - self._centers[:, None, None]):
-                inside = self.body.encloses(ends.reshape(-1, 3)).reshape(-1, 2).any(axis=1)
-                for k in np.flatnonzero(inside).tolist():
-                    decision.violated.append((row, row, self.names((k, 0)), -float(radius[k])))
-                    decision.bound = min(decision.bound, -float(radius[k]))
-        return decision
-
-    def _first_look(self, floor: float, decision: Decision) -> tuple[Index, Pairs]:
-        if self.others == 1:
-            return super()._first_look(floor, decision)
-        way, found = self.way, []
-        for k, step in enumerate(way.step.tolist()):
-            link, piece = self._near(way.low[k], way.high[k], step, step + 1, floor)
-            found.append((np.full(len(link), k), link, piece))
-        interval, link, piece = (np.concatenate(side) for side in zip(*found, strict=True))
-        decision.bound = min(decision.bound, floor)
-        return interval, (link, piece)
-
-    def _gaps(self, pair: Pairs, chosen: slice) -> Array:
-        way, link = self.way, pair[0]
-        start = way.start[chosen]
-        centers = self.body.at(way.time(start)), self.body.at(way.time(start + way.width[chosen]))
-        low, high = np.minimum(*centers) + self._low[0], np.maximum(*centers) + self._high[0]
-        gap = box_gap(way.low[chosen][:, link], way.high[chosen][:, link], low[:, None], high[:, None])
-        return gap - way.chain.radius[link]
-
-    def _depths(self, pair: Pairs) -> Array:
-        return self.way.chain.radius[pair[0]]
-
-
-class DecidedLinks(Decided, AgainstMembers):
-    """Links against links, with a floor."""
-
-    def __init__(self, way: Way) -> None:
-        AgainstMembers.__init__(self, way.motion)
-        self.way, self.others = way, len(way.chain.member_names)
-
-    def names(self, pair: tuple[int, int]) -> tuple[str, str]:
-        """Return the two links."""
-        first, second = (self.way.chain.member_names[k] for k in pair)
-        return first, second
-
-    def _gaps(self, pair: Pairs, chosen: slice) -> Array:
-        low, high = self.way.low[chosen], self.way.high[chosen]
-        return box_gap(low[:, pair[0]], high[:, pair[0]], low[:, pair[1]], high[:, pair[1]]) - self._depths(
-            pair
+    def _apart(self, pair: Index, points: Array, normal: Array) -> Array:
+        """Return (P,) the gaps, m, that planes across the normals (P, 3) leave between pairs (P,) at points."""
+        return np.concatenate(
+            [np.zeros(0)]
+            + [
+                own.apart(points[rows], normal[rows], self._pair(pair[rows]))
+                for own, rows in self._groups(pair)
+            ]
         )
 
-    def _bends(self, step: Index, pair: Pairs) -> Array:
-        return np.asarray(self.way.bends[step, pair[0]] + self.way.bends[step, pair[1]])
+    def _look_closer(self) -> None:
+        """Look at pairs that are too near at some more instants, for when they are and how near."""
+        broken = np.flatnonzero(self.found < self.least)[:_GREATEST_COUNT]
+        share = np.linspace(0.0, 1.0, _INSTANTS)
+        self._edge(np.repeat(broken, len(share)), np.tile(share, len(broken)))
 
-    def _depths(self, pair: Pairs) -> Array:
-        return self._radii(pair)
+    def _tell(self, decision: Decision) -> None:
+        """Note what came out; what is found of the same bodies in successive segments is one finding."""
+        decision.bound = float(np.minimum(self.rest, self.proven.min(initial=np.inf)))
+        floor, kind = self.kept[0].floor, self.kept[0].kind
+        broken = np.flatnonzero(self.found < self.least)
+        for names, run in self._runs(broken):
+            worst = run[int(np.argmin(self.found[run]))]
+            start, end = float(self.since[run].min()), float(self.until[run].max())
+            value, at = float(self.found[worst]), float(self.at[worst])
+            decision.violations.append(Finding(start, end, kind, names, value, floor, at))
+        decision.violations += self._enclosed(decision)
+        if not self.left:
+            return
+        pair, begin, width, proven = (np.concatenate(parts) for parts in zip(*self.left, strict=True))
+        for names, run in self._runs(np.unique(pair[~(self.found[pair] < self.least)])):
+            own = np.isin(pair, run)
+            segment = self.segment[pair[own]]
+            low, high = (self.motion.times_at(segment, x[own]) for x in (begin, begin + width))
+            found = float(low.min()), float(high.max()), kind, names, float(proven[own].min()), floor
+            decision.undecided.append(Finding(*found))
+
+    def _enclosed(self, decision: Decision) -> Iterator[Finding]:
+        """Yield the bodies that are within a surface, from the first to the last state at which they are."""
+        floor, kind, time = self.kept[0].floor, self.kept[0].kind, self.motion.time
+        for own in self.kept:
+            states: dict[tuple[int, int], list[int]] = {}
+            for state, pair in own.enclosed():
+                states.setdefault(pair, []).append(state)
+            for (first, second), found in states.items():
+                depth = -float(own.depth((np.array([first]), np.array([second])))[0])
+                decision.bound = min(decision.bound, depth)
+                start, end = float(time[found[0]]), float(time[found[-1]])
+                yield Finding(start, end, kind, own.names((first, second)), depth, floor, start)
+
+    def _runs(self, pair: Index) -> Iterator[tuple[tuple[str, str], Index]]:
+        """Yield the names of pairs, and those of them (R,) that are in one segment or in successive ones."""
+        named: dict[tuple[str, str], list[int]] = {}
+        for own, rows in self._groups(pair):
+            for k in pair[rows].tolist():
+                named.setdefault(own.names((int(self.first[k]), int(self.second[k]))), []).append(k)
+        for names, found in named.items():
+            each = np.array(found)
+            each = each[np.argsort(self.segment[each], kind="stable")]
+            for run in np.split(each, np.flatnonzero(np.diff(self.segment[each]) > 1) + 1):
+                yield names, run
+
+
+def _edge_of(own: Kept, pair: Pairs, ends: Array, time: Array, which: Index) -> _Edge:
+    """Return pairs (P,) at instants `which` (P,) of those of `ends` (U, B, 2, 3), m, and `time` (U,), s."""
+    points = own.points(pair, lambda member: ends[which, member], time[which])
+    distance, normal = own.separation(points, pair)
+    return _Edge(points, distance, normal, own.apart(points, normal, pair))

@@ -1,46 +1,285 @@
-"""The CSV file of a trajectory: the values of all joints, one instant a row."""
+"""A trajectory as it is given: arrays, a CSV file, a ROS 2 bag or a JointTrajectory message."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import Mistake, closest
-from vgtm_qp.problem.timed_rows import check_columns, read_timed_rows
+from vgtm_qp.errors import Mistake, ProblemError, nearest
+from vgtm_qp.problem.fields import GREATEST_LENGTH, quoted
+from vgtm_qp.problem.table import shown
+from vgtm_qp.problem.timed_rows import GREATEST_MISTAKES, NUMBER, read_timed_rows, time_mistakes
+from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.verify.arm import Arm
+
+if TYPE_CHECKING:
+    from vgtm_qp.problem import Problem
 
 
-def read_trajectory(file: str | Path, names: Sequence[str]) -> tuple[Array, Array]:
-    """Return times (T,), s, and values (T, J), rad or m, of the joints `names`, from columns of any order.
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """What a trajectory gives: the values of joints, or the lengths of a truss's actuators.
 
-    What ``vgtm export --to csv`` writes is such a file too; its rates are not needed. ProblemError where the file is
-    missing, is not text, lacks a column or has wrong cells: each is named by line and column.
+    Attributes
+    ----------
+    names, units : tuple of str
+    quantities : (K,) int
+        Which of the arm's quantities they are.
+    needed : (K,) bool
+        False for those that are locked from the start.
     """
-    _, values = read_timed_rows(Path(file), partial(_check_columns, names), named=_named)
-    return np.array([row["t"] for row in values]), np.array([[row[name] for name in names] for row in values])
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    quantities: NDArray[np.int64]
+    needed: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, arm: Arm, problem: Problem) -> Columns:
+        """Return the columns of an arm's trajectories."""
+        stuck: set[str] = set()
+        if problem.truss is not None:
+            stuck = {lock.member for lock in problem.truss.locked}
+        chosen = [
+            k
+            for k, name in enumerate(arm.quantity_names)
+            if isinstance(arm, RecordedChain) or arm.actuated[k] or name in stuck
+        ]
+        turns = (
+            arm.revolute if isinstance(arm, RecordedChain) else np.zeros(len(arm.quantity_names), dtype=bool)
+        )
+        index = np.array(chosen, dtype=np.int64)
+        return cls(
+            tuple(arm.quantity_names[k] for k in chosen),
+            tuple("rad" if turns[k] else "m" for k in chosen),
+            index,
+            np.asarray(arm.actuated[index]),
+        )
+
+    @cached_property
+    def keys(self) -> tuple[str, ...]:
+        """What the columns of a table are called: their names, but for a joint that is called as the time is."""
+        named = zip(self.names, self.units, strict=True)
+        return tuple(f"{name} [{unit}]" if name == "t" else name for name, unit in named)
+
+    @cached_property
+    def spellings(self) -> dict[str, str]:
+        """The keys of the columns of a table, by what may stand in its header; rates are as exports name them."""
+        found = {"t": "t", "time [s]": "t"}
+        for name, unit, key in zip(self.names, self.units, self.keys, strict=True):
+            rate = f"d {name}/dt [{unit}/s]"
+            found |= {key: key, f"{name} [{unit}]": key, rate: rate}
+        return found
+
+    def needed_names(self) -> tuple[str, ...]:
+        """Return the names that a trajectory has to have."""
+        return tuple(name for name, needed in zip(self.names, self.needed, strict=True) if needed)
+
+    def expected(self) -> str:
+        """Return in words what names there are."""
+        known = self.names
+        more = f" and {len(known) - 8} more" if len(known) > 8 else ""
+        return f"{', '.join(known[:8])}{more}"
 
 
-def _named(header: list[str]) -> list[str]:
-    """Return the names of an exported maneuver's columns without their units; any other header as it is."""
-    if header[:1] != ["time [s]"]:
-        return header
-    return ["t", *(column.rpartition(" [")[0] or column for column in header[1:])]
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Times (T,), s, increasing, and values (T, K) of the quantities (K,) of an arm, rad or m."""
+
+    time: Array
+    values: Array
+    quantities: NDArray[np.int64]
+
+    def filled(self, home: Array) -> Array:
+        """Return (T, M) all quantities of the arm: those that are not given are those of `home` (M,)."""
+        found = np.tile(home, (len(self.time), 1))
+        found[:, self.quantities] = self.values
+        return found
 
 
-def _check_columns(names: Sequence[str], header: list[str], mistakes: list[Mistake]) -> None:
-    """Add the mistakes of a header that has to hold ``t`` and `names`, each once."""
-    known = ("t", *names)
-    expected = f"the columns {','.join(known[:7])}{f' and {len(known) - 7} more' if len(known) > 7 else ''}"
-    if not header:
-        mistakes.append(Mistake("line 1", "nothing", expected))
-        return
-    all_known = (*known, *(f"d {name}/dt" for name in names))
-    check_columns(header, all_known, expected, mistakes)
-    unknown = [name for name in header if name not in all_known]
-    for name in known:
-        # A column that is probably meant for it was told.
-        if name not in header and closest(name, unknown) is None:
-            mistakes.append(Mistake("line 1", f'no column "{name}"', expected))
+def read_trajectory(file: str | Path, columns: Columns) -> Trajectory:
+    """Read a trajectory from a CSV file, a ROS 2 bag (``.mcap``) or a JointTrajectory message (``.yaml``).
+
+    The CSV file has a header, ``t`` in seconds and the names of `columns`, in any order, and a row for each instant;
+    what ``vgtm export`` writes is read too.
+
+    Raises
+    ------
+    ProblemError
+        With one mistake per mistake, each with its line and column.
+    MissingExtraError
+        The package that reads bags, or YAML, is not installed.
+    """
+    from vgtm_qp.certify import messages
+
+    kind = Path(file).suffix.lower()
+    if kind == ".mcap":
+        return _from_points(file, *messages.read_bag(Path(file)), columns)
+    if kind in (".yaml", ".yml"):
+        return _from_points(file, *messages.read_message(Path(file)), columns)
+    return _read_csv(file, columns)
+
+
+def _read_csv(file: str | Path, columns: Columns) -> Trajectory:
+    header, rows = read_timed_rows(Path(file), partial(_read_header, columns))
+    given = [k for k, key in enumerate(columns.keys) if key in header]
+    values = np.array([[row[columns.keys[k]] for k in given] for row in rows])
+    return Trajectory(
+        np.array([row["t"] for row in rows]), values.reshape(len(rows), -1), columns.quantities[given]
+    )
+
+
+def _read_header(columns: Columns, cells: list[str], mistakes: list[Mistake]) -> list[str]:
+    """Return the key of each column: "t", one of `columns.keys`, or an exported rate's; `mistakes` has the others."""
+    expected = f"t and the names {columns.expected()}"
+    spellings = columns.spellings
+    if len(cells) == 1 and re.search(r"[;\t|]", cells[0]):
+        mistakes.append(Mistake("line 1", shown(cells[0]), "names with commas between them"))
+        return []
+    for number, cell in enumerate(cells, start=1):
+        if "\n" in cell:
+            told = "a name on one line; its quotation mark stays open"
+            mistakes.append(Mistake(f"line 1, column {number}", shown(cell), told))
+            return []
+    header = [spellings.get(cell, cell) for cell in cells]
+    unknown = [cell for cell in cells if cell not in spellings]
+    known = set(header) & set(columns.keys)
+    if (unknown or not cells) and not known and not any(_meant(cell, spellings) for cell in unknown):
+        mistakes.append(Mistake("line 1", shown(",".join(cells) or None), f"a header with {expected}"))
+        return []
+    for number, (cell, key) in enumerate(zip(cells, header, strict=True), start=1):
+        place = f"line 1, column {number}"
+        if cell in unknown:
+            told = expected + _meant(cell, ("t", *columns.names))
+            mistakes.append(Mistake(place, shown(cell or None), told))
+        elif key in header[: number - 1]:
+            mistakes.append(Mistake(place, shown(cell), f'each column once; "{key}" stands before it'))
+    needed = ("t", *(key for key, wanted in zip(columns.keys, columns.needed, strict=True) if wanted))
+    # What is misspelt is told as such, not as missing too.
+    absent = [
+        key for key in needed if key not in header and not any(_meant(cell, (key,)) for cell in unknown)
+    ]
+    if absent:
+        mistakes.append(Mistake("line 1", f"no column {quoted(absent)}", f"a column for each of {expected}"))
+    return header
+
+
+def _meant(cell: str, names: Iterable[str]) -> str:
+    """Return in words which of `names` a cell is meant for, whatever its case and its unit; empty if none."""
+    bare, names = re.sub(r" *\[.*\]$", "", cell), list(names)
+    same = [name for name in names if name.lower() == bare.lower()]
+    return f'; did you mean "{same[0]}"?' if same else nearest(bare, names)
+
+
+def _from_points(
+    file: str | Path,
+    names: Sequence[str],
+    points: Sequence[tuple[str, float, Sequence[Any]]],
+    columns: Columns,
+) -> Trajectory:
+    """Return the trajectory of points of joints `names`: the place of each in words, its time, s, and its positions."""
+    mistakes = list(_wrong_names(names, columns))
+    before = -math.inf
+    for place, time, positions in points:
+        if len(positions) != len(names):
+            found = f"{len(positions)} positions"
+            mistakes.append(Mistake(f"{place}, positions", found, f"{len(names)}, one for each joint name"))
+        for name, value in zip(names, positions, strict=False):
+            if not _is_number(value):
+                mistakes.append(Mistake(f"{place}, {name}", shown(value), NUMBER))
+        mistakes += time_mistakes(f"{place}, time", time, before)
+        before = time
+    if not points:
+        mistakes.append(Mistake("points", "nothing", "at least one point"))
+    if mistakes:
+        raise ProblemError(str(file), mistakes[:GREATEST_MISTAKES])
+    given = [k for k, name in enumerate(columns.names) if name in names]
+    order = [list(names).index(columns.names[k]) for k in given]
+    values = np.array([positions for _, _, positions in points], dtype=np.float64)
+    return Trajectory(np.array([time for _, time, _ in points]), values[:, order], columns.quantities[given])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= GREATEST_LENGTH
+
+
+def _wrong_names(names: Sequence[str], columns: Columns) -> Iterator[Mistake]:
+    expected = f"the names {columns.expected()}"
+    for k, name in enumerate(names):
+        if name not in columns.names:
+            yield Mistake(f"joint_names[{k}]", shown(name), expected + nearest(name, columns.names))
+        elif name in names[:k]:
+            yield Mistake(f"joint_names[{k}]", shown(name), "each name once")
+    unknown, absent = [name for name in names if name not in columns.names], []
+    for name in columns.needed_names():
+        if name not in names and not nearest(name, unknown):
+            absent.append(name)
+    if absent:
+        yield Mistake("joint_names", f"no {quoted(absent)}", f"each of {expected}")
+
+
+def given_trajectory(
+    times: ArrayLike, joints: ArrayLike | Mapping[str, ArrayLike], columns: Columns
+) -> Trajectory:
+    """Return the trajectory of arrays: (T,) and (T, K), or (T,) by name; ProblemError where they are none."""
+    mistakes: list[Mistake] = []
+    time = _array("times", times, mistakes)
+    if isinstance(joints, Mapping):
+        names = [str(name) for name in joints]
+        mistakes += _wrong_names(names, columns)
+        arrays = [_array(f'joints["{name}"]', value, mistakes) for name, value in joints.items()]
+        if not mistakes:
+            wrong = [(name, a) for name, a in zip(names, arrays, strict=True) if a.shape != time.shape]
+            mistakes += [Mistake(f'joints["{n}"]', _shape(a), f"{len(time)} values") for n, a in wrong]
+        chosen = [columns.names.index(name) for name in names] if not mistakes else []
+        values = np.stack(arrays, axis=1) if arrays and not mistakes else np.zeros((len(time), 0))
+    else:
+        values = _array("joints", joints, mistakes)
+        chosen = list(range(len(columns.names)))
+        if values.ndim == 2 and values.shape[1] == columns.needed.sum() < len(chosen):
+            chosen = np.flatnonzero(columns.needed).tolist()
+        if not mistakes and values.shape != (*time.shape, len(chosen)):
+            expected = (
+                f"values ({len(time)}, {len(columns.names)}): a row a time, columns {columns.expected()}"
+            )
+            mistakes.append(Mistake("joints", _shape(values), expected))
+    if not mistakes:
+        mistakes = list(_wrong_values(time, values))
+    if mistakes:
+        raise ProblemError("certify", mistakes[:GREATEST_MISTAKES])
+    return Trajectory(time, values, columns.quantities[chosen])
+
+
+def _shape(array: Array) -> str:
+    return f"an array of shape {array.shape}"
+
+
+def _array(name: str, given: Any, mistakes: list[Mistake]) -> Array:
+    try:
+        array = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        mistakes.append(Mistake(name, shown(type(given).__name__), "an array of numbers"))
+        return np.zeros(1)
+    if name == "times" and (array.ndim != 1 or not len(array)):
+        mistakes.append(Mistake(name, _shape(array), "times (T,), at least one"))
+        return np.zeros(1)
+    return array
+
+
+def _wrong_values(time: Array, values: Array) -> Iterator[Mistake]:
+    for name, array in (("times", time), ("joints", values)):
+        for place in np.argwhere(~(np.abs(array) <= GREATEST_LENGTH))[:1]:
+            index = ", ".join(map(str, place.tolist()))
+            yield Mistake(f"{name}[{index}]", shown(float(array[tuple(place)])), NUMBER)
+    steps = zip(time.tolist(), [-math.inf, *time[:-1].tolist()], strict=True)
+    found = (time_mistakes(f"times[{k}]", at, before) for k, (at, before) in enumerate(steps))
+    yield from next(filter(None, found), [])

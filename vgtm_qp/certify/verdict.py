@@ -1,4 +1,4 @@
-"""What is said of a trajectory: whether it is certified, and otherwise where it is wrong or in doubt."""
+"""What is said of a trajectory: certified, or where it is wrong or in doubt."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong, or not decided, from one time to another.
+    """Something that is wrong, or neither proven nor refuted, from one time to another.
 
     Attributes
     ----------
     start, end : float
-        Times, s. Of a clearance: the first and the last instant at which it was found too small, or the interval in
-        which it is not decided.
+        Times, s. Between them, but not always all the time, it is so.
     kind : str
-        ``limit``, ``rate``, ``acceleration``, ``lock``, ``clearance``, ``self-clearance``, ``base`` or ``angle``.
+        ``limit``, ``rate``, ``acceleration``, ``lock``, ``clearance``, ``self-clearance``, ``angle`` or ``motion``.
     names : tuple of str
-        The joint, or the two bodies.
+        The joint or actuator; the body and the obstacle; or the two bodies.
     value, bound : float
-        The worst value found, or what is proven where nothing is decided, and what it has to keep to: rad or m, their
-        rates and accelerations, or m.
+        The worst value that was found, or what is proven where it is in doubt, and what it has to keep to. Lengths and
+        clearances in m, joints in rad or m, rates and accelerations of these over s and s^2. NaN if there is none.
+    at : float
+        Time of that value, s; NaN where it is in doubt.
+    reason : str
+        Why it is in doubt, if there is more to say than that the proof did not come to an end.
     """
 
     start: float
@@ -31,39 +34,51 @@ class Finding:
     names: tuple[str, ...]
     value: float
     bound: float
+    at: float = math.nan
+    reason: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON data; what is infinite is null."""
-        return {
+        """Return it as JSON data; what is not finite is null."""
+        found = {
             "from": self.start,
             "to": self.end,
             "kind": self.kind,
             "names": list(self.names),
             "value": _finite(self.value),
             "bound": _finite(self.bound),
+            "at": _finite(self.at),
         }
+        return found | ({"reason": self.reason} if self.reason else {})
 
     def __str__(self) -> str:
-        when = f"at {self.start:.6g} s" if self.start == self.end else f"{self.start:.6g} to {self.end:.6g} s"
-        return f"{when}: {self.kind} of {' / '.join(self.names)} is {self.value:.6g}; its bound is {self.bound:.6g}"
+        when = f"{self.start:.6g} to {self.end:.6g} s" if self.end > self.start else f"at {self.start:.6g} s"
+        parts = [f"{when}: {self.kind} of {' / '.join(self.names)}"]
+        if math.isfinite(self.value):
+            known = f"is {self.value:.6g}" if math.isfinite(self.at) else f"is {self.value:.6g} or more"
+            parts.append(known + (f" at {self.at:.6g} s" if math.isfinite(self.at) else ""))
+        if math.isfinite(self.bound):
+            parts.append(f"its bound is {self.bound:.6g}")
+        return ", ".join(parts) + (f": {self.reason}" if self.reason else "")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is proven of a trajectory whose joints move linearly between its rows.
+    """What is proven of a trajectory whose joints or actuators move linearly between its rows.
 
     Attributes
     ----------
     certified : bool
-        Whether all is proven at every instant: limits, rates, accelerations, locks, and each clearance to be no less
-        than asked for, to 1e-9 m.
+        Whether it is proven that at every instant all limits, rates, accelerations and locks hold and every clearance
+        is at least the one asked for, to 1e-9 m.
     clearance, self_clearance : float
-        Proven lower bounds over the whole trajectory of the clearance to obstacles, and of links to links, m; infinite
-        where there are none. They are as high as the proof needed them to be: the real ones are often greater.
+        Proven lower bounds over the whole trajectory of the clearance to obstacles and of that between bodies of the
+        arm, m: infinite where there is nothing to keep clear of, minus infinite where the motion is not known.
     violations, undecided : tuple of Finding
-        What was found to be wrong, and what was neither found to be wrong nor proven to be right.
+        What is wrong; and what was neither proven nor refuted.
     time : float
-        How long the proof took, s.
+        Duration of the proof, s.
+    notes : tuple of str
+        What the proof leaves out, and why.
     """
 
     clearance: float
@@ -71,33 +86,43 @@ class Verdict:
     violations: tuple[Finding, ...]
     undecided: tuple[Finding, ...]
     time: float
+    notes: tuple[str, ...] = ()
 
     @property
     def certified(self) -> bool:
         """Whether nothing is wrong and nothing is in doubt."""
         return not self.violations and not self.undecided
 
+    @property
+    def answer(self) -> str:
+        """``certified``, ``violated`` or ``undecided``."""
+        if self.certified:
+            return "certified"
+        return "violated" if self.violations else "undecided"
+
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON data; what is infinite is null."""
+        """Return it as JSON data; what is not finite is null."""
         return {
             "certified": self.certified,
+            "answer": self.answer,
             "clearance": _finite(self.clearance),
             "self_clearance": _finite(self.self_clearance),
             "violations": [finding.to_dict() for finding in self.violations],
             "undecided": [finding.to_dict() for finding in self.undecided],
             "time": self.time,
+            "notes": list(self.notes),
         }
 
     def __str__(self) -> str:
-        found = [f"violated, {finding}" for finding in self.violations]
-        found += [f"undecided, {finding}" for finding in self.undecided]
-        bounds = (
+        bounds = [
             f"{what} at least {value:.6g} m"
             for what, value in (("clearance", self.clearance), ("self-clearance", self.self_clearance))
             if math.isfinite(value)
-        )
-        head = "certified" if self.certified else "NOT CERTIFIED"
-        return "\n".join([", ".join([head, *bounds]), *(f"  {line}" for line in found)])
+        ]
+        head = "certified" if self.certified else f"NOT CERTIFIED, {self.answer}"
+        lines = [f"violated, {finding}" for finding in self.violations]
+        lines += [f"undecided, {finding}" for finding in self.undecided]
+        return "\n".join([", ".join([head, *bounds]), *(f"  {line}" for line in (*lines, *self.notes))])
 
 
 def _finite(value: float) -> float | None:

@@ -12,20 +12,26 @@ from vgtm_qp.cli.output import ExitCode, Json, ProblemName, answer
 
 def certify(
     problem: ProblemName,
-    trajectory: Annotated[Path, Parameter(name="TRAJECTORY", help="CSV file: t and the names of the joints")],
+    trajectory: Annotated[
+        Path,
+        Parameter(
+            name="TRAJECTORY",
+            help="CSV file: t and the names of joints or actuators; or a ROS 2 bag, or a JointTrajectory in YAML",
+        ),
+    ],
     /,
     *,
     json: Json = False,
 ) -> int:
     """Prove or refute a trajectory for a problem's arm and obstacles, over the whole time and not at its rows alone.
 
-    Joints move linearly between the rows. Proven are limits, rates, accelerations and clearances: exit code 0; 4 if
-    one is violated or cannot be decided.
+    Joints and actuators move linearly between the rows. Proven are limits, rates, accelerations and clearances: exit
+    code 0; 4 if one is violated or cannot be decided.
     """
-    from vgtm_qp.certify.certify import certify_file
+    from vgtm_qp.certify.certify import Certifier
     from vgtm_qp.problem import load_problem
 
-    verdict = certify_file(load_problem(problem), trajectory)
+    verdict = Certifier(load_problem(problem)).certify_file(trajectory)
     found = {"trajectory": str(trajectory), **verdict.to_dict()}
     answer(found, f"{trajectory}: {verdict}", as_json=json)
     return ExitCode.SOLVED if verdict.certified else ExitCode.UNVERIFIED

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vgtm_qp.errors import Mistake
-from vgtm_qp.problem.fields import LONGEST_STEP, SHORTEST_STEP
 from vgtm_qp.problem.table import shown
 from vgtm_qp.problem.timed_rows import check_columns, read_timed_rows
 
@@ -38,18 +37,18 @@ def read_path(file: str | Path) -> PathTable:
     """
     import numpy as np
 
-    header, values = read_timed_rows(Path(file), _check_header, SHORTEST_STEP, LONGEST_STEP)
+    header, values = read_timed_rows(Path(file), _read_header)
     columns = {name: np.array([row[name] for row in values]) for name in header}
     turns = np.column_stack([columns[name] for name in _TURNS]) if "rx" in columns else None
     return PathTable(columns["t"], np.column_stack([columns[name] for name in "xyz"]), turns)
 
 
-def _check_header(header: list[str], mistakes: list[Mistake]) -> None:
+def _read_header(header: list[str], mistakes: list[Mistake]) -> list[str]:
     known = (*_COLUMNS, *_TURNS)
     expected = "the header t,x,y,z or t,x,y,z,rx,ry,rz"
     if not set(header) & set(known):
         mistakes.append(Mistake("line 1", shown(",".join(header) or None), expected))
-        return
+        return header
     check_columns(header, known, expected, mistakes)
     needed = known if set(header) & set(_TURNS) else _COLUMNS
     absent = [name for name in needed if name not in header]
@@ -57,3 +56,4 @@ def _check_header(header: list[str], mistakes: list[Mistake]) -> None:
         mistakes.append(
             Mistake("line 1", shown(",".join(header)), f"{expected}; missing: {', '.join(absent)}")
         )
+    return header

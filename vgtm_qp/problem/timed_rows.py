@@ -8,35 +8,27 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vgtm_qp.errors import Mistake, ProblemError, nearest
-from vgtm_qp.problem.fields import GREATEST_LENGTH
+from vgtm_qp.problem.fields import GREATEST_LENGTH, LONGEST_STEP, SHORTEST_STEP
 from vgtm_qp.problem.table import shown
 
 _GREATEST_BYTES = 200_000_000
-_GREATEST_MISTAKES = 100
-_NUMBER = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
+GREATEST_MISTAKES = 100
+NUMBER = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
 
 Mistakes = list[Mistake]
 
 
 def read_timed_rows(
-    file: Path,
-    check_header: Callable[[list[str], Mistakes], None],
-    shortest: float = 0.0,
-    longest: float = math.inf,
-    named: Callable[[list[str]], list[str]] = list,
+    file: Path, read_header: Callable[[list[str], Mistakes], list[str]]
 ) -> tuple[list[str], list[dict[str, float]]]:
-    """Return the header, and the numbers of each row by column; times increase, from 0 or later.
+    """Return the keys of the columns, and the numbers of each row by key; the times ``t`` increase, from 0 or later.
 
     Parameters
     ----------
     file
         With cells of numbers; empty lines are skipped.
-    check_header
-        Adds what is wrong with the columns to the mistakes that it is given.
-    shortest, longest
-        Least and greatest time from one row to the next, s; for the first row, from 0 if it is later.
-    named
-        Returns the names of the columns for a header that has others.
+    read_header
+        Returns the key of each column, and adds what is wrong with the columns to the mistakes that it is given.
 
     Raises
     ------
@@ -44,28 +36,33 @@ def read_timed_rows(
         The file is missing, is not text, or has wrong columns or cells: each is named by line and column.
     """
     header, rows = _rows(file)
-    header, mistakes = named(header), list[Mistake]()
-    check_header(header, mistakes)
+    mistakes: Mistakes = []
+    header, values = read_header(header, mistakes), list[dict[str, float]]()
     if not mistakes:
-        values = [_numbers(header, line, cells, mistakes) for line, cells in rows]
         before = -math.inf
-        for (line, _), row in zip(rows, values, strict=True):
+        for line, cells in rows:
+            row = _numbers(header, line, cells, mistakes)
             time = row.get("t", math.nan)
-            step, place = time - max(before, 0.0), f"line {line}, column t"
-            if time < 0:
-                mistakes.append(Mistake(place, f"{time:g}", "a time in seconds, 0 or more"))
-            elif time <= before:
-                expected = f"a time after that of the row before, {before:.9g} s"
-                mistakes.append(Mistake(place, f"{time:.9g}", expected))
-            elif time > 0 and not shortest <= step <= longest:
-                mistakes.append(Mistake(place, f"{step:g} s", f"a step of {shortest:g} to {longest:g} s"))
-            if math.isfinite(time):
-                before = time
+            mistakes += time_mistakes(f"line {line}, column t", time, before)
+            before = time if math.isfinite(time) else before
+            values.append(row)
         if not rows:
             mistakes.append(Mistake("line 2", "nothing", "at least one row of numbers below the header"))
     if mistakes:
-        raise ProblemError(str(file), mistakes[:_GREATEST_MISTAKES])
+        raise ProblemError(str(file), mistakes[:GREATEST_MISTAKES])
     return header, values
+
+
+def time_mistakes(place: str, time: float, before: float) -> Mistakes:
+    """Return what is wrong with the time of a row after one `before`, s, which is -inf for the first; NaN passes."""
+    step = time - max(before, 0.0)
+    if time < 0:
+        return [Mistake(place, f"{time:g}", "a time in seconds, 0 or more")]
+    if time <= before:
+        return [Mistake(place, f"{time:.9g}", f"a time after that of the row before, {before:.9g} s")]
+    if time > 0 and not SHORTEST_STEP <= step <= LONGEST_STEP:
+        return [Mistake(place, f"{step:g} s", f"a step of {SHORTEST_STEP:g} to {LONGEST_STEP:g} s")]
+    return []
 
 
 def check_columns(header: list[str], known: tuple[str, ...], expected: str, mistakes: Mistakes) -> None:
@@ -106,12 +103,13 @@ def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mist
     row: dict[str, float] = {}
     for name, cell in zip(header, cells, strict=True):
         try:
-            number = float(cell)
+            # Python reads 1_000 too.
+            number = math.nan if "_" in cell else float(cell)
         except ValueError:
             number = math.nan
         # NaN fails this comparison too.
         if abs(number) <= GREATEST_LENGTH:
             row[name] = number
         else:
-            mistakes.append(Mistake(f"line {line}, column {name}", shown(cell), _NUMBER))
+            mistakes.append(Mistake(f"line {line}, column {name}", shown(cell), NUMBER))
     return row

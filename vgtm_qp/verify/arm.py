@@ -125,23 +125,23 @@ class RecordedArm:
         return np.asarray(origin + offset[..., :1] * x + offset[..., 1:2] * y + offset[..., 2:] * z)
 
     def bend(self, before: Array, after: Array, member: Index) -> Array:
-        """Return (P,) an upper bound, m, of |d2 r / d share2| of members' ends between node positions (N, 3).
+        """Return (..., P) an upper bound, m, of |d2 r / d share2| of members' ends between node positions (..., N, 3).
 
         Zero for pin joints. The joint frame's axes are unit vectors of polynomials w of the share, and
         |(w/|w|)''| <= |w''|/|w| + 3 (|w'|/|w|)^2, with |w| bounded below from its ends; inf where that fails.
         """
         if self.has_pin_joints:
-            return np.zeros(len(member))
+            return np.zeros((*before.shape[:-2], len(member)))
         corner = self.corners[member]
-        first = [nodes[corner[..., 1]] - nodes[corner[..., 0]] for nodes in (before, after)]
-        second = [nodes[corner[..., 2]] - nodes[corner[..., 0]] for nodes in (before, after)]
+        first = [nodes[..., corner[..., 1], :] - nodes[..., corner[..., 0], :] for nodes in (before, after)]
+        second = [nodes[..., corner[..., 2], :] - nodes[..., corner[..., 0], :] for nodes in (before, after)]
         x_rate, x_bend = _bisector_bounds(first, second)
         z_rate, z_bend = _normal_bounds(first, second)
         offset = np.abs(self.offset[member])
         y_bend = z_bend + 2.0 * z_rate * x_rate + x_bend
         with np.errstate(invalid="ignore"):
             bound = offset[..., 0] * x_bend + offset[..., 1] * y_bend + offset[..., 2] * z_bend
-        return np.asarray(np.where(np.isnan(bound), 0.0, bound).max(axis=1))
+        return np.asarray(np.where(np.isnan(bound), 0.0, bound).max(axis=-1))
 
     def lengths(self, nodes: Array) -> Array:
         """Return (..., M) member lengths, m, at node positions (..., N, 3)."""
@@ -162,24 +162,24 @@ class RecordedArm:
         frames = [polygon_frame(polygon, angles)[0] for polygon in nodes[:, self.tip]]
         return np.asarray(frames @ home_frame.T @ self.tip_frame)
 
-    def _length_gradient(self, nodes: Array) -> tuple[Array, Index]:
-        """Return (M, Q, 3) the gradients of the lengths with respect to (M, Q) nodes, m/m.
+    def length_gradient(self, nodes: Array) -> tuple[Array, Index]:
+        """Return (..., M, Q, 3) the gradients of the lengths with respect to (M, Q) nodes, m/m, at nodes (..., N, 3).
 
         For offset joints by central differences of the joints' own corners: exact to about 1e-9.
         """
-        place = nodes[self.corners]
+        place = nodes[..., self.corners, :]
         if self.has_pin_joints:
-            direction = _unit(place[:, 1, 0] - place[:, 0, 0])
-            return np.stack([-direction, direction], axis=1), self.members
+            direction = _unit(place[..., 1, 0, :] - place[..., 0, 0, :])
+            return np.stack([-direction, direction], axis=-2), self.members
         step = 1e-6 * float(self.length.max())
-        gradient = np.empty((len(self.members), 2, 3, 3))
+        gradient = np.empty((*place.shape[:-3], 2, 3, 3))
         for e, c, axis in np.ndindex(2, 3, 3):
             change = np.zeros((2, 3, 3))
             change[e, c, axis] = step
             ahead, behind = (self._ends_at(place + sign * change, self.offset) for sign in (1.0, -1.0))
-            longer, shorter = (_norm(ends[:, 1] - ends[:, 0]) for ends in (ahead, behind))
-            gradient[:, e, c, axis] = (longer - shorter) / (2.0 * step)
-        return gradient.reshape(-1, 6, 3), self.corners.reshape(-1, 6)
+            longer, shorter = (_norm(ends[..., 1, :] - ends[..., 0, :]) for ends in (ahead, behind))
+            gradient[..., e, c, axis] = (longer - shorter) / (2.0 * step)
+        return gradient.reshape(*gradient.shape[:-3], 6, 3), self.corners.reshape(-1, 6)
 
     def singular_values(self, nodes: Array) -> tuple[float, float, float] | None:
         """Return the least singular value of the length Jacobian, and the least and greatest of the tip's.
@@ -192,7 +192,7 @@ class RecordedArm:
         unknowns = 3 * len(self.free)
         if unknowns != len(self.members) or not self.actuated.any():
             return None
-        gradient, index = self._length_gradient(nodes)
+        gradient, index = self.length_gradient(nodes)
         column = np.full(len(self.home), -1)
         column[self.free] = np.arange(len(self.free))
         place = column[index]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.result import Result
@@ -49,7 +49,7 @@ _SAFE = 0.05
 """Default of ``clearance.safe``, m."""
 _SELF_SHARE = 0.25
 """Default of ``clearance.self_safe``, as a share of ``safe``."""
-_INSTANT = 1e-9
+INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 _ROUNDING = 4.0 * float(np.finfo(float).eps)
 """Relative rounding of a length and of the duration between two times of a large clock."""
@@ -137,14 +137,16 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
     """
     time, unit, names = maneuver.time, arm.unit, arm.quantity_names
     per = f"({unit})" if " " in unit else unit
-    locks = [(names.index(name), since) for name, since in _locks(maneuver) if name in names]
+    locks = [
+        (names.index(name), since) for name, since in locks_of(maneuver.manifest["problem"]) if name in names
+    ]
     held = np.where(arm.actuated, 0.0, np.abs(lengths - arm.home_quantities))
     for k, since in locks:
-        rows = np.flatnonzero(time >= since - _INSTANT)
+        rows = np.flatnonzero(time >= since - INSTANT)
         held[rows, k] = np.maximum(held[rows, k], np.abs(lengths[rows, k] - lengths[rows[:1], k]))
     rates, accelerations, rounding, its_rounding = changes(time, lengths, float(np.abs(maneuver.nodes).max()))
     for k, since in locks:
-        accelerations[np.abs(time[1:-1] - since) <= _INSTANT, k] = 0.0
+        accelerations[np.abs(time[1:-1] - since) <= INSTANT, k] = 0.0
     poses = base_poses(maneuver.manifest["problem"], time)
     placed = arm.home[arm.base] @ np.swapaxes(rotations(poses[:, 3:]), 1, 2) + poses[:, None, :3]
     moved = np.linalg.norm(maneuver.nodes[:, arm.base] - placed, axis=2)
@@ -235,9 +237,8 @@ def _difference(stored: Array, found: Array) -> Array:
         return np.asarray(np.where(stored == found, 0.0, np.abs(stored - found)))
 
 
-def _locks(maneuver: Result) -> list[tuple[str, float]]:
-    """Return name and time, s, of the actuators that the problem locks."""
-    problem = maneuver.manifest["problem"]
+def locks_of(problem: Mapping[str, Any]) -> list[tuple[str, float]]:
+    """Return name and time, s, of the actuators that a problem, as JSON data, locks."""
     entries = (problem.get("truss") or problem.get("arm") or {}).get("locked") or ()
     tables = ({"member": entry} if isinstance(entry, str) else entry for entry in entries)
     return [(table.get("joint") or table["member"], float(table.get("time", 0.0))) for table in tables]
@@ -247,19 +248,14 @@ def _jams_between_rows(maneuver: Result) -> list[str]:
     """Return the members that lock between two rows, so that the length at which they locked is unknown."""
     return [
         f"{name} locks at {since:g} s, where there is no state"
-        for name, since in _locks(maneuver)
-        if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > _INSTANT
+        for name, since in locks_of(maneuver.manifest["problem"])
+        if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > INSTANT
     ]
 
 
 def _member_angle(motion: RecordedMotion) -> Least:
     """Return the least angle at any state between two members that share a node, rad."""
-    members = motion.arm.members
-    node = members.reshape(-1)
-    order = np.argsort(node, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(node[order])) + 1)
-    corners = [np.stack(np.triu_indices(len(group), 1), axis=1) for group in groups]
-    pairs = np.concatenate([group[pair] for group, pair in zip(groups, corners, strict=True)])
+    pairs = joined_ends(motion.arm.members)
     least = Least()
     for state, ends in enumerate(motion.ends):
         along = ends[:, 1] - ends[:, 0]
@@ -269,6 +265,15 @@ def _member_angle(motion: RecordedMotion) -> Least:
             names = " / ".join(motion.arm.member_names[k // 2] for k in pairs[int(np.argmin(between))])
             least = Least(float(between.min()), f"state {state}: {names}")
     return least
+
+
+def joined_ends(members: Index) -> Index:
+    """Return (P, 2) each two ends of members (M, 2) that are in one node: end e of member m is 2 m + e."""
+    node = members.reshape(-1)
+    order = np.argsort(node, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(node[order])) + 1)
+    corners = [np.stack(np.triu_indices(len(group), 1), axis=1) for group in groups]
+    return np.concatenate([group[pair] for group, pair in zip(groups, corners, strict=True)])
 
 
 def _singular_values(arm: Arm, nodes: Array) -> Array:

@@ -83,14 +83,14 @@ class Encounters(ABC):
         """Return the pairs of that name, an empty list if there are none."""
 
     @abstractmethod
-    def _near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:
+    def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:
         """Return the pairs (P,), (P,) that may be nearer than `limit`, m.
 
         `low`, `high` (M, 3) bound each member from state `start` to state `stop`.
         """
 
     @abstractmethod
-    def _points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
+    def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
         """Return (P, 2 or 4, 3) the points that the pairs' separation depends on, m.
 
         `ends` gives (P, 2, 3) the ends of members (P,) at the times (P,), s.
@@ -101,7 +101,7 @@ class Encounters(ABC):
         """Return the exact surface distance (P,), m, and the normal (P, 3) at those points."""
 
     @abstractmethod
-    def _apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
+    def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """Return (P,) the gap between the surfaces' supporting planes across `normal`, m.
 
         With a zero normal it is the value for axes that touch.
@@ -118,7 +118,7 @@ class Encounters(ABC):
     def distances(self, state: int, pair: Pairs) -> Array:
         """Return the exact distances (P,) of pairs at a state, m."""
         ends, time = self.motion.ends[state], np.full(len(pair[0]), self.motion.time[state])
-        return self.separation(self._points(pair, lambda member: ends[member], time), pair)[0]
+        return self.separation(self.points(pair, lambda member: ends[member], time), pair)[0]
 
     def at_state(self, state: int) -> Least:
         """Return the exact least clearance at a state."""
@@ -141,8 +141,8 @@ class Encounters(ABC):
         return np.inf
 
     def _counting(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Iterator[Pairs]:
-        """Yield what `_near` finds and counts from state `start` on, some pairs at a time."""
-        first, second = self._near(low, high, start, stop, limit)
+        """Yield what `near` finds and counts from state `start` on, some pairs at a time."""
+        first, second = self.near(low, high, start, stop, limit)
         if self.held_from:
             each = zip(first.tolist(), second.tolist(), strict=True)
             kept = np.array([self.held_from.get(pair, 0) <= start for pair in each], dtype=bool)
@@ -177,8 +177,8 @@ class Encounters(ABC):
             for points, share in zip(edges, shares, strict=True):
                 distance, normal = self.separation(points, pair)
                 limit = limit.or_lower(distance, self._called_between(step, share, pair))
-                held = np.minimum(*(self._apart(ends, normal, pair) for ends in edges))
-                touching = self._apart(points, np.zeros_like(normal), pair)
+                held = np.minimum(*(self.apart(ends, normal, pair) for ends in edges))
+                touching = self.apart(points, np.zeros_like(normal), pair)
                 proven = np.maximum(proven, np.maximum(held - bend * width**2 / 8.0, touching))
             open_ = (proven < limit.value - self.motion.resolution) & np.isfinite(bend)
             if depth == _GREATEST_DEPTH - 1 or open_.sum() > _GREATEST_COUNT:
@@ -196,7 +196,7 @@ class Encounters(ABC):
     def _points_between(self, step: int, pair: Pairs, share: Array) -> Array:
         before, after = self.motion.time[step : step + 2]
         time = before + share * (after - before)
-        return self._points(pair, lambda member: self.motion.ends_between(step, member, share), time)
+        return self.points(pair, lambda member: self.motion.ends_between(step, member, share), time)
 
     def _called_between(self, step: int, share: Array, pair: Pairs) -> Callable[[int], str]:
         return lambda k: self._called(f"step {step + 1} at {share[k]:.4f}", pair)(k)
@@ -217,7 +217,8 @@ class AgainstBody(Encounters):
         named = [k for k in range(len(self.motion.arm.member_names)) if self.name((k, 0)) == name]
         return [(member, piece) for member in named for piece in range(len(self._low))]
 
-    def _near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:
+    def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:
+        """Return the members and pieces of the body that may be nearer than `limit`."""
         reach = limit + self.motion.arm.radius
         shift = self._centers[start : stop + 1]
         low, high = low - shift.max(axis=0), high - shift.min(axis=0)
@@ -239,7 +240,8 @@ class AgainstBody(Encounters):
         depth = np.where(inside, -self.motion.arm.radius, np.inf)
         return super().at_state(state).or_lower(depth, lambda k: f"state {state}: {self.name((k, 0))}")
 
-    def _points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
+    def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
+        """Return (P, 2, 3) the ends of the members, seen from the centre of the body."""
         return np.asarray(ends(pair[0]) - self.body.at(time)[:, None])
 
     def separation(self, points: Array, pair: Pairs) -> Separation:
@@ -247,7 +249,8 @@ class AgainstBody(Encounters):
         distance, normal = self.body.separation(points[:, 0], points[:, 1], pair[1])
         return distance - self.motion.arm.radius[pair[0]], normal
 
-    def _apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
+    def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
+        """Return the gaps between members and pieces."""
         nearest = np.einsum("pec,pc->pe", points, normal).min(axis=1)
         return np.asarray(nearest - self.body.support(normal, pair[1]) - self.motion.arm.radius[pair[0]])
 
@@ -290,7 +293,8 @@ class AgainstMembers(Encounters):
         pairs = zip(first.tolist(), second.tolist(), strict=True)
         return np.array([pair in self._touching for pair in pairs], dtype=bool)
 
-    def _near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:  # noqa: ARG002
+    def near(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Pairs:  # noqa: ARG002
+        """Return the members that may be nearer to one another than `limit`; `start` and `stop` do not matter."""
         axis = int(np.argmax(high.max(axis=0) - low.min(axis=0)))
         radius = self.motion.arm.radius
         reach = limit + 2.0 * float(radius.max())
@@ -309,17 +313,19 @@ class AgainstMembers(Encounters):
         gap = box_gap(low[a], high[a], low[b], high[b]) - radius[a] - radius[b]
         return a[gap < limit], b[gap < limit]
 
-    def _points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:  # noqa: ARG002
+    def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:  # noqa: ARG002
+        """Return (P, 4, 3) the ends of both members."""
         return np.concatenate([ends(member) for member in pair], axis=1)
 
     def separation(self, points: Array, pair: Pairs) -> Separation:
         """Return surface distances and normals."""
         distance, normal = segment_segment(*(points[:, k] for k in range(4)))
-        return distance - self._radii(pair), normal
+        return distance - self.radii(pair), normal
 
-    def _apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
+    def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
+        """Return the gaps between both members."""
         along = np.einsum("pec,pc->pe", points, normal)
-        return np.asarray(along[:, :2].min(axis=1) - along[:, 2:].max(axis=1) - self._radii(pair))
+        return np.asarray(along[:, :2].min(axis=1) - along[:, 2:].max(axis=1) - self.radii(pair))
 
     def _bend(self, step: int, pair: Pairs) -> Array:
         return self.motion.bend(step, pair[0]) + self.motion.bend(step, pair[1])
@@ -328,7 +334,8 @@ class AgainstMembers(Encounters):
         """Return ``member / member``."""
         return " / ".join(self.motion.arm.member_names[k] for k in pair)
 
-    def _radii(self, pair: Pairs) -> Array:
+    def radii(self, pair: Pairs) -> Array:
+        """Return (P,) the sums of both radii, m."""
         return np.asarray(self.motion.arm.radius[pair[0]] + self.motion.arm.radius[pair[1]])
 
 

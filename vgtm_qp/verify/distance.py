@@ -15,12 +15,12 @@ Separation = tuple[Array, Array]
 
 
 def segment_box(start: Array, end: Array, half: Array) -> Separation:
-    """Segments against the solid box |x_i| <= half_i.
+    """Segments against the solid boxes |x_i| <= half_i; `half` is (3,) or (P, 3), m.
 
     The squared distance is convex and piecewise quadratic along the segment, with a break where it crosses a
     face plane: between two breaks its derivative is linear, so its minimum is found in closed form.
     """
-    along = end - start
+    along, half = end - start, np.broadcast_to(half, start.shape)
     moving = np.where(along == 0.0, 1.0, along)
     with np.errstate(over="ignore"):
         crossings = np.concatenate([(half - start) / moving, (-half - start) / moving], axis=1)
@@ -28,7 +28,7 @@ def segment_box(start: Array, end: Array, half: Array) -> Separation:
     breaks = np.concatenate([np.zeros((len(start), 1)), crossings, np.ones((len(start), 1))], axis=1)
     breaks = np.sort(np.clip(breaks, 0.0, 1.0), axis=1)
 
-    outside = _beyond(start[:, None] + breaks[:, :, None] * along[:, None], half)
+    outside = _beyond(start[:, None] + breaks[:, :, None] * along[:, None], half[:, None])
     slope = np.sum(outside * along[:, None], axis=2)
     low, high = slope[:, :-1], slope[:, 1:]
     rise = np.where(high > low, high - low, 1.0)
@@ -36,7 +36,7 @@ def segment_box(start: Array, end: Array, half: Array) -> Separation:
     stationary = breaks[:, :-1] + share * np.diff(breaks, axis=1)
     candidates = np.concatenate([breaks, stationary], axis=1)
 
-    apart = _beyond(start[:, None] + candidates[:, :, None] * along[:, None], half)
+    apart = _beyond(start[:, None] + candidates[:, :, None] * along[:, None], half[:, None])
     return _nearest(apart)
 
 
@@ -45,34 +45,38 @@ def _beyond(points: Array, half: Array) -> Array:
     return points - np.clip(points, -half, half)
 
 
-def segment_ball(start: Array, end: Array, radius: float) -> Separation:
-    """Segments against the solid ball round the origin."""
+def segment_ball(start: Array, end: Array, radius: float | Array) -> Separation:
+    """Segments against the solid balls round the origin; `radius` is one number or (P,), m."""
     point = _to_segment(np.zeros(3), start, end - start)
     span = np.linalg.norm(point, axis=1)
     outside = np.maximum(span - radius, 0.0)
     return outside, np.where(outside[:, None] > 0.0, -point / np.maximum(span, 1e-300)[:, None], 0.0)
 
 
-def segment_cylinder(start: Array, end: Array, radius: float, half_height: float) -> Separation:
-    """Segments against the solid cylinder round the z axis, |z| <= half_height.
+def segment_cylinder(
+    start: Array, end: Array, radius: float | Array, half_height: float | Array
+) -> Separation:
+    """Segments against the solid cylinders round the z axis, |z| <= half_height; both sizes one number or (P,), m.
 
     The squared distance to a convex body is convex along the segment and differentiable, so its minimum is
     where the derivative changes sign: bisection down to the rounding of the parameter.
     """
-    along = end - start
-    low, high = np.zeros(len(start)), np.ones(len(start))
+    along, low, high = end - start, np.zeros(len(start)), np.ones(len(start))
+    sizes = np.stack(np.broadcast_arrays(radius, half_height, low)[:2], axis=1)
     for _ in range(54):
         middle = (low + high) / 2
-        outside = _beyond_cylinder(start + middle[:, None] * along, radius, half_height)
+        outside = _beyond_cylinder(start + middle[:, None] * along, sizes)
         rising = np.sum(outside * along, axis=1) >= 0.0
         high = np.where(rising, middle, high)
         low = np.where(rising, low, middle)
     candidates = np.stack([np.zeros(len(start)), low, high, np.ones(len(start))], axis=1)
-    apart = _beyond_cylinder(start[:, None] + candidates[:, :, None] * along[:, None], radius, half_height)
+    apart = _beyond_cylinder(start[:, None] + candidates[:, :, None] * along[:, None], sizes[:, None])
     return _nearest(apart)
 
 
-def _beyond_cylinder(points: Array, radius: float, half_height: float) -> Array:
+def _beyond_cylinder(points: Array, sizes: Array) -> Array:
+    """Vectors from cylinders of `sizes` (..., 2), radius and half height, to `points` (..., 3)."""
+    radius, half_height = sizes[..., :1], sizes[..., 1:]
     span = np.linalg.norm(points[..., :2], axis=-1, keepdims=True)
     radial = points[..., :2] * (np.maximum(span - radius, 0.0) / np.maximum(span, 1e-300))
     axial = points[..., 2:] - np.clip(points[..., 2:], -half_height, half_height)

@@ -22,14 +22,16 @@ _GREATEST = 1e6
 
 @dataclass(frozen=True)
 class Shape:
-    """K convex pieces about the origin, along their own axes."""
+    """K convex pieces of one kind about the origin, along their own axes."""
 
     corners: Array
     """(K, C, 3) points whose convex hulls hold the pieces, m."""
-    separation: Callable[[Array, Array, Index], Separation]
-    """Distances and normals of P segments, from start to end (P, 3), against the pieces (P,)."""
-    support: Callable[[Array, Index], Array]
-    """Greatest ``normal . x`` (P,) over the points x of the pieces (P,) for normals (P, 3), m."""
+    sizes: Array
+    """(K, ...) what the functions of the kind know of a piece, m."""
+    distance: Callable[[Array, Array, Array], Separation]
+    """Distances and normals of P segments, from start to end (P, 3), against pieces of sizes (P, ...)."""
+    reach: Callable[[Array, Array], Array]
+    """Greatest ``normal . x`` (P,) over the points x of pieces of sizes (P, ...) for normals (P, 3), m."""
     closed: bool | None = None
     """Whether the pieces are a closed surface, with an inside; None where they are solid themselves."""
 
@@ -39,39 +41,44 @@ _BOX_CORNERS: Array = np.array([list(itertools.product((-1.0, 1.0), repeat=3))])
 
 def box(half: Array) -> Shape:
     """Return a solid box of half edges `half` (3,), m."""
-    return Shape(
-        _BOX_CORNERS * half,
-        lambda start, end, _: segment_box(start, end, half),
-        lambda normal, _: np.asarray(np.abs(normal) @ half),
-    )
+    return Shape(_BOX_CORNERS * half, np.array([half], dtype=float), segment_box, _box_reach)
 
 
 def ball(radius: float) -> Shape:
     """Return a solid sphere of radius `radius`, m."""
-    return Shape(
-        _BOX_CORNERS * radius,
-        lambda start, end, _: segment_ball(start, end, radius),
-        lambda normal, _: np.asarray(radius * np.linalg.norm(normal, axis=1)),
-    )
+    return Shape(_BOX_CORNERS * radius, np.array([radius]), segment_ball, _ball_reach)
 
 
 def cylinder(radius: float, half_height: float) -> Shape:
     """Return a solid cylinder round the z axis, of radius `radius` and height 2 `half_height`, m."""
-    return Shape(
-        _BOX_CORNERS * np.array([radius, radius, half_height]),
-        lambda start, end, _: segment_cylinder(start, end, radius, half_height),
-        lambda normal, _: radius * np.linalg.norm(normal[:, :2], axis=1) + half_height * np.abs(normal[:, 2]),
-    )
+    corners = _BOX_CORNERS * np.array([radius, radius, half_height])
+    return Shape(corners, np.array([[radius, half_height]]), _cylinder_distance, _cylinder_reach)
 
 
 def mesh(triangles: Array, closed: bool) -> Shape:
     """Return a surface of `triangles` (F, 3, 3), m; that of a solid where `closed`."""
-    return Shape(
-        triangles,
-        lambda start, end, piece: segment_triangle(start, end, triangles[piece]),
-        lambda normal, piece: np.einsum("pkc,pc->pk", triangles[piece], normal).max(axis=1),
-        closed,
-    )
+    return Shape(triangles, triangles, segment_triangle, _triangle_reach, closed)
+
+
+def _box_reach(normal: Array, half: Array) -> Array:
+    return np.asarray(np.einsum("pc,pc->p", np.abs(normal), half))
+
+
+def _ball_reach(normal: Array, radius: Array) -> Array:
+    return np.asarray(radius * np.linalg.norm(normal, axis=1))
+
+
+def _cylinder_distance(start: Array, end: Array, sizes: Array) -> Separation:
+    return segment_cylinder(start, end, sizes[:, 0], sizes[:, 1])
+
+
+def _cylinder_reach(normal: Array, sizes: Array) -> Array:
+    radial = np.linalg.norm(normal[:, :2], axis=1)
+    return np.asarray(sizes[:, 0] * radial + sizes[:, 1] * np.abs(normal[:, 2]))
+
+
+def _triangle_reach(normal: Array, triangles: Array) -> Array:
+    return np.asarray(np.einsum("pkc,pc->pk", triangles, normal).max(axis=1))
 
 
 @dataclass(frozen=True)
@@ -97,12 +104,13 @@ class Body:
 
     def separation(self, start: Array, end: Array, piece: Index) -> Separation:
         """Return distances and normals of P segments against the pieces (P,) of this body."""
-        distance, normal = self.shape.separation(start @ self.rotation, end @ self.rotation, piece)
+        start, end = start @ self.rotation, end @ self.rotation
+        distance, normal = self.shape.distance(start, end, self.shape.sizes[piece])
         return distance, normal @ self.rotation.T
 
     def support(self, normal: Array, piece: Index) -> Array:
         """Return (P,) the greatest ``normal . x`` over the points x of the pieces, m."""
-        return self.shape.support(normal @ self.rotation, piece)
+        return self.shape.reach(normal @ self.rotation, self.shape.sizes[piece])
 
     def encloses(self, points: Array) -> NDArray[np.bool_]:
         """Return (Q,) True for points (Q, 3) inside a closed mesh: its winding number round them is not zero.
@@ -131,8 +139,8 @@ def read_obstacles(
 ) -> tuple[list[Body], list[str], list[str]]:
     """Return the obstacles of `problem`, as JSON data, what contradicts the problem, and what could not be checked.
 
-    The result recorded SHA-256 and triangle count of mesh files in `meshes`, by obstacle; None without a result.
-    Relative paths of those files start in `directory`.
+    The result recorded SHA-256 and triangle count of mesh files in `meshes`, by obstacle; None without a result. Paths
+    of those files start in `directory`.
     """
     bodies: list[Body] = []
     contradictions: list[str] = []

@@ -1,0 +1,298 @@
+"""Trajectories of trusses: the motion is followed with a proof, and what is certified is so at every instant."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+import pytest
+from arms import arm_problem
+from numpy.typing import NDArray
+
+import vgtm_qp as vq
+from vgtm_qp.arm.build import make_arm
+from vgtm_qp.certify.certify import Certifier
+from vgtm_qp.certify.truss_motion import TrussSolver, truss_motion, tube
+from vgtm_qp.verify.arm import RecordedArm
+
+Array = NDArray[np.float64]
+MODULES = ("octahedral", "double-octahedral", "hexapod", "longeron", "tetrahedral")
+
+
+def recorded(problem: vq.Problem) -> RecordedArm:
+    arm = make_arm(problem)
+    return RecordedArm(arm.record(), arm.bodies.joints)
+
+
+def two_bays(module: str = "octahedral", **more: Any) -> vq.Problem:
+    return arm_problem(
+        truss={"module": module, "actuated": [1, 2, 3] if module == "tetrahedral" else None}, **more
+    )
+
+
+def actuator_rows(rng: np.random.Generator, arm: RecordedArm, rows: int, step: float) -> Array:
+    """(T, M) lengths that start at home, whose actuators walk at random."""
+    walk = np.zeros((rows, len(arm.length)))
+    walk[1:, arm.actuated] = step * rng.normal(size=(rows - 1, int(arm.actuated.sum())))
+    return arm.length + np.cumsum(walk, axis=0)
+
+
+def followed(solver: TrussSolver, start: Array, lengths: Array, steps: int) -> Array:
+    """(steps + 1, N, 3) nodes as the lengths go in a straight line, by many small Newton steps."""
+    nodes, found = start, [start]
+    before = solver.arm.lengths(start)
+    for k in range(1, steps + 1):
+        nodes = solver.solve(nodes[None], (before + k / steps * (lengths - before))[None])[0][0]
+        found.append(nodes)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_tube_holds_the_motion_and_its_bends(module: str, rng: np.random.Generator) -> None:
+    arm = recorded(two_bays(module))
+    solver = TrussSolver(arm)
+    closed = 0
+    for step in (0.002, 0.01, 0.04):
+        start, end = actuator_rows(rng, arm, 3, step)[1:]
+        first, solved = solver.solve(arm.home[None], start[None])
+        assert solved[0]
+        found = tube(solver, first, start[None], (end - start)[None])
+        if not found.closed[0]:
+            continue
+        closed += 1
+        ways = followed(solver, first[0], end, 100)
+        moved = ways - ways[0]
+        apart = np.linalg.norm(moved[:, arm.members[:, 1]] - moved[:, arm.members[:, 0]], axis=2)
+        assert (apart.max(axis=0) <= found.apart[0] + 1e-12).all()
+        speed = np.linalg.norm(np.diff(ways, axis=0), axis=2).max(axis=0) * 100
+        assert (speed <= found.speed[0] * (1.0 + 1e-6) + 1e-9).all()
+        bend = np.linalg.norm(np.diff(ways, n=2, axis=0), axis=2).max(axis=0) * 100**2
+        assert (bend <= found.bend[0] * (1.0 + 1e-6) + 1e-8).all()
+        # An error of lengths may move nodes more at the end than at the start.
+        last = np.linalg.norm(solver.inverse(ways[-1:])[0], axis=1).sum(axis=1).max()
+        assert last <= found.sensitivity[0]
+        # The bounds are of use: within some hundred times the greatest that there is.
+        assert found.bend[0].max() <= 300.0 * bend.max() + 1e-6
+    assert closed
+
+
+def tripod() -> vq.Problem:
+    # Three members in a plane hold a node that can leave it.
+    nodes = [
+        {"name": name, "position": position, "fixed": name != "top"}
+        for name, position in {"a": [1, 0, 0], "b": [-1, 1, 0], "c": [-1, -1, 0], "top": [0, 0, 0.02]}.items()
+    ]
+    members = [
+        {"name": f"{name}-top", "nodes": [name, "top"], "actuated": True, "stroke": [0.5, 3.0]}
+        for name in "abc"
+    ]
+    truss = {"module": "graph", "node": nodes, "member": members, "tip": ["top"], "member_radius": 0.01}
+    return vq.Problem.from_dict(
+        {
+            "truss": truss,
+            "maneuver": {"waypoint": [{"time": 1.0, "position": [0.0, 0.0, 0.1]}]},
+            "method": {"tracking": "none"},
+            "clearance": {"safe": 0.01, "influence": 0.1, "self_collision": False},
+        }
+    )
+
+
+@pytest.mark.parametrize("size", [1e200, np.inf, np.nan])
+def test_numbers_that_overflow_prove_nothing(size: float) -> None:
+    arm = recorded(tripod())
+    solver = TrussSolver(arm)
+    inverse = solver.inverse
+    solver.inverse = lambda nodes: inverse(nodes) * size  # type: ignore[method-assign]
+    assert not tube(solver, arm.home[None], arm.length[None], np.full((1, 3), 1e-3)).closed.any()
+    solver.inverse = lambda nodes: inverse(nodes) * 1e160 * size  # type: ignore[method-assign]
+    assert not tube(solver, arm.home[None], arm.length[None], np.full((1, 3), 1e-3)).closed.any()
+
+
+def test_nodes_of_the_same_lengths_elsewhere_are_not_taken_for_the_motion() -> None:
+    arm = recorded(tripod())
+    lengths = arm.length + np.array([[0.0], [0.05]])
+    motion, doubts = truss_motion(arm, np.array([0.0, 1.0]), lengths, {})
+    assert motion is not None
+    assert not doubts
+    half, middle = np.full(len(motion.time) - 1, 0.5), np.arange(len(motion.time) - 1)
+    above = motion.ends_at(middle, half)
+    assert not list(motion.doubts())
+    solve = motion._solver.solve
+    under = np.array([1.0, 1.0, -1.0])
+    motion._solver.solve = lambda nodes, lengths: (solve(nodes, lengths)[0] * under, solve(nodes, lengths)[1])  # type: ignore[method-assign]
+    below = motion.ends_at(middle, half)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(below, axis=2)), np.linalg.norm(np.diff(above, axis=2)))
+    assert [doubt.reason for doubt in motion.doubts()] == [
+        "its nodes were not found to the last digits"
+    ] * len(middle)
+
+
+def test_a_tube_does_not_close_at_a_singular_pose() -> None:
+    problem = tripod()
+    arm = recorded(problem)
+    shorter = arm.length - 0.001
+    (finding,) = vq.certify(problem, [0.0, 1.0], [arm.length, shorter]).undecided
+    assert finding.kind == "motion"
+    assert (finding.start, finding.end) == (0.0, 1.0)
+    assert "singular" in finding.reason
+    assert vq.certify(problem, [0.0, 1.0], [arm.length, arm.length + 0.05]).certified
+    # Where it cannot be reached from home, nothing is said of it.
+    far = vq.certify(problem, [0.0], [shorter])
+    assert far.answer == "undecided"
+    assert far.clearance == -np.inf
+    assert far.to_dict()["clearance"] is None
+    assert "home" in far.undecided[0].reason
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_what_sampling_finds_is_above_what_is_proven(module: str, rng: np.random.Generator) -> None:
+    answers = set()
+    for size in (0.1, 0.2, 0.3):
+        problem = two_bays(module)
+        arm = recorded(problem)
+        rows = actuator_rows(rng, arm, 4, 0.02)
+        solver = TrussSolver(arm)
+        tops = followed(solver, arm.home, rows[-1], 20)[-1]
+        middle = 0.5 * (tops[arm.tip].mean(axis=0) + arm.home[arm.tip].mean(axis=0))
+        away = np.append(rng.normal(size=2), 0.3)
+        center = middle + 0.7 * away / np.linalg.norm(away)
+        ball = {"name": "ball", "shape": "sphere", "center": center.tolist(), "radius": size}
+        scene = problem.replace(
+            {"obstacle": [ball], "clearance.safe": 0.02, "clearance.self_collision": False}
+        )
+        times = np.arange(4.0)
+        certifier = Certifier(scene)
+        verdict = certifier.certify(times, rows[:, certifier.columns.quantities])
+        ways, nodes = [], arm.home
+        for row in rows[1:]:
+            ways.append(followed(solver, nodes, row, 300))
+            nodes = ways[-1][-1]
+        ends = arm.ends(np.concatenate(ways))
+        along = np.linspace(0, 1, 41)[:, None]
+        points = ends[:, :, None, 0] + along * (ends[:, :, None, 1] - ends[:, :, None, 0])
+        apart = np.maximum(np.linalg.norm(points - center, axis=-1).min(axis=(0, 2)) - size, 0.0) - arm.radius
+        assert verdict.clearance <= apart.min() + 1e-9
+        clear = [found for found in (*verdict.violations, *verdict.undecided) if found.kind == "clearance"]
+        assert clear or apart.min() >= 0.02 - 1e-9
+        answers.add(verdict.answer)
+    assert answers <= {"certified", "violated"}
+
+
+def two_tripods() -> vq.Problem:
+    feet = {
+        f"{x}{k}": [1.5 * x + 0.6 * np.cos(w), 0.6 * np.sin(w), 0.0]
+        for x in (0, 1)
+        for k, w in enumerate((0, 2, 4))
+    }
+    nodes = [{"name": name, "position": place, "fixed": True} for name, place in feet.items()]
+    nodes += [{"name": f"top{x}", "position": [1.5 * x, 0.0, 0.8]} for x in (0, 1)]
+    members = [
+        {"name": f"m{foot}", "nodes": [foot, f"top{foot[0]}"], "actuated": True, "stroke": [0.1, 5.0]}
+        for foot in feet
+    ]
+    truss = {"module": "graph", "node": nodes, "member": members, "tip": ["top0"], "member_radius": 0.01}
+    return vq.Problem.from_dict(
+        {
+            "truss": truss,
+            "maneuver": {"waypoint": [{"time": 1.0, "position": [0.0, 0.0, 0.9]}]},
+            "method": {"tracking": "none"},
+            "clearance": {"safe": 0.1, "influence": 5.0},
+        }
+    )
+
+
+def test_members_that_pass_one_another_between_rows_are_found(rng: np.random.Generator) -> None:
+    problem = two_tripods()
+    arm = recorded(problem)
+    for _ in range(4):
+        aside, rows = np.array([0.0, 0.35, 0.0]) + rng.uniform(-0.1, 0.1, 3), []
+        for side in (-1.0, 1.0):
+            nodes = arm.home.copy()
+            nodes[arm.free] += np.array([[0.7, 0.0, 0.0], [-0.7, 0.0, 0.1]]) + side * np.array(
+                [aside, -aside]
+            )
+            rows.append(arm.lengths(nodes))
+        solver = TrussSolver(arm)
+        start = followed(solver, arm.home, rows[0], 50)[-1]
+        ends = arm.ends(followed(solver, start, rows[1], 200))
+        along = np.linspace(0.0, 1.0, 31)[:, None]
+        points = ends[:, :, None, 0] + along * (ends[:, :, None, 1] - ends[:, :, None, 0])
+        apart = np.linalg.norm(points[:, :3, None, :, None] - points[:, None, 3:, None], axis=-1)
+        at_rows, least = apart[[0, -1]].min() - 0.02, apart.min() - 0.02
+        assert 0.01 < least < at_rows - 0.05
+        nearer = Certifier(problem.replace({"clearance.self_safe": float(least + 1e-3)})).certify(
+            [0.0, 1.0], rows
+        )
+        assert {each.kind for each in nearer.violations} == {"self-clearance"}
+        assert nearer.self_clearance <= least + 1e-9
+        assert vq.certify(
+            problem.replace({"clearance.self_safe": float(least - 0.01)}), [0.0, 1.0], rows
+        ).certified
+
+
+def test_what_our_own_solver_made_is_certified() -> None:
+    problem = two_bays(steps=6)
+    maneuver = vq.solve(problem)
+    lengths = maneuver.member_lengths[:, maneuver.member_actuated]
+    verdict = vq.certify(problem, maneuver.time, lengths)
+    assert verdict.certified, str(verdict)
+    # Chords of long steps are not the arcs that the nodes take.
+    assert verdict.self_clearance == pytest.approx(
+        maneuver.certificate.self_clearance_between.value, abs=5e-3
+    )
+    named = dict(zip(maneuver.actuator_names, lengths.T, strict=True))
+    assert vq.certify(problem, maneuver.time, named).self_clearance == verdict.self_clearance
+    too_long = lengths.copy()
+    too_long[-1, 0] = 1.6
+    found = vq.certify(problem, maneuver.time, too_long)
+    assert "limit" in {finding.kind for finding in found.violations}
+
+
+def test_a_truss_is_certified_on_a_base_that_moves() -> None:
+    problem = vq.load_problem("moving_base").replace({"maneuver.steps": 10})
+    maneuver = vq.solve(problem)
+    lengths = maneuver.member_lengths[:, maneuver.member_actuated]
+    verdict = vq.certify(problem, maneuver.time, lengths)
+    assert verdict.clearance <= maneuver.clearance.min() + 1e-9
+    assert not verdict.undecided
+    still = problem.replace({"truss.base_motion": []})
+    # On a base that stays the same lengths lead elsewhere.
+    assert vq.certify(still, maneuver.time, lengths).clearance != pytest.approx(verdict.clearance, abs=1e-3)
+
+
+def test_what_is_locked_keeps_its_length() -> None:
+    problem = two_bays(steps=3)
+    arm = recorded(problem)
+    actuated = np.flatnonzero(arm.actuated)
+    name = arm.member_names[int(actuated[0])]
+    stuck = problem.replace({"truss.locked": [name]})
+    home = arm.length[actuated]
+    rest = {arm.member_names[k]: [arm.length[k], arm.length[k] + 0.01] for k in actuated[1:].tolist()}
+    assert vq.certify(stuck, [0.0, 1.0], rest).certified
+    (finding,) = vq.certify(stuck, [0.0, 1.0], rest | {name: [home[0], home[0] + 0.01]}).violations
+    assert (finding.kind, finding.names) == ("lock", (name,))
+
+
+def test_offset_joints_leave_it_undecided_but_limits_are_still_checked() -> None:
+    problem = two_bays().replace({"truss.joint_offset": 0.05})
+    arm = recorded(problem)
+    home = arm.length[arm.actuated]
+    verdict = vq.certify(problem, [0.0, 1.0], [home, home + 0.001])
+    assert verdict.answer == "undecided"
+    assert verdict.clearance == -np.inf
+    assert "offset joints" in verdict.undecided[0].reason
+    assert vq.certify(problem, [0.0, 1.0], [home, home + 5.0]).answer == "violated"
+
+
+def test_a_motion_that_cannot_be_followed_to_its_end_is_certified_to_where_it_can(monkeypatch: Any) -> None:
+    module = importlib.import_module("vgtm_qp.certify.truss_motion")
+    monkeypatch.setattr(module, "_GREATEST_DEPTH", 1)
+    problem = two_bays()
+    arm = recorded(problem)
+    lengths = np.tile(arm.length, (3, 1))
+    lengths[2, arm.actuated] += np.linspace(0.0, 0.4, int(arm.actuated.sum()))
+    motion, doubts = truss_motion(arm, np.array([0.0, 1.0, 2.0]), lengths, problem.to_dict())
+    assert motion is not None
+    assert motion.time[-1] == 1.0
+    assert [(doubt.start, doubt.end) for doubt in doubts] == [(1.0, 2.0)]
