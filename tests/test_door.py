@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
 from vgtm_qp.arm.build import make_arm
+from vgtm_qp.arm.serial import chain as serial_chain
+from vgtm_qp.arm.serial.chain import SerialChain
 from vgtm_qp.cli import main
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import sphere
@@ -713,3 +715,16 @@ def test_bodies_of_another_problem_are_found(change, said):
     change(data["arm"]["body"])
     certificate = vq.verify(maneuver, problem=Problem.from_dict(data))
     assert any(said in line for line in certificate.contradictions)
+
+
+@pytest.mark.parametrize("prismatic", [False, True])
+def test_long_chains_loop_over_their_joints_and_give_the_same(monkeypatch, prismatic, rng):
+    spec = serial_problem(chain(12, prismatic=prismatic)).arm
+    looped, written_out = SerialChain.of(spec), SerialChain.of(spec)
+    monkeypatch.setattr(serial_chain, "_UNROLLED", 0)
+    assert looped.functions[1].is_a("MXFunction")
+    monkeypatch.setattr(serial_chain, "_UNROLLED", 100)
+    assert written_out.functions[1].is_a("SXFunction")
+    q = rng.normal(scale=0.3, size=len(looped) + 6)
+    for one, other in zip(looped.at(q), written_out.at(q), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-14)

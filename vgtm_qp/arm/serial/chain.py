@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import casadi as ca
 import numpy as np
@@ -13,6 +13,9 @@ from vgtm_qp.arm.symbols import rotated
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.problem.arm import ArmBody, ArmTable
 from vgtm_qp.rotation import rotation_from_vector
+
+_UNROLLED = 20
+"""Number of joints up to which their functions are written out one after another: faster, but long in C."""
 
 _LEAST_AXIS = 1e-3
 """A ball is a capsule whose axis is that share of its radius: axes without a length have no direction."""
@@ -120,25 +123,22 @@ class SerialChain:
         the base, the joints and the tip, the points of bodies, and two beside each station, along its x- and y-axes.
         """
         count = len(self)
-        q, axes = ca.SX.sym("q", count + 6), ca.SX.sym("axes", 3, count)
-        positions, rotations = ca.SX.sym("positions", 3, count), ca.SX.sym("rotations", 3, 3 * count)
-        tip, points = ca.SX.sym("tip", 3), ca.SX.sym("points", 3, len(self.points))
-        origin, frame = q[count : count + 3], rotated(q[count + 3 :])
+        q, axes = ca.MX.sym("q", count + 6), ca.MX.sym("axes", 3, count)
+        positions, rotations = ca.MX.sym("positions", 3, count), ca.MX.sym("rotations", 3, 3 * count)
+        tip, points = ca.MX.sym("tip", 3), ca.MX.sym("points", 3, len(self.points))
+        origin, frame = q[count : count + 3], _turned()(q[count + 3 :])
         # Each node and station is paired with the number of joints that move it.
-        nodes, stations, joints, frames = [(origin, 0)], [(origin, frame, 0)], [], [(origin, frame)]
+        nodes, stations, frames = [(origin, 0)], [(origin, frame, 0)], [(origin, frame)]
+        directions, places = [], []
         for j, turns in enumerate(self.revolute.tolist()):
-            origin = origin + frame @ positions[:, j]
-            frame = frame @ rotations[:, 3 * j : 3 * j + 3]
-            axis = frame @ axes[:, j]
-            joints.append((axis, origin, turns))
-            nodes.append((origin, j))
-            if turns:
-                frame = frame @ rotated(q[j] * axes[:, j])
+            geometry = axes[:, j], positions[:, j], rotations[:, 3 * j : 3 * j + 3]
+            place, direction, origin, frame = _joint(turns)(origin, frame, q[j], *geometry)
+            directions.append(direction)
+            places.append(place)
+            nodes.append((place, j))
             if j in self.tracked:
                 # Its station turns with a joint, but stays where a slide begins.
-                stations.append((origin, frame, j + 1 if turns else j))
-            if not turns:
-                origin = origin + q[j] * axis
+                stations.append((place, frame, j + 1 if turns else j))
             frames.append((origin, frame))
         end = origin + frame @ tip
         nodes.append((end, count))
@@ -148,22 +148,19 @@ class SerialChain:
             nodes.append((at + attitude @ points[:, k], carrier))
         for place, attitude, moving in stations:
             nodes += [(place + self.spread * attitude[:, axis], moving) for axis in (0, 1)]
-        rest = ca.SX.zeros(3)
-        columns = [
-            ca.vertcat(
-                *(
-                    (ca.cross(axis, node - at) if turns else axis) if j < moving else rest
-                    for node, moving in nodes
-                )
-            )
-            for j, (axis, at, turns) in enumerate(joints)
-        ]
-        arguments, places = (
-            [q, axes, positions, rotations, tip, points],
-            ca.horzcat(*(node for node, _ in nodes)),
+        every, movers = ca.horzcat(*(node for node, _ in nodes)), ca.DM([moving for _, moving in nodes])
+        jacobian = _columns(len(nodes), count)(
+            ca.horzcat(*directions),
+            ca.horzcat(*places),
+            ca.DM(self.revolute.astype(float)).T,
+            ca.DM(range(count)).T,
+            movers,
+            every,
         )
-        both = ca.Function("chain", arguments, [places, ca.densify(ca.horzcat(*columns))])
-        return ca.Function("chain_nodes", arguments, [places]), both
+        arguments = [q, axes, positions, rotations, tip, points]
+        both = ca.Function("chain", arguments, [every, jacobian])
+        alone = ca.Function("chain_nodes", arguments, [every])
+        return (alone, both) if count > _UNROLLED else (alone.expand(), both.expand())
 
     def attitude(self, joints: Array, turn: Sequence[float]) -> Array:
         """Return (3, 3) the attitude in the base's frame of what is turned by the vector `turn` in the last frame."""
@@ -176,6 +173,49 @@ class SerialChain:
         """Return nodes (N, 3), m, and Jacobian (N, 3, J) at a configuration."""
         nodes, jacobian = self.functions[1](q, *(value.T for value in self.constants.values()))
         return np.asarray(nodes, dtype=float).T, np.asarray(jacobian, dtype=float).reshape(-1, 3, len(self))
+
+
+@cache
+def _turned() -> ca.Function:
+    """Return the function from a rotation vector (3) to its rotation (3, 3)."""
+    vector = ca.SX.sym("vector", 3)
+    return ca.Function("turned", [vector], [ca.densify(rotated(vector))])
+
+
+@cache
+def _joint(turns: bool) -> ca.Function:
+    """Return the function of one joint that turns, or slides.
+
+    Arguments: origin (3) and frame (3, 3) before it, its value, axis, position and rotation, see :class:`SerialChain`.
+    Results: place and direction (3) of its axis, origin and frame after it.
+    """
+    origin, frame, value = ca.SX.sym("origin", 3), ca.SX.sym("frame", 3, 3), ca.SX.sym("value")
+    axis, position = ca.SX.sym("axis", 3), ca.SX.sym("position", 3)
+    rotation = ca.SX.sym("rotation", 3, 3)
+    place, after = origin + frame @ position, frame @ rotation
+    direction = after @ axis
+    moved = (place, after @ rotated(value * axis)) if turns else (place + value * direction, after)
+    arguments = [origin, frame, value, axis, position, rotation]
+    return ca.Function("turning" if turns else "sliding", arguments, [place, direction, *moved])
+
+
+@cache
+def _columns(nodes: int, joints: int) -> ca.Function:
+    """Return the function that gives the Jacobian (3 N, J) of nodes, a column a joint, by a loop over the joints.
+
+    Arguments: directions and places (3, J) of the joints' axes, whether they turn and their numbers (1, J); numbers (N)
+    of joints that move each node, and the nodes (3, N).
+    """
+    direction, place = ca.SX.sym("direction", 3), ca.SX.sym("place", 3)
+    turns, number = ca.SX.sym("turns"), ca.SX.sym("number")
+    moving, every = ca.SX.sym("moving", nodes), ca.SX.sym("every", 3, nodes)
+    columns = []
+    for k in range(nodes):
+        turned = ca.if_else(turns, ca.cross(direction, every[:, k] - place), direction)
+        columns.append(ca.if_else(number < moving[k], turned, ca.SX.zeros(3)))
+    arguments = [direction, place, turns, number, moving, every]
+    column = ca.Function("column", arguments, [ca.densify(ca.vertcat(*columns))])
+    return column.map("columns", "serial", joints, [4, 5], [])
 
 
 def ends_of(body: ArmBody) -> Array:
