@@ -16,10 +16,12 @@ SAYS = {
     "control_loop": ("75 cycles at 25 Hz", "the tip is 0.000 mm from its goal"),
     "compare_methods": ("curve-pseudoinverse", "pseudoinverse", "qp"),
     "jammed_actuator": ("it moved by 0.000000000 m", "verified: True"),
-    "certify_a_spline": (
+    "certify_plans": (
         "clear at all of its 6 waypoints: True",
         "NOT CERTIFIED",
-        "through 7 waypoints: certified",
+        "clear at all of its 7 waypoints: True\ncertified",
+        "from ROS: certified",
+        "OMPL",
     ),
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
 }

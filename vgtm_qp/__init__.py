@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from vgtm_qp.arm.truss.build import build_truss
     from vgtm_qp.arm.truss.mobility import describe
     from vgtm_qp.arm.truss.truss import Truss
-    from vgtm_qp.certify.certify import certify
+    from vgtm_qp.certify.certify import Certifier, certify
     from vgtm_qp.certify.verdict import Finding, Verdict
     from vgtm_qp.comparison.compare import Report, compare
     from vgtm_qp.export import export_maneuver
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from vgtm_qp.verify import verify, verify_file
 
 _HOMES = {
-    "vgtm_qp.certify.certify": ("certify",),
+    "vgtm_qp.certify.certify": ("Certifier", "certify"),
     "vgtm_qp.certify.verdict": ("Finding", "Verdict"),
     "vgtm_qp.export": ("export_maneuver",),
     "vgtm_qp.result.certificate": ("Certificate", "Measure"),
@@ -56,6 +56,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Certificate",
+    "Certifier",
     "CurveError",
     "ExportError",
     "Finding",
