@@ -9,15 +9,17 @@ from vgtm_qp.arrays import Array
 
 
 def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
-    """Return the greatest speed of a step of `dt` after which steps slowing by `acceleration` stop within `distance`.
+    """Return the greatest speed of a step of `dt` after which further ones stop within `distance`, m/s.
 
-    Speeds v, v - a dt, v - 2 a dt, ... cover dt (N v - a dt N (N - 1) / 2) in the N steps before they reach zero;
-    this is the exact inverse, so a speed that was allowed once can always be braked within the limits. m/s.
+    The mean speed v of a step is that in its middle if the speed falls by `acceleration` a all along. So does it from
+    there on: at the end of the step it is v - a dt / 2, and the way to rest from there is half its square over a. Steps
+    into which this motion is divided, of whatever durations, change their mean speeds by a times the time between their
+    middles, or by less in the last. So a speed that was allowed once can be braked within the limits, also where steps
+    become longer or shorter.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        gap = np.maximum(distance, 0.0)
-        steps = np.maximum(np.ceil((np.sqrt(1.0 + 8.0 * gap / (acceleration * dt * dt)) - 1.0) / 2.0), 1.0)
-        speed = gap / (steps * dt) + acceleration * dt * (steps - 1.0) / 2.0
+    with np.errstate(invalid="ignore", over="ignore"):
+        gap, lost = np.maximum(distance, 0.0), 0.5 * acceleration * dt
+        speed = np.where(gap <= lost * dt, gap / dt, np.sqrt(2.0 * acceleration * gap) - lost)
     # A joint without limits has an infinite distance.
     return np.asarray(np.where(np.isfinite(acceleration) & np.isfinite(gap), speed, np.inf))
 
