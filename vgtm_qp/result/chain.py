@@ -72,6 +72,8 @@ class RecordedChain:
         self.members = table.integers("joined", (links, 2), 2 * links + joints + 2)
         self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
         self.stretches = np.zeros(links, dtype=np.bool_)
+        self._way: tuple[bytes, bytes, Array, Array] | None = None
+        """The way asked about last by :meth:`ends_between`: its ends, and the shares and links placed so far."""
         home = np.concatenate([self.home_quantities, np.zeros(6)])[None]
         points, _, frames = self.placed(home)
         self.home, self._home_tip = points[0], frames[0]
@@ -193,10 +195,18 @@ class RecordedChain:
 
     def ends_between(self, before: Array, after: Array, share: Array, link: Index) -> Array:
         """Return (P, 2, 3) the ends, m, of links (P,) at shares (P,) of the straight way between configurations."""
-        # Many pairs are asked about at few instants.
-        instants, which = np.unique(share, return_inverse=True)
-        points = self.placed(before + instants[:, None] * (after - before))[0]
-        return np.asarray(points[which[:, None], self.links[link]])
+        # Many pairs, one kind after another, are asked about at few instants, and at the same ones.
+        if self._way is None or self._way[:2] != (before.tobytes(), after.tobytes()):
+            self._way = before.tobytes(), after.tobytes(), np.zeros(0), np.zeros((0, *self.links.shape, 3))
+        known, ends = self._way[2:]
+        new = np.setdiff1d(share, known)
+        if len(new):
+            known = np.concatenate([known, new])
+            order = np.argsort(known)
+            ends = np.concatenate([ends, self.states_ends(before + new[:, None] * (after - before))])[order]
+            known = known[order]
+            self._way = *self._way[:2], known, ends
+        return np.asarray(ends[np.searchsorted(known, share), link])
 
     def bend(self, before: Array, after: Array, link: Index) -> Array:
         """Return (..., P) bounds, m, of |d2 r / d share2| of points of links (P,) as the configuration moves straight.
