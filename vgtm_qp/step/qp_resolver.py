@@ -123,8 +123,9 @@ class QPResolver(Resolver, serves="qp"):
         """See :class:`Resolver`."""
         path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
         dt = duration(self.setup.dt if dt is None else dt)
-        limits = self._actuation.limits(self.state, dt, slowing=True)
-        target = self._shaping.target(self.state, dt, path, 0.0, 1.0, limits[:2])
+        share = self._until_jam(dt)
+        limits = self._actuation.limits(self.state, share * dt, slowing=True)
+        target = self._shaping.target(self.state, share * dt, path, 0.0, share, limits[:2])
         return self.setup.engine.qp(self._attempt.first_input(self.state, target))
 
     def _follow(self, path: Path, start: float, end: float, dt: float, whole: float) -> Step:

@@ -226,10 +226,14 @@ class Resolver:
             `dt` is not a positive number; the state is unchanged.
         """
         dt = duration(self.setup.dt if dt is None else dt)
+        whole = self._until_jam(dt)
+        return self._follow(path, start, start + whole * (end - start), whole * dt, whole)
+
+    def _until_jam(self, dt: float) -> float:
+        """Lock what has jammed by now, and return the share of a step of `dt`, s, that ends at the next jam."""
         for name in self._actuation.jammed(self.state.time):
             self.lock(name)
-        whole = self._actuation.until_jam(self.state.time, dt)
-        return self._follow(path, start, start + whole * (end - start), whole * dt, whole)
+        return self._actuation.until_jam(self.state.time, dt)
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:  # noqa: ARG002
         """Do the next of the braking steps that bring a moving arm with limited accelerations to rest.
