@@ -11,9 +11,13 @@ import numpy as np
 import pytest
 import study_tasks
 
+import vgtm_qp as vq
 from vgtm_qp.comparison.tables import exponent, wilson_interval
 from vgtm_qp.errors import GoalError
-from vgtm_qp.study import STUDIES, Study, clutter, loops, run_study
+from vgtm_qp.problem import Problem
+from vgtm_qp.problem.snake import snake
+from vgtm_qp.step.checks import check_problem
+from vgtm_qp.study import STUDIES, Study, clutter, loops, run_study, snakes
 from vgtm_qp.study import study as study_module
 from vgtm_qp.study.workers import run_dask, run_here, run_processes
 
@@ -86,6 +90,22 @@ def test_an_interrupted_study_goes_on_where_it_stopped(
     assert [row["double"] for row in data["rows"]] == [0, 2, 4, 6]
     assert (tmp_path / "nothing" / "nothing.csv").read_text().splitlines()[0] == "value,double"
     assert "4 rows" in (tmp_path / "nothing" / "nothing.md").read_text()
+
+
+def test_a_scene_of_snakes_is_the_same_each_time_clear_at_home_and_in_reach() -> None:
+    first, again = snakes.scene(7, 6, 3, 40), snakes.scene(7, 6, 3, 40)
+    assert first.to_dict() == again.to_dict()
+    assert len(first.obstacle) == 6
+    assert vq.Resolver(first).setup.least_clearance(vq.Resolver(first).state.q, 0.0, "obstacles") >= 0.1
+
+
+@pytest.mark.parametrize("universal", [2, 3, 15, 40])
+def test_a_snake_can_start_in_every_direction(universal: int) -> None:
+    goal = {"waypoint": [{"time": 1.0, "position": [0.5, 0.0, 2.0]}]}
+    problem = Problem.from_dict({"arm": snake(universal, length=3.0), "maneuver": goal})
+    setup = vq.Resolver(problem).setup
+    assert setup.arm.height == pytest.approx(3.0)
+    assert not check_problem(problem, setup)
 
 
 SHORT = ("figure4", "figure7", "figure8", "joints", "clutter")

@@ -93,8 +93,8 @@ def study(
         list[str],
         Parameter(
             name="NAME",
-            help="figure3, figure4, figure7, figure8, figure9, redundancy, joints, clutter, tracking, robustness, "
-            "loops, or all",
+            help="figure3, figure4, figure7, figure8, figure9, redundancy, joints, clutter, snakes, tracking, "
+            "robustness, loops, or all",
         ),
     ],
     /,

@@ -74,7 +74,11 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
 
 def run(seed: int, cubes: int, number: int, steps: int, methods: list[str]) -> Row:
     """Return for each method whether it kept everything but 1 mm of drift, how far it came, and why not further."""
-    problem = scene(seed, cubes, number, steps)
+    return successes(scene(seed, cubes, number, steps), methods)
+
+
+def successes(problem: Problem, methods: Sequence[str]) -> Row:
+    """Return what :func:`run` does, of a problem."""
     row: Row = {"placed": len(problem.obstacle)}
     for method in methods:
         found, _ = run_method(problem, method)
@@ -108,6 +112,11 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 def text(rows: Sequence[Row]) -> str:
     """Give successes with their intervals."""
+    return crossed("Five octahedral bays", rows)
+
+
+def crossed(arm: str, rows: Sequence[Row]) -> str:
+    """Give the successes of rows of scenes about an `arm` in words, with their intervals."""
     if not rows:
         return "No scene was run."
     methods = rows[0]["methods"]
@@ -121,10 +130,9 @@ def text(rows: Sequence[Row]) -> str:
         },
     )
     return (
-        f"Five octahedral bays, seed {rows[0]['seed']}, scenes numbered from 0 at each density. Solved: the whole "
-        "path, every stroke and every clearance kept at and between the states, members and tip off by at most 1 mm. "
-        f"No scene is known to have a solution, so that the QP's misses are not all its own."
-        f"\n\n{table}"
+        f"{arm}, seed {rows[0]['seed']}, scenes numbered from 0 at each density. Solved: the whole path, every stroke "
+        "and every clearance kept at and between the states, members and tip off by at most 1 mm. No scene is known to "
+        f"have a solution, so that the QP's misses are not all its own.\n\n{table}"
     )
 
 

@@ -42,6 +42,7 @@ STUDIES = {
     ),
     "joints": Study("vgtm_qp.study.joints", "Offset joints: what ignoring them costs"),
     "clutter": Study("vgtm_qp.study.clutter", "Clutter: success over random scenes"),
+    "snakes": Study("vgtm_qp.study.snakes", "Snakes: success over random scenes of a serial arm"),
     "tracking": Study("vgtm_qp.study.tracking", "Tracking as an equality, and how it gives way"),
     "robustness": Study("vgtm_qp.study.robustness", "Robustness: random scenes of every module"),
     "loops": Study("vgtm_qp.study.loops", "Control loops: random goals among obstacles that move"),

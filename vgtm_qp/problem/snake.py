@@ -1,0 +1,45 @@
+"""Snakes: the ``[arm]`` table of a serial arm of universal joints, as many as are wanted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def snake(
+    universal: int,
+    *,
+    length: float = 4.0,
+    radius: float = 0.03,
+    bend: float = 1.0,
+    limit: float = 1.0,
+    rate: float = 0.5,
+) -> dict[str, Any]:
+    """Return the ``[arm]`` table of a snake of so many universal joints, each two joints in one place.
+
+    At home it is a gentle arc, since straight snakes are singular.
+
+    Parameters
+    ----------
+    length, radius
+        Of the whole snake and of its links, m.
+    bend
+        How much its end is turned at home, rad.
+    limit, rate
+        Of every joint, rad to both sides and rad/s.
+    """
+    link, home = length / universal, bend / universal
+    # The arc leaves the plane: else its joints could not move the tip in every direction.
+    kinds = (("pitch", [1.0, 0.0, 0.0], 0.6 * home, link), ("yaw", [0.0, 1.0, 0.0], home, 0.0))
+    joints = [
+        {
+            "name": f"{name}-{k + 1}",
+            "axis": axis,
+            "position": [0.0, 0.0, apart if k else 0.0],
+            "limits": [-limit, limit],
+            "home": value,
+            "rate": rate,
+        }
+        for k in range(universal)
+        for name, axis, value, apart in kinds
+    ]
+    return {"joint": joints, "tip": [0.0, 0.0, link], "link_radius": radius}
