@@ -87,3 +87,67 @@ def test_the_command_prints_the_table_or_one_document(
     document = json.loads(capsys.readouterr().out)
     assert document["kinematic"]["max_tip_error"] < 1e-9
     assert document["physics"]["contacts"] == 0
+
+
+MOVING = [{"time": 4.0, "position": [0.1, 0.0, 0.05], "rotation_vector": [0.0, 0.1, 0.05]}]
+DRONE = {
+    "name": "drone",
+    "shape": "sphere",
+    "center": [-1.0, 0.5, 1.0],
+    "radius": 0.1,
+    "velocity": [0.01, 0, 0],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("snake_past_a_cube", {}),
+        ("snake_past_a_cube", {"arm.base_motion": MOVING, "obstacle": [DRONE], "arm.locked": ["yaw-4"]}),
+        ("station_arm_past_a_module", {}),
+    ],
+)
+def test_a_serial_arm_is_replayed_joint_by_joint(name: str, changes: dict):
+    maneuver = vq.solve(vq.load_problem(name).replace({"maneuver.steps": 20, **changes}))
+    assert maneuver.arrived
+    found = replay(maneuver)
+    # MuJoCo's kinematics know nothing of ours.
+    assert found.kinematic.length_error.max() < 1e-12
+    assert found.kinematic.tip_error.max() < 1e-12 * maneuver.manifest["arm"].get("unit", 20.0)
+    assert np.allclose(found.kinematic.clearance, maneuver.clearance, atol=1e-9)
+    assert found.kinematic.contacts == found.physics.contacts == 0
+    assert 1e-9 < found.physics.length_error.max() < 5e-3
+    expected = found.certified_tip_error_per_millimetre
+    assert expected / 1.2 < found.tip_error_per_millimetre < 1.2 * expected
+    assert "joint error [mrad or mm]" in found.rows()[0][0]
+
+
+def test_a_link_inside_an_obstacle_is_found_and_one_that_stretches_has_no_model():
+    joints = [
+        {"name": "turn", "axis": [1, 0, 0], "home": 0.3, "rate": 1.0, "limits": [-2, 2]},
+        {"name": "swing", "axis": [0, 1, 0], "position": [0, 0, 0.5], "home": 0.2, "limits": [-2, 2]},
+        {
+            "name": "slide",
+            "kind": "prismatic",
+            "axis": [0, 0, 1],
+            "position": [0, 0, 0.5],
+            "limits": [-0.2, 0.2],
+        },
+    ]
+    body = [{"name": "rod", "joint": "slide", "points": [[0, 0, 0], [0, 0, 0.4]], "radius": 0.05}]
+    ball = {"name": "ball", "shape": "sphere", "center": [0.1, -0.4, 1.2], "radius": 0.3}
+    table = {
+        "arm": {"joint": joints, "tip": [0, 0, 0.4], "body": body},
+        "maneuver": {"steps": 2, "waypoint": [{"time": 5.0, "position": [0.2, -0.4, 1.25]}]},
+        "method": {"name": "pseudoinverse"},
+    }
+    clear = vq.solve(vq.Problem.from_dict(table))
+    problem = {**clear.manifest["problem"], "obstacle": [ball]}
+    through = vq.Maneuver(**clear.arrays, manifest={**clear.manifest, "problem": problem})
+    found = replay(through)
+    assert found.kinematic.tip_error.max() < 1e-12
+    assert found.kinematic.contacts == len(through.time)
+    assert found.kinematic.clearance.max() < 0.0
+    del table["arm"]["body"]
+    with pytest.raises(vq.ExportError, match="link slide stretches"):
+        replay(vq.solve(vq.Problem.from_dict(table)))

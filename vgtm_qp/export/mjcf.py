@@ -1,17 +1,19 @@
-"""The truss as a MuJoCo model: nodes as point masses, members as tendons, every state a keyframe."""
+"""The arm as a MuJoCo model: a truss of point masses and tendons, or joints and links; every state a keyframe."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError
+from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.result.poses import base_poses
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import RecordedArm, arm_of
+from vgtm_qp.verify.arm import Arm, RecordedArm, arm_of
 from vgtm_qp.view.drawing import (
     FIXED_COLOUR,
     OBSTACLE_COLOUR,
@@ -29,7 +31,8 @@ TIME_STEP = 0.001
 ACTUATOR_GROUP = 1
 """Group of the position actuators, so that a replay through equality constraints can switch them off."""
 
-_STIFFNESS = 2.0e5
+_STIFFNESS, _TURNING = 2.0e5, 2.0e4
+_LEAST_MASS = 1e-6
 _THINNEST = 1e-6
 """Least radius of what is drawn, m: MuJoCo takes none that is zero."""
 
@@ -37,21 +40,25 @@ _THINNEST = 1e-6
 def mjcf(maneuver: Result) -> str:
     """Return the MuJoCo model of a maneuver as XML, which opens in MuJoCo's own viewer.
 
-    Free nodes are bodies with three slide joints, so ``qpos`` is their displacement from the home pose; base
-    nodes and moving obstacles are mocap bodies. Each member is a tendon called by its name with an equality
-    constraint of the same name; those of actuated members are off, since position actuators drive them:
-    ``ctrl`` is a length, m. Members have mass but do not collide; nodes collide with obstacles, meshes
-    as their convex hulls.
+    Of a truss free nodes are bodies with three slide joints, so ``qpos`` is their displacement from the home pose. Each
+    member is a tendon called by its name. Members have mass but do not collide; nodes collide with obstacles. Of a
+    serial arm ``qpos`` are the joints' values, and its links are capsules that collide with obstacles.
+
+    Base and moving obstacles are mocap bodies, meshes their convex hulls. Every member and joint has an equality
+    constraint of the same name that holds its length or value; those of actuated ones are off, since position actuators
+    drive them: ``ctrl`` is a length, m, or a joint's value, rad or m.
 
     Raises
     ------
     ExportError
-        The arm is no truss, or has offset joints, whose attitude point masses cannot have.
+        A truss has offset joints, whose attitude point masses cannot have, or a link of a serial arm stretches.
     """
-    record, arm = maneuver.manifest["arm"], pinned_truss(maneuver)
-    name = str(maneuver.manifest["problem"].get("name", "truss"))
+    arm = modelled_arm(maneuver)
+    is_chain = isinstance(arm, RecordedChain)
+    name = str(maneuver.manifest["problem"].get("name", "arm" if is_chain else "truss"))
     root = Element("mujoco", model=name)
-    _add(root, "compiler", angle="radian", autolimits="true")
+    # Joints in one place have bodies between them that need a mass.
+    _add(root, "compiler", angle="radian", autolimits="true", boundmass=_LEAST_MASS, boundinertia=_LEAST_MASS)
     _add(root, "option", timestep=TIME_STEP, integrator="implicitfast", gravity=(0.0, 0.0, -9.81))
     extent = float(np.ptp(maneuver.nodes.reshape(-1, 3), axis=0).max())
     _add(root, "statistic", extent=extent, center=maneuver.nodes.reshape(-1, 3).mean(axis=0))
@@ -59,24 +66,28 @@ def mjcf(maneuver: Result) -> str:
     _add(visual, "headlight", ambient=(0.4, 0.4, 0.4), diffuse=(0.5, 0.5, 0.5))
     asset, world = _add(root, "asset"), _add(root, "worldbody")
     _add(world, "light", pos=(0.0, 0.0, 3.0 * extent), dir=(0.2, 0.3, -1.0), directional="true")
-    names = [str(node) for node in record["node_names"]]
-    _add_nodes(world, arm, names)
+    names = [str(node) for node in maneuver.manifest["arm"].get("node_names") or ()]
+    if isinstance(arm, RecordedChain):
+        _add_joints(world, arm)
+    else:
+        _add_nodes(world, arm, names)
     obstacles = drawing_of_maneuver(maneuver).obstacles
     tables = {entry["name"]: entry for entry in maneuver.manifest["problem"].get("obstacle") or ()}
     for mesh in obstacles:
         _add_obstacle(asset, world, mesh, tables[mesh.name], float(maneuver.time[0]))
-    _add_members(root, arm, names)
+    if isinstance(arm, RecordedChain):
+        _add_drives(root, arm)
+    else:
+        _add_members(root, arm, names)
     _add_keyframes(root, maneuver, arm, [mesh for mesh in obstacles if mesh.velocity.any()])
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def pinned_truss(maneuver: Result) -> RecordedArm:
-    """Return the truss of a maneuver; ExportError where a MuJoCo model of it would not be the same."""
+def modelled_arm(maneuver: Result) -> Arm:
+    """Return the arm of a maneuver; ExportError where a MuJoCo model of it would not be the same."""
     arm = arm_of(maneuver)
-    if not isinstance(arm, RecordedArm):
-        raise ExportError(f"this is the result of a {arm.kind} arm; expected that of a truss")
-    if not arm.has_pin_joints:
+    if isinstance(arm, RecordedArm) and not arm.has_pin_joints:
         raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
     return arm
 
@@ -101,6 +112,72 @@ def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
             look["mass"] = masses[k]
         _add(body, "geom", type="sphere", **look)
         _add(body, "site", name=name, size=0.5 * radius)
+
+
+def _add_joints(world: Element, arm: RecordedChain) -> None:
+    """Add the joints of a serial arm, each a body in the one before, with the links that move with them."""
+    parent = _add(world, "body", name="base", mocap="true", pos=(0.0, 0.0, 0.0))
+    bodies = [parent]
+    for j, name in enumerate(arm.quantity_names):
+        parent = _add(parent, "body", name=name, pos=arm.position[j], quat=_quaternion(arm.rotation[j]))
+        kind = "hinge" if arm.revolute[j] else "slide"
+        joint = _add(parent, "joint", name=name, type=kind, axis=arm.axis[j])
+        if np.isfinite(arm.stroke[j]).all():
+            joint.set("range", _text(arm.stroke[j]))
+        bodies.append(parent)
+    _add(parent, "site", name="tip", pos=arm.tip, size=max(float(np.median(arm.radius)), _THINNEST))
+    for k, name in enumerate(arm.member_names):
+        carrier, ends = _carried(arm, k)
+        length = float(np.linalg.norm(ends[1] - ends[0]))
+        look = {
+            "size": max(arm.radius[k], _THINNEST),
+            "rgba": (*FIXED_COLOUR, 1.0),
+            "contype": 1,
+            "conaffinity": 2,
+        }
+        mass = MASS_PER_LENGTH * max(length, 2.0 * float(arm.radius[k]))
+        _add(bodies[carrier], "geom", name=name, type="capsule", fromto=ends, mass=mass, **look)
+
+
+def _carried(arm: RecordedChain, link: int) -> tuple[int, Array]:
+    """Return the number of the joint that moves a link, 0 for the base, and its ends (2, 3) in that frame, m."""
+    count, places = len(arm.quantity_names), np.vstack([arm.position, arm.tip])
+    # Each point stays in place in one frame or in two: an origin in those before and after a joint that turns.
+    known: list[dict[int, Array]] = []
+    for point in arm.links[link].tolist():
+        if point > count + 1:
+            known.append({int(arm.carriers[point - count - 2]): arm.points[point - count - 2]})
+        elif point == 0:
+            known.append({0: np.zeros(3)})
+        else:
+            own = {point: np.zeros(3)} if point <= count and arm.revolute[point - 1] else {}
+            known.append({point - 1: places[point - 1], **own})
+    common = sorted(known[0].keys() & known[1].keys())
+    if not common:
+        raise ExportError(f"link {arm.member_names[link]} stretches; a MuJoCo model needs links that do not")
+    return common[-1], np.array([known[0][common[-1]], known[1][common[-1]]])
+
+
+def _add_drives(root: Element, arm: RecordedChain) -> None:
+    equalities, actuators = (_add(root, kind) for kind in ("equality", "actuator"))
+    for k, name in enumerate(arm.quantity_names):
+        stiff = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}
+        held = (float(arm.home_quantities[k]), 0.0, 0.0, 0.0, 0.0)
+        active = "false" if arm.actuated[k] else "true"
+        _add(equalities, "joint", name=name, joint1=name, polycoef=held, active=active, **stiff)
+        if arm.actuated[k]:
+            drive = _add(
+                actuators, "position", name=name, joint=name, kp=_TURNING, dampratio=1.0, group=ACTUATOR_GROUP
+            )
+            if np.isfinite(arm.stroke[k]).all():
+                drive.set("ctrlrange", _text(arm.stroke[k]))
+
+
+def _quaternion(rotation: Array) -> Array:
+    """Return the quaternion w, x, y, z of a rotation (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(np.roll(Rotation.from_matrix(rotation).as_quat(), 1))
 
 
 def _add_obstacle(
@@ -145,15 +222,42 @@ def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
             _add(actuators, "position", name=member, tendon=member, **drive)
 
 
-def _add_keyframes(root: Element, maneuver: Result, arm: RecordedArm, moving: Sequence[ObstacleMesh]) -> None:
-    keyframes = _add(root, "keyframe")
-    lengths = maneuver.member_lengths[:, arm.actuated]
-    for k, time in enumerate(maneuver.time):
-        mocap = [*maneuver.nodes[k, np.sort(arm.base)], *(mesh.position(float(time)) for mesh in moving)]
-        displacement = (maneuver.nodes[k] - arm.home)[arm.free]
-        key = _add(keyframes, "key", name=f"state {k}", time=time, qpos=displacement, ctrl=lengths[k])
-        if mocap:
-            key.set("mpos", _text(mocap))
+def _add_keyframes(root: Element, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> None:
+    keyframes, given = _add(root, "keyframe"), GivenPoses.of(maneuver, arm, moving)
+    values = maneuver.joints if maneuver.joints is not None else (maneuver.nodes - arm.home)[:, arm.free]
+    for k, (time, controls) in enumerate(zip(maneuver.time, maneuver.actuator_values, strict=True)):
+        key = _add(keyframes, "key", name=f"state {k}", time=time, qpos=values[k], ctrl=controls)
+        if given.position.shape[1]:
+            key.set("mpos", _text(given.position[k]))
+            key.set("mquat", _text(given.quaternion[k]))
+
+
+class GivenPoses(NamedTuple):
+    """Positions (T, G, 3), m, and quaternions (T, G, 4) of what a maneuver moves by itself: base, then obstacles."""
+
+    position: Array
+    quaternion: Array
+
+    @classmethod
+    def of(cls, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> GivenPoses:
+        """Return those of a maneuver at its states; of a truss the base nodes, which do not turn."""
+        from scipy.spatial.transform import Rotation
+
+        time = maneuver.time
+        if isinstance(arm, RecordedChain):
+            poses = base_poses(maneuver.manifest["problem"], time)
+            base, turned = poses[:, None, :3], Rotation.from_rotvec(poses[:, 3:]).as_quat()
+            turns = np.roll(turned, 1, axis=1)[:, None]
+        else:
+            base = maneuver.nodes[:, np.sort(arm.base)]
+            turns = np.zeros((len(time), base.shape[1], 4))
+            turns[..., 0] = 1.0
+        paths = np.array([[mesh.position(float(t)) for mesh in moving] for t in time]).reshape(
+            len(time), -1, 3
+        )
+        still = np.zeros((len(time), len(moving), 4))
+        still[..., 0] = 1.0
+        return cls(np.concatenate([base, paths], axis=1), np.concatenate([turns, still], axis=1))
 
 
 def _add(parent: Element, tag: str, **attributes: object) -> Element:

@@ -11,7 +11,8 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError, MissingExtraError
-from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf, pinned_truss
+from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf, modelled_arm
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.clearance import AgainstBody, RecordedMotion
 from vgtm_qp.verify.obstacles import read_obstacles
@@ -23,18 +24,18 @@ _PROBED_STATES = 51
 
 @dataclass(frozen=True, eq=False)
 class ReplayRun:
-    """How a replay followed a maneuver, over its states; all but the contacts are (T,), m."""
+    """How a replay followed a maneuver, over its states; all but the contacts are (T,), m, of joints rad or m."""
 
     length_error: Array
-    """Greatest error of a member length."""
+    """Greatest error of a member's length, or of a joint's value."""
     tip_error: Array
     """Distance of the tip from where it should be."""
     actuator_error: Array
-    """Root of the summed squares of the errors of the actuated lengths."""
+    """Root of the summed squares of the errors of the actuated ones."""
     clearance: Array
-    """Least distance from members to obstacles at the states; inf without obstacles."""
+    """Least distance from members or links to obstacles at the states; inf without obstacles."""
     contacts: int
-    """Time steps in which MuJoCo found a node in contact with an obstacle."""
+    """Time steps in which MuJoCo found a node or link in contact with an obstacle."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the worst values as strict JSON data, m; None if there are no obstacles."""
@@ -61,13 +62,16 @@ class Replay:
     """The state at which that was measured: the one where it is greatest."""
     certified_tip_error_per_millimetre: float
     """The same from the Jacobian, as the certificate has it."""
+    of_joints: bool = False
+    """Whether actuators are joints: mm at the tip are then for errors of 1 mrad or 1 mm."""
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return the table: quantity, certificate, kinematic replay, physics replay."""
         exact, real = self.kinematic.to_dict(), self.physics.to_dict()
         expected = self.certified_tip_error_per_millimetre * self.physics.actuator_error
+        what, unit, body = ("joint", "mrad or mm", "link") if self.of_joints else ("length", "mm", "node")
         lengths = (
-            ("greatest length error [mm]", "0", "max_length_error"),
+            (f"greatest {what} error [{unit}]", "0", "max_length_error"),
             ("greatest tip error [mm]", f"at most {_mm(expected.max())}", "max_tip_error"),
             ("tip error at the end [mm]", f"at most {_mm(expected[-1])}", "last_tip_error"),
             ("least clearance [mm]", "-", "min_clearance"),
@@ -75,8 +79,8 @@ class Replay:
         measured, certified = self.tip_error_per_millimetre, self.certified_tip_error_per_millimetre
         return [
             *((name, wanted, _mm(exact[key]), _mm(real[key])) for name, wanted, key in lengths),
-            ("steps with a node in contact", "0", str(exact["contacts"]), str(real["contacts"])),
-            ("tip error per mm of actuator error [mm]", f"{certified:.4g}", "-", f"{measured:.4g}"),
+            (f"steps with a {body} in contact", "0", str(exact["contacts"]), str(real["contacts"])),
+            (f"tip error per {unit} of actuator error [mm]", f"{certified:.4g}", "-", f"{measured:.4g}"),
         ]
 
     def to_dict(self) -> dict[str, Any]:
@@ -88,20 +92,21 @@ class Replay:
 def replay(maneuver: Result) -> Replay:
     """Replay a maneuver in MuJoCo, as it was solved and under gravity.
 
-    The physics replay drives the length of every member through equality constraints, in straight lines
-    between the states; gravity pulls at the nodes. The nodes' masses are `vgtm_qp.export.mjcf.node_masses`.
+    The physics replay drives the length of every member, or the value of every joint, through equality constraints, in
+    straight lines between the states; gravity pulls. Members and links have `vgtm_qp.export.mjcf.MASS_PER_LENGTH`.
 
     Raises
     ------
     MissingExtraError
         MuJoCo is not installed.
     ExportError
-        The truss has offset joints.
+        As ``mjcf``.
     """
     simulation = _Simulation(maneuver)
     kinematic, physics = (simulation.recorded(move) for move in (simulation.place, simulation.drive))
     state, certified = simulation.most_sensitive_state()
-    return Replay(kinematic, physics, simulation.measured_sensitivity(state, certified), state, certified)
+    measured, of_joints = simulation.measured_sensitivity(state, certified), maneuver.joints is not None
+    return Replay(kinematic, physics, measured, state, certified, of_joints)
 
 
 class _Simulation:
@@ -113,7 +118,7 @@ class _Simulation:
         except ImportError:
             raise MissingExtraError("mujoco", "mujoco") from None
         self._mujoco, self._maneuver = mujoco, maneuver
-        self._arm = pinned_truss(maneuver)
+        self._arm = modelled_arm(maneuver)
         try:
             self._model: Any = mujoco.MjModel.from_xml_string(mjcf(maneuver))
         except ValueError as error:
@@ -122,37 +127,48 @@ class _Simulation:
         manifest = maneuver.manifest
         directory = Path(manifest.get("directory") or ".")
         self._bodies = read_obstacles(manifest["problem"], manifest.get("meshes") or {}, directory)[0]
-        self._home_lengths = np.array(self._model.tendon_length0)
-        self._mocap = np.array(self._model.key_mpos).reshape(len(maneuver.time), -1, 3)
+        count, chain = len(maneuver.time), isinstance(self._arm, RecordedChain)
+        self._is_chain = chain
+        self._wanted = maneuver.member_lengths if maneuver.joints is None else maneuver.joints
+        # Equality constraints of tendons hold the difference to this length.
+        self._held_from = np.zeros(self._model.nq) if chain else np.array(self._model.tendon_length0)
+        self._mocap = np.array(self._model.key_mpos).reshape(count, -1, 3)
+        self._turned = np.array(self._model.key_mquat).reshape(count, -1, 4)
 
     def recorded(self, move: Callable[[int], int]) -> ReplayRun:
         """Return how the arm followed where `move` takes it to each state, and counts the time steps with a contact."""
         maneuver, arm = self._maneuver, self._arm
-        nodes, lengths = np.empty_like(maneuver.nodes), np.empty_like(maneuver.member_lengths)
-        contacts = 0
-        for k in range(len(nodes)):
+        states, values = np.array(maneuver.configurations), np.empty_like(self._wanted)
+        tips, contacts = np.empty_like(maneuver.tip_position), 0
+        for k in range(len(states)):
             contacts += move(k)
-            nodes[k], lengths[k] = self._data.site_xpos, self._data.ten_length
-        errors = lengths - maneuver.member_lengths
-        motion = RecordedMotion(arm, maneuver.time, nodes)
+            values[k] = self._data.qpos if self._is_chain else self._data.ten_length
+            tips[k] = self._tip_now()
+            if self._is_chain:
+                # Its base is where the problem has it.
+                states[k, : values.shape[1]] = values[k]
+            else:
+                states[k] = self._data.site_xpos
+        errors = values - self._wanted
+        motion = RecordedMotion(arm, maneuver.time, states)
         pairs = [AgainstBody(motion, body) for body in self._bodies]
-        least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(nodes))]
+        least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(states))]
         return ReplayRun(
             length_error=np.abs(errors).max(axis=1),
-            tip_error=np.linalg.norm(arm.tip_position(nodes) - maneuver.tip_position, axis=1),
+            tip_error=np.linalg.norm(tips - maneuver.tip_position, axis=1),
             actuator_error=np.linalg.norm(errors[:, arm.actuated], axis=1),
             clearance=np.array(least),
             contacts=contacts,
         )
 
     def place(self, state: int) -> int:
-        """Put the nodes where they should be."""
+        """Put the arm where it should be."""
         self._mujoco.mj_resetDataKeyframe(self._model, self._data, state)
         self._mujoco.mj_forward(self._model, self._data)
         return int(self._data.ncon > 0)
 
     def drive(self, state: int) -> int:
-        """Let the lengths be constraints that move from the state before, and gravity pull."""
+        """Let lengths or joints be constraints that move from the state before, and gravity pull."""
         if state == 0:
             self._hold(0)
             self._settle()
@@ -170,13 +186,14 @@ class _Simulation:
         """Return the state where actuator errors move the tip most, and how far by the Jacobian, mm/mm."""
         states = np.unique(np.linspace(0, len(self._mocap) - 1, _PROBED_STATES).round().astype(int))
         values = [
-            found[2] if (found := self._arm.singular_values(self._maneuver.nodes[k])) else 0.0 for k in states
+            found[2] if (found := self._arm.singular_values(self._maneuver.configurations[k])) else 0.0
+            for k in states
         ]
         worst = int(np.argmax(values))
         return int(states[worst]), float(values[worst])
 
     def measured_sensitivity(self, state: int, expected: float) -> float:
-        """Return the same by lengthening one actuator after another and waiting for the tip.
+        """Return the same by moving one actuator after another and waiting for the tip.
 
         Without gravity, whose sag takes a nearly singular pose away from its singularity, and each by so
         little that the tip should move a tenth of a millimetre: there it soon moves less than in proportion.
@@ -199,19 +216,20 @@ class _Simulation:
         return float(np.linalg.norm(np.array(moved), ord=2)) if moved else 0.0
 
     def _hold(self, state: int) -> None:
-        """Rest at a state with every length a constraint."""
+        """Rest at a state with every length or joint a constraint."""
         self._mujoco.mj_resetDataKeyframe(self._model, self._data, state)
         self._model.opt.disableactuator |= 1 << ACTUATOR_GROUP
         self._data.eq_active[:] = 1
         self._command(state, 0.0)
 
     def _command(self, state: int, share: float) -> None:
-        """Ask for the lengths at a `share` of the motion from `state` to the next, and move what is given."""
+        """Ask for lengths or joints at a `share` of the motion from `state` to the next, and move what is given."""
         after = min(state + 1, len(self._mocap) - 1)
-        lengths = self._maneuver.member_lengths
-        wanted = (1.0 - share) * lengths[state] + share * lengths[after]
-        self._model.eq_data[:, 0] = wanted - self._home_lengths
+        wanted = (1.0 - share) * self._wanted[state] + share * self._wanted[after]
+        self._model.eq_data[:, 0] = wanted - self._held_from
         self._data.mocap_pos[:] = (1.0 - share) * self._mocap[state] + share * self._mocap[after]
+        # MuJoCo normalises quaternions.
+        self._data.mocap_quat[:] = (1.0 - share) * self._turned[state] + share * self._turned[after]
 
     def _settle(self) -> None:
         for _ in range(_SETTLING_STEPS):
@@ -219,7 +237,9 @@ class _Simulation:
         self._mujoco.mj_fwdPosition(self._model, self._data)
 
     def _tip_now(self) -> Array:
-        return self._arm.tip_position(np.asarray(self._data.site_xpos))
+        if self._is_chain:
+            return np.array(self._data.site("tip").xpos)
+        return np.asarray(self._arm.tip_position(np.asarray(self._data.site_xpos)))
 
 
 def _mm(metres: float | None) -> str:
