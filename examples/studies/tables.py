@@ -32,7 +32,7 @@ UNITS = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 NUMBER = re.compile(r"(?<![\w.])([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?: (us|ms|s)\b)?")
 
 OPTIONS = {
-    "robustness": "--scenes 300 --seed 20261129",
+    "robustness": "--scenes 1000 --seed 20261129",
     "tracking": "--scenes 120 --seed 1991",
     "loops": "--scenes 40 --seed 1991",
 }
