@@ -24,6 +24,7 @@ SAYS = {
         "OMPL",
     ),
     "snakes": ("snake of 15 universal joints", "lower cube", "qp "),
+    "panda_among_shelves": ("Panda among shelves", "upper board", "| qp                      | yes"),
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
 }
 
@@ -41,7 +42,12 @@ def test_an_example_runs(
     for extra in ("viser", "mcap", "mujoco", "distributed", "dask"):
         monkeypatch.setitem(sys.modules, extra, None)
     monkeypatch.setattr(sys, "argv", [str(example)])
-    runpy.run_path(str(example), run_name="__main__")
+    try:
+        runpy.run_path(str(example), run_name="__main__")
+    except SystemExit as ended:
+        if "pip install" not in str(ended):
+            raise
+        pytest.skip(str(ended))
     printed = capsys.readouterr().out
     for words in SAYS[example.stem]:
         assert words in printed
