@@ -800,3 +800,23 @@ def test_what_holds_an_actuator_is_named_by_the_limit_that_does():
     step = gentle.step(position=[0.06, 0.0, 4.0], dt=0.2)
     assert step.status is vq.StepStatus.BLOCKED
     assert all(not name.startswith("stroke: ") for name in step.active), step.active
+
+
+def test_a_trial_curve_without_a_frame_blocks_its_piece_alone(crate_problem, monkeypatch):
+    resolver, target = vq.Resolver(crate_problem), vq.Resolver(crate_problem).tip()[0] + [0.02, 0.0, 0.0]
+    right, calls = resolver._attempt._run, []
+
+    def spoilt(state, asked, *rest):
+        calls.append(asked.target.end - asked.target.start)
+        if calls[-1] > 0.5:
+            raise vq.CurveError("no frame")
+        return right(state, asked, *rest)
+
+    monkeypatch.setattr(resolver._attempt, "_run", spoilt)
+    step = resolver.step(position=target)
+    assert step.status is vq.StepStatus.SLOWED
+    assert 0.0 < step.progress <= 0.5
+    monkeypatch.setattr(
+        resolver._attempt, "_run", lambda *a: (_ for _ in ()).throw(vq.CurveError("no frame"))
+    )
+    assert resolver.step(position=target).reason == "no frame"

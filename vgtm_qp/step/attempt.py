@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import EvaluationError, SolverError
+from vgtm_qp.errors import CurveError, EvaluationError, SolverError
 from vgtm_qp.qp.answer import Accuracy, Closed, Move
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
@@ -140,7 +140,11 @@ class Attempt:
         short = self.separation.shortfall_of(state)
         for gain in (self._recovery(short), 0.0) if short else (0.0,):
             asked, reach = self._first(state, target, share, progress, short, gain)
-            step = self._run(state, asked, reach, short, gain, engine, tracking)
+            try:
+                step = self._run(state, asked, reach, short, gain, engine, tracking)
+            except CurveError as error:
+                # A trial curve may have no frame, where a shorter piece has one.
+                step = Step(StepStatus.BLOCKED, 0.0, state, str(error), 1, True)
             if step.moved:
                 break
         return step
