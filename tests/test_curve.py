@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
+from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from vgtm_qp.curve.curve import Curve, straight_curve
-from vgtm_qp.curve.families import b_spline, beta_spline, bezier, make_family
+from vgtm_qp.curve.families import b_spline, bernstein, beta_spline, bezier, make_family
 from vgtm_qp.errors import CurveError
 
 FAMILIES = [
@@ -228,3 +229,31 @@ def test_arc_parameters_around_a_cusp_and_a_sudden_stop():
 def test_curves_without_an_answer_are_refused(build, message):
     with pytest.raises(CurveError, match=message):
         build()
+
+
+@pytest.mark.parametrize("part", [1.0, 0.1, 1e-2, 1e-3, 1e-5])
+def test_arc_length_is_as_exact_beside_a_cusp(part):
+    # Its legs cross so that r' vanishes in the middle, but for a part that leaves the plane.
+    polygon = np.array([[0.0, 0.0, 0.0], [1.0, part, 1.0], [0.0, 0.0, 1.0], [1.0, 0.3 * part, 0.0]])
+    thirds = np.arange(4) / 3.0
+    # A part of it: in the middle cells meet, and are as exact as they can be.
+    begun = BPoly(polygon[:, None, :], [0.0, 1.0])(0.83 * thirds)
+    curve = Curve(bezier(4), np.linalg.solve(bernstein(3, thirds), begun))
+    whole = BPoly(curve.control_vertices[:, None, :], [0.0, 1.0]).derivative()
+    fine = np.linspace(0.0, 1.0, 2001)
+    fine = np.unique(np.append(fine, minimum_speed(whole) + np.outer([-1, 1], 0.7 ** np.arange(90)).ravel()))
+    fine = fine[(fine >= 0.0) & (fine <= 1.0)]
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    points = fine[:-1, None] + 0.5 * np.diff(fine)[:, None] * (nodes + 1.0)
+    pieces = 0.5 * np.diff(fine) * (np.linalg.norm(whole(points), axis=-1) @ weights)
+    exact = np.append(0.0, np.cumsum(pieces))
+    np.testing.assert_allclose(curve.length(fine), exact, atol=1e-10 * exact[-1])
+
+
+def minimum_speed(derivative):
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        s = np.linspace(low, high, 101)
+        k = int(np.argmin(np.linalg.norm(derivative(s), axis=-1)))
+        low, high = s[max(k - 1, 0)], s[min(k + 1, 100)]
+    return 0.5 * (low + high)

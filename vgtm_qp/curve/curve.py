@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +18,8 @@ _FRAME_STEPS_PER_CELL = 1
 _NO_STEP = 1e-9
 _NEWTON_STEPS = 100
 _CONVERGED = 1e-13
+_DIP, _GRADES = 0.1, 40
+"""Speed, as a share of the mean, below which cells are graded towards where it is least; halvings of their widths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +133,7 @@ class Curve:
         fraction = np.asarray(fraction, dtype=float)
         if not np.all((fraction >= 0.0) & (fraction <= 1.0)):
             raise CurveError("fractions of the arc length must be within 0 to 1")
-        cells = self.family.cells
+        cells = self._cells
         lengths = self.length(cells)
         goal = fraction.ravel() * lengths[-1]
         cell = np.clip(np.searchsorted(lengths, goal, side="right") - 1, 0, len(cells) - 2)
@@ -230,17 +233,44 @@ class Curve:
         chord = _reflections(np.where(nearby, tangent, self.position(end) - self.position(start)))
         return np.asarray(_reflections(goal - np.einsum("nij,nj->ni", chord, tangent)) @ chord)
 
+    @cached_property
+    def _cells(self) -> Array:
+        """The family's cells for quadrature; where the curve has nearly a cusp, graded towards it."""
+        cells = self.family.cells
+        at = within(cells, self.family.gauss[0]).ravel()
+        speed = np.linalg.norm(self.family.quadrature[0] @ self.control_vertices, axis=-1).ravel()
+        beside = np.pad(speed, 1, constant_values=np.inf)
+        dips = (speed < _DIP * speed.mean()) & (speed <= beside[:-2]) & (speed <= beside[2:])
+        if not dips.any():
+            return cells
+        around = np.pad(at, 1, constant_values=(0.0, 1.0))
+        widths, found = 0.5 ** np.arange(_GRADES), [cells]
+        for k in np.flatnonzero(dips):
+            low, high = around[k], around[k + 2]
+            # The square of the speed is smooth, and least where the curve turns back.
+            for _ in range(_GRADES):
+                s = np.linspace(low, high, 9)
+                least = int(np.argmin(np.linalg.norm(self.derivative(s), axis=-1)))
+                low, high = s[max(least - 1, 0)], s[min(least + 1, 8)]
+            middle = 0.5 * (low + high)
+            found += [np.array([middle]), middle - widths, middle + widths]
+        graded = np.unique(np.concatenate(found))
+        return np.asarray(graded[(graded >= 0.0) & (graded <= 1.0)])
+
     def _integral(self, integrand: Callable[[Array, Array], Array], s: ArrayLike) -> Array:
         """Integrate a function of the tables w', w'' over 0 to s; its values may have further axes."""
         s = np.asarray(s, dtype=float)
-        flat = np.clip(s.ravel(), 0.0, 1.0)
-        cells = self.family.cells
+        flat, cells = np.clip(s.ravel(), 0.0, 1.0), self._cells
         nodes, weights = self.family.gauss
 
         def over(widths: Array, *tables: Array) -> Array:
             return np.asarray((np.tensordot(weights, integrand(*tables), axes=(0, 1)).T * widths).T)
 
-        whole = over(np.diff(cells), *self.family.quadrature)
+        tables = self.family.quadrature
+        if cells is not self.family.cells:
+            inside = within(cells, nodes)
+            tables = self.family.weights(inside, 1), self.family.weights(inside, 2)
+        whole = over(np.diff(cells), *tables)
         until = np.concatenate([np.zeros((1, *whole.shape[1:])), np.cumsum(whole, axis=0)])
         cell = np.clip(np.searchsorted(cells, flat, side="right") - 1, 0, len(cells) - 2)
         rest = flat - cells[cell]
