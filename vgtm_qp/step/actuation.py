@@ -23,6 +23,9 @@ _APPROACH = 0.3
 _LEAST_APPROACH = 2e-3
 """What it may always use: rad, or a share of the arm's unit."""
 
+_SPARE_RATE = 1e-6
+"""Greatest share of a rate that is kept for what settling leaves."""
+
 _ROUNDING = float(np.finfo(float).eps)
 
 _INSTANT = 1e-9
@@ -134,8 +137,9 @@ class Actuation:
         With `slowing`, actuators slow down before the ends of their strokes, if the problem asks for it.
         """
         value, rates, stroke = self.values(state), state.rates.take(self._actuators), self._stroke
-        # In a very short step the error that settling leaves would be a rate of its own.
-        rate = np.maximum(self._rate - self._settled / dt, 0.0)
+        # What settling may leave, over the duration, would be a rate of its own. It leaves less in a very short step.
+        spare = np.minimum(self.tolerance / dt, _SPARE_RATE * self._rate)
+        rate = np.maximum(self._rate - np.maximum(spare, self._settled / dt), 0.0)
         ends = stroke, rate, self._acceleration
         lower, upper = actuator_box(value, rates, *ends, dt, state.duration or None)
         if slowing and self._slows_down:
