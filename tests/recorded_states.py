@@ -464,7 +464,7 @@ def _loops() -> Iterator[Case]:
     yield Case(
         "loop octahedral 6, locks",
         _scene(63, "octahedral", 6),
-        loop={"steps": 50, "seed": 7, "locks": {12: "B2-1", 30: "B5-3"}},
+        loop={"steps": 40, "seed": 7, "locks": {12: "B2-1", 30: "B5-3"}},
     )
     turned = _turned(_scene(64, "octahedral", 6), ["position", "pointing"], pointing=_UP)
     yield Case("loop octahedral 6, pointing", turned, loop={"steps": 40, "seed": 4, "pointing": True})
