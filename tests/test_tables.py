@@ -87,5 +87,8 @@ def test_what_moved_is_told():
         "free, step: 2 ms -> 2.5 ms",
     ]
     assert tables.moved(old, old) == []
-    assert tables.value("1.5e-02") == 0.015
-    assert tables.value("870 us") == pytest.approx(0.87 * tables.value("1.0 ms"))
+    assert tables.values("1.5e-02") == [0.015]
+    assert tables.values("870 us, x 2") == [pytest.approx(0.87e-3), 2.0]
+    for cell, other in (("yes; 100", "no, 100 %"), ("9 us, x 1.7", "9 us, x 17"), ("40 of 40", "40 of 400")):
+        assert len(tables.moved(old.replace("| yes", f"| {cell}"), old.replace("| yes", f"| {other}"))) == 1
+    assert "free, step: 2 ms -> nothing" in tables.moved(old, head)

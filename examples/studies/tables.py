@@ -97,24 +97,24 @@ def cells(text: str) -> dict[tuple[str, ...], str]:
     return found
 
 
-def value(cell: str) -> float | None:
-    """Return the first number of a cell, times in seconds; None where it has none."""
-    number = NUMBER.search(cell)
-    return float(number[1]) * UNITS.get(number[2] or "s", 1.0) if number else None
+def values(cell: str) -> list[float]:
+    """Return the numbers of a cell, times in seconds."""
+    return [float(number) * UNITS.get(unit or "s", 1.0) for number, unit in NUMBER.findall(cell)]
 
 
 def moved(old: str, new: str) -> list[str]:
-    """Return a line for each figure that differs by more than a fifth from what it was."""
-    before, lines = cells(old), []
-    for place, cell in cells(new).items():
+    """Return a line for each cell that is lost, has other words, or a number that differs by more than a fifth."""
+    before, after, lines = cells(old), cells(new), []
+    for place, cell in after.items():
         if place not in before:
             continue
-        was, now = value(before[place]), value(cell)
-        same = before[place] == cell
-        if was is not None and now is not None:
-            same = abs(now - was) <= LARGE * abs(was)
-        if not same:
+        was, now = values(before[place]), values(cell)
+        same = NUMBER.sub("", before[place]) == NUMBER.sub("", cell) and len(was) == len(now)
+        if not same or any(abs(b - a) > LARGE * abs(a) for a, b in zip(was, now, strict=False)):
             lines.append(f"{', '.join(place)}: {before[place]} -> {cell}")
+    lines += [
+        f"{', '.join(place)}: {cell} -> nothing" for place, cell in before.items() if place not in after
+    ]
     return lines
 
 

@@ -38,7 +38,7 @@ def compare(
     *,
     methods: Annotated[
         list[str] | None,
-        Parameter(help="methods by name, all of them with all; nine by default", consume_multiple=True),
+        Parameter(help="methods by name, all of them with all; ten by default", consume_multiple=True),
     ] = None,
     output: Annotated[Path | None, Output(help="folder for compare.md, .json and .pdf")] = None,
     json: Json = False,
