@@ -277,8 +277,10 @@ def test_half_a_turn_of_the_tip_is_an_error_of_half_a_turn(track, rng):
 @pytest.mark.parametrize(("name", "curve"), CASES)
 def test_condensed_answer_satisfies_the_full_qp(name, curve, rng):
     clearance = strokes = 0
-    for seed, joint_offset in zip(rng.integers(2**32, size=4), (0.0, 0.1, 0.0, 0.1), strict=True):
-        layout, numbers = make_case(name, curve, seed=seed, joint_offset=joint_offset)
+    for number, seed in enumerate(rng.integers(2**32, size=40)):
+        if number >= 4 and clearance and strokes:
+            break
+        layout, numbers = make_case(name, curve, seed=seed, joint_offset=0.1 * (number % 2))
         solution = make_solver("daqp", layout).solve(numbers)
         builder = FullBuilder(layout)
         qp = builder.build(numbers)
