@@ -11,7 +11,7 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError
 from vgtm_qp.result.chain import RecordedChain
-from vgtm_qp.result.poses import base_poses
+from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm, RecordedArm, arm_of
 from vgtm_qp.view.drawing import (
@@ -32,7 +32,11 @@ ACTUATOR_GROUP = 1
 """Group of the position actuators, so that a replay through equality constraints can switch them off."""
 
 _STIFFNESS, _TURNING = 2.0e5, 2.0e4
+"""Of the position actuators of members, N/m, and of joints, N m/rad or N/m."""
 _LEAST_MASS = 1e-6
+"""kg and kg m^2 of bodies between joints in one place."""
+_STIFF = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}
+"""How firmly equality constraints hold lengths and joints."""
 _THINNEST = 1e-6
 """Least radius of what is drawn, m: MuJoCo takes none that is zero."""
 
@@ -57,7 +61,6 @@ def mjcf(maneuver: Result) -> str:
     is_chain = isinstance(arm, RecordedChain)
     name = str(maneuver.manifest["problem"].get("name", "arm" if is_chain else "truss"))
     root = Element("mujoco", model=name)
-    # Joints in one place have bodies between them that need a mass.
     _add(root, "compiler", angle="radian", autolimits="true", boundmass=_LEAST_MASS, boundinertia=_LEAST_MASS)
     _add(root, "option", timestep=TIME_STEP, integrator="implicitfast", gravity=(0.0, 0.0, -9.81))
     extent = float(np.ptp(maneuver.nodes.reshape(-1, 3), axis=0).max())
@@ -161,10 +164,9 @@ def _carried(arm: RecordedChain, link: int) -> tuple[int, Array]:
 def _add_drives(root: Element, arm: RecordedChain) -> None:
     equalities, actuators = (_add(root, kind) for kind in ("equality", "actuator"))
     for k, name in enumerate(arm.quantity_names):
-        stiff = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}
         held = (float(arm.home_quantities[k]), 0.0, 0.0, 0.0, 0.0)
         active = "false" if arm.actuated[k] else "true"
-        _add(equalities, "joint", name=name, joint1=name, polycoef=held, active=active, **stiff)
+        _add(equalities, "joint", name=name, joint1=name, polycoef=held, active=active, **_STIFF)
         if arm.actuated[k]:
             drive = _add(
                 actuators, "position", name=name, joint=name, kp=_TURNING, dampratio=1.0, group=ACTUATOR_GROUP
@@ -174,10 +176,10 @@ def _add_drives(root: Element, arm: RecordedChain) -> None:
 
 
 def _quaternion(rotation: Array) -> Array:
-    """Return the quaternion w, x, y, z of a rotation (3, 3)."""
+    """Return the quaternions w, x, y, z (..., 4) of rotations (..., 3, 3), one or a row of them."""
     from scipy.spatial.transform import Rotation
 
-    return np.asarray(np.roll(Rotation.from_matrix(rotation).as_quat(), 1))
+    return np.asarray(np.roll(Rotation.from_matrix(rotation).as_quat(), 1, axis=-1))
 
 
 def _add_obstacle(
@@ -214,16 +216,15 @@ def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
         )
         for node in arm.members[k]:
             _add(tendon, "site", site=names[node])
-        stiff = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}
         active = "false" if arm.actuated[k] else "true"
-        _add(equalities, "tendon", name=member, tendon1=member, active=active, **stiff)
+        _add(equalities, "tendon", name=member, tendon1=member, active=active, **_STIFF)
         if arm.actuated[k]:
             drive = {"kp": _STIFFNESS, "dampratio": 1.0, "ctrlrange": arm.stroke[k], "group": ACTUATOR_GROUP}
             _add(actuators, "position", name=member, tendon=member, **drive)
 
 
 def _add_keyframes(root: Element, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> None:
-    keyframes, given = _add(root, "keyframe"), GivenPoses.of(maneuver, arm, moving)
+    keyframes, given = _add(root, "keyframe"), _GivenPoses.of(maneuver, arm, moving)
     values = maneuver.joints if maneuver.joints is not None else (maneuver.nodes - arm.home)[:, arm.free]
     for k, (time, controls) in enumerate(zip(maneuver.time, maneuver.actuator_values, strict=True)):
         key = _add(keyframes, "key", name=f"state {k}", time=time, qpos=values[k], ctrl=controls)
@@ -232,22 +233,19 @@ def _add_keyframes(root: Element, maneuver: Result, arm: Arm, moving: Sequence[O
             key.set("mquat", _text(given.quaternion[k]))
 
 
-class GivenPoses(NamedTuple):
+class _GivenPoses(NamedTuple):
     """Positions (T, G, 3), m, and quaternions (T, G, 4) of what a maneuver moves by itself: base, then obstacles."""
 
     position: Array
     quaternion: Array
 
     @classmethod
-    def of(cls, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> GivenPoses:
+    def of(cls, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> _GivenPoses:
         """Return those of a maneuver at its states; of a truss the base nodes, which do not turn."""
-        from scipy.spatial.transform import Rotation
-
         time = maneuver.time
         if isinstance(arm, RecordedChain):
             poses = base_poses(maneuver.manifest["problem"], time)
-            base, turned = poses[:, None, :3], Rotation.from_rotvec(poses[:, 3:]).as_quat()
-            turns = np.roll(turned, 1, axis=1)[:, None]
+            base, turns = poses[:, None, :3], _quaternion(rotations(poses[:, 3:]))[:, None]
         else:
             base = maneuver.nodes[:, np.sort(arm.base)]
             turns = np.zeros((len(time), base.shape[1], 4))

@@ -84,10 +84,8 @@ class MethodResolver(Resolver, ABC):
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
         """Raise SolverError where nodes (N, 3) are so far away, m, that the linear step means nothing."""
-        arm, members = (
-            self.setup.arm,
-            None if self.setup.arm.bays is None else truss_of(self.setup.arm).members,
-        )
+        arm = self.setup.arm
+        members = None if arm.bays is None else truss_of(arm).members
         shortest = arm.unit if members is None else float(arm.home_quantities.min())
         if too_long := self.setup.too_long(nodes - self.state.nodes):
             raise SolverError(too_long)
