@@ -122,7 +122,7 @@ class _Goals:
         self._pointing = self._rotation[:, 2] + 0.3 * random.normal(size=3)
 
     def note(self, step: Step) -> bool:
-        """Take note of a step, and return whether a goal is met with it."""
+        """Take note of the step towards what `next` gave, and return whether a goal is met with it."""
         met = step.status is StepStatus.REACHED and bool(self._shares[-self._left] == 1.0)
         self._left = 0 if met else self._left - 1
         return met
@@ -155,7 +155,9 @@ def draw(rows: Sequence[Row]) -> Figure:
         counts = np.array([row[status] for row in ordered], dtype=float)
         axes[0].fill_between(range(len(ordered)), below, below + counts, step="mid", label=str(status))
         below += counts
-    label(axes[0], "loops, by steps that reached their goal", "steps")
+    label(axes[0], "loops, by steps that reached their goal", "steps", legend=False)
+    # The bars fill the panel.
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
