@@ -103,7 +103,7 @@ def test_stations_give_way_where_they_must_and_come_back():
     certificate = exact.certificate
     assert certificate.ok
     assert 0.0 < certificate.states_off_curve.value <= sum(gave) / len(gave)
-    assert certificate.tracking_gap.value > 1e-3
+    assert certificate.tracking_gap.value > 1e-4
     assert certificate.curve_end_gap.value < 1e-9
     hard = vq.solve(problem.replace({"method.tracking_mode": "hard"}))
     assert hard.certificate.ok
@@ -155,6 +155,24 @@ def test_curve_nodes_of_the_certificate_are_those_of_the_curve(family, seed, ver
     np.testing.assert_allclose(end / np.linalg.norm(end), curve.tangent(1.0), atol=1e-12)
 
 
+def test_stations_that_gave_way_come_back_within_a_few_steps():
+    """With the weights of elastic tracking none of them would: the next equality has to close the whole gap at once."""
+    problem = vq.load_problem("five_bay_two_cubes_pointing").replace({"method.retries": False})
+    resolver = vq.Resolver(problem)
+    home, goal = resolver.tip()[0], np.array(problem.maneuver.waypoint[-1].position)
+
+    def go(to, steps):
+        for _ in range(steps):
+            away = to - resolver.tip()[0]
+            step = resolver.step(position=resolver.tip()[0] + away * min(1.0, 0.05 / np.linalg.norm(away)))
+            assert not step.moved or step.gap == pytest.approx(gaps(resolver).max(), abs=1e-12)
+            yield step.gave_way
+
+    assert sum(go(goal, 30)) > 10
+    assert not any(list(go(home, 15))[8:])
+    assert gaps(resolver).max() < 1e-6
+
+
 def test_no_retry_lets_hard_tracking_give_way():
     """Elastic tracking reaches the end of this path; hard tracking does not, whatever else is tried."""
     problem = vq.load_problem("five_bay_two_cubes_pointing").replace(
@@ -169,7 +187,7 @@ def test_no_retry_lets_hard_tracking_give_way():
     assert set(modes) == {"hard"}
     exact = problem.replace({"method.tracking_mode": "exact"})
     names = [name for name, _ in retries(exact, DeadEnd(stop, vertices, 4.0, np.eye(3)[0]))]
-    assert names == ["elastic tracking"]
+    assert names == ["more control vertices", "elastic tracking"]
 
 
 def test_braking_steps_say_whether_stations_are_off_the_curve():

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from synthetic import maneuver_of, place, tripod
 
 import vgtm_qp as vq
-from vgtm_qp.view.drawing import camera_for, drawing_of_maneuver, resampled, stroke_colours
+from vgtm_qp.view.drawing import camera_for, drawing_of_maneuver, off_curve, resampled, stroke_colours
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +56,24 @@ def test_tip_error_and_step_time_are_those_of_the_result(maneuver: vq.Maneuver):
     for container in axes.containers:
         tops = np.maximum(tops, [bar.get_y() + bar.get_height() for bar in container])
     assert np.allclose(tops, 1000.0 * maneuver.step_time[1:])
+
+
+def test_gaps_to_the_curve_are_shown_in_plot_frames_and_page():
+    problem = vq.load_problem("five_bay_two_cubes_pointing").replace(
+        {"method.tracking_mode": "elastic", "maneuver.steps": 6, "method.retries": False}
+    )
+    maneuver = vq.solve(problem)
+    gap, where = maneuver.certificate.tracking_gap.value, maneuver.certificate.tracking_gap.where
+    (axes,) = maneuver.plot_tracking_gap().axes
+    shown = axes.lines[0].get_ydata()
+    assert shown[1:].max() == pytest.approx(gap, rel=1e-12)
+    assert f"row {int(np.argmax(shown))}," in where
+    titles = [axes.get_title() for axes in maneuver.plot(frames=[0, int(np.argmax(shown))]).axes[:2]]
+    assert "off the curve" not in titles[0]
+    assert titles[1].endswith(f"\n{1000.0 * gap:.3g} mm off the curve")
+    assert off_curve(maneuver)[int(np.argmax(shown))] == f"{1000.0 * gap:.3g} mm off the curve"
+    (axes,) = vq.solve(problem.replace({"method": {"tracking": "none"}})).plot_tracking_gap().axes
+    assert len(axes.lines) == 1
 
 
 @pytest.mark.smoke

@@ -135,11 +135,19 @@ def _report(summary: dict[str, Any], *, serial: bool) -> str:
         ("rate violation", _number(summary["max_rate_violation"], f"({unit})/s" if serial else "m/s")),
         ("tip error", _number(summary["max_tip_error"], "m", "not tracked")),
         ("tip direction error", _number(summary["max_tip_direction_error"], "rad", "not tracked")),
+        ("off the curve", _off_curve(summary)),
         ("time of a step, median and 99 %", f"{_milliseconds(step['median'])}, {_milliseconds(step['p99'])}"),
         ("set-up", _milliseconds(summary["setup_time"])),
         ("method and solver", ", ".join(filter(None, (summary["method"], summary["solver"])))),
     ]
     return "\n".join([*lines, table(rows, indent="  ")])
+
+
+def _off_curve(summary: dict[str, Any]) -> str:
+    share = summary["states_off_curve"]
+    if share is None:
+        return "no curve"
+    return f"{_number(summary['max_tracking_gap'], 'm')} at most; {100 * share:.3g} % of the states"
 
 
 def _number(value: float | None, unit: str, absent: str = "-") -> str:

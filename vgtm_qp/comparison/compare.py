@@ -30,6 +30,7 @@ _NUMBERS = {
     "least clearance [m]": ("least_clearance", 1.0, ".4f"),
     "stroke beyond [m]": ("stroke_violation", 1.0, ".3g"),
     "rate beyond [m/s]": ("rate_violation", 1.0, ".3g"),
+    "off the curve [m]": ("tracking_gap", 1.0, ".1e"),
     "travel [m]": ("actuator_travel", 1.0, ".2f"),
     "step [ms]": ("step_time", 1e3, ".2f"),
 }

@@ -27,6 +27,8 @@ class Row:
         That of the maneuver, ``refused`` (the method cannot be set up for this arm) or ``interrupted``.
     least_clearance : float or None
         From obstacles, over all states and between them.
+    tracking_gap : float or None
+        Greatest distance of a station from its node of the reference curve.
     reached : float
         Share of the path covered, 0 to 1.
     reason : str
@@ -50,6 +52,7 @@ class Row:
     least_clearance: float | None = None
     stroke_violation: float | None = None
     rate_violation: float | None = None
+    tracking_gap: float | None = None
     actuator_travel: float | None = None
     step_time: float | None = None
     setup_time: float | None = None
@@ -81,6 +84,7 @@ def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
         least_clearance=maneuver.least_clearance,
         stroke_violation=certificate.stroke_violation.value,
         rate_violation=certificate.rate_violation.value,
+        tracking_gap=certificate.tracking_gap.value,
         actuator_travel=float(travel),
         step_time=summary["step_time"]["median"],
         setup_time=summary["setup_time"],

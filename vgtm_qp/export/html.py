@@ -7,7 +7,7 @@ from html import escape
 import numpy as np
 
 from vgtm_qp.result.result import Result
-from vgtm_qp.view.drawing import camera_for, drawing_of_maneuver, resampled
+from vgtm_qp.view.drawing import camera_for, drawing_of_maneuver, off_curve, resampled
 from vgtm_qp.view.scene import ArmScene
 from vgtm_qp.view.server import viser_server
 
@@ -25,7 +25,8 @@ def html_text(maneuver: Result) -> str:
     at = np.linspace(time[0], time[-1], _FRAMES) if len(time) > 1 else time
     moving, curves = resampled(time, nodes, at), resampled(time, vertices, at)
     # Of the last state: between two states it is not on the line between their clearances.
-    clearance = maneuver.clearance[np.searchsorted(time, at + 1e-9, side="right") - 1]
+    rows = np.searchsorted(time, at + 1e-9, side="right") - 1
+    off = off_curve(maneuver)
     tip = maneuver.tip_position
 
     with viser_server() as server:
@@ -39,19 +40,21 @@ def html_text(maneuver: Result) -> str:
         )
         recording = server.get_scene_serializer()
         pause = min(float(time[-1] - time[0]), _LONGEST) / max(len(at) - 1, 1)
-        for k, moment in enumerate(at):
+        for k, (moment, row) in enumerate(zip(at, rows, strict=True)):
             scene.move(moving[k], curves[k], float(moment), coarse=True)
-            read_out.text = _read_out(maneuver, float(moment), float(clearance[k]))
+            read_out.text = _read_out(maneuver, float(moment), float(maneuver.clearance[row]), off[row])
             recording.insert_sleep(pause)
         page: str = recording.as_html()
     title = escape(f"{drawing.name or 'maneuver'} ({maneuver.status})")
     return page.replace("<title>Viser</title>", f"<title>{title}</title>", 1)
 
 
-def _read_out(maneuver: Result, time: float, clearance: float) -> str:
+def _read_out(maneuver: Result, time: float, clearance: float, off: str = "") -> str:
     text = f"{time:.1f} s"
     if np.isfinite(clearance):
         text += f"   clearance {1000.0 * clearance:.0f} mm"
+    if off:
+        text += f"   {off}"
     if time >= maneuver.time[-1] and maneuver.status != "solved":
         text += f"   {maneuver.status}: {maneuver.why_not}"
     return text

@@ -16,7 +16,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
-from vgtm_qp.live.session import Session
+from vgtm_qp.live.session import Reading, Session
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import solve
@@ -334,6 +334,7 @@ def read_out(session: Session, message: str) -> str:
     rows = [
         ("clearance", _distance(reading.clearance, safe), reading.nearest),
         (f"{session.drawing.arm.body}s apart", _distance(reading.self_clearance, -np.inf), ""),
+        ("off the curve", _distance(reading.gap, -np.inf), _why_off(reading)),
         ("tip to target", f"{1000 * float(np.linalg.norm(session.target - session.tip)):.1f} mm", ""),
         ("step", step_time, method_name(session.problem)),
     ]
@@ -358,6 +359,11 @@ def read_out(session: Session, message: str) -> str:
         f"<div style='color:#6b7280;margin-top:0.4em'>active constraints</div>"
         f"<ul style='margin:0;padding-left:1.2em;min-height:5.4em'>{active}</ul></div>"
     )
+
+
+def _why_off(reading: Reading) -> str:
+    """Return what the page says of stations that exact tracking let leave the curve."""
+    return "the curve gave way" if reading.gave_way else ""
 
 
 def _distance(distance: float, least: float) -> str:

@@ -37,7 +37,8 @@ class Reading(NamedTuple):
     """What the page shows: one of `OUTCOMES` or ``"at rest"``, and what holds the arm back, most decisive first.
 
     Then all active rows of the last QP, the least distances to obstacles and between members that share no node, m, the
-    pair nearest to an obstacle, and the computing time of the last step, s.
+    pair nearest to an obstacle, the greatest gap between stations and curve, m, NaN without a curve, whether
+    exact tracking gave way in the last step, and the computing time of that step, s.
     """
 
     outcome: str
@@ -46,6 +47,8 @@ class Reading(NamedTuple):
     clearance: float
     self_clearance: float
     nearest: str
+    gap: float
+    gave_way: bool
     step_time: float
 
 
@@ -197,6 +200,8 @@ class Session:
             clearance=clearance,
             self_clearance=monitor.least(points, state.time, among="members")[0],
             nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),
+            gap=setup.gap_of(state),
+            gave_way=last is not None and last.gave_way,
             step_time=self._step_time,
         )
 

@@ -33,6 +33,10 @@ class Maneuver(Result):
         """Plot the distance of the tip from its target over time."""
         return self._plot("tip error", axes)
 
+    def plot_tracking_gap(self, *, axes: Axes | None = None) -> Figure:
+        """Plot the greatest distance of a station from its node of the reference curve over time."""
+        return self._plot("tracking gap", axes)
+
     def plot_step_time(self, *, axes: Axes | None = None) -> Figure:
         """Plot the computing time of each step by phase."""
         return self._plot("step time", axes)

@@ -33,7 +33,9 @@ _BULGES = (
 """Name, side and size: sides in quarters of a turn about the arm, from the direction away from the obstacle."""
 _FIRM_TRACKING = 1.0
 """Least weight of tracking in a retry with a bulged curve."""
-_MORE_VERTICES = 3
+_MORE_VERTICES = "more control vertices"
+_MORE = 3
+"""So many more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +54,15 @@ class DeadEnd:
 def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]]:
     """Yield name and changed problem of each retry that applies; nothing if retries are off.
 
-    If elastic tracking on demand was not enough, tracking is elastic from the start. All other retries are then those
-    of that problem, from where it stops: so no path is lost that elastic tracking finds. Hard tracking and a solver by
-    bays have no elastic tracking.
+    Where stations gave way on demand and that was not enough, the curve first becomes more flexible. Then tracking is
+    elastic from the start, and all other retries are those of that problem, from where it stops: so no path is lost
+    that elastic tracking finds. Hard tracking and a solver by bays have no elastic tracking.
     """
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
     if problem.method.gives_way:
+        if len(dead_end.control_vertices):
+            yield _MORE_VERTICES, problem.replace(_more_vertices(problem))
         yield "elastic tracking", problem.replace({"method.tracking_mode": "elastic"})
         return
     for name, changes in _changes(problem, dead_end):
@@ -86,7 +90,11 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
     if method.tracking == "coupled" and method.tracking_mode != "hard":
         yield "no curve", {"method": method.kept_by("qp", "none"), "curve.control_vertex_goals": []}
     if vertices:
-        yield "more control vertices", {"curve.control_vertices": curve.control_vertices + _MORE_VERTICES}
+        yield _MORE_VERTICES, _more_vertices(problem)
+
+
+def _more_vertices(problem: Problem) -> dict[str, Any]:
+    return {"curve.control_vertices": problem.curve.control_vertices + _MORE}
 
 
 def bulge(dead_end: DeadEnd, quarter: int, size: float = _BULGE) -> Array:

@@ -239,7 +239,7 @@ def _retry(
             break
         attempt = _Attempt(other, resolver)
         found = attempt.run(progress)
-        if problem.method.gives_way and found is not None:
+        if problem.method.gives_way and not other.method.gives_way and found is not None:
             way, attempt, found = _retry(other, attempt, found, progress)
             name = way or name
         if found is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,10 @@ def with_angles(weights: Weights, arm: Arm) -> Weights:
     """Return weights in which those of stations' squared angles are m^2/rad^2: times the square of the arm's unit."""
     area = arm.unit**2
     return weights.model_copy(update={"tangent": area * weights.tangent, "roll": area * weights.roll})
+
+
+_FIRM = 1e3
+"""Least weight of gaps that give way: far above the terms of the null space, so that only other rows open them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +75,19 @@ class Layout:
     hard_turns: bool = False
     shape: CurveShape | None = None
     vertex_goals: tuple[int, ...] = ()
+
+    def giving_way(self) -> Layout:
+        """Return the layout in which what hard tracking holds at stations gives way where other rows leave no choice.
+
+        Its weights draw stations back within a few steps; the weights of elastic tracking would leave them where they
+        are.
+        """
+        weights, firm = self.weights, {"tracking": _FIRM}
+        if self.hard_turns:
+            firm |= dict.fromkeys(("tangent", "roll"), _FIRM * self.arm.unit**2)
+        least = {key: max(value, getattr(weights, key)) for key, value in firm.items()}
+        weights = weights.model_copy(update=least)
+        return replace(self, hard_tracking=False, hard_turns=False, weights=weights)
 
     @cached_property
     def node_column(self) -> Index:

@@ -60,6 +60,7 @@ class Osqp:
 
     def __init__(self) -> None:
         self._workspace: _Workspace | None = None
+        self._further: list[_Workspace] = []
 
     def ask(
         self,
@@ -80,7 +81,7 @@ class Osqp:
             answer = workspace.solved(*qp)
             off = np.inf if answer is None else max(residuals(answer, *qp))
             if not off <= self.accuracy:
-                answer = _again(workspace, answer, off, *qp)
+                answer = self._again(workspace, answer, off, *qp)
         except InfeasibleStepError:
             self._workspace = workspace
             raise
@@ -97,28 +98,31 @@ class Osqp:
             return old
         return _Workspace(size, bounded, max(rows, 2 * old.sizes[2]), start=old.last)
 
+    def _again(
+        self, workspace: _Workspace, answer: DenseAnswer | None, off: float, *qp: Array
+    ) -> DenseAnswer:
+        """Return an accurate answer by further tries after one with the residual `off`; the next QP starts from it.
 
-def _again(workspace: _Workspace, answer: DenseAnswer | None, off: float, *qp: Array) -> DenseAnswer:
-    """Return an accurate answer by further tries after one with the residual `off`, from which the next QP starts.
-
-    Raises
-    ------
-    InfeasibleStepError, AnswerError
-        There is no answer, or none is accurate.
-    """
-    for settings in _AGAIN:
-        start = answer if off <= _NEAR else None
-        found = _Workspace(*workspace.sizes, settings, start=start).solved(*qp)
-        apart = np.inf if found is None else max(residuals(found, *qp))
-        if apart <= off:
-            answer, off = found, apart
-        if off <= TOLERANCE:
-            break
-    if answer is None:
-        raise AnswerError("osqp: neither an answer nor a proof that there is none")
-    check(answer, *qp)
-    workspace.start(answer)
-    return answer
+        Raises
+        ------
+        InfeasibleStepError, AnswerError
+            There is no answer, or none is accurate.
+        """
+        if not self._further or self._further[0].sizes != workspace.sizes:
+            self._further = [_Workspace(*workspace.sizes, settings) for settings in _AGAIN]
+        for further in self._further:
+            further.restart(answer if off <= _NEAR else None)
+            found = further.solved(*qp)
+            apart = np.inf if found is None else max(residuals(found, *qp))
+            if apart <= off:
+                answer, off = found, apart
+            if off <= TOLERANCE:
+                break
+        if answer is None:
+            raise AnswerError("osqp: neither an answer nor a proof that there is none")
+        check(answer, *qp)
+        workspace.start(answer)
+        return answer
 
 
 class _Workspace:
@@ -156,11 +160,19 @@ class _Workspace:
         self._lower, self._upper = np.zeros(self._used), np.zeros(self._used)
         self._solver: Any = None
 
-    def start(self, answer: DenseAnswer) -> None:
-        """Let the iterations for the next QP start from `answer`."""
-        multipliers = np.zeros(len(self._lower))
-        multipliers[: len(answer.multipliers)] = answer.multipliers
-        self._solver.warm_start(x=answer.x, y=multipliers)
+    def start(self, answer: DenseAnswer | None) -> None:
+        """Let the iterations for the next QP start from `answer`, or from zero."""
+        unknowns, multipliers = np.zeros(self.sizes[0]), np.zeros(len(self._lower))
+        if answer is not None:
+            unknowns, multipliers[: len(answer.multipliers)] = answer.x, answer.multipliers
+        self._solver.warm_start(x=unknowns, y=multipliers)
+
+    def restart(self, answer: DenseAnswer | None) -> None:
+        """Let them start from `answer`, or from zero, with the step size of a new workspace."""
+        self.last = answer
+        if self._solver is not None:
+            self._solver.update_settings(rho=self._settings["rho"])
+            self.start(answer)
 
     def solved(
         self, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array

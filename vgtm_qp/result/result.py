@@ -241,6 +241,8 @@ class Result:
             "max_rate_violation": worst("rate_violation"),
             "max_tip_error": worst("tip_error"),
             "max_tip_direction_error": worst("tip_direction_error"),
+            "max_tracking_gap": worst("tracking_gap"),
+            "states_off_curve": worst("states_off_curve"),
             "step_time": self._step_time(),
             "setup_time": manifest.get("setup_time"),
             "blocked_by": list(self.blocked_by),

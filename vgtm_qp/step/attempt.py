@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from enum import Enum
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from vgtm_qp.qp.answer import Accuracy, Closed, Move
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
-from vgtm_qp.step.acceptance import Acceptance, TrackingError
+from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.separation import RECOVERY, Separation
@@ -94,9 +95,7 @@ class Attempt:
 
     def use(self, setup: Setup) -> None:
         """Go on with the curve of another `setup` of the arm."""
-        layout = setup.layout
         self._setup = setup
-        self._tracking = TrackingError(layout, setup.kinematics) if layout.hard_tracking else None
 
     @property
     def gives_way(self) -> bool:
@@ -120,11 +119,11 @@ class Attempt:
         self.phases.start()
         elastic, piece = self._setup.elastic, (state, target, share, progress)
         if elastic is not None and tracking is Tracking.ELASTIC:
-            return self._separated(*piece, elastic(), None)
-        step = self._separated(*piece, self._setup.engine, self._tracking)
+            return self._separated(*piece, elastic())
+        step = self._separated(*piece, self._setup.engine)
         if elastic is None or tracking is Tracking.HARD or (step.moved and step.progress >= WHOLE):
             return step
-        other = self._separated(*piece, elastic(), None)
+        other = self._separated(*piece, elastic())
         return other if not step.moved or other.progress > step.progress + _FURTHER else step
 
     def _separated(
@@ -134,14 +133,13 @@ class Attempt:
         share: float,
         progress: float,
         engine: Engine,
-        tracking: TrackingError | None,
     ) -> Step:
         """Return the step of an engine that drives apart pairs too near each other; if that fails, only keeps them."""
         short = self.separation.shortfall_of(state)
         for gain in (self._recovery(short), 0.0) if short else (0.0,):
             asked, reach = self._first(state, target, share, progress, short, gain)
             try:
-                step = self._run(state, asked, reach, short, gain, engine, tracking)
+                step = self._run(state, asked, reach, short, gain, engine)
             except CurveError as error:
                 # A trial curve may have no frame, where a shorter piece has one.
                 step = Step(StepStatus.BLOCKED, 0.0, state, str(error), 1, True)
@@ -153,14 +151,14 @@ class Attempt:
         """Return the distance by which pairs that are too near are driven apart, m."""
         return RECOVERY * self._arm.unit if short else 0.0
 
-    def gave_way(self, state: State) -> bool:
-        """Return whether stations of a state are off the curve that exact tracking keeps them on."""
-        setup, base = self._setup, self._setup.base_motion
-        if setup.elastic is None or self._tracking is None:
-            return False
-        pose = None if base is None else base.pose(state.time)
-        gap = self._tracking.greatest(state.q, state.control_vertices, state.torsion, pose)
-        return not gap <= self.accuracy.tracking
+    def with_gap(self, step: Step) -> Step:
+        """Return a step with the gap between curve and stations in its state."""
+        gap = self._setup.gap_of(step.state)
+        return replace(step, gap=gap, gave_way=self._gave_way(gap))
+
+    def _gave_way(self, gap: float) -> bool:
+        """Return whether stations with that gap are off the curve that exact tracking keeps them on."""
+        return self.gives_way and not gap <= self.accuracy.tracking
 
     def first_input(self, state: State, target: Target) -> QPInput:
         """Return the input of the first QP of a step from `state`."""
@@ -190,7 +188,6 @@ class Attempt:
         short: Shortfall,
         gain: float,
         engine: Engine,
-        tracking: TrackingError | None,
     ) -> Step:
         """Run the attempt from its first input; pairs too near at the start, `short`, are driven apart by `gain`, m."""
         phases, separation, target = self.phases, self.separation, asked.target
@@ -245,8 +242,8 @@ class Attempt:
             q, closed = move.closed.q, move.closed
             # Linearised rows leave a small gap between the curve's end and the tip.
             vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
-            off = 0.0 if tracking is None else tracking.greatest(q, vertices, move.torsion, target.base)
-            if not off <= self.accuracy.tracking:
+            gap = self._setup.gap(q, vertices, move.torsion, target.base)
+            if engine.layout.hard_tracking and not gap <= self.accuracy.tracking:
                 continue
             report, after = separation.proof(state, q, target.time, short)
             phases.add("acceptance")
@@ -260,10 +257,8 @@ class Attempt:
                 then = state.next(self._arm, target.duration, closed, vertices, move.torsion, after)
                 progress = covered * move.progress
                 status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
-                gave_way = tracking is None and self._tracking is not None
-                return Step(
-                    status, progress, then, "", count, gave_way=gave_way, solution=first.solution, rows=rows
-                )
+                told: dict[str, Any] = {"gave_way": self._gave_way(gap), "gap": gap}
+                return Step(status, progress, then, "", count, solution=first.solution, rows=rows, **told)
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -279,11 +278,12 @@ def make_engine(
 def elastic_engine(
     solver: str, layout: Layout, kinematics: Kinematics, task: TipTask, *, plain: bool = False
 ) -> Callable[[], Engine]:
-    """Return a function that gives the engine of the same layout with elastic tracking, built on its first call."""
-    elastic = replace(layout, hard_tracking=False, hard_turns=False)
+    """Return a function that gives the engine of a layout whose hard tracking gives way, built on its first call."""
     # That of a long arm is built faster if it is not compiled, and seldom needed.
     is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
-    return cache(partial(make_engine, solver, elastic, kinematics, task, compiled=is_short, plain=plain))
+    return cache(
+        lambda: make_engine(solver, layout.giving_way(), kinematics, task, compiled=is_short, plain=plain)
+    )
 
 
 def check_solver(problem: Problem) -> None:

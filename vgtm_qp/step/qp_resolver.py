@@ -158,7 +158,7 @@ class QPResolver(Resolver, serves="qp"):
         """Do the first step of `braking`, instead of the `blocked` one, and return it."""
         step = braking.first(path, start, end, blocked)
         self.state, self._braking = step.state, braking.rest
-        return replace(step, gave_way=self._attempt.gave_way(step.state))
+        return self._attempt.with_gap(step)
 
     def explain(
         self,

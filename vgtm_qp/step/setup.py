@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.engine import Engine
+from vgtm_qp.step.gap import Gap
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
@@ -95,6 +97,18 @@ class Setup:
     def least_clearance(self, q: Array, time: float, among: str = "all") -> float:
         """Return the exact least clearance at a configuration, m; see ``Clearance.least``."""
         return (self.measure or self.monitor).least(self.arm.points(q), time, among=among)[0]
+
+    @cached_property
+    def _gap(self) -> Gap:
+        return Gap(self.layout, self.kinematics)
+
+    def gap(self, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
+        """Return the greatest distance of a station from its curve node, m; see :class:`Gap`. NaN without a curve."""
+        return self._gap.greatest(q, vertices, torsion, base) if len(self.layout.tracked) else np.nan
+
+    def gap_of(self, state: State) -> float:
+        """Return the same of a state."""
+        return self.gap(state.q, state.control_vertices, state.torsion, self.base_at(state.time))
 
     def base_at(self, time: float) -> Pose | None:
         """Return where the base is at `time`, s; None where it rests."""

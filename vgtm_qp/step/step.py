@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
@@ -50,8 +51,11 @@ class Step:
         True if the only step found was to brake on the arm's previous path, which limited accelerations do not let it
         leave at once.
     gave_way : bool
-        True if stations left the curve, with ``method.tracking_mode`` exact, because the arm got further that way, or
-        are off it while the arm brakes.
+        True if stations are off the curve after the step, with ``method.tracking_mode`` exact, because the arm got
+        further that way, or brakes.
+    gap : float
+        Greatest distance of a station from its curve node after the step, m; where turns are kept as well, at least the
+        greatest turn times the arm's unit. NaN if the step was blocked, or no station tracks a curve in it.
     left_path : bool
         True if the tip left the path while braking, because it is elastic or its base moves on.
     solution, rows, limits
@@ -69,6 +73,7 @@ class Step:
     braked: bool = False
     left_path: bool = False
     gave_way: bool = False
+    gap: float = math.nan
     solution: StepSolution | None = None
     rows: ClearanceRows | None = None
     limits: Limits | None = None

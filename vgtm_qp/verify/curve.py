@@ -111,18 +111,38 @@ class RecordedCurve(NamedTuple):
         return np.asarray(ends[:, 1] - ends[:, 0])
 
 
+def recorded_curve(maneuver: Result) -> RecordedCurve | None:
+    """Return the curve that a maneuver records; None without one."""
+    record, vertices = maneuver.manifest.get("curve"), maneuver.control_vertices.shape[1]
+    return (
+        None
+        if record is None or not vertices
+        else RecordedCurve.of(record, maneuver.nodes.shape[1], vertices)
+    )
+
+
+def greatest_gaps(maneuver: Result) -> Array | None:
+    """Return (T,) the greatest of the gaps in every state, m; None without a curve."""
+    curve = recorded_curve(maneuver)
+    return None if curve is None else gaps(maneuver, curve).max(axis=1)
+
+
+def gaps(maneuver: Result, curve: RecordedCurve) -> Array:
+    """Return (T, K) the distances of the stations from the nodes of their curve in every state, m."""
+    stations = np.einsum("kq,tkqc->tkc", curve.weights, maneuver.nodes[:, curve.stations])
+    return np.asarray(np.linalg.norm(stations - curve.points(maneuver.control_vertices), axis=2))
+
+
 def curve_measures(maneuver: Result, rotation: Array, size: float) -> dict[str, Measure]:
     """Return the measures of a maneuver's curve, whose tip has the attitudes `rotation` (T, 3, 3).
 
     Tolerances are for members or links whose mean length is `size`, m.
     """
-    record, vertices = maneuver.manifest.get("curve"), maneuver.control_vertices
-    if record is None or not vertices.shape[1]:
+    curve, vertices = recorded_curve(maneuver), maneuver.control_vertices
+    if curve is None:
         return {}
-    table, tolerance = Record(record, "manifest.curve"), TRACKING_TOLERANCE * size
-    curve = RecordedCurve.of(record, maneuver.nodes.shape[1], vertices.shape[1])
-    stations = np.einsum("kq,tkqc->tkc", curve.weights, maneuver.nodes[:, curve.stations])
-    off = np.linalg.norm(stations - curve.points(vertices), axis=2)
+    table, tolerance = Record(maneuver.manifest["curve"], "manifest.curve"), TRACKING_TOLERANCE * size
+    off = gaps(maneuver, curve)
     # At home the curve is fitted to the arm, however that is bent.
     moved = off[min(1, len(off) - 1) :]
     row, k = divmod(int(np.argmax(moved)), moved.shape[1])

@@ -14,6 +14,7 @@ from vgtm_qp.curve.families import make_family
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.verify.arm import Arm, arm_of
+from vgtm_qp.verify.curve import TRACKING_TOLERANCE, greatest_gaps
 
 FIXED_COLOUR = (0.70, 0.72, 0.74)
 OBSTACLE_COLOUR = (0.90, 0.62, 0.0)
@@ -212,6 +213,15 @@ def _hidden(obstacles: Sequence[ObstacleMesh], eye: Array, points: Array) -> int
         enters, leaves = crossings[0].max(axis=1), crossings[1].min(axis=1)
         behind |= (enters < leaves) & (enters < 1.0) & (leaves > 0.0)
     return int(behind.sum())
+
+
+def off_curve(maneuver: Result) -> list[str]:
+    """Return how far stations are off the reference curve in each state, as text; empty where they are on it."""
+    gaps = greatest_gaps(maneuver)
+    if gaps is None:
+        return [""] * len(maneuver.time)
+    limit = TRACKING_TOLERANCE * arm_of(maneuver).size
+    return [f"{1000.0 * gap:.3g} mm off the curve" if gap > limit else "" for gap in gaps]
 
 
 def resampled(time: Array, values: Array, at: Array) -> Array:

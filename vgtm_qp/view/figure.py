@@ -28,6 +28,7 @@ from vgtm_qp.view.drawing import (
     POLYGON_COLOUR,
     drawing_of_maneuver,
     heading,
+    off_curve,
     stroke_colours,
     with_surroundings,
 )
@@ -77,7 +78,8 @@ def plot_frames(
     """Return a figure of states of a maneuver side by side, all in the same view and scale.
 
     Members are drawn as thick as they are, grey where fixed and coloured by length where actuated; with them
-    the reference curve, its control polygon, the obstacles, the tip's path so far and the rest of it.
+    the reference curve, its control polygon, the obstacles, the tip's path so far and the rest of it. Where stations
+    are off the curve the title says how far.
 
     Parameters
     ----------
@@ -97,6 +99,8 @@ def plot_frames(
     titles = [f"step {row}, {maneuver.time[row]:.3g} s" for row in rows]
     if 1 < len(rows) <= 26:
         titles = [f"({chr(ord('a') + k)}) {title}" for k, title in enumerate(titles)]
+    off = off_curve(maneuver)
+    titles = [f"{title}\n{off[row]}".strip() for title, row in zip(titles, rows, strict=True)]
     return _View(maneuver, rows, azimuth, elevation).figure(rows, titles)
 
 
@@ -156,7 +160,8 @@ class _View:
         """Return a figure of states side by side."""
         columns = min(3, len(rows)) if len(rows) != 4 else 4
         with mpl.rc_context(_RC):
-            figure, panels, scale = self._panels(len(rows), columns)
+            title_lines = 1 + max(title.count("\n") for title in titles)
+            figure, panels, scale = self._panels(len(rows), columns, _TITLE * title_lines)
             for k, (row, axes, title) in enumerate(zip(rows, panels, titles, strict=True)):
                 at_left, at_bottom = k % columns == 0, k + columns >= len(rows)
                 self._draw_floor(axes, scale, ruler=at_left, labels=at_left and at_bottom)
@@ -166,22 +171,22 @@ class _View:
             self._draw_legend(figure)
         return figure
 
-    def _panels(self, count: int, columns: int) -> tuple[Figure, list[Axes], float]:
-        """Return the figure, one axes a frame at equal scale, and that scale, points a metre."""
+    def _panels(self, count: int, columns: int, title: float) -> tuple[Figure, list[Axes], float]:
+        """Return the figure, one axes a frame at equal scale under a `title` so high, inches, and points a metre."""
         lines = -(-count // columns)
         extent = self.high - self.low
         room = (_WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) / columns
-        height = (_GREATEST_HEIGHT - _FOOT - lines * (_TITLE + _GAP)) / lines
+        height = (_GREATEST_HEIGHT - _FOOT - lines * (title + _GAP)) / lines
         inches = min(room / extent[0], height / extent[1])
         width, tall = extent * inches
-        total = _FOOT + lines * (tall + _TITLE + _GAP)
+        total = _FOOT + lines * (tall + title + _GAP)
         left = (_WIDTH - columns * width - (columns - 1) * _GAP) / 2
         figure = Figure(figsize=(_WIDTH, total))
         panels = []
         for k in range(count):
             line, column = divmod(k, columns)
             x = left + column * (width + _GAP)
-            y = total - (line + 1) * (tall + _TITLE + _GAP) + _GAP
+            y = total - (line + 1) * (tall + title + _GAP) + _GAP
             axes = figure.add_axes((x / _WIDTH, y / total, width / _WIDTH, tall / total))
             axes.set_xlim(self.low[0], self.high[0])
             axes.set_ylim(self.low[1], self.high[1])

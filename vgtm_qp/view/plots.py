@@ -1,4 +1,4 @@
-"""Quantities of a maneuver over time: clearance, strokes, tip error and step time."""
+"""Quantities of a maneuver over time: clearance, strokes, tip error, gap to the curve and step time."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import arm_of
+from vgtm_qp.verify.curve import TRACKING_TOLERANCE, greatest_gaps
 from vgtm_qp.verify.path import TIP_TOLERANCE, tip_error
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -76,17 +78,24 @@ def _draw_strokes(axes: Axes, maneuver: Result) -> None:
 def _draw_tip_error(axes: Axes, maneuver: Result) -> None:
     """Draw the distance of the tip from its target over the tracked axes, m."""
     error = tip_error(maneuver, maneuver.tip_position)
+    _draw_error(axes, maneuver, error, TIP_TOLERANCE)
+    axes.set_ylabel("tip error (m)")
+
+
+def _draw_gap(axes: Axes, maneuver: Result) -> None:
+    """Draw the greatest distance of a station from its node of the reference curve over time, m."""
+    _draw_error(axes, maneuver, greatest_gaps(maneuver), TRACKING_TOLERANCE)
+    axes.set_ylabel("greatest gap to the curve (m)")
+
+
+def _draw_error(axes: Axes, maneuver: Result, error: Array | None, tolerance: float) -> None:
+    """Draw errors (T,), m, if there are any, and their tolerance, which is relative to the arm's size."""
     if error is not None:
         shown = np.maximum(error, _SMALLEST)
         axes.semilogy(maneuver.time, shown, color=_COLOURS[0], marker=".", markersize=3.0)
-    axes.axhline(
-        TIP_TOLERANCE * arm_of(maneuver).size,
-        color="#b91c1c",
-        linestyle="--",
-        linewidth=0.9,
-        label="tolerance",
-    )
-    axes.set(ylabel="tip error (m)", ylim=(_SMALLEST / 2.0, None))
+    level = tolerance * arm_of(maneuver).size
+    axes.axhline(level, color="#b91c1c", linestyle="--", linewidth=0.9, label="tolerance")
+    axes.set_ylim(bottom=_SMALLEST / 2.0)
     axes.legend(frameon=False)
 
 
@@ -113,6 +122,7 @@ _DRAW: dict[str, Callable[[Axes, Result], None]] = {
     "clearance": _draw_clearance,
     "strokes": _draw_strokes,
     "tip error": _draw_tip_error,
+    "tracking gap": _draw_gap,
     "step time": _draw_step_time,
 }
 
