@@ -17,7 +17,8 @@ class StepSolution:
     Attributes
     ----------
     nodes : (N, 3)
-        Displacements of all nodes, base nodes included, m.
+        Displacements of all nodes, base nodes included, m; (0, 3) if one compiled call made the whole move, which
+        keeps them, and those of the control vertices, to itself.
     actuators : (n_a,)
         Changes of the actuated lengths, m.
     vertices : (V, 3)
