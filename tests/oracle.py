@@ -366,7 +366,7 @@ def tracking_error(layout: Layout, X: Array, vertices: Array, frames: Array | No
     `points` (K, 3) and `frames` (K, 3, 3) of the curve; the latter None where it has slopes alone.
     """
     truss, tracked = truss_of(layout.arm), layout.tracked
-    found = [gaps(truss, X, tracked, points).reshape(-1)]
+    found = [np.linalg.norm(gaps(truss, X, tracked, points).reshape(-1, 3), axis=1)]
     if layout.hard_turns:
         rotations = face_rotations(truss, X)[tracked]
         slopes = layout.curve_slopes @ vertices

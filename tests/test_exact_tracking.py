@@ -173,6 +173,49 @@ def test_stations_that_gave_way_come_back_within_a_few_steps():
     assert gaps(resolver).max() < 1e-6
 
 
+def test_a_curve_by_arc_length_stays_near_the_arm_where_it_gives_way():
+    """So great a weight on the whole gap would throw the curve metres away: its rows are linear near the gap alone."""
+    problem = vq.load_problem("beta_spline_past_a_cube").replace(
+        {"maneuver.waypoint": [{"time": 10.0, "position": [1.17, 0.3, 1.95]}], "method.retries": False}
+    )
+    maneuver = vq.solve(problem)
+    assert maneuver.certificate.ok
+    assert 1e-3 < maneuver.certificate.tracking_gap.value < 0.6
+    assert np.abs(maneuver.control_vertices).max() < 5.0
+
+
+def test_an_arm_with_limited_accelerations_leaves_its_curve_only_where_that_takes_more_than_half():
+    problem = vq.load_problem("five_bay_two_cubes_pointing").replace({"truss.acceleration": 0.3})
+    exact, hard = vq.Resolver(problem), vq.Resolver(problem.replace({"method.tracking_mode": "hard"}))
+    left, goal = 0, np.array([1.15, 0.0, 2.2])
+    for _ in range(20):
+        hard.state = exact.state
+        away = goal - exact.tip()[0]
+        asked = {"position": exact.tip()[0] + 0.2 * away / np.linalg.norm(away)}
+        step = exact.step(**asked)
+        if step.gave_way and not step.braked:
+            left += 1
+            assert hard.step(**asked).progress < 0.5 * (1.0 + 1e-9)
+    assert left > 0
+
+
+def test_a_step_counts_all_its_qps_and_a_blocked_one_says_where_stations_are():
+    problem = vq.load_problem("five_bay_blocked_by_wall").replace({"end_effector.mode": "hard"})
+    resolver, steps = vq.Resolver(problem), []
+    goal = np.array(problem.maneuver.waypoint[-1].position)
+    for _ in range(60):
+        away = goal - resolver.tip()[0]
+        steps.append(resolver.step(position=resolver.tip()[0] + 0.08 * away / np.linalg.norm(away)))
+        assert steps[-1].gap == pytest.approx(gaps(resolver).max(), abs=1e-12)
+        if not steps[-1].moved:
+            break
+    assert steps[-1].status == "blocked"
+    assert steps[-1].gave_way == (steps[-1].gap > 1e-7)
+    # On the curve, and off it.
+    assert steps[-1].qps >= 2
+    assert steps[0].qps == 1
+
+
 def test_no_retry_lets_hard_tracking_give_way():
     """Elastic tracking reaches the end of this path; hard tracking does not, whatever else is tried."""
     problem = vq.load_problem("five_bay_two_cubes_pointing").replace(
@@ -191,17 +234,17 @@ def test_no_retry_lets_hard_tracking_give_way():
 
 
 def test_braking_steps_say_whether_stations_are_off_the_curve():
-    resolver = Resolver(
-        vq.load_problem("five_bay_two_cubes").replace({"truss.rate": 0.4, "truss.acceleration": 0.3})
-    )
-    start = resolver.tip()[0]
-    for k in range(1, 4):
-        assert resolver.step(position=start + k * np.array([0.08, 0.0, -0.1]), dt=0.3).moved
+    problem = vq.load_problem("five_bay_two_cubes_pointing").replace({"truss.acceleration": 0.3})
     off = []
-    while (step := resolver.brake()) is not None:
-        assert step.braked
-        off.append(bool(gaps(resolver).max() > 1e-6))
-        assert step.gave_way == off[-1]
+    for count in (2, 14):
+        resolver = Resolver(problem)
+        for _ in range(count):
+            away = np.array([1.15, 0.0, 2.2]) - resolver.tip()[0]
+            resolver.step(position=resolver.tip()[0] + 0.2 * away / np.linalg.norm(away))
+        while (step := resolver.brake()) is not None:
+            assert step.braked
+            off.append(bool(gaps(resolver).max() > 1e-6))
+            assert step.gave_way == off[-1]
     assert True in off
     assert False in off
 
@@ -214,6 +257,38 @@ def hard_result():
         return vq.solve(
             problem.replace({"method.tracking_mode": "hard", "method.retries": False, "maneuver.steps": 10})
         )
+
+
+@pytest.mark.parametrize(
+    ("vertex", "name"), [(0, "curve_start_gap"), (1, "curve_start_angle"), (-1, "curve_end_gap")]
+)
+def test_a_certificate_holds_both_ends_of_the_curve(hard_result, vertex, name):
+    assert getattr(hard_result.certificate, name).value < 1e-9
+    vertices = hard_result.control_vertices.copy()
+    vertices[2:, vertex, 0] += 0.1
+    found = getattr(vq.verify(replace(hard_result, control_vertices=vertices)), name)
+    assert not found.ok
+    assert found.value > 0.05
+
+
+def test_a_certificate_measures_the_turns_that_are_kept_along_the_curve():
+    both = {"method.hard_coordinates": ["position", "pointing"]}
+    kept = vq.solve(vq.load_problem("hexapod_past_a_cube").replace(both))
+    assert kept.certificate.tracking_angle.value < 1e-8
+    problem = vq.load_problem("longeron_past_a_cube").replace(
+        {
+            **both,
+            "method.retries": False,
+            "maneuver.waypoint": [{"time": 10.0, "position": [1.3, 0.0, 2.3]}],
+        }
+    )
+    gave: list[float] = []
+    left = vq.solve(problem, progress=lambda _, step: gave.append(step.gap))
+    measure = left.certificate.tracking_angle
+    assert 1e-3 < measure.value < 0.1
+    assert measure.bound is None
+    # Step.gap is the sine of each tilt times the mean length of members.
+    assert max(gave) == pytest.approx(measure.value, rel=0.3)
 
 
 def last_station_alone(curve):

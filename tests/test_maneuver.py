@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from hypothesis import strategies as st
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem, load_problem
+from vgtm_qp.step.qp_resolver import QPResolver
+from vgtm_qp.step.step import StepStatus
 from vgtm_qp.verify import verify
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
@@ -112,6 +115,21 @@ def test_slow_actuators_take_more_steps_and_more_time():
 
 
 @pytest.mark.smoke
+def test_an_arm_that_covers_half_of_what_is_left_in_each_step_arrives(monkeypatch):
+    """It came within 1e-16 of the end and went on: progress was compared with what was left alone."""
+    follow = QPResolver.follow
+
+    def half(self, path, start, end, *, dt=None):
+        step = follow(self, path, start, start + 0.5 * (end - start), dt=dt)
+        return replace(step, status=StepStatus.SLOWED, progress=0.5 * step.progress)
+
+    monkeypatch.setattr(QPResolver, "follow", half)
+    maneuver = solve(load_problem("five_bay_free").replace({"maneuver.steps": 4}))
+    assert maneuver.status == "solved"
+    assert len(maneuver.time) < 80
+    assert maneuver.certificate.tip_error.value < 1e-8
+
+
 def test_waypoints_are_all_passed():
     data = arm_problem((0.35, 0.0, 1.35), steps=12, time=3.0).to_dict()
     data["maneuver"]["waypoint"].append({"time": 6.0, "position": [0.0, 0.3, 1.4]})

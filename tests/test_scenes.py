@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.study.robustness import draw, features, run, tasks, text
+from vgtm_qp.study.robustness import draw, features, kind_of, run, tasks, text
 from vgtm_qp.study.scenes import MODULES, SAFE, random_scene
 from vgtm_qp.study.varied import varied_scene
 
@@ -39,7 +39,7 @@ def test_scenes_of_a_seed_are_of_every_module_with_and_without_direction_and_rea
 
 def test_the_study_tells_what_was_solved_and_what_stopped_the_rest():
     assert tasks(False, scenes=3, seed=5) == [
-        {"seed": 5, "steps": 30, "number": number, "compiler": compiler}
+        {"seed": 5, "steps": 30, "arms": "trusses", "number": number, "compiler": compiler}
         for number, compiler in ((0, True), (0, False), (1, True), (2, True))
     ]
     rows = [{**task, **run(**task)} for task in tasks(True, scenes=2, seed=0)]
@@ -65,10 +65,40 @@ def test_scenes_of_a_seed_have_everything_that_a_problem_may_say():
     assert varied_scene(3, 0).to_dict() == scenes[0].to_dict()
 
 
-def test_no_scene_of_a_new_seed_is_unsafe_or_ends_without_a_word(rng):
-    """Forty scenes that nobody has seen, by the independent certificate; every tenth without a compiler, too."""
-    seed = int(rng.integers(2**31))
-    rows = [{**task, **run(**task)} for task in tasks(False, scenes=40, seed=seed, steps=12)]
+def test_serial_scenes_have_everything_that_a_problem_may_say_about_serial_arms():
+    scenes = [varied_scene(3, k, arms="serial") for k in range(40)]
+    found = {words for scene in scenes for words in features(scene)}
+    assert found >= {
+        *(
+            "a direction of the tip",
+            "an attitude of the tip",
+            "limited accelerations",
+            "jams",
+            "a moving base",
+        ),
+        *("moving obstacles", "obstacles: sphere", "obstacles: cylinder", "obstacles: mesh", "no curve"),
+        *("a general curve", "tip: scaled", "tip: hard", "tip: elastic"),
+    }
+    assert {kind_of(scene) for scene in scenes} == {"snake", "joints that turn", "joints that turn or slide"}
+    assert {scene.arm.body is None for scene in scenes} == {True, False}
+    assert {any(joint.limits is None for joint in scene.arm.joint) for scene in scenes} == {True, False}
+    assert varied_scene(3, 0, arms="serial").to_dict() == scenes[0].to_dict()
+    for scene in scenes[:8]:
+        setup = build_arm(scene, compiled=False, solves=False)
+        resting = scene.replace(
+            {"obstacle": [{**o, "velocity": (0, 0, 0)} for o in scene.to_dict()["obstacle"]]}
+        )
+        home = build_arm(resting, compiled=False, solves=False).least_clearance(
+            setup.arm.home_configuration, 0.0, "obstacles"
+        )
+        assert home >= scene.clearance.safe
+
+
+@pytest.mark.parametrize("arms", ["trusses", "serial"])
+def test_no_scene_of_a_new_seed_is_unsafe_or_ends_without_a_word(rng, arms):
+    """Scenes that nobody has seen, by the independent certificate; every tenth without a compiler, too."""
+    seed, count = int(rng.integers(2**31)), 40 if arms == "trusses" else 12
+    rows = [{**task, **run(**task)} for task in tasks(False, scenes=count, seed=seed, steps=12, arms=arms)]
     assert [row for row in rows if row["failures"]] == []
     refused = [row for row in rows if row["status"] == "refused"]
     assert all("expected" in row["blocked_by"] for row in refused)

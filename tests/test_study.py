@@ -154,6 +154,12 @@ def test_wilson_intervals_and_exponents() -> None:
     assert exponent(sizes, 3.0 * sizes**1.7) == pytest.approx(1.7)
 
 
+def test_a_loop_of_a_serial_arm_keeps_everything() -> None:
+    row = loops.run(11, 4, 30, arms="serial")
+    assert row["reached"] + row["slowed"] + row["blocked"] == 30
+    assert not row["failures"]
+
+
 def test_a_loop_counts_its_steps_and_what_breaks_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     row = loops.run(7, 5, 20)
     assert row["reached"] + row["slowed"] + row["blocked"] == 20

@@ -39,10 +39,12 @@ OPTIONS = {
 """Of the studies that take any."""
 COMMANDS = {
     **{name: f"vgtm study {name} {OPTIONS.get(name, '')}".strip() for name in STUDIES},
+    "serial": "vgtm study robustness --arms serial --scenes 300 --seed 20261129",
     "bench": "vgtm bench --seconds 0.7",
 }
 SHORT = {
     **{name: f"vgtm study {name} --short" for name in STUDIES},
+    "serial": "vgtm study robustness --arms serial --short",
     "bench": "vgtm bench --scene cubes --bays 5 --tracking elastic --seconds 0.1 --steps 20 --baselines eq28",
 }
 
@@ -55,7 +57,8 @@ def marks(name: str) -> tuple[str, str]:
 def made(name: str, folder: Path, workers: int, *, short: bool = False) -> str:
     """Return the tables that a command prints, and where they were made."""
     words = (SHORT if short else COMMANDS)[name].split()
-    if name in STUDIES:
+    study = words[2] if words[1] == "study" else None
+    if study:
         words += ["--workers", str(workers), "--output", str(folder)]
     program = [sys.executable, "-c", "import sys; from vgtm_qp.cli import main; sys.exit(main(sys.argv[1:]))"]
     path = os.pathsep.join(part for part in (str(ROOT), os.environ.get("PYTHONPATH")) if part)
@@ -63,7 +66,7 @@ def made(name: str, folder: Path, workers: int, *, short: bool = False) -> str:
     done = subprocess.run(
         [*program, *words[1:]], check=True, stdout=subprocess.PIPE, text=True, env=environment
     )
-    found = (folder / name / f"{name}.md").read_text() if name in STUDIES else done.stdout
+    found = (folder / study / f"{study}.md").read_text() if study else done.stdout
     return re.sub(r"\A## .*\n+", "", found).strip()
 
 

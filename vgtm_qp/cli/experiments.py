@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -108,6 +108,10 @@ def study(
     seed: Annotated[
         int | None, Parameter(help="seed of the random scenes, of tracking, robustness and loops")
     ] = None,
+    arms: Annotated[
+        Literal["trusses", "serial"] | None,
+        Parameter(help="arms of the random scenes, of robustness and loops: trusses by default"),
+    ] = None,
     output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
     json: Json = False,
 ) -> int:
@@ -128,7 +132,8 @@ def study(
     for option, value in (("--workers", workers), ("--scenes", scenes)):
         if value is not None and value < 1:
             raise GoalError(f"{option} must be 1 or more, not {value}")
-    options = {key: value for key, value in (("scenes", scenes), ("seed", seed)) if value is not None}
+    given = {"scenes": scenes, "seed": seed, "arms": arms}
+    options = {key: value for key, value in given.items() if value is not None}
     for name in titles:
         study_tasks(name, short=short, **options)
     written: list[dict[str, str]] = []

@@ -122,7 +122,14 @@ class Curve:
 
     def length(self, s: ArrayLike = 1.0) -> Array:
         """Arc length from 0 to s, m: (...)."""
-        return self._integral(lambda w1, _: np.linalg.norm(w1 @ self.control_vertices, axis=-1), s)
+        return self._from_cells(self._speed_of, s, self._lengths, (1,))
+
+    @cached_property
+    def _lengths(self) -> Array:
+        return self._over_cells(self._speed_of, (1,))
+
+    def _speed_of(self, w1: Array) -> Array:
+        return np.asarray(np.linalg.norm(w1 @ self.control_vertices, axis=-1))
 
     def arc_parameter(self, fraction: ArrayLike) -> Array:
         """Parameters s at which these fractions, 0 to 1, of the whole arc length are reached: (...).
@@ -133,8 +140,7 @@ class Curve:
         fraction = np.asarray(fraction, dtype=float)
         if not np.all((fraction >= 0.0) & (fraction <= 1.0)):
             raise CurveError("fractions of the arc length must be within 0 to 1")
-        cells = self._cells
-        lengths = self.length(cells)
+        cells, lengths = self._cells, self._lengths
         goal = fraction.ravel() * lengths[-1]
         cell = np.clip(np.searchsorted(lengths, goal, side="right") - 1, 0, len(cells) - 2)
         low, high = cells[cell], cells[cell + 1]
@@ -259,24 +265,33 @@ class Curve:
 
     def _integral(self, integrand: Callable[[Array, Array], Array], s: ArrayLike) -> Array:
         """Integrate a function of the tables w', w'' over 0 to s; its values may have further axes."""
-        s = np.asarray(s, dtype=float)
-        flat, cells = np.clip(s.ravel(), 0.0, 1.0), self._cells
-        nodes, weights = self.family.gauss
+        return self._from_cells(integrand, s, self._over_cells(integrand, (1, 2)), (1, 2))
 
-        def over(widths: Array, *tables: Array) -> Array:
-            return np.asarray((np.tensordot(weights, integrand(*tables), axes=(0, 1)).T * widths).T)
-
-        tables = self.family.quadrature
+    def _over_cells(self, integrand: Callable[..., Array], orders: tuple[int, ...]) -> Array:
+        """Return the integrals (C + 1, ...) of a function of tables of these `orders` until the end of each cell."""
+        cells, tables = self._cells, [self.family.quadrature[order - 1] for order in orders]
         if cells is not self.family.cells:
-            inside = within(cells, nodes)
-            tables = self.family.weights(inside, 1), self.family.weights(inside, 2)
-        whole = over(np.diff(cells), *tables)
-        until = np.concatenate([np.zeros((1, *whole.shape[1:])), np.cumsum(whole, axis=0)])
+            inside = within(cells, self.family.gauss[0])
+            tables = [self.family.weights(inside, order) for order in orders]
+        whole = self._quadrature(np.diff(cells), integrand(*tables))
+        return np.concatenate([np.zeros((1, *whole.shape[1:])), np.cumsum(whole, axis=0)])
+
+    def _from_cells(
+        self, integrand: Callable[..., Array], s: ArrayLike, until: Array, orders: tuple[int, ...]
+    ) -> Array:
+        """Return the integral over 0 to s, with the integrals `until` the end of each cell."""
+        s, cells = np.asarray(s, dtype=float), self._cells
+        flat = np.clip(s.ravel(), 0.0, 1.0)
         cell = np.clip(np.searchsorted(cells, flat, side="right") - 1, 0, len(cells) - 2)
         rest = flat - cells[cell]
-        points = cells[cell, None] + rest[:, None] * nodes
-        total = until[cell] + over(rest, self.family.weights(points, 1), self.family.weights(points, 2))
+        points = cells[cell, None] + rest[:, None] * self.family.gauss[0]
+        values = integrand(*(self.family.weights(points, order) for order in orders))
+        total = until[cell] + self._quadrature(rest, values)
         return np.asarray(total.reshape(s.shape + total.shape[1:]))
+
+    def _quadrature(self, widths: Array, values: Array) -> Array:
+        """Integrate `values` (n, G, ...) at Gauss points of intervals of some `widths` (n,): (n, ...)."""
+        return np.asarray((np.tensordot(self.family.gauss[1], values, axes=(0, 1)).T * widths).T)
 
 
 def straight_curve(family: CurveFamily, start: ArrayLike, end: ArrayLike) -> Curve:

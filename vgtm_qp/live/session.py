@@ -12,7 +12,7 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.methods import PRESETS, Resolver
 from vgtm_qp.problem import Problem
-from vgtm_qp.rows.curve import free_basis
+from vgtm_qp.rows.curve import fitted
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
@@ -28,9 +28,6 @@ _RETRY_AFTER = 10
 
 _WEIGHTS = {key for changes in PRESETS.values() for key in changes if key.count(".") == 2}
 """Keys of the weights and gains that some methods bring with them."""
-
-_STRAIGHTENS = 1e-6
-"""Weight that makes a fitted curve as straight as the stations let it be."""
 
 
 class Reading(NamedTuple):
@@ -214,10 +211,6 @@ def _with_curve(state: State, setup: Setup) -> State:
     if not layout.vertices:
         return replace(state, control_vertices=np.zeros((0, 3)), torsion=np.zeros(0))
     centres = stations.centres(state.nodes)
-    basis = free_basis(stations.frames[0][:, 2], 3 * layout.vertices)
-    second = np.diff(np.eye(layout.vertices), n=2, axis=0)
-    rows = np.kron(np.vstack([layout.curve_weights, _STRAIGHTENS * second]), np.eye(3)) @ basis
-    away = np.vstack([centres[layout.tracked] - centres[0], np.zeros((len(second), 3))])
-    free = np.linalg.lstsq(rows, away.ravel(), rcond=None)[0]
-    vertices = centres[0] + (basis @ free).reshape(-1, 3)
+    normal = stations.frames[0][:, 2]
+    vertices = fitted(layout.curve_weights, centres[layout.tracked], centres[0], normal)
     return replace(state, control_vertices=frozen(vertices), torsion=frozen(setup.torsion))

@@ -30,6 +30,8 @@ from vgtm_qp.verify import verify as check
 STALLED_PROGRESS = 1e-2
 """Progress of a step, as a share of it, below which the arm hardly moves; it gives up after so many such steps."""
 STALLED_STEPS = 5
+_NOTHING_LEFT = 1e-9
+"""Share of the path that is left of a piece of which nothing is left to cover."""
 _FURTHER = 1e-3
 """Share of the whole path by which a retry must get further than another to be the better one."""
 
@@ -221,9 +223,11 @@ class _Attempt:
 
     def _advance(self, aim: float, step: Step) -> None:
         """Record a step towards `aim`."""
-        reached = step.status is StepStatus.REACHED
-        self.value = aim if reached else self.value + step.progress * (aim - self.value)
-        self.log.add(step, self.plan.path.pose(self.value), self.progress)
+        path, rest = self.plan.path, (1.0 - step.progress) * (aim - self.value)
+        # An arm that covers a half of what is left in each step would never be there.
+        is_there = step.status is StepStatus.REACHED or rest <= _NOTHING_LEFT * (path.end - path.start)
+        self.value = aim if is_there else self.value + step.progress * (aim - self.value)
+        self.log.add(step, path.pose(self.value), self.progress)
 
 
 def _retry(

@@ -98,7 +98,7 @@ def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX])
         hard = [ca.DM(mask[k].astype(float)) for mask in (layout.hard_gaps, layout.hard_tilts)]
         # Corrections close hard rows too, and these have no weight.
         closed = [mask + (1.0 - mask) * motion for mask in hard]
-        rows = station(*graph.station(k), moving, every, graph.normal, *closed)
+        rows = station(*graph.station(k), moving, every, graph.normal, *closed, *hard)
         weighed = [mask + (1.0 - mask) * scale for mask, scale in zip(hard, scales, strict=True)]
         gap, tilt = (ca.repmat(w, 1, row.shape[1]) * row for w, row in zip(weighed, rows, strict=True))
         gaps.append(gap)
@@ -134,11 +134,13 @@ def _condensed_station(layout: Layout, actuators: int) -> ca.Function:
     )
     centre, turned = ca.kron(station.weights.T, ca.SX.eye(3)) @ moving, station.face @ moving
     gap_curve, turn_curve, gap_offset, turn_offset = station.over_curve(offset, normal)
-    gap = gap_on * station.gap + centre[:, -1] + gap_offset
-    turn = turn_on * station.turn + turned[:, -1] + turn_offset
+    hard = ca.SX.sym("hard_gap", 3), ca.SX.sym("hard_turn", layout.turns)
+    drawn_gap, drawn_turn = station.drawn(*hard)
+    gap = gap_on * drawn_gap + centre[:, -1] + gap_offset
+    turn = turn_on * drawn_turn + turned[:, -1] + turn_offset
     results = [
         ca.horzcat(centre[:, :-1], gap_curve, gap),
         ca.horzcat(turned[:, :-1], turn_curve, turn),
     ]
-    inputs = [*station.inputs, moving, offset, normal, gap_on, turn_on]
+    inputs = [*station.inputs, moving, offset, normal, gap_on, turn_on, *hard]
     return ca.Function("curve_node", inputs, [ca.densify(result) for result in results])

@@ -194,6 +194,21 @@ class StationSymbols:
             self.turn, c = tracking.turns(rotation, frame.T, layout.turns)
             self._position, self._turned = position_rows.T, -c @ spin_rows.T
         self.gap, self.face = tracking.gap(nodes @ self.weights, point), c @ spin
+        self._reaches = layout.reach, layout.reach / layout.arm.unit
+
+    def drawn(self, hard_gap: Any, hard_turn: Any) -> tuple[Any, Any]:
+        """Return gap (3,) and turn (R,), those that are not equalities within the reach of a step.
+
+        The masks `hard_gap` (3,) and `hard_turn` (R,) say which are.
+        """
+        both = (self.gap, hard_gap), (self.turn, hard_turn)
+        if not np.isfinite(self._reaches[0]):
+            return self.gap, self.turn
+        gap, turn = (
+            mask * error + (1.0 - mask) * tracking.within(error, reach)
+            for (error, mask), reach in zip(both, self._reaches, strict=True)
+        )
+        return gap, turn
 
     def over_curve(self, offset: ca.SX, normal: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         """Return the rows (3, q) and (R, q) of gap and turn over the curve's free coordinates.

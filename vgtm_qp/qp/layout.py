@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -33,6 +34,9 @@ def with_angles(weights: Weights, arm: Arm) -> Weights:
     return weights.model_copy(update={"tangent": area * weights.tangent, "roll": area * weights.roll})
 
 
+_REACH = 0.03
+"""Share of the arm's unit by which a step draws such a gap back."""
+
 _FIRM = 1e3
 """Least weight of gaps that give way: far above the terms of the null space, so that only other rows open them."""
 
@@ -58,6 +62,8 @@ class Layout:
         With those of squared angles in m^2/rad^2, see :func:`with_angles`.
     hard_turns : bool
         The stations' turns as equalities too, beside their positions.
+    reach : float
+        Greatest part of a gap that is not an equality, m, or of a turn times the arm's unit, that a step draws back.
     shape : CurveShape or None
         How the curve's nodes are placed; None for a curve that constant tables describe.
     vertex_goals : tuple of int
@@ -73,6 +79,7 @@ class Layout:
     hard_tracking: bool = False
     elastic_tip: bool = False
     hard_turns: bool = False
+    reach: float = math.inf
     shape: CurveShape | None = None
     vertex_goals: tuple[int, ...] = ()
 
@@ -80,14 +87,16 @@ class Layout:
         """Return the layout in which what hard tracking holds at stations gives way where other rows leave no choice.
 
         Its weights draw stations back within a few steps; the weights of elastic tracking would leave them where they
-        are.
+        are. A step draws them by no more than a share of the arm's unit: so great a weight on the whole of a gap would
+        pay for motions beyond what is linear.
         """
         weights, firm = self.weights, {"tracking": _FIRM}
         if self.hard_turns:
             firm |= dict.fromkeys(("tangent", "roll"), _FIRM * self.arm.unit**2)
         least = {key: max(value, getattr(weights, key)) for key, value in firm.items()}
         weights = weights.model_copy(update=least)
-        return replace(self, hard_tracking=False, hard_turns=False, weights=weights)
+        reach = _REACH * self.arm.unit
+        return replace(self, hard_tracking=False, hard_turns=False, weights=weights, reach=reach)
 
     @cached_property
     def node_column(self) -> Index:
@@ -260,7 +269,9 @@ class Layout:
 
         Keys: ``breaks``, ``extraction``, ``nodes`` and ``by_arc_length`` of the curve, see ``CurveFamily`` and
         ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``, whether they are
-        kept on the curve; ``ends_at_tip``, ``ends_along_tip``.
+        kept on the curve, and ``frames``, those of the stations at home whose normals are kept along it, or none;
+        ``start``, ``start_weights``, ``normal``, the same of the base and its normal at home; ``ends_at_tip``,
+        ``ends_along_tip``.
         """
         if self.shape is None:
             return None
@@ -274,6 +285,10 @@ class Layout:
             "stations": stations.nodes[self.tracked][:, used].tolist(),
             "weights": stations.weights[self.tracked][:, used].tolist(),
             "held": self.hard_tracking,
+            "frames": stations.frames[self.tracked].tolist() if self.hard_turns else [],
+            "start": stations.nodes[0, used].tolist(),
+            "start_weights": stations.weights[0, used].tolist(),
+            "normal": stations.frames[0][:, 2].tolist(),
             "ends_at_tip": self.ends_at_tip,
             "ends_along_tip": self.ends_along_tip,
         }

@@ -167,9 +167,16 @@ def linear_function(layout: Layout) -> Bound:
     blocks: list[list[ca.MX]] = [[none], [none], [none], [none]]
     if layout.vertices:
         station = StationSymbols(layout)
-        results = [station.gap, station.turn, station.face, station.curve]
-        function = ca.Function("station", station.inputs, [ca.densify(result) for result in results])
-        found = [function(*graph.station(k)) for k in range(len(layout.tracked))]
+        hard = [ca.SX.sym("hard_gap", 3), ca.SX.sym("hard_turn", layout.turns)]
+        results = [*station.drawn(*hard), station.face, station.curve]
+        function = ca.Function(
+            "station", [*station.inputs, *hard], [ca.densify(result) for result in results]
+        )
+        masks = layout.hard_gaps.astype(float), layout.hard_tilts.astype(float)
+        found = [
+            function(*graph.station(k), *(ca.DM(mask[k]) for mask in masks))
+            for k in range(len(layout.tracked))
+        ]
         blocks = [list(column) for column in zip(*found, strict=True)]
     outputs = [
         symbols.quantities(graph.q),

@@ -92,6 +92,10 @@ class Certificate:
     tracking_gap, states_off_curve : Measure
         Greatest distance of a station from its node on the reference curve, m, and the share of the states in which it
         is more than 1e-6 of the mean member or link; but for the home pose, to which the curve is fitted.
+    tracking_angle : Measure
+        Greatest angle between a station's normal and the curve, rad, where the method keeps these, too.
+    curve_start_gap, curve_start_angle : Measure
+        Greatest distance of the curve's start from the base, m, and angle from the base's normal, rad.
     curve_end_gap, curve_end_angle : Measure
         Greatest distance of the curve's end from the end effector, m, and angle between their directions, rad, where
         the method ties them.
@@ -120,6 +124,9 @@ class Certificate:
     tip_error_per_millimetre: Measure
     tracking_gap: Measure = Measure(None, "m")
     states_off_curve: Measure = Measure(None, "of the states")
+    tracking_angle: Measure = Measure(None, "rad")
+    curve_start_gap: Measure = Measure(None, "m")
+    curve_start_angle: Measure = Measure(None, "rad")
     curve_end_gap: Measure = Measure(None, "m")
     curve_end_angle: Measure = Measure(None, "rad")
     fcl_rows: Measure = Measure(None, "")

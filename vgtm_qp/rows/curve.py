@@ -10,6 +10,10 @@ import numpy as np
 from vgtm_qp.arrays import Array
 
 _TINY = 1e-300
+_STRAIGHTENS = 1e-6
+"""Weight that makes a fitted curve as straight as its points let it be."""
+_LEAST_FIRST = 0.1
+"""Least length of the first leg of a fitted curve, as a share of a leg of a straight one."""
 
 
 def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
@@ -37,6 +41,25 @@ def legs(vertices: Any, normal: Any, least: Any, *, both: bool) -> tuple[Any, An
         lengths.append(ca.norm_2(last))
         axes.append(last / ca.fmax(lengths[1], _TINY))
     return ca.horzcat(*axes), ca.fmin(least - ca.vertcat(*lengths), 0.0)
+
+
+def fitted(weights: Array, points: Array, start: Array, normal: Array) -> Array:
+    """Return (V, 3) the vertices of the straightest curve from `start` (3,), along `normal` (3,), through `points`.
+
+    These are (K, 3), m, and met at the curve nodes with `weights` (K, V) as well as they can be.
+    """
+    vertices = weights.shape[1]
+    basis = free_basis(normal, 3 * vertices)
+    second = np.diff(np.eye(vertices), n=2, axis=0)
+    rows = np.kron(np.vstack([weights, _STRAIGHTENS * second]), np.eye(3)) @ basis
+    away = np.vstack([points - start, np.zeros((len(second), 3))]).ravel()
+    free = np.linalg.lstsq(rows, away, rcond=None)[0]
+    least = _LEAST_FIRST * float(np.linalg.norm(points[-1] - start)) / max(vertices - 1, 1)
+    if free[0] < least:
+        # It must not begin backwards.
+        rest = np.linalg.lstsq(rows[:, 1:], away - least * rows[:, 0], rcond=None)[0]
+        free = np.concatenate([[least], rest])
+    return np.asarray(start + (basis @ free).reshape(-1, 3))
 
 
 def free_basis(normal: Array, size: int) -> Array:

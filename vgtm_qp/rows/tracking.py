@@ -29,6 +29,12 @@ def turns(rotation: Any, frame: Any, count: int) -> tuple[Any, Any]:
     return ca.vertcat(*residual), ca.horzcat(*along).T
 
 
+def within(error: Any, reach: float) -> Any:
+    """Return an error, shortened to the length `reach`: what one step is to make good of it."""
+    square = ca.dot(error, error)
+    return error * ca.fmin(1.0, reach / ca.sqrt(ca.fmax(square, (1e-3 * reach) ** 2)))
+
+
 def slope_rows(rotation: Any, slope: Any) -> tuple[Any, Any, Any]:
     """Return the two tilts (2,), c (2, 3) as :func:`turns` does, and the tilts' rows (2, 3) over the slope r' (3,).
 

@@ -70,7 +70,7 @@ class Advancer:
         once, are refused. The step takes `dt`, s; shares below `smallest` are not tried.
         """
         best: Advance | None = None
-        too_long = ""
+        too_long, before = "", self._attempt.qps
         for found in self._attempts(state, target, dt, smallest):
             if found.step.reason.startswith(TOO_LONG):
                 too_long = found.step.reason
@@ -78,7 +78,8 @@ class Advancer:
                 best, worst = found, found.rank - 1
                 if not found.rank:
                     break
-        return best or Advance(_blocked(found.step, state, too_long or found.step.reason or _OFF_PATH), None)
+        last = best or Advance(_blocked(found.step, state, too_long or found.step.reason or _OFF_PATH), None)
+        return last._replace(step=replace(last.step, qps=self._attempt.qps - before))
 
     def _attempts(self, state: State, target: Target, dt: float, smallest: float) -> Iterator[Advance]:
         """Yield the attempts at a target: the whole piece, halves of it if the tip may slow down, and creeping.
@@ -141,7 +142,8 @@ class Advancer:
         tracking: Tracking = Tracking.EITHER,
     ) -> Advance:
         """Return a step towards a target that is a `share` of the one that progress refers to."""
-        step = self._attempt.run(state, target, share, tracking=tracking)
+        enough = _LEAST_HELD if self._tip_mode == "scaled" else WHOLE
+        step = self._attempt.run(state, target, share, tracking=tracking, enough=enough)
         if not step.moved:
             return Advance(step, None)
         if tracking is Tracking.HARD and step.progress * share < _LEAST_HELD:

@@ -39,6 +39,9 @@ _MOTION_MARGIN = 2.5
 _TOO_FAR = 1e3
 """Displacement of a node, over the arm's length, from which on the answer of a QP shows a singular pose."""
 
+_LEAP = 1.0
+"""Greatest displacement of a control vertex's coordinate in one step, over the arm's length."""
+
 _DEVIATION = 0.1
 """Greatest deviation of points from their chords in one step, over the arm's length."""
 
@@ -48,8 +51,8 @@ _SETTLING = 5e-3
 _NOTHING = 1e-9
 """Progress of a QP below which its corrections may go further than it did."""
 
-_FURTHER = 1e-6
-"""Least gain in progress for which stations leave the curve."""
+_FURTHER = 1.25
+"""Least ratio of progresses for which stations leave the curve."""
 
 
 class Tracking(Enum):
@@ -79,13 +82,20 @@ class Phases:
 
 
 class Attempt:
-    """Tries one piece of path from one state; keeps the workspaces."""
+    """Tries one piece of path from one state; keeps the workspaces.
+
+    Attributes
+    ----------
+    qps : int
+        QPs solved so far.
+    """
 
     def __init__(self, setup: Setup, separation: Separation, actuation: Actuation) -> None:
         self._arm, self._influence = setup.arm, setup.influence
         self._has_limit, self._too_long = setup.step_limit < np.inf, setup.too_long
         self.separation = separation
         self.phases = Phases("distance", "qp", "correction", "acceptance")
+        self.qps = 0
         arm = setup.arm
         self.accuracy = Accuracy(
             actuation.tolerance, tip=1e-8 * arm.unit, start=_SETTLING * arm.height, tracking=1e-7 * arm.unit
@@ -110,21 +120,23 @@ class Attempt:
         *,
         progress: float = 0.0,
         tracking: Tracking = Tracking.EITHER,
+        enough: float = WHOLE,
     ) -> Step:
         """Return the step from `state` along the target's piece of path, with its progress on that piece.
 
         The motion of the step before, times `share`, predicts the motion of this one. `progress` is the part of the
-        piece that is covered at the start.
+        piece that is covered at the start. Stations that may leave the curve do so only if they do not get as far as
+        is `enough` on it.
         """
         self.phases.start()
         elastic, piece = self._setup.elastic, (state, target, share, progress)
         if elastic is not None and tracking is Tracking.ELASTIC:
             return self._separated(*piece, elastic())
         step = self._separated(*piece, self._setup.engine)
-        if elastic is None or tracking is Tracking.HARD or (step.moved and step.progress >= WHOLE):
+        if elastic is None or tracking is Tracking.HARD or (step.moved and step.progress >= enough):
             return step
         other = self._separated(*piece, elastic())
-        return other if not step.moved or other.progress > step.progress + _FURTHER else step
+        return other if not step.moved or other.progress > _FURTHER * step.progress else step
 
     def _separated(
         self,
@@ -214,6 +226,7 @@ class Attempt:
                 at = q, q, move.vertices, move.torsion
                 asked = QPInput(*at, target, target.goal(move.progress), move.progress, near, False)
             phases.add("distance")
+            self.qps += 1
             try:
                 move = engine.move(asked, self.accuracy, phases.add)
             except AnswerError as error:
@@ -232,6 +245,9 @@ class Attempt:
             is_finite = move.closed is not None or np.isfinite(q).all()
             if not move.furthest < _TOO_FAR * self._arm.height or not is_finite:
                 return blocked("singular pose")
+            leap = np.abs(move.vertices - state.control_vertices).max(initial=0.0)
+            if not leap < _LEAP * self._arm.height:
+                return blocked("the curve moves too far in one step")
             # A pair that one correction pushed apart must stay listed for the next, or two corrections alternate.
             reach = max(reach, move.furthest)
             if move.closed is None:

@@ -127,7 +127,7 @@ class Brakes:
     def _done(self, state: State, path: Path, start: float, end: float, box: Box, progress: float) -> Step:
         """Return the attempt at a piece of path of which the tip has already covered `progress`."""
         target = self.shaping.target(state, self.dt, path, start, end, box)
-        return self.attempt.run(state, target, progress=progress)
+        return self.attempt.run(state, target, progress=progress, enough=0.0)
 
     def _along(self, state: State, path: Path, value: float, piece: float, until: float) -> Steps | None:
         """Brake on the path, and stay on it until a time, s.

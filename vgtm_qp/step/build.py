@@ -29,14 +29,12 @@ from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_stage
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, dense_solver, make_solver
 from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
 from vgtm_qp.step.path import base_motion
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import TipTask
-
-_STRAIGHTENS = 1e-6
-"""Weight that makes a curve as straight as the stations of a bent arm let it be."""
 
 _CONDENSED_ALL_THE_SAME = (
     "elastic end effector: the elimination along the bays does not know its slacks, so the QP is condensed onto the "
@@ -150,7 +148,8 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
     centres = stations.centres(arm.home)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
     fractions = travelled[tracked] / travelled[-1]
-    s, vertices = _fitted(family, fractions, centres[0], centres[tracked])
+    normal = stations.frames[0][:, 2]
+    s, vertices = _fitted(family, fractions, centres[0], centres[tracked], normal)
     torsion = np.zeros(spec.torsion_vertices)
     tracks_roll = bool(torsion.size) or (is_hard and "orientation" in method.hard_coordinates)
     roll = None
@@ -192,25 +191,23 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
     return HomeCurve(layout, vertices, torsion, goals)
 
 
-def _fitted(family: CurveFamily, fractions: Array, start: Array, points: Array) -> tuple[Array, Array]:
+def _fitted(
+    family: CurveFamily, fractions: Array, start: Array, points: Array, normal: Array
+) -> tuple[Array, Array]:
     """Return s_k (K,) and control vertices (V, 3) at home: on the straight axis, or fitted to the faces of a bent arm.
 
-    `fractions` (K,) are those of the length from `start` (3,) through the `points` (K, 3) at each point.
+    `fractions` (K,) are those of the length from `start` (3,) through the `points` (K, 3) at each point; the curve of
+    a bent arm begins along the base's `normal` (3,).
     """
     end, length = points[-1], float(np.linalg.norm(points[-1] - start))
     straight = straight_curve(family, start, end)
     off = points - start - fractions[:, None] * (end - start)
-    if np.abs(off).max() <= 1e-9 * length:
+    aside = np.linalg.norm(np.cross(normal, end - start))
+    if np.abs(off).max() <= 1e-9 * length and aside <= 1e-9 * length:
         # Families without linear precision run along the axis at a varying speed.
         even = np.abs(straight.position(fractions) - points).max() <= 1e-12 * length
         return fractions if even else straight.arc_parameter(fractions), straight.control_vertices
-    weights = family.weights(fractions)
-    second = np.diff(np.eye(family.control_vertices), n=2, axis=0)
-    system = np.vstack([weights[:, 1:], _STRAIGHTENS * second[:, 1:]])
-    known = np.vstack(
-        [points - np.outer(weights[:, 0], start), -_STRAIGHTENS * np.outer(second[:, 0], start)]
-    )
-    return fractions, np.vstack([start, np.linalg.lstsq(system, known, rcond=None)[0]])
+    return fractions, curve_rows.fitted(family.weights(fractions), points, start, normal)
 
 
 def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mistake]:

@@ -139,7 +139,7 @@ class QPResolver(Resolver, serves="qp"):
         if step.moved:
             self._state, self._braking = step.state, braking
             return step.over(whole, limits)
-        step = step.over(0.0, limits)
+        step = self._attempt.with_gap(step.over(0.0, limits))
         return step if brake is None else self._brake(brake, path, start, end, step)
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:

@@ -44,7 +44,7 @@ class Step:
     reason : str
         Why the step was cut short; empty if it was not.
     qps : int
-        QPs solved.
+        QPs solved, those of attempts that were not accepted among them.
     solver_failed : bool
         True if the step was blocked only because the QP solver gave no accurate answer.
     braked : bool
@@ -52,10 +52,10 @@ class Step:
         leave at once.
     gave_way : bool
         True if stations are off the curve after the step, with ``method.tracking_mode`` exact, because the arm got
-        further that way, or brakes.
+        further that way, or brakes, or because a blocked arm stood there before.
     gap : float
         Greatest distance of a station from its curve node after the step, m; where turns are kept as well, at least the
-        greatest turn times the arm's unit. NaN if the step was blocked, or no station tracks a curve in it.
+        greatest turn times the arm's unit. NaN if no station tracks a curve in it.
     left_path : bool
         True if the tip left the path while braking, because it is elastic or its base moves on.
     solution, rows, limits

@@ -16,11 +16,12 @@ from vgtm_qp.errors import ProblemError
 from vgtm_qp.maneuver.log import Log
 from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
+from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.study.drawing import label, panels, select
-from vgtm_qp.study.robustness import SEED, features
-from vgtm_qp.study.varied import varied_scene
+from vgtm_qp.study.robustness import SEED, features, kind_of
+from vgtm_qp.study.varied import Arms, varied_scene
 from vgtm_qp.study.workers import Row, Task
 from vgtm_qp.verify import verify
 
@@ -36,22 +37,24 @@ _STRIDE = (1e-4, 1e-2)
 """How far goals move in a step, as a share of the arm's height."""
 
 
-def tasks(short: bool, *, scenes: int | None = None, seed: int = SEED, steps: int = 250) -> list[Task]:
+def tasks(
+    short: bool, *, scenes: int | None = None, seed: int = SEED, steps: int = 250, arms: Arms = "trusses"
+) -> list[Task]:
     """Return one task a loop of so many steps."""
     count = scenes if scenes is not None else 3 if short else 400
-    scene = {"seed": seed, "steps": min(steps, 40) if short else steps}
+    scene = {"seed": seed, "steps": min(steps, 40) if short else steps, "arms": arms}
     return [{**scene, "number": k} for k in range(count)]
 
 
-def run(seed: int, number: int, steps: int) -> Row:
+def run(seed: int, number: int, steps: int, arms: Arms = "trusses") -> Row:
     """Run one loop and return its row.
 
     Keys: ``module``, ``features`` of the scene; how many steps were ``reached``, ``slowed`` and ``blocked``; the
     ``goals`` that were met; ``failures`` of the independent check of all states and of what is between them; and CPU
     ``seconds`` of the steps alone.
     """
-    problem = varied_scene(seed, number)
-    found: Row = {"module": problem.to_dict()["truss"]["module"], "features": features(problem)}
+    problem = varied_scene(seed, number, arms=arms)
+    found: Row = {"module": kind_of(problem), "features": features(problem)}
     random, started = np.random.default_rng([seed, number, 2]), process_time()
     dt = float(random.choice(_PERIODS))
     if {"limited accelerations", "a moving base"} <= set(found["features"]):
@@ -91,7 +94,7 @@ class _Goals:
         self._start = self._end = self._home
         self._shares: Array = np.zeros(0)
         self._left = 0
-        self._pointing = self._rotation[:, 2]
+        self._pointing, self._turn = self._rotation[:, 2], np.zeros(3)
 
     def next(self) -> dict[str, Any]:
         """Return the arguments of the next step."""
@@ -104,6 +107,8 @@ class _Goals:
             goal["position"] = None
         if task.turns != "pointing":
             goal["pointing"] = None
+        if task.turns == "orientation":
+            goal["rotation_vector"] = self._turn
         return goal
 
     def _set(self) -> None:
@@ -119,7 +124,9 @@ class _Goals:
             way *= min(1.0, self._left * stride / float(np.linalg.norm(way)))
             self._shares = np.arange(1, self._left + 1) / self._left
         self._end = self._start + way
-        self._pointing = self._rotation[:, 2] + 0.3 * random.normal(size=3)
+        tilt = 0.3 * random.normal(size=3)
+        self._pointing = self._rotation[:, 2] + tilt
+        self._turn = vector_from_rotation(rotation_from_vector(tilt) @ self._rotation)
 
     def note(self, step: Step) -> bool:
         """Take note of the step towards what `next` gave, and return whether a goal is met with it."""
@@ -134,12 +141,17 @@ def _pose(resolver: Resolver) -> Pose:
 
 def _along(problem: Problem, targets: Sequence[Pose]) -> Problem:
     """Return the problem with the path that a loop took: it was not known before."""
-    turns = "pointing" in problem.to_dict()["end_effector"]["track"]
+    track = problem.to_dict()["end_effector"]["track"]
     waypoints = [
         {
             "time": float(k + 1),
             "position": target.position.tolist(),
-            **({"pointing": target.rotation[:, 2].tolist()} if turns else {}),
+            **({"pointing": target.rotation[:, 2].tolist()} if "pointing" in track else {}),
+            **(
+                {"rotation_vector": vector_from_rotation(target.rotation).tolist()}
+                if "orientation" in track
+                else {}
+            ),
         }
         for k, target in enumerate(targets)
     ]

@@ -15,7 +15,7 @@ from vgtm_qp.machine import environment
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.drawing import label, panels, select
-from vgtm_qp.study.varied import varied_scene
+from vgtm_qp.study.varied import Arms, varied_scene
 from vgtm_qp.study.workers import Row, Task
 
 SEED = 1991
@@ -23,10 +23,12 @@ _APART = 10
 """Of so many scenes one is solved without a compiler, too: its steps take ten times as long."""
 
 
-def tasks(short: bool, *, scenes: int | None = None, seed: int = SEED, steps: int = 30) -> list[Task]:
+def tasks(
+    short: bool, *, scenes: int | None = None, seed: int = SEED, steps: int = 30, arms: Arms = "trusses"
+) -> list[Task]:
     """Return one task a scene, and for every tenth scene another one without a compiler."""
     count = scenes if scenes is not None else 10 if short else 1000
-    scene = {"seed": seed, "steps": steps}
+    scene = {"seed": seed, "steps": steps, "arms": arms}
     return [
         {**scene, "number": k, "compiler": compiler}
         for k in range(count)
@@ -34,14 +36,14 @@ def tasks(short: bool, *, scenes: int | None = None, seed: int = SEED, steps: in
     ]
 
 
-def run(seed: int, number: int, steps: int, compiler: bool) -> Row:
+def run(seed: int, number: int, steps: int, compiler: bool, arms: Arms = "trusses") -> Row:
     """Solve one scene, with a `compiler` or without, and return its row.
 
     Keys: what the scene is, see :func:`features`; ``status``, the part of the path that was ``reached``, ``states``,
     ``failures`` of the independent check, ``stop``, ``blocked_by``, ``way_out`` and CPU ``seconds``.
     """
-    problem = varied_scene(seed, number, steps=steps)
-    found: Row = {"module": problem.to_dict()["truss"]["module"], "features": features(problem)}
+    problem = varied_scene(seed, number, steps=steps, arms=arms)
+    found: Row = {"module": kind_of(problem), "features": features(problem)}
     started = process_time()
     try:
         with nullcontext() if compiler else environment({"VGTM_CC": "none"}):
@@ -65,17 +67,29 @@ def run(seed: int, number: int, steps: int, compiler: bool) -> Row:
     }
 
 
+def kind_of(problem: Problem) -> str:
+    """Return the module of a truss, or what joints a serial arm has."""
+    if problem.truss is not None:
+        return str(problem.to_dict()["truss"]["module"])
+    assert problem.arm is not None
+    if problem.arm.joint[0].name.startswith("pitch"):
+        return "snake"
+    has_slides = any(joint.kind == "prismatic" for joint in problem.arm.joint)
+    return "joints that turn or slide" if has_slides else "joints that turn"
+
+
 def features(problem: Problem) -> list[str]:
     """Return in words what makes a scene harder than an arm of pin joints among cubes at rest."""
     table = problem.to_dict()
-    truss, curve, method = table["truss"], table["curve"], table["method"]
+    arm, curve, method = table.get("truss") or table["arm"], table["curve"], table["method"]
     shapes = {obstacle["shape"] for obstacle in table["obstacle"]}
     found = {
         "a direction of the tip": "pointing" in table["end_effector"]["track"],
-        "offset joints": truss["joint_offset"] > 0.0,
-        "limited accelerations": truss.get("acceleration") is not None,
-        "jams": bool(truss["locked"]),
-        "a moving base": bool(truss["base_motion"]),
+        "an attitude of the tip": "orientation" in table["end_effector"]["track"],
+        "offset joints": arm.get("joint_offset", 0.0) > 0.0,
+        "limited accelerations": (arm.get("joint") or [arm])[0].get("acceleration") is not None,
+        "jams": bool(arm["locked"]),
+        "a moving base": bool(arm["base_motion"]),
         "moving obstacles": any(any(obstacle["velocity"]) for obstacle in table["obstacle"]),
         **{f"obstacles: {shape}": shape in shapes for shape in ("sphere", "cylinder", "mesh")},
         f"curve: {curve['family']}": method["tracking"] != "none",

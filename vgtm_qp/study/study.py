@@ -102,7 +102,7 @@ def run_study(
     progress
         Called with the numbers of tasks done and in all.
     options
-        Of the study: ``scenes`` and ``seed`` of tracking, robustness and loops.
+        Of the study: ``scenes`` and ``seed`` of tracking, robustness and loops, ``arms`` of the last two.
 
     Raises
     ------

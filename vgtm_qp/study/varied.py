@@ -5,48 +5,57 @@ from __future__ import annotations
 import tempfile
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
 
-from vgtm_qp.arm.truss.build import build_truss
+from vgtm_qp.arm.build import make_arm
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.scenes import random_scene
+from vgtm_qp.study.serial_scenes import random_serial_scene
+
+Arms = Literal["trusses", "serial"]
 
 _FASTEST = 0.05
 """Greatest coordinate of an obstacle's velocity, m/s."""
 
 
-def varied_scene(seed: int, number: int, *, steps: int = 30) -> Problem:
+def varied_scene(seed: int, number: int, *, steps: int = 30, arms: Arms = "trusses") -> Problem:
     """Return scene `number` of a `seed`: always the same, whichever scenes were made before it.
 
-    The arm, its goal and the places of the obstacles are those of ``random_scene``. Obstacles that rest are clear of
-    the arm at home; nothing says that the goal can be reached.
+    The arm, its goal and the places of the obstacles are those of ``random_scene``, or for serial `arms` of
+    ``random_serial_scene``. Obstacles that rest are clear of the arm at home; nothing says that the goal can be
+    reached.
     """
     random = np.random.default_rng([seed, number, 1])
-    plain = random_scene(seed, number, steps=steps).problem
-    assert plain.truss is not None
-    problem, arm = plain.to_dict(), build_truss(plain.truss)
-    members = [arm.member_names[k] for k in arm.actuators]
+    if arms == "serial":
+        plain = random_serial_scene(seed, number, steps=steps)
+    else:
+        plain = random_scene(seed, number, steps=steps).problem
+    problem, arm = plain.to_dict(), make_arm(plain)
+    actuators = [arm.quantity_names[k] for k in arm.actuators]
+    table, key = (problem["truss"], "member") if plain.truss else (problem["arm"], "joint")
 
     def happens(share: float) -> bool:
         return bool(random.random() < share)
 
-    truss = problem["truss"]
     method: dict[str, Any] = {"name": "qp"}
     problem["obstacle"] = [_obstacle(cube, random) for cube in problem["obstacle"]]
     if happens(0.25):
-        truss["acceleration"] = float(random.uniform(0.2, 1.0))
+        limit = {"acceleration": float(random.uniform(0.2, 1.0))}
+        if plain.truss:
+            table |= limit
+        else:
+            table["joint"] = [joint | limit for joint in table["joint"]]
     if happens(0.2):
-        jammed = random.choice(members, int(random.integers(1, 4)), replace=False)
-        truss["locked"] = [
-            {"member": str(name), "time": float(random.choice([0.0, random.uniform(0.5, 9.0)]))}
-            for name in jammed
+        jammed = random.choice(actuators, int(random.integers(1, 4)), replace=False)
+        table["locked"] = [
+            {key: str(name), "time": float(random.choice([0.0, random.uniform(0.5, 9.0)]))} for name in jammed
         ]
     if happens(0.15):
         drift, turn = random.uniform(-0.2, 0.2, 3), random.uniform(-0.2, 0.2, 3)
-        truss["base_motion"] = [{"time": 10.0, "position": drift.tolist(), "rotation_vector": turn.tolist()}]
+        table["base_motion"] = [{"time": 10.0, "position": drift.tolist(), "rotation_vector": turn.tolist()}]
     problem["curve"] = _curve(problem["curve"]["control_vertices"], random)
     problem["end_effector"]["mode"] = str(random.choice(["scaled", "hard", "elastic"], p=[0.7, 0.15, 0.15]))
     method["tracking"] = str(random.choice(["coupled", "none"], p=[0.8, 0.2]))
@@ -59,7 +68,7 @@ def varied_scene(seed: int, number: int, *, steps: int = 30) -> Problem:
     clearance = problem["clearance"]
     clearance["self_collision"] = not happens(0.1)
     clearance["distance"] = "exact" if happens(0.1) else "fcl"
-    if happens(0.1):
+    if happens(0.1) and table.get("body") is None:
         clearance["minimum_angle"] = float(random.uniform(0.05, 0.2))
     return Problem.from_dict({**problem, "method": method})
 

@@ -11,8 +11,10 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Measure
+from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.record import Record
 from vgtm_qp.result.result import Result
+from vgtm_qp.verify.arm import polygon_frame
 from vgtm_qp.verify.path import DIRECTION_TOLERANCE, angles
 
 TRACKING_TOLERANCE = 1e-6
@@ -40,6 +42,8 @@ class RecordedCurve(NamedTuple):
         Parameters of the curve nodes, or their shares of the arc length where `by_arc_length`.
     stations, weights : (K, Q) int, (K, Q)
         The nodes that each station is the weighted mean of.
+    frames : (K or 0, 3, 3)
+        Frames at home of stations whose normals are kept along the curve.
     """
 
     breaks: Array
@@ -48,6 +52,7 @@ class RecordedCurve(NamedTuple):
     by_arc_length: bool
     stations: Index
     weights: Array
+    frames: Array = np.zeros((0, 3, 3))
 
     @classmethod
     def of(cls, record: Mapping[str, Any], nodes: int, vertices: int) -> RecordedCurve:
@@ -64,24 +69,39 @@ class RecordedCurve(NamedTuple):
             raise ResultError("manifest.curve.nodes is empty")
         stations = table.integers("stations", (len(at), None), nodes)
         weights = table.numbers("weights", stations.shape)
-        return cls(breaks, extraction, at, table.flag("by_arc_length"), stations, weights)
+        frames = np.zeros((0, 3, 3))
+        # Earlier versions did not record them.
+        if table.has("frames") and record["frames"]:
+            frames = table.numbers("frames", (len(at), 3, 3))
+        return cls(breaks, extraction, at, table.flag("by_arc_length"), stations, weights, frames)
 
     def at(self, s: Array, vertices: Array) -> Array:
         """Return (T, K, 3) the points at parameters `s` (T, K) of curves with control vertices (T, V, 3), m."""
+        return self._mean(self.extraction, s, vertices)
+
+    def _mean(self, tables: Array, s: Array, vertices: Array) -> Array:
+        """Return (T, K, 3) what the Bezier points (S, d + 1, V) of `tables` give at `s` (T, K)."""
         segment = np.searchsorted(self.breaks[1:-1], s, side="right")
         u = (s - self.breaks[segment]) / np.diff(self.breaks)[segment]
-        degree = self.extraction.shape[1] - 1
+        degree = tables.shape[1] - 1
         j = np.arange(degree + 1)
         share = (
             np.array([comb(degree, k) for k in j]) * u[..., None] ** j * (1.0 - u[..., None]) ** (degree - j)
         )
-        table = np.einsum("tkj,tkjv->tkv", share, self.extraction[segment])
-        return np.asarray(table @ vertices)
+        return np.asarray(np.einsum("tkj,tkjv->tkv", share, tables[segment]) @ vertices)
 
     def points(self, vertices: Array) -> Array:
         """Return (T, K, 3) the curve nodes of curves with control vertices (T, V, 3), m."""
+        return self.at(self._parameters(vertices), vertices)
+
+    def tangents(self, vertices: Array) -> Array:
+        """Return (T, K, 3) the directions of the curves at their nodes, not of unit length."""
+        return self._mean(np.diff(self.extraction, axis=1), self._parameters(vertices), vertices)
+
+    def _parameters(self, vertices: Array) -> Array:
+        """Return (T, K) the parameters of the curve nodes."""
         if not self.by_arc_length:
-            return self.at(np.tile(self.nodes, (len(vertices), 1)), vertices)
+            return np.tile(self.nodes, (len(vertices), 1))
         states = np.arange(len(vertices))[:, None]
         pieces = max(_PIECES // (len(self.breaks) - 1), _FEWEST)
         within = np.arange(2 * pieces) / (2 * pieces)
@@ -103,7 +123,7 @@ class RecordedCurve(NamedTuple):
             chord = np.linalg.norm(self.at(s, vertices) - before, axis=2)
             share = np.divide(left, chord, out=np.ones_like(left), where=chord > 0.0)
             s = np.clip(start + (s - start) * share, 0.0, 1.0)
-        return self.at(s, vertices)
+        return np.asarray(s)
 
     def end_direction(self, vertices: Array) -> Array:
         """Return (T, 3) the direction in which the curves end."""
@@ -133,6 +153,17 @@ def gaps(maneuver: Result, curve: RecordedCurve) -> Array:
     return np.asarray(np.linalg.norm(stations - curve.points(maneuver.control_vertices), axis=2))
 
 
+def _turns(maneuver: Result, curve: RecordedCurve) -> Array:
+    """Return (T, K) the angles between the stations' normals and the curve in every state, rad."""
+    tangents, found = curve.tangents(maneuver.control_vertices), []
+    for k, nodes in enumerate(curve.stations):
+        polygons = maneuver.nodes[:, nodes]
+        home, angle = polygon_frame(polygons[0], None)
+        frames = np.stack([polygon_frame(polygon, angle)[0] for polygon in polygons])
+        found.append(angles((frames @ home.T @ curve.frames[k])[:, :, 2], tangents[:, k]))
+    return np.stack(found, axis=1)
+
+
 def curve_measures(maneuver: Result, rotation: Array, size: float) -> dict[str, Measure]:
     """Return the measures of a maneuver's curve, whose tip has the attitudes `rotation` (T, 3, 3).
 
@@ -158,6 +189,19 @@ def curve_measures(maneuver: Result, rotation: Array, size: float) -> dict[str, 
         ),
         "states_off_curve": Measure(float(np.mean(moved.max(axis=1) > tolerance)), "of the states"),
     }
+    if len(curve.frames):
+        turned = _turns(maneuver, curve)
+        row, k = divmod(int(np.argmax(turned[-len(moved) :])), moved.shape[1])
+        row += len(off) - len(moved)
+        found["tracking_angle"] = Measure(
+            float(turned[row, k]),
+            "rad",
+            DIRECTION_TOLERANCE if is_hard else None,
+            "most",
+            f"row {row}, station {k + 1}",
+        )
+    if table.has("start"):
+        found |= _start(maneuver, table, tolerance)
     ends = {
         "curve_end_gap": ("ends_at_tip", off[:, -1], "m", tolerance),
         "curve_end_angle": (
@@ -172,6 +216,23 @@ def curve_measures(maneuver: Result, rotation: Array, size: float) -> dict[str, 
             row = int(np.argmax(errors))
             found[name] = Measure(float(errors[row]), unit, bound, "most", f"row {row}")
     return found
+
+
+def _start(maneuver: Result, table: Record, tolerance: float) -> dict[str, Measure]:
+    """Return how far the curve is from beginning at the base, m, and along its normal, rad."""
+    nodes, vertices = maneuver.nodes, maneuver.control_vertices
+    start = table.integers("start", (None,), nodes.shape[1])
+    weights, normal = table.numbers("start_weights", start.shape), table.numbers("normal", (3,))
+    turned = rotations(base_poses(maneuver.manifest["problem"], maneuver.time)[:, 3:]) @ normal
+    off = np.linalg.norm(vertices[:, 0] - np.einsum("q,tqc->tc", weights, nodes[:, start]), axis=1)
+    found = {"curve_start_gap": (off, "m", tolerance)}
+    if vertices.shape[1] > 1:
+        aside = angles(vertices[:, 1] - vertices[:, 0], turned)
+        found["curve_start_angle"] = (aside, "rad", DIRECTION_TOLERANCE)
+    return {
+        name: Measure(float(errors.max()), unit, bound, "most", f"row {int(np.argmax(errors))}")
+        for name, (errors, unit, bound) in found.items()
+    }
 
 
 def keeps_stations(problem: Mapping[str, Any]) -> bool:

@@ -38,7 +38,7 @@ SUFFIXES = (".pdf", ".png", ".svg")
 _RC: Any = {"font.size": 8.0, "font.family": "sans-serif", "pdf.fonttype": 42, "svg.fonttype": "none"}
 _WIDTH = 7.1
 _GREATEST_HEIGHT = 9.0
-_MARGIN, _GAP, _TITLE, _FOOT = 0.42, 0.16, 0.24, 0.95
+_MARGIN, _GAP, _TITLE, _FOOT, _NOTE = 0.42, 0.16, 0.24, 0.95, 0.16
 _POINTS_PER_INCH = 72.0
 _DARK = (0.12, 0.12, 0.14)
 _GRID = (0.80, 0.80, 0.82)
@@ -101,7 +101,7 @@ def plot_frames(
         titles = [f"({chr(ord('a') + k)}) {title}" for k, title in enumerate(titles)]
     off = off_curve(maneuver)
     titles = [f"{title}\n{off[row]}".strip() for title, row in zip(titles, rows, strict=True)]
-    return _View(maneuver, rows, azimuth, elevation).figure(rows, titles)
+    return _View(maneuver, rows, azimuth, elevation).figure(rows, titles, _off_somewhere(maneuver, off))
 
 
 def each_frame(maneuver: Result, rows: Sequence[int]) -> Iterator[Figure]:
@@ -122,6 +122,16 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     with replacing(path) as scratch, mpl.rc_context(_RC):
         figure.savefig(scratch, dpi=220, format=path.suffix[1:].lower())
     return path
+
+
+def _off_somewhere(maneuver: Result, off: Sequence[str]) -> str:
+    """Return in which states stations are off the curve, and by how much at most; empty where they are in none."""
+    certificate, count = maneuver.certificate, sum(map(bool, off[1:]))
+    if certificate is None or not count:
+        return ""
+    gap = certificate.tracking_gap
+    most = f"{1000.0 * (gap.value or 0.0):.3g} mm at most ({gap.where})"
+    return f"stations are off the curve in {count} of {len(off) - 1} states, by {most}"
 
 
 class _View:
@@ -156,30 +166,39 @@ class _View:
         pad = 0.03 * float((most - least).max())
         self.low, self.high = least - pad, most + pad
 
-    def figure(self, rows: Sequence[int], titles: Sequence[str]) -> Figure:
-        """Return a figure of states side by side."""
+    def figure(self, rows: Sequence[int], titles: Sequence[str], note: str = "") -> Figure:
+        """Return a figure of states side by side, with a note at its foot."""
         columns = min(3, len(rows)) if len(rows) != 4 else 4
         with mpl.rc_context(_RC):
             title_lines = 1 + max(title.count("\n") for title in titles)
-            figure, panels, scale = self._panels(len(rows), columns, _TITLE * title_lines)
+            room = _NOTE if note else 0.0
+            figure, panels, scale = self._panels(len(rows), columns, _TITLE * title_lines, _FOOT + room)
             for k, (row, axes, title) in enumerate(zip(rows, panels, titles, strict=True)):
                 at_left, at_bottom = k % columns == 0, k + columns >= len(rows)
                 self._draw_floor(axes, scale, ruler=at_left, labels=at_left and at_bottom)
                 self._draw_state(axes, row, scale)
                 self._draw_tip(axes, row)
                 axes.set_title(title, fontsize=8.0, pad=3.0)
-            self._draw_legend(figure)
+            self._draw_legend(figure, room)
+            if note:
+                at = 1.0 - _MARGIN / _WIDTH, 0.06 / float(figure.get_figheight())
+                figure.text(*at, note, ha="right", va="bottom", fontsize=7.0, color=_DARK)
         return figure
 
-    def _panels(self, count: int, columns: int, title: float) -> tuple[Figure, list[Axes], float]:
-        """Return the figure, one axes a frame at equal scale under a `title` so high, inches, and points a metre."""
+    def _panels(
+        self, count: int, columns: int, title: float, foot: float
+    ) -> tuple[Figure, list[Axes], float]:
+        """Return the figure, one axes a frame at equal scale, and points a metre.
+
+        There is room for a `title` above each and for the `foot` of all, inches.
+        """
         lines = -(-count // columns)
         extent = self.high - self.low
         room = (_WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) / columns
-        height = (_GREATEST_HEIGHT - _FOOT - lines * (title + _GAP)) / lines
+        height = (_GREATEST_HEIGHT - foot - lines * (title + _GAP)) / lines
         inches = min(room / extent[0], height / extent[1])
         width, tall = extent * inches
-        total = _FOOT + lines * (tall + title + _GAP)
+        total = foot + lines * (tall + title + _GAP)
         left = (_WIDTH - columns * width - (columns - 1) * _GAP) / 2
         figure = Figure(figsize=(_WIDTH, total))
         panels = []
@@ -267,7 +286,8 @@ class _View:
         goals = np.array([w["position"] for w in waypoints if w.get("position")]).reshape(-1, 3)
         axes.plot(*flat(goals).T, **_GOAL)
 
-    def _draw_legend(self, figure: Figure) -> None:
+    def _draw_legend(self, figure: Figure, room: float) -> None:
+        """Draw what the colours and marks mean, above some `room` at the foot, inches."""
         width, height = figure.get_size_inches()
         arm = self.drawing.arm
         strokes = np.unique(arm.stroke[arm.actuated].round(9), axis=0)
@@ -275,7 +295,7 @@ class _View:
             alike = len(strokes) == 1
             low, high = strokes[0] if alike else (0.0, 1.0)
             label = "length of actuated members (m)" if alike else "actuated members, share of the stroke"
-            bar = figure.add_axes((_MARGIN / width, 0.52 / height, 2.3 / width, 0.09 / height))
+            bar = figure.add_axes((_MARGIN / width, (0.52 + room) / height, 2.3 / width, 0.09 / height))
             colours = ListedColormap(stroke_colours(np.linspace(0.0, 1.0, 256)).tolist())
             scalar = mpl.cm.ScalarMappable(Normalize(low, high), colours)
             figure.colorbar(scalar, cax=bar, orientation="horizontal", label=label)
@@ -288,7 +308,7 @@ class _View:
         figure.legend(
             handles=handles,
             loc="lower right",
-            bbox_to_anchor=(1.0 - _MARGIN / width, 0.08 / height),
+            bbox_to_anchor=(1.0 - _MARGIN / width, (0.08 + room) / height),
             ncol=3,
             frameon=False,
             fontsize=7.0,
