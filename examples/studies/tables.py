@@ -39,7 +39,7 @@ OPTIONS = {
 """Of the studies that take any."""
 COMMANDS = {
     **{name: f"vgtm study {name} {OPTIONS.get(name, '')}".strip() for name in STUDIES},
-    "serial": "vgtm study robustness --arms serial --scenes 300 --seed 20261129",
+    "serial": "vgtm study robustness --arms serial --scenes 100 --seed 1991",
     "bench": "vgtm bench --seconds 0.7",
 }
 SHORT = {
