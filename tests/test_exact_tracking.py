@@ -367,3 +367,28 @@ def test_where_exact_tracking_is_stuck_its_ways_out_are_those_of_elastic_trackin
     assert exact.status == elastic.status == "solved"
     assert exact.manifest["way_out"] == elastic.manifest["way_out"] != ""
     np.testing.assert_array_equal(exact.nodes, elastic.nodes)
+
+
+def test_joints_in_one_place_may_both_be_stations():
+    joints = [
+        {"name": f"joint {k}", "axis": axis, "position": [0.0, 0.0, z], "home": 0.3, "limits": [-2.0, 2.0]}
+        for k, (axis, z) in enumerate(
+            [([1, 0, 0], 0.0), ([0, 1, 0], 0.4), ([1, 0, 0], 0.0), ([0, 1, 0], 0.4), ([1, 0, 0], 0.4)]
+        )
+    ]
+    data = {
+        "name": "joints in one place",
+        "arm": {"joint": joints, "tip": [0.0, 0.0, 0.4], "every": 1},
+        "curve": {"family": "bezier", "control_vertices": 5},
+        "method": {"tracking_mode": "elastic", "retries": False},
+        "end_effector": {"track": ["position"]},
+        "maneuver": {"steps": 4, "waypoint": [{"time": 4.0, "position": [0.0, 0.0, 1.0]}]},
+        "clearance": {"safe": 0.01, "influence": 0.2},
+    }
+    start = vq.Resolver(vq.Problem.from_dict(data)).tip()[0]
+    data["maneuver"]["waypoint"][0]["position"] = (start + [0.05, 0.03, -0.05]).tolist()
+    maneuver = vq.solve(vq.Problem.from_dict(data))
+    nodes = maneuver.manifest["curve"]["nodes"]
+    assert np.min(np.diff(nodes)) == 0.0
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok, maneuver.certificate.contradictions

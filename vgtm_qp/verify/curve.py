@@ -260,8 +260,12 @@ def curve_contradictions(maneuver: Result) -> Iterator[str]:
     for name, shares in (("extraction", curve.extraction), ("weights", curve.weights)):
         if np.abs(shares.sum(axis=-1) - 1.0).max() > _ROUNDING:
             yield f"manifest.curve.{name} are not those of means: they do not add up to 1"
-    for name, values in (("breaks", curve.breaks), ("nodes", np.append(0.0, curve.nodes))):
-        if np.abs(values[[0, -1]] - [0.0, 1.0]).max() > _ROUNDING or (np.diff(values) <= 0.0).any():
+    # Two joints in one place may both be stations.
+    for name, values, least in (
+        ("breaks", curve.breaks, np.nextafter(0.0, 1.0)),
+        ("nodes", np.append(0.0, curve.nodes), 0.0),
+    ):
+        if np.abs(values[[0, -1]] - [0.0, 1.0]).max() > _ROUNDING or (np.diff(values) < least).any():
             yield f"manifest.curve.{name} do not increase to 1"
     if "bays" in truss:
         count = truss["bays"] // (2 if truss["module"] == "longeron" and held else 1)
