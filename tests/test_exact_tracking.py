@@ -386,7 +386,7 @@ def test_joints_in_one_place_may_both_be_stations():
         "clearance": {"safe": 0.01, "influence": 0.2},
     }
     start = vq.Resolver(vq.Problem.from_dict(data)).tip()[0]
-    data["maneuver"]["waypoint"][0]["position"] = (start + [0.05, 0.03, -0.05]).tolist()
+    data["maneuver"]["waypoint"][0]["position"] = np.add(start, [0.05, 0.03, -0.05]).tolist()
     maneuver = vq.solve(vq.Problem.from_dict(data))
     nodes = maneuver.manifest["curve"]["nodes"]
     assert np.min(np.diff(nodes)) == 0.0
