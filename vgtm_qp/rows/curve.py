@@ -12,6 +12,8 @@ from vgtm_qp.arrays import Array
 _TINY = 1e-300
 _STRAIGHTENS = 1e-6
 """Weight that makes a fitted curve as straight as its points let it be."""
+_KEEPS = 1e3
+"""Weight of the direction in which a fitted curve ends, beside its points."""
 _LEAST_FIRST = 0.1
 """Least length of the first leg of a fitted curve, as a share of a leg of a straight one."""
 
@@ -43,16 +45,23 @@ def legs(vertices: Any, normal: Any, least: Any, *, both: bool) -> tuple[Any, An
     return ca.horzcat(*axes), ca.fmin(least - ca.vertcat(*lengths), 0.0)
 
 
-def fitted(weights: Array, points: Array, start: Array, normal: Array) -> Array:
+def fitted(
+    weights: Array, points: Array, start: Array, normal: Array, end: tuple[Array, Array] | None = None
+) -> Array:
     """Return (V, 3) the vertices of the straightest curve from `start` (3,), along `normal` (3,), through `points`.
 
-    These are (K, 3), m, and met at the curve nodes with `weights` (K, V) as well as they can be.
+    These are (K, 3), m, and met at the curve nodes with `weights` (K, V) as well as they can be. The `end`, weights
+    (V,) of the slope there and an axis (3,), is a direction that the curve ends in.
     """
     vertices = weights.shape[1]
     basis = free_basis(normal, 3 * vertices)
     second = np.diff(np.eye(vertices), n=2, axis=0)
     rows = np.kron(np.vstack([weights, _STRAIGHTENS * second]), np.eye(3)) @ basis
     away = np.vstack([points - start, np.zeros((len(second), 3))]).ravel()
+    if end is not None:
+        slope, axis = end
+        aside = np.kron(slope, np.eye(3) - np.outer(axis, axis)) @ basis
+        rows, away = np.vstack([rows, _KEEPS * aside]), np.concatenate([away, np.zeros(3)])
     free = np.linalg.lstsq(rows, away, rcond=None)[0]
     least = _LEAST_FIRST * float(np.linalg.norm(points[-1] - start)) / max(vertices - 1, 1)
     if free[0] < least:

@@ -187,8 +187,13 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         vertex_goals=tuple(sorted(goal.index for goal in spec.control_vertex_goals)),
     )
     end = arm.end_effector
-    vertices = layout.ended(vertices, end.position(arm.home), end.frame)
-    return HomeCurve(layout, vertices, torsion, goals)
+    ended = layout.ended(vertices, end.position(arm.home), end.frame)
+    if layout.ends_along_tip and np.abs(ended - vertices).max() > 1e-9 * arm.height:
+        # The direction of its end is to cost the stations of a bent arm as little as it can.
+        along = layout.curve_slopes[-1], end.frame[:, 2]
+        vertices = curve_rows.fitted(layout.curve_weights, centres[tracked], centres[0], normal, along)
+        ended = layout.ended(vertices, end.position(arm.home), end.frame)
+    return HomeCurve(layout, ended, torsion, goals)
 
 
 def _fitted(
