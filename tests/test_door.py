@@ -504,6 +504,39 @@ def test_a_recorded_chain_bends_no_more_than_its_bound(rng):
             assert (second[chain.links].max(axis=1) <= bound * (1.0 + 1e-6) + 1e-9).all()
 
 
+def test_bodies_come_no_nearer_than_the_bound_of_their_approach(rng):
+    tightest = np.inf
+    for serial in SERIAL:
+        arm = make_arm(problem_of(serial))
+        joints = len(arm.chain)
+        slides = ~arm.revolute
+        for size in (0.02, 0.5):
+            before = arm.home_configuration + 0.3 * rng.normal(size=joints + 6)
+            motion = size * rng.normal(size=joints + 6) * rng.integers(0, 2, size=joints + 6)
+            motion[joints:] = 0.0
+            before[:-6][slides] = rng.uniform(*arm.stroke[slides].T)
+            motion[:-6][slides] = rng.uniform(*arm.stroke[slides].T) - before[:-6][slides]
+            approach, bodies = arm.approach(motion), np.arange(len(arm.bodies))
+            ends = np.stack(
+                [arm.nodes(before + s * motion)[arm.bodies.points] for s in np.linspace(0, 1, 21)]
+            )
+            # Points of a body: its ends and its middle.
+            points = np.concatenate([ends, ends.mean(axis=2, keepdims=True)], axis=2)
+            moved = np.linalg.norm(points - points[0], axis=3).max(axis=(0, 2))
+            assert (moved <= approach(bodies) + 1e-12).all()
+            first, second = np.triu_indices(len(bodies), 1)
+            apart = np.linalg.norm(points[:, first, :, None] - points[:, second, None], axis=4)
+            nearer, bound = (apart[0] - apart).max(axis=(0, 2, 3)), approach(first, second)
+            assert (nearer <= bound + 1e-12).all()
+            np.testing.assert_allclose(bound, approach(second, first))
+            assert (bound <= approach(first) + approach(second) + 1e-12).all()
+            tightest = min(tightest, float((bound / np.maximum(nearer, 1e-3)).min()))
+        still = arm.approach(np.zeros(joints + 6))
+        assert not still(bodies).any()
+        assert not still(first, second).any()
+    assert tightest < 1.5
+
+
 @pytest.mark.parametrize("form", ["png", "html", "csv", "mcap", "ros"])
 def test_a_serial_maneuver_is_drawn_and_exported(form, maneuvers, tmp_path):
     from vgtm_qp.export.formats import export_maneuver

@@ -103,7 +103,7 @@ def test_what_is_proven_on_the_way_holds_at_every_instant(rng):
                 for is_self in (False, True)
             ]
             watch.near(start, floors[0] + 0.2, floors[1] + 0.2)
-            if not watch.follow(start, end, *floors):
+            if not watch.follow(np.stack([start, end]), *floors):
                 continue
             proven += 1
             for s in np.linspace(0.0, 1.0, 11):
@@ -118,16 +118,16 @@ def test_a_way_into_an_obstacle_is_not_proven():
     monitor = Clearance(capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False)
     start = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     watch = watch_of(monitor)
-    assert watch.follow(start, start + 0.1 * FORWARD, 0.08, 0.0)
-    assert not watch.follow(start, start + 0.9 * FORWARD, 0.08, 0.0)
+    assert watch.follow(np.stack([start, start + 0.1 * FORWARD]), 0.08, 0.0)
+    assert not watch.follow(np.stack([start, start + 0.9 * FORWARD]), 0.08, 0.0)
     # Through the wall to where all is clear again: only the way tells.
-    assert not watch.follow(start, start + 2.0 * FORWARD, 0.08, 0.0)
-    assert watch.follow(start, start - 0.5 * FORWARD, 0.08, 0.0)
+    assert not watch.follow(np.stack([start, start + 2.0 * FORWARD]), 0.08, 0.0)
+    assert watch.follow(np.stack([start, start - 0.5 * FORWARD]), 0.08, 0.0)
     for number in (np.nan, np.inf):
         with pytest.raises(GeometryError, match="finite"):
-            watch.follow(start, np.full((2, 3), number), 0.08, 0.0)
-    assert watch.follow(start, start + 0.1 * FORWARD, 0.08, 0.0)
-    assert not watch.follow(start, start + 0.9 * FORWARD, 0.08, 0.0)
+            watch.follow(np.stack([start, np.full((2, 3), number)]), 0.08, 0.0)
+    assert watch.follow(np.stack([start, start + 0.1 * FORWARD]), 0.08, 0.0)
+    assert not watch.follow(np.stack([start, start + 0.9 * FORWARD]), 0.08, 0.0)
 
 
 def test_a_way_from_a_state_that_was_left_is_bound_from_there(rng):
@@ -223,7 +223,7 @@ def test_a_pair_whose_centres_coincide_at_first_is_watched_like_every_other():
     watch.near(clear, 0.6, 1.2)
     found = watch.near(clear, 0.6, 1.2)
     assert sorted(found.is_self.tolist()) == [False, False, True]
-    assert not watch.follow(clear, X, 0.08, 0.02)
+    assert not watch.follow(np.stack([clear, X]), 0.08, 0.02)
     assert len(every_pair(monitor.scene, X)[0]) == 2
 
 
@@ -232,9 +232,9 @@ def test_members_that_all_meet_at_one_node_have_nothing_to_watch():
     X = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     watch = watch_of(monitor)
     assert not len(watch.near(X, 0.5, 0.5).distance)
-    assert watch.follow(X, X + 0.1 * FORWARD, 0.08, 0.02)
+    assert watch.follow(np.stack([X, X + 0.1 * FORWARD]), 0.08, 0.02)
     with pytest.raises(GeometryError):
-        watch.follow(X, np.full(X.shape, np.nan), 0.08, 0.02)
+        watch.follow(np.stack([X, np.full(X.shape, np.nan)]), 0.08, 0.02)
 
 
 @pytest.mark.parametrize("floor", [-0.05, -0.001, 0.0])
@@ -245,8 +245,8 @@ def test_floors_below_zero_are_those_of_surfaces_that_overlap_already(floor):
     )
     X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]) + 0.93 * FORWARD
     watch = watch_of(monitor)
-    assert not watch.follow(X, X + 0.2 * FORWARD, floor, floor)
-    assert watch.follow(X - 0.2 * FORWARD, X - 0.1 * FORWARD, floor, floor)
+    assert not watch.follow(np.stack([X, X + 0.2 * FORWARD]), floor, floor)
+    assert watch.follow(X + np.array([[[-0.2]], [[-0.1]]]) * FORWARD, floor, floor)
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -256,20 +256,53 @@ def test_a_pair_without_a_bound_is_never_proven_by_the_pairs_beside_it(broken):
     assert building(WATCH).finish() is not None
     ends, known = ca.SX.sym("ends", 24), ca.SX.sym("known", 19)
     contact = Kernel(ca.Function("contact", [ends, known], [ca.repmat(known[0], 19)]), compiled=False)
-    pairs = Program(WATCH, "Pairs")
-    state, bounds = np.zeros((2, 3)), np.full(3, 0.05)
+    pairs, way = Program(WATCH, "Pairs"), Program(WATCH, "Way")
     given = np.zeros((3, 19))
     given[:, 0] = 0.05
     given[broken, 0] = np.nan
-    places = {"before": state, "after": state.copy()}
-    moved = {"middle": np.zeros((3, 3)), "turned": np.zeros(3), "furthest": np.zeros(3)}
     numbers = {"body": np.arange(3), "other": np.zeros(3), "points": np.zeros((3, 4))}
-    pairs.set(**{name: array.astype(np.int32) for name, array in numbers.items()}, **places, **moved)
-    pairs.set(count=3, is_self=0, lower=bounds, known=given, limit=0.1, next=2.0, contact=contact)
+    pairs.set(**{name: array.astype(np.int32) for name, array in numbers.items()})
+    pairs.set(count=3, is_self=0, lower=np.full(3, 0.05), known=given, next=2.0, contact=contact)
     pairs.set(ends=contact.inputs[0], pair=contact.inputs[1], found=contact.outputs[0])
     pairs.set(rows=np.zeros(3, dtype=np.int64), contacts=np.zeros((6, 9)))
-    for _ in range(2):
-        assert pairs.call("evaluate") == 0
+    way.set(pieces=1, points=2, bodies=3, groups=1, furthest=1e60, places=np.zeros((2, 2, 3)))
+    way.set(
+        ends=np.tile(np.array([0, 1], dtype=np.int32), 3), group=np.array([pairs.address], dtype=np.uintp)
+    )
+    way.set(floors=np.zeros(1), limits=np.full(1, 0.1), middle=np.zeros((3, 3)), turned=np.zeros(3))
+    way.set(moved=np.zeros(3))
+    for code in (0, 3):
+        assert way.call("follow") == code
         assert pairs.data.near == 3
         assert pairs.data.overlaps
     assert not pairs.data.lowest >= 0.0
+
+
+def test_a_way_in_pieces_is_proven_where_each_piece_is(rng):
+    """Round a corner: the straight way leads through the wall, and so does a way whose pieces touch it."""
+    wall = box("wall", [1.0, 0.0, 0.0], [0.1, 2.0, 4.0])
+    monitor = Clearance(capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False)
+    start = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    angles = np.linspace(np.pi, 0.0, 13)
+    stops = np.stack([1.0 + np.cos(angles), 1.6 * np.sin(angles), 0.0 * angles], axis=1)
+    round_it, through = start + stops[:, None], start + stops[[0, 12, 6]][:, None]
+    for ask in (watch_of(monitor).follow, lambda *way: monitor.along(way[0], 0.0, 1.0, *way[1:]).certified):
+        assert ask(round_it, 0.08, 0.0)
+        assert not ask(through, 0.08, 0.0)
+        assert ask(round_it, 0.08, 0.0)
+    unwatched = Clearance(
+        capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False, watch=False
+    )
+    assert unwatched.along(round_it, 0.0, 1.0, 0.08).certified
+    refused = unwatched.along(np.stack([start, start, start + 2.0 * FORWARD]), 0.0, 1.0, 0.08)
+    assert not refused.certified
+    # Half of the way is the first piece, in which nothing moves.
+    assert 0.5 < refused.fraction[0] < 1.0
+    for watched in (True, False):
+        monitor = Clearance(
+            capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False, watch=watched
+        )
+        for _ in range(20):
+            way = start + np.cumsum(rng.normal(scale=0.4, size=(6, 1, 3)), axis=0)
+            pieces = [monitor.between(*piece, 0.0, 0.0, 0.08).certified for piece in pairwise(way)]
+            assert monitor.along(way, 0.0, 1.0, 0.08).certified == all(pieces)

@@ -69,6 +69,12 @@ def _building(source: Path, *_: object) -> Building:
 class Program:
     """Functions of a C source that share one structure, and what its pointers point to.
 
+    Attributes
+    ----------
+    data : ctypes.Structure
+    address : int
+        Of the structure.
+
     Raises
     ------
     OSError
@@ -81,7 +87,7 @@ class Program:
             raise OSError(f"{source.name} could not be compiled")
         self._library = ctypes.CDLL(str(library))
         self.data = structure(source, name)()
-        self._at = ctypes.addressof(self.data)
+        self.address = ctypes.addressof(self.data)
         self._kept: dict[str, Any] = {}
         self._interpreted: dict[str, Kernel] = {}
 
@@ -103,11 +109,15 @@ class Program:
             else:
                 setattr(self.data, name, value)
 
-    def call(self, name: str, *arguments: float) -> int:
-        """Call the C function of that name with the structure and numbers; kernels compiled meanwhile are used."""
+    def refresh(self) -> None:
+        """Use the kernels that were compiled meanwhile."""
         if self._interpreted:
             self.set(**{key: kernel for key, kernel in self._interpreted.items() if kernel.is_done})
-        code: int = self._library[name](ctypes.c_void_p(self._at), *map(ctypes.c_double, arguments))
+
+    def call(self, name: str, *arguments: float) -> int:
+        """Call the C function of that name with the structure and numbers; kernels compiled meanwhile are used."""
+        self.refresh()
+        code: int = self._library[name](ctypes.c_void_p(self.address), *map(ctypes.c_double, arguments))
         return code
 
 

@@ -161,6 +161,14 @@ class LengthRowsLike(Protocol):
     rhs: Array
 
 
+class Approach(Protocol):
+    """How much nearer bodies can come to others, or to what rests."""
+
+    def __call__(self, body: Index, other: Index | None = None) -> Array:
+        """Return (R,) bounds, m, for bodies (R,) and other bodies (R,); NaN or inf where there is none."""
+        ...
+
+
 class Bays(Protocol):
     """The bays of an arm, for speed alone: the order of its members, as in ``truss.Truss``."""
 
@@ -304,23 +312,17 @@ class Arm(ABC):
         `solve` returns the displacements (N - N_c, 3) of the free nodes, for arms that need them.
         """
 
+    @abstractmethod
     def nodes(self, q: Array) -> Array:
         """Return (N, 3) the nodes at a configuration, m."""
-        kernel = self._nodes
-        kernel.inputs[0][:] = q.reshape(-1)
-        kernel()
-        return kernel.outputs[0].reshape(-1, 3).copy()
-
-    @cached_property
-    def _nodes(self) -> Kernel:
-        constants = Constants()
-        symbols = self.symbols(constants)
-        q = ca.MX.sym("q", *symbols.shape)
-        return constants.bound("nodes", [q], [symbols.nodes(q)]).kernel(compiled=False)
 
     def points(self, q: Array) -> Array:
         """Return (P, 3) the points that span the bodies, m; by default the nodes."""
         return self.nodes(q)
+
+    def ways(self, start: Array, end: Array, pieces: int) -> Array:
+        """Return (K + 1, P, 3) the points, m, where K `pieces` of a straight motion of the configuration meet."""
+        return np.stack([self.points(q) for q in between(start, end, pieces)])
 
     def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:  # noqa: ARG002
         """Return nodes (R, S) and coefficients (R, S, 3) of rows over the displacements of points.
@@ -336,6 +338,13 @@ class Arm(ABC):
     @abstractmethod
     def travel(self, motion: Array) -> float:
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
+
+    def approach(self, motion: Array) -> Approach | None:  # noqa: ARG002
+        """Return how much nearer bodies come in a displacement of the configuration; None where that is unknown.
+
+        The base rests.
+        """
+        return None
 
     @abstractmethod
     def reach(self) -> Array:
@@ -435,6 +444,12 @@ class Kinematics:
     def motion(self) -> MotionRows:
         """Return how the nodes move at the configuration evaluated last."""
         return self._arm.motion_rows(self._motion.copy(), np.zeros(3 * len(self._arm.free)))
+
+
+def between(start: Array, end: Array, pieces: int) -> Array:
+    """Return (K + 1, ...) the configurations where K `pieces` of a straight motion meet; both ends without rounding."""
+    shares = (np.arange(pieces + 1) / pieces).reshape(-1, *[1] * start.ndim)
+    return np.asarray((1.0 - shares) * start + shares * end)
 
 
 def rank(values: NDArray[Any]) -> int:

@@ -13,9 +13,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose
-from vgtm_qp.arm.symbols import ArmSymbols, Constants
+from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, between
+from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants
 from vgtm_qp.arrays import Array, Mask
+from vgtm_qp.compiled import Compiling, Kernel
 from vgtm_qp.rotation import vector_near
 
 
@@ -106,6 +107,36 @@ class JointSpaceArm(Arm):
         """See ``arm.Arm``: K column by column, and r."""
         response, rhs = values
         return JacobianRows(response.reshape(len(self.actuators), len(rhs)).T, rhs)
+
+    def nodes(self, q: Array) -> Array:
+        return np.asarray(self._nodes(q[None])[0])
+
+    def ways(self, start: Array, end: Array, pieces: int) -> Array:
+        return self._nodes(between(start, end, pieces))
+
+    def _nodes(self, states: Array) -> Array:
+        """Return (K, N, 3) the nodes at configurations (K, J + 6), m."""
+        count, (bound, compiling) = len(states), self._placing
+        if count not in self._kernels:
+            self._kernels[count] = bound.kernel(times=count, compiled=compiling)
+        kernel = self._kernels[count]
+        kernel.inputs[0][:] = states.reshape(-1)
+        kernel()
+        return kernel.outputs[0].reshape(count, -1, 3).copy()
+
+    @cached_property
+    def _placing(self) -> tuple[Bound, Compiling]:
+        """The nodes as a function, and what compiles it."""
+        constants = Constants()
+        symbols = self.symbols(constants)
+        q = ca.MX.sym("q", *symbols.shape)
+        bound = constants.bound("nodes", [q], [symbols.nodes(q)])
+        return bound, Compiling(bound.function)
+
+    @cached_property
+    def _kernels(self) -> dict[int, Kernel]:
+        """Kernels for so many configurations at once."""
+        return {}
 
     def measured(self, q: Array) -> Array:
         return np.array(q[:-6])

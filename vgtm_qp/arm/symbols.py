@@ -12,7 +12,7 @@ import numpy as np
 
 from vgtm_qp.arm.frames import frame_function, frame_tables
 from vgtm_qp.arrays import Array, Index
-from vgtm_qp.compiled import Kernel
+from vgtm_qp.compiled import Compiling, Kernel
 
 _TINY = 1e-30
 
@@ -43,12 +43,12 @@ class Bound:
     function: ca.Function
     constants: list[Array]
 
-    def kernel(self, *, compiled: bool = True) -> Kernel:
-        """Return the function as a kernel with its constants bound."""
-        kernel = Kernel(self.function, compiled=compiled)
+    def kernel(self, *, times: int = 1, compiled: bool | Compiling = True) -> Kernel:
+        """Return the function as a kernel with its constants bound; see ``compiled.Kernel``."""
+        kernel = Kernel(self.function, times=times, compiled=compiled)
         first = len(kernel.inputs) - len(self.constants)
         for k, values in enumerate(self.constants):
-            kernel.bind_input(first + k, values)
+            kernel.bind_input(first + k, np.tile(values, times))
         return kernel
 
 

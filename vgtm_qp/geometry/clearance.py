@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.exact import NORMAL
 from vgtm_qp.geometry.formulas import FAR
 from vgtm_qp.geometry.groups import Found, Group, Scene
-from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair
+from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, Wanted
 from vgtm_qp.geometry.shapes import Obstacle
 from vgtm_qp.geometry.solids import Solids
 from vgtm_qp.geometry.sweep import sweep_group
@@ -87,6 +88,7 @@ class Clearance:
         self_reach: float | None = None,
         by_fcl: bool = False,
         tracked: bool = False,
+        wanted: Wanted | None = None,
     ) -> Contacts:
         """Return all contacts of surfaces nearer than `reach`, exact; to 1e-6 m where FCL supplies them.
 
@@ -106,11 +108,13 @@ class Clearance:
         tracked : bool
             Whether `X` is an accepted state, from which :meth:`between` goes on. A watched scene is then evaluated from
             state to state. Trial positions would make the watch go there and back.
+        wanted : Wanted or None
+            Which of the pairs nearer than `reach` have contacts; all by default.
         """
         reach = self.influence if reach is None else reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
         if tracked and (watch := self._watch()) is not None:
-            watched = watch.near(X, reach, self_reach, by_fcl=by_fcl)
+            watched = watch.near(X, reach, self_reach, by_fcl=by_fcl, wanted=wanted)
             if watched is not None:
                 return watched
         candidates = self._candidates
@@ -127,6 +131,9 @@ class Clearance:
                 which, k = np.nonzero(~(distance >= min(limit, FAR)))
                 found, pairs = both[k, which], rows[k]
                 candidates.count_unneeded(group, len(rows) - int(np.count_nonzero(which == 0)))
+                if wanted is not None:
+                    needed = group.wanted(wanted, pairs, found)
+                    found, pairs = found[needed], pairs[needed]
                 if group.shape == "triangle":
                     kept = self._distinct(group, pairs, found)
                     found, pairs = found[kept], pairs[kept]
@@ -207,18 +214,37 @@ class Clearance:
     ) -> BetweenReport:
         """Prove that no surface distance falls below its floor while the points move on straight lines.
 
-        The watch is tried first, then bounds of the motion, then separating planes, then halves of the time for the
-        remaining pairs. A motion not proven after twelve halvings is refused: a false alarm, never a false proof.
+        See :meth:`along`, for `start` and `end` (P, 3), m.
+        """
+        return self.along(np.stack([start, end]), start_time, end_time, floor, self_floor)
+
+    def along(
+        self,
+        places: Array,
+        start_time: float,
+        end_time: float,
+        floor: float,
+        self_floor: float | None = None,
+        *,
+        thorough: bool = True,
+    ) -> BetweenReport:
+        """Prove that no surface distance falls below its floor on a way in straight pieces, one as long as the other.
+
+        The watch is tried first, then for each piece bounds of the motion, then separating planes, then halves of the
+        time for the remaining pairs. What is not proven after twelve halvings is refused: a false alarm, never a false
+        proof. The pieces after one that is not proven are not looked at.
 
         Parameters
         ----------
-        start, end : (P, 3)
-            m.
+        places : (K + 1, P, 3)
+            Positions of the points where pieces meet, m.
         start_time, end_time : float
             s; the obstacles move meanwhile.
         floor, self_floor : float
             For obstacles and, if it differs, between bodies, m. Below zero, where surfaces overlap already, only
             the watch can prove them; without it they count as zero.
+        thorough : bool
+            False if the watch, where there is one, is enough of a try.
 
         Raises
         ------
@@ -226,8 +252,23 @@ class Clearance:
             A position is not finite; so do `near` and `least`.
         """
         self_floor = floor if self_floor is None else self_floor
-        if (watch := self._watch()) is not None and watch.follow(start, end, floor, self_floor):
-            return BetweenReport(True, min(floor, self_floor), np.zeros(0), self.scene.nothing)
+        if (watch := self._watch()) is not None:
+            proven = watch.follow(places, floor, self_floor)
+            if proven or not thorough:
+                return BetweenReport(proven, min(floor, self_floor), np.zeros(0), self.scene.nothing)
+        pieces, lowest = len(places) - 1, np.inf
+        for k in range(pieces):
+            since, until = (start_time + j / pieces * (end_time - start_time) for j in (k, k + 1))
+            report = self._between(places[k], places[k + 1], since, until, floor, self_floor)
+            lowest = min(lowest, report.clearance)
+            if not report.certified:
+                break
+        return replace(report, clearance=lowest, fraction=(k + report.fraction) / pieces)
+
+    def _between(
+        self, start: Array, end: Array, start_time: float, end_time: float, floor: float, self_floor: float
+    ) -> BetweenReport:
+        """Return the proof for one piece, without the watch."""
         floor, self_floor = max(floor, 0.0), max(self_floor, 0.0)
         motion = self._candidates.cover(start, start_time, floor, self_floor, end, end_time)
         lowest, fractions = min(self._candidates.beyond(motion)), [np.zeros(0)]

@@ -22,7 +22,7 @@ from vgtm_qp.geometry.exact import (
     width,
 )
 from vgtm_qp.geometry.fcl_queries import FclQueries
-from vgtm_qp.geometry.pairs import Contacts, PairNames
+from vgtm_qp.geometry.pairs import Contacts, PairNames, Wanted
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 
 Found = tuple[Index, Array]
@@ -247,6 +247,10 @@ class Group:
                 rows = np.flatnonzero(self.lower(motion, best)[0] < best)
                 rows = rows[rows >= _FIRST]
         return best, row, len(rows)
+
+    def wanted(self, wanted: Wanted, rows: Index, found: Array) -> Mask:
+        """Return which of the contacts `found` (R, ``CONTACT``) of the pairs `rows` are wanted."""
+        return wanted(self.body[rows], self.other[rows], found[:, 0], is_self=self.is_self)
 
     def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> Found:
         """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`, with `by_fcl` FCL's contacts instead.

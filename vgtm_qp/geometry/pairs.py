@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -83,6 +83,14 @@ class Contacts:
     def pair(self, k: int) -> Pair:
         """Return the pair of row `k`."""
         return Pair(int(self.body[k]), int(self.other[k]), bool(self.is_self[k]))
+
+
+class Wanted(Protocol):
+    """Which pairs of bodies and pieces, or bodies, are wanted at their distances."""
+
+    def __call__(self, body: Index, other: Index, distance: Array, *, is_self: bool) -> Mask:
+        """Return (R,) for pairs (R,), (R,) at surface distances (R,), m; all are of one kind."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,10 +1,10 @@
-/* Pairs of bodies and pieces over a straight motion: which may have come near, and the contacts of these. */
+/* Pairs of bodies and pieces over straight motions: which may have come near, and the contacts of these. */
 
 /* Numbers of the ends of a pair before and after a motion; of what is known of it, of which the last three are a normal;
    and of its two contacts, of which the sixth to eighth are a normal: see follow_function. */
 enum { ENDS = 24, KNOWN = 19, KNOWN_NORMAL = 16, CONTACTS = 18, NORMAL = 5 };
 
-enum { DONE, NO_VALUE };
+enum { DONE, NO_VALUE, TOO_FAR, NOT_PROVEN };
 
 /* The lesser of two numbers; NaN if one of them is, for ever. */
 static double least_of(double a, double b)
@@ -12,48 +12,19 @@ static double least_of(double a, double b)
     return b >= a || a != a ? a : b;
 }
 
-/* How the axes of bodies move: of each the displacement of its middle, half that of one end from the other, and the
-   greatest of its ends'. */
-typedef struct {
-    int points, bodies;
-    const int *ends;                 /* (B, 2) points */
-    const double *before, *after;    /* (P, 3) */
-    double *middle, *turned, *furthest;    /* (B, 3), (B), (B) */
-    double square;                   /* sum of all squares, which is NaN if a position is */
-} Motion;
-
-EXPORT int follow(Motion *m)
+static double square_of(const double *before, const double *after)
 {
-    m->square = 0.0;
-    for (int k = 0; k < 3 * m->points; k++) {
-        double moved = m->after[k] - m->before[k];
-        m->square += moved * moved;
-    }
-    for (int b = 0; b < m->bodies; b++) {
-        double square[3] = {0.0, 0.0, 0.0};
-        const int *ends = m->ends + 2 * b;
-        for (int a = 0; a < 3; a++) {
-            double first = m->after[3 * ends[0] + a] - m->before[3 * ends[0] + a];
-            double second = m->after[3 * ends[1] + a] - m->before[3 * ends[1] + a];
-            m->middle[3 * b + a] = 0.5 * (first + second);
-            square[0] += first * first;
-            square[1] += second * second;
-            square[2] += 0.25 * (second - first) * (second - first);
-        }
-        m->turned[b] = sqrt(square[2]);
-        m->furthest[b] = sqrt(square[0] > square[1] ? square[0] : square[1]);
-    }
-    return DONE;
+    double square = 0.0;
+    for (int a = 0; a < 3; a++) square += (after[a] - before[a]) * (after[a] - before[a]);
+    return square;
 }
 
 /* Pairs of one shape, each with a lower bound of its distance. */
 typedef struct {
     int count, is_self;
     const int *body, *other, *points;    /* (C), (C), (C, 4) */
-    const double *before, *after;        /* (P, 3) */
-    const double *middle, *turned, *furthest;    /* of Motion */
     double *lower, *known;               /* (C), (C, 19): see follow_function */
-    double limit, next;                  /* pairs nearer than this are evaluated; ratio to it if none is near */
+    double next;                         /* ratio to the limit below which pairs are evaluated if none is near */
 
     Kernel contact;                      /* (ends 24, known 19) -> 18 numbers of contacts, and a bound */
     double *ends, *pair;
@@ -65,40 +36,79 @@ typedef struct {
     double *contacts;                    /* (2 C, 9): two for each */
 } Pairs;
 
-/* Lower the bounds by what the bodies moved, and evaluate the pairs that may be near. */
-EXPORT int evaluate(Pairs *p)
+/* The way of an arm in pieces, each straight from one place of all its points to the next. */
+typedef struct {
+    int pieces, points, bodies, groups;
+    const int *ends;                 /* (B, 2) points */
+    const double *places;            /* (K + 1, P, 3) */
+    double furthest;                 /* bound of the sum of the squares of displacements */
+    Pairs **group;                   /* (G) */
+    const double *floors, *limits;   /* (G): distance to prove on the way; pairs nearer than the other are evaluated */
+
+    double *middle, *turned, *moved; /* (B, 3), (B), (B): of each body's axis in the present piece the displacement of
+                                        its middle, half that of one end from the other, the greatest of its ends' */
+    int done;                        /* number of pieces that were followed */
+} Way;
+
+static void move(Way *w, const double *before, const double *after)
 {
-    double least = INFINITY, reach = p->is_close ? p->limit : fmax(p->limit, p->next * p->limit);
+    for (int b = 0; b < w->bodies; b++) {
+        double square[3] = {0.0, 0.0, 0.0};
+        const int *ends = w->ends + 2 * b;
+        for (int a = 0; a < 3; a++) {
+            double first = after[3 * ends[0] + a] - before[3 * ends[0] + a];
+            double second = after[3 * ends[1] + a] - before[3 * ends[1] + a];
+            w->middle[3 * b + a] = 0.5 * (first + second);
+            square[0] += first * first;
+            square[1] += second * second;
+            square[2] += 0.25 * (second - first) * (second - first);
+        }
+        w->turned[b] = sqrt(square[2]);
+        w->moved[b] = sqrt(square[0] > square[1] ? square[0] : square[1]);
+    }
+}
+
+/* Evaluate pair k on a straight motion, with a plane at its begin that is known. */
+static int contact(Pairs *p, int k, const double *before, const double *after)
+{
+    for (int i = 0; i < 4; i++) {
+        memcpy(p->ends + 3 * i, before + 3 * p->points[4 * k + i], 3 * sizeof(double));
+        memcpy(p->ends + ENDS / 2 + 3 * i, after + 3 * p->points[4 * k + i], 3 * sizeof(double));
+    }
+    memcpy(p->pair, p->known + KNOWN * k, KNOWN * sizeof(double));
+    if (call(&p->contact)) return NO_VALUE;
+    memcpy(p->known + KNOWN * k + KNOWN_NORMAL, p->found + NORMAL, 3 * sizeof(double));
+    return DONE;
+}
+
+/* Lower the bounds by what the bodies moved, and evaluate the pairs that may be nearer than the limit; if there are any
+   and none was near before, all nearer than the reach. */
+static int evaluate(const Way *w, Pairs *p, double floor, double limit, double reach, const double *before,
+                    const double *after)
+{
+    double least = INFINITY;
     int is_known = 1;
+    if (p->is_close) reach = limit;
     for (int k = 0; k < p->count; k++) {
         int a = p->body[k], b = p->other[k];
-        double nearer = p->furthest[a];
-        if (p->is_self) {
-            double square = 0.0;
-            for (int i = 0; i < 3; i++) {
-                double apart = p->middle[3 * a + i] - p->middle[3 * b + i];
-                square += apart * apart;
-            }
-            nearer = sqrt(square) + p->turned[a] + p->turned[b];
-        }
+        double nearer = w->moved[a];
+        if (p->is_self)
+            nearer = sqrt(square_of(w->middle + 3 * a, w->middle + 3 * b)) + w->turned[a] + w->turned[b];
         p->lower[k] -= nearer;
         /* A negated comparison is true for NaN. */
-        if (!(p->lower[k] >= p->limit)) is_known = 0;
+        if (!(p->lower[k] >= limit)) is_known = 0;
     }
     p->near = p->is_close = p->overlaps = 0;
     p->lowest = INFINITY;
     if (is_known) return DONE;
     for (int k = 0; k < p->count; k++) {
         if (p->lower[k] >= reach) continue;
-        double *known = p->known + KNOWN * k, *contacts = p->contacts + CONTACTS * p->near;
-        for (int i = 0; i < 4; i++) {
-            memcpy(p->ends + 3 * i, p->before + 3 * p->points[4 * k + i], 3 * sizeof(double));
-            memcpy(p->ends + ENDS / 2 + 3 * i, p->after + 3 * p->points[4 * k + i], 3 * sizeof(double));
-        }
-        memcpy(p->pair, known, KNOWN * sizeof(double));
-        if (call(&p->contact)) return NO_VALUE;
-        memcpy(contacts, p->found, CONTACTS * sizeof(double));
-        memcpy(known + KNOWN_NORMAL, p->found + NORMAL, 3 * sizeof(double));
+        if (contact(p, k, before, after)) return NO_VALUE;
+        /* The known plane may be one of long ago: that of the place before proves more. */
+        if (p->found[CONTACTS] < floor && p->lower[k] < floor
+            && (contact(p, k, before, before) || contact(p, k, before, after)))
+            return NO_VALUE;
+        memcpy(p->contacts + CONTACTS * p->near, p->found, CONTACTS * sizeof(double));
         /* The bound from the motion alone holds as well. */
         double bound = p->found[CONTACTS] > p->lower[k] ? p->found[CONTACTS] : p->lower[k];
         p->lowest = least_of(p->lowest, bound);
@@ -107,6 +117,30 @@ EXPORT int evaluate(Pairs *p)
         least = least_of(least, p->found[0]);
         p->rows[p->near++] = k;
     }
-    p->is_close = least < p->limit;
+    p->is_close = least < limit;
     return DONE;
+}
+
+/* Follow the way to its end, or to the end of the first piece that is not proven to keep the floors. */
+EXPORT int follow(Way *w)
+{
+    int step = 3 * w->points, is_proven = 1;
+    double square = 0.0;
+    for (int k = 0; k < w->pieces * step; k += 3) square += square_of(w->places + k, w->places + k + step);
+    w->done = 0;
+    if (!(square < w->furthest)) return TOO_FAR;
+    while (is_proven && w->done < w->pieces) {
+        const double *before = w->places + w->done * step, *after = before + step;
+        int is_last = ++w->done == w->pieces;
+        move(w, before, after);
+        for (int g = 0; g < w->groups; g++) {
+            Pairs *pairs = w->group[g];
+            /* On the way only what it has to keep matters. */
+            double floor = w->floors[g], limit = is_last ? w->limits[g] : floor;
+            double reach = is_last ? fmax(limit, pairs->next * limit) : limit;
+            if (evaluate(w, pairs, floor, limit, reach, before, after)) return NO_VALUE;
+            if (!(pairs->lowest >= floor)) is_proven = 0;
+        }
+    }
+    return is_proven ? DONE : NOT_PROVEN;
 }

@@ -9,6 +9,7 @@ and its distance on the way from the state before is bounded: ``watch.c``.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from enum import IntEnum
 from functools import cache
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from vgtm_qp.geometry.candidates import every_pair
 from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
 from vgtm_qp.geometry.formulas import FURTHEST
 from vgtm_qp.geometry.groups import Found, Group, Scene
-from vgtm_qp.geometry.pairs import Contacts
+from vgtm_qp.geometry.pairs import Contacts, Wanted
 from vgtm_qp.geometry.shapes import GeometryError
 from vgtm_qp.native import Program, building
 
@@ -36,6 +37,12 @@ _AHEAD = 1.2
 
 _NEXT = 2.0
 """If no pair is near, ratio to the limit below which pairs are evaluated all the same, in one call."""
+
+
+class _Code(IntEnum):
+    """What ``follow`` of ``watch.c`` returns."""
+
+    DONE, NO_VALUE, TOO_FAR, NOT_PROVEN = range(4)
 
 
 def can_be_watched(scene: Scene) -> bool:
@@ -65,8 +72,8 @@ def is_ready(shapes: Iterable[str]) -> bool:
 class _WatchedGroup:
     """The pairs of one shape, with bounds and contacts of the last evaluation."""
 
-    def __init__(self, group: Group, places: Array, motion: dict[str, Array]) -> None:
-        count, points = len(group), len(places) // 2
+    def __init__(self, group: Group) -> None:
+        count = len(group)
         self.group = group
         piece = np.zeros((count, WIDTH)) if group.is_self else group.scene.pieces.parameters[group.other]
         normal = np.tile([0.0, 0.0, 1.0], (count, 1))
@@ -80,8 +87,6 @@ class _WatchedGroup:
             body=group.body.astype(np.int32),
             other=group.other.astype(np.int32),
             points=np.ascontiguousarray(group.points, dtype=np.int32),
-            before=places[:points],
-            after=places[points:],
             lower=group.distance.copy(),
             known=np.concatenate([piece, group.radius[:, None], normal], axis=1),
             next=_NEXT,
@@ -91,21 +96,23 @@ class _WatchedGroup:
             found=contact.outputs[0],
             rows=self._rows,
             contacts=self._contacts,
-            **motion,
         )
         self.data = self._program.data
 
-    def evaluate(self, limit: float) -> None:
-        """Evaluate the pairs that may be nearer than `limit`, m, in the present state."""
-        self.data.limit = limit
-        if self._program.call("evaluate"):
-            raise EvaluationError(f"the distance of a {self.group.shape} has no value")
+    def address(self) -> int:
+        """Return where C finds the pairs; what was compiled since is used from now on."""
+        self._program.refresh()
+        return self._program.address
 
-    def near(self, X: Array, limit: float, by_fcl: bool) -> Found:
-        """Return the contacts nearer than `limit`, m, in the present state `X`."""
+    def near(self, X: Array, limit: float, by_fcl: bool, wanted: Wanted | None) -> Found:
+        """Return the `wanted` contacts nearer than `limit`, m, in the present state `X`."""
         contacts = self._contacts[: 2 * self.data.near]
-        rows = (contacts[:, 0] < limit).nonzero()[0]
-        return self.group.contacts(X, 0.0, self._rows.take(rows >> 1), contacts.take(rows, axis=0), by_fcl)
+        near = (contacts[:, 0] < limit).nonzero()[0]
+        rows, contacts = self._rows.take(near >> 1), contacts.take(near, axis=0)
+        if wanted is not None:
+            kept = self.group.wanted(wanted, rows, contacts)
+            rows, contacts = rows[kept], contacts[kept]
+        return self.group.contacts(X, 0.0, rows, contacts, by_fcl)
 
 
 class Watch:
@@ -114,72 +121,104 @@ class Watch:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._groups: list[_WatchedGroup] = []
-        self._motion: Program | None = None
-        self._at, self._places = b"", np.zeros((0, 3))
-        self._limits = self._wanted = (-np.inf, -np.inf)
+        self._way: Program | None = None
+        self._place: Array = np.zeros((0, 3))
+        self._at = b""
+        self._floors = self._limits = self._pairs = np.zeros(0)
+        self._reach = self._wanted = (-np.inf, -np.inf)
 
-    def near(self, X: Array, limit: float, self_limit: float, *, by_fcl: bool = False) -> Contacts | None:
-        """Return all contacts nearer than `limit`, or `self_limit` between bodies, m; None where surfaces overlap.
+    def near(
+        self,
+        X: Array,
+        limit: float,
+        self_limit: float,
+        *,
+        by_fcl: bool = False,
+        wanted: Wanted | None = None,
+    ) -> Contacts | None:
+        """Return the contacts nearer than `limit`, or `self_limit` between bodies, m; None where surfaces overlap.
 
-        `X` (P, 3) are positions of the points; `by_fcl` says whether FCL supplies the contacts.
+        `X` (P, 3) are positions of the points; `by_fcl` says whether FCL supplies the contacts, and `wanted` of which
+        pairs.
         """
-        if limit > self._limits[0] or self_limit > self._limits[1] or not self._is_at(X):
+        if limit > self._reach[0] or self_limit > self._reach[1] or not self._is_at(X):
             self._move_to(X, (limit, self_limit))
         self._wanted = _AHEAD * limit, _AHEAD * self_limit
         limits, near = (limit, self_limit), [pairs for pairs in self._groups if pairs.data.near]
         if any(pairs.data.overlaps for pairs in near):
             return None
-        return self._scene.contacts([pairs.near(X, limits[pairs.group.is_self], by_fcl) for pairs in near])
-
-    def follow(self, start: Array, end: Array, floor: float, self_floor: float) -> bool:
-        """Return whether no surface distance falls below its floor, m, while points move straight to `end`.
-
-        False may also mean that this was not proven. `start` and `end` are positions of the points (P, 3), m.
-        """
-        limits = max(self._wanted[0], floor), max(self._wanted[1], self_floor)
-        if not self._is_at(start):
-            self._move_to(start, limits)
-        self._move_to(end, limits)
-        return all(
-            pairs.data.lowest >= (self_floor if pairs.group.is_self else floor) for pairs in self._groups
+        return self._scene.contacts(
+            [pairs.near(X, limits[pairs.group.is_self], by_fcl, wanted) for pairs in near]
         )
+
+    def follow(self, places: Array, floor: float, self_floor: float) -> bool:
+        """Return whether no surface distance falls below its floor, m, on a way in straight pieces.
+
+        False may also mean that this was not proven. The way leads from one of the `places` of the points (K + 1, P, 3)
+        to the next, m; the last that was come to is the present state.
+        """
+        reach = max(self._wanted[0], floor), max(self._wanted[1], self_floor)
+        if not self._is_at(places[0]):
+            self._move_to(places[0], reach)
+        return self._go(places, (floor, self_floor), reach)
 
     def _is_at(self, X: Array) -> bool:
         """Return whether `X` (P, 3) are the positions of the present state."""
         return X.tobytes() == self._at
 
-    def _move_to(self, X: Array, limits: tuple[float, float]) -> None:
-        """Make `X` the present state, and evaluate the pairs that may be nearer than the limits, m, there.
+    def _move_to(self, X: Array, reach: tuple[float, float]) -> None:
+        """Make `X` the present state, and evaluate the pairs that may be nearer than the `reach`, m, there."""
+        before = X if self._way is None else self._place
+        self._go(np.stack([before, X]), (-np.inf, -np.inf), reach)
+
+    def _go(self, places: Array, floors: tuple[float, float], reach: tuple[float, float]) -> bool:
+        """Go from place to place as long as the floors, m, are proven, and return whether they all are.
+
+        Where that ends is the present state. At the last place the pairs that may be nearer than the `reach`, m, are
+        evaluated.
 
         Raises
         ------
         GeometryError
             A position is not finite; nothing has changed.
         """
-        motion = self._start(X) if self._motion is None else self._motion
-        self._places[len(X) :] = X
-        motion.call("follow")
-        if not motion.data.square < FURTHEST:
+        way = self._start(places[0]) if self._way is None else self._way
+        places = np.ascontiguousarray(places)
+        for k, pairs in enumerate(self._groups):
+            self._pairs[k] = pairs.address()
+            self._floors[k], self._limits[k] = floors[pairs.group.is_self], reach[pairs.group.is_self]
+        way.set(pieces=len(places) - 1, places=places)
+        code = _Code(way.call("follow"))
+        if code is _Code.TOO_FAR:
             raise GeometryError("node positions must be finite numbers")
-        self._at, self._motion = b"", None
-        for pairs in self._groups:
-            pairs.evaluate(limits[pairs.group.is_self])
-        self._motion = motion
-        self._places[: len(X)] = X
-        self._at, self._limits = X.tobytes(), limits
+        if code is _Code.NO_VALUE:
+            self._way, self._at = None, b""
+            raise EvaluationError("the distance of a pair has no value")
+        done = way.data.done
+        self._place = places[done]
+        self._at = self._place.tobytes()
+        self._reach = reach if done == len(places) - 1 else floors
+        return code is _Code.DONE
 
     def _start(self, X: Array) -> Program:
         """List all pairs, with their distances at `X`."""
-        bodies, groups = len(self._scene.bodies), every_pair(self._scene, X)
-        self._places, motion = np.concatenate([X, X]), Program(SOURCE, "Motion")
-        found = {"middle": np.zeros((bodies, 3)), "turned": np.zeros(bodies), "furthest": np.zeros(bodies)}
-        motion.set(
+        bodies, way = self._scene.bodies, Program(SOURCE, "Way")
+        self._groups = [_WatchedGroup(group) for group in every_pair(self._scene, X)]
+        count = len(self._groups)
+        self._pairs = np.zeros(count, dtype=np.uintp)
+        self._floors, self._limits = np.zeros(count), np.zeros(count)
+        way.set(
             points=len(X),
-            bodies=bodies,
-            ends=np.ascontiguousarray(self._scene.bodies.points, dtype=np.int32),
-            before=self._places[: len(X)],
-            after=self._places[len(X) :],
-            **found,
+            bodies=len(bodies),
+            groups=count,
+            ends=np.ascontiguousarray(bodies.points, dtype=np.int32),
+            furthest=FURTHEST,
+            group=self._pairs,
+            floors=self._floors,
+            limits=self._limits,
+            middle=np.zeros((len(bodies), 3)),
+            turned=np.zeros(len(bodies)),
+            moved=np.zeros(len(bodies)),
         )
-        self._groups = [_WatchedGroup(group, self._places, found) for group in groups]
-        return motion
+        self._way, self._place = way, X.copy()
+        return way

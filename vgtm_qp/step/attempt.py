@@ -182,10 +182,11 @@ class Attempt:
     ) -> tuple[QPInput, float]:
         """Return the first input, and the distance, m, beyond which no pair can become active."""
         q, arm, goal, guess = state.q, self._arm, target.goal(progress), share * state.motion
-        reach = self._influence
+        reach, expected = self._influence, None
         if share >= 1.0:
-            reach = _MOTION_MARGIN * self._expected(target, goal, guess)
-        rows = self.separation.rows(q, state.time, target.duration, reach, short, gain)
+            reach, last = _MOTION_MARGIN * self._expected(target, goal, guess), arm.travel(guess)
+            expected = None if target.base is not None or last == 0.0 else reach / last * guess
+        rows = self.separation.rows(q, state.time, target.duration, reach, short, gain, expected=expected)
         if target.base is not None:
             # The displacement of nodes with the base is known.
             rows = rows.after(arm.nodes(arm.based(q, target.base)) - arm.nodes(q))

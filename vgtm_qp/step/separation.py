@@ -6,12 +6,12 @@ A pair that is already below its clearance does not stop the arm: it must not co
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.clearance import BetweenReport, Contacts, Pair
+from vgtm_qp.geometry.pairs import Wanted
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.angles import angle_gradients, angles, corners
 from vgtm_qp.rows.clearance import clearance_rows, slowed
@@ -102,35 +102,38 @@ class Separation:
                 self_floor = min(self_floor, distance)
             else:
                 floor = min(floor, distance)
-        points, between = self._arm.points, self._monitor.between
+        along, ways = self._monitor.along, self._arm.ways
         if not self._arm.leaves_chords:
             floors = floor - self._rounding, max(self_floor - self._rounding, 0.0)
-            return between(points(start), points(end), start_time, end_time, *floors)
+            return along(ways(start, end, 1), start_time, end_time, *floors)
         deviation = self.deviation(start, end)
         # In k pieces, the deviation from the chords is 1 / k^2 of the whole. Most motions need one piece alone.
         is_far = deviation >= self._arm.unit
         needed = 1 if is_far else math.ceil(math.sqrt(max(deviation / self._between, 1.0)))
-        for pieces in sorted({1, min(needed, _MOST_PIECES)}):
-            spare, lowest = deviation / pieces**2 - self._between, np.inf
+        tries = sorted({1, min(needed, _MOST_PIECES)})
+        for pieces in tries:
+            spare = deviation / pieces**2 - self._between
             floors = floor + spare, max(self_floor + spare, 0.0)
-            lapse, there = (end_time - start_time) / pieces, points(start)
-            for k in range(pieces):
-                here, there = there, points(start + (k + 1) / pieces * (end - start))
-                since = start_time + k * lapse
-                report = between(here, there, since, since + lapse, *floors)
-                lowest = min(lowest, report.clearance)
-                if not report.certified:
-                    break
+            is_last = pieces == tries[-1]
+            report = along(ways(start, end, pieces), start_time, end_time, *floors, thorough=is_last)
             if report.certified:
                 break
-        return replace(report, clearance=lowest, fraction=(k + report.fraction) / pieces)
+        return report
 
     def deviation(self, start: Array, end: Array) -> float:
         """Return a bound of how much nearer two points come to each other than their chords do, m."""
         return self._arm.deviation(start, end) if self._arm.leaves_chords else 0.0
 
     def rows(
-        self, q: Array, time: float, duration: float, reach: float, short: Shortfall, gain: float
+        self,
+        q: Array,
+        time: float,
+        duration: float,
+        reach: float,
+        short: Shortfall,
+        gain: float,
+        *,
+        expected: Array | None = None,
     ) -> ClearanceRows:
         """Return the rows at a configuration: of every pair that can become active, by FCL as far as it is proven.
 
@@ -145,17 +148,42 @@ class Separation:
             further, the check of the new state finds the missed pair, and another QP corrects it.
         short, gain
             Pairs that were too near at the start of the step, and the distance by which they are driven apart, m.
+        expected
+            Displacement of the configuration that is as far as `reach`, if one is expected and the base rests: bodies
+            that move less or together then need fewer rows.
         """
         kept, motion, monitor = self._setup, duration > 0.0, self._monitor
         reach += monitor.pieces.fastest * duration
         limits = min(kept.influence, kept.safe + reach), min(kept.influence, kept.self_safe + 2.0 * reach)
+        wanted = None if expected is None else self._wanted(expected, duration)
         contacts = monitor.near(
-            self._arm.points(q), time, limits[0], self_reach=limits[1], by_fcl=True, tracked=not short
+            self._arm.points(q),
+            time,
+            limits[0],
+            self_reach=limits[1],
+            by_fcl=True,
+            tracked=not short,
+            wanted=wanted,
         )
         rows = self._clearance_rows(q, contacts)
         if len(contacts):
             self._allow(rows, contacts, duration, short, gain)
         return rows.joined(self._angle_rows(q, motion=motion)) if len(self._corners) else rows
+
+    def _wanted(self, expected: Array, duration: float) -> Wanted | None:
+        """Return which pairs can become active in an expected displacement; None for all."""
+        approach = self._arm.approach(expected)
+        if approach is None:
+            return None
+        kept, drift = self._setup, self._monitor.pieces.fastest * duration
+
+        def wanted(body: Index, other: Index, distance: Array, *, is_self: bool) -> Mask:
+            floor, nearer = (
+                (kept.self_safe, approach(body, other)) if is_self else (kept.safe, approach(body) + drift)
+            )
+            return distance < floor + nearer
+
+        return wanted
 
     def _allow(
         self, rows: ClearanceRows, contacts: Contacts, duration: float, short: Shortfall, gain: float

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Stations, Tip, has_full_rank
+from vgtm_qp.arm.arm import Approach, Stations, Tip, has_full_rank
 from vgtm_qp.arm.frames import frames_along
 from vgtm_qp.arm.joint_space import JointSpaceArm
 from vgtm_qp.arm.serial.chain import SerialChain
@@ -90,8 +91,7 @@ class SerialArm(JointSpaceArm):
 
     def _reaches(self) -> Array:
         """Return (J + 1,) the :attr:`reaches`: all slides fully extended, all links in one line."""
-        chain = self.chain
-        slide = np.where(chain.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
+        chain, slide = self.chain, self._slides()
         beside = np.full(len(chain) + 1, np.sqrt(2.0) * chain.spread)
         np.maximum.at(beside, chain.carriers, np.linalg.norm(chain.points, axis=1))
         reaches, beyond = np.empty(len(chain) + 1), np.sqrt(2.0) * chain.spread
@@ -100,6 +100,54 @@ class SerialArm(JointSpaceArm):
             reaches[k] = beyond = slide[k - 1] + max(beside[k], chain.lengths[k] + beyond)
         reaches[0] = max(beside[0], chain.lengths[0] + beyond)
         return reaches
+
+    def approach(self, motion: Array) -> Approach:
+        """See ``arm.Arm``.
+
+        A joint between two bodies moves the further one, by no more than its turn times the length of the way there.
+        """
+        turn, slide = (moved[1:] for moved in self._motions(motion))
+        # Sums over the joints before each: of turns, of turns times ways, of slides.
+        sums = np.zeros((3, len(turn) + 1))
+        np.cumsum([turn, turn * self._ways[0], slide], axis=1, out=sums[:, 1:])
+        points, way, (first, last) = self.bodies.points, self._ways[1], self._movers
+
+        def bound(body: Index, other: Index | None = None) -> Array:
+            begin, end, furthest = (
+                np.zeros(len(body), dtype=np.int64),
+                last[body],
+                way[points[body]].max(axis=1),
+            )
+            if other is not None:
+                begin, end = np.minimum(first[body], first[other]), np.maximum(end, last[other])
+                furthest = np.maximum(furthest, way[points[other]].max(axis=1))
+            turns, levers, slides = sums[:, end] - sums[:, begin]
+            return np.asarray(furthest * turns - levers + slides)
+
+        return bound
+
+    @cached_property
+    def _movers(self) -> tuple[Index, Index]:
+        """(B,) numbers of joints that move a body as a whole, and that move a part of it."""
+        places = np.concatenate([[0], np.arange(len(self.chain) + 1), self.chain.carriers])
+        last = places[self.bodies.points].max(axis=1)
+        # Where a slide begins, the body stretches; a joint that turns a body is at its end.
+        stretches = (last > 0) & ~self.revolute[last - 1] & (places[self.bodies.points].min(axis=1) < last)
+        return last - stretches, last
+
+    @cached_property
+    def _ways(self) -> tuple[Array, Array]:
+        """Lengths (J,) of the way along the links, slides fully extended, to each joint; and to the same, m."""
+        chain, slide = self.chain, self._slides()
+        steps = chain.lengths + np.concatenate([[0.0], slide])
+        to_joints = np.cumsum(steps)
+        before = np.concatenate([[0.0], to_joints[:-1] + slide])
+        to_points = before[chain.carriers] + np.linalg.norm(chain.points, axis=1)
+        return to_joints[:-1], np.concatenate([[0.0], to_joints, to_points])
+
+    def _slides(self) -> Array:
+        """Return (J,) the greatest extensions of slides, m; 0 for joints that turn."""
+        return np.where(self.chain.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
 
     def _links(self, radius: float) -> Bodies:
         """Return links between successive origins; those of joints in one place are joined as if they were one."""
