@@ -89,9 +89,11 @@ def first_answer(resolver, asked):
     return found[0]
 
 
-@pytest.mark.parametrize("name", QPS)
-def test_other_solvers_give_the_first_answer_of_the_step(name):
+@pytest.mark.parametrize(("name", "limit"), [*((name, None) for name in QPS), ("five_bay_two_cubes", 0.03)])
+def test_other_solvers_give_the_first_answer_of_the_step(name, limit):
     problem = vq.load_problem(name)
+    if limit:
+        problem = problem.replace({"method.step_limit": limit})
     resolver = vq.Resolver(build_arm(problem, plain=True))
     plan, compared, task = make_plan(problem, *resolver.tip()), 0, resolver.setup.task
     value = plan.path.start

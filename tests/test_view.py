@@ -139,6 +139,24 @@ def test_the_hand_changes_between_all_methods_and_back(session: Session):
     assert session.problem.method == given
 
 
+@pytest.mark.parametrize(
+    "own",
+    [
+        {"method.tracking_mode": "elastic"},
+        {"method.solver": "piqp"},
+        {"method.slow_approach": False},
+        {"method.weights.curve_rate": 0.01, "method.weights.tangent": 0.02},
+    ],
+)
+def test_the_hand_offers_the_methods_that_the_command_takes_whatever_the_problem_asks_of_its_own(own):
+    session = Session(vq.load_problem("five_bay_two_cubes").replace(own))
+    for name, problem in methods_for(session.problem).items():
+        session.use_method(name)
+        assert session.problem.method == problem.method, name
+    session.use_method("qp")
+    assert session.problem.method == vq.load_problem("five_bay_two_cubes").replace(own).method
+
+
 def test_a_serial_arm_is_offered_what_can_move_it():
     served = list(methods_for(vq.load_problem("snake_past_a_cube")))
     assert served[:3] == ["qp", "qp-osqp", "qp-none"]

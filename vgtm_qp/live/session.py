@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.methods import PRESETS, Resolver
+from vgtm_qp.methods import Resolver
+from vgtm_qp.methods.presets import with_method
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.curve import fitted
 from vgtm_qp.step.path import Path
@@ -25,9 +26,6 @@ OUTCOMES = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatu
 _REACHED = 1e-4
 _STRIDE = 0.06
 _RETRY_AFTER = 10
-
-_WEIGHTS = {key for changes in PRESETS.values() for key in changes if key.count(".") == 2}
-"""Keys of the weights and gains that some methods bring with them."""
 
 
 class Reading(NamedTuple):
@@ -136,22 +134,22 @@ class Session:
 
         VgtmError, and no change, where a value is wrong or the method cannot serve this problem.
         """
-        problem = self.problem.replace(settings)
+        self._use(self.problem.replace(settings))
+
+    def _use(self, problem: Problem) -> None:
+        """Go on with another problem from the same state."""
         resolver = Resolver(problem)
         resolver.state = _with_curve(self.state, resolver.setup)
         self.problem, self._resolver = problem, resolver
         self._waiting, self._held_by = 0, ()
 
     def use_method(self, name: str) -> None:
-        """Change to the method called `name`, with the weights, gains and solver of the problem that was given.
+        """Change to the method called `name`, with the keys of the problem that was given as far as it has them.
 
         VgtmError, and no change, where it cannot move this arm.
         """
-        own = {
-            key: getattr(getattr(self._given.method, key.split(".")[1]), key.split(".")[2])
-            for key in _WEIGHTS
-        }
-        self.change({**own, "method.solver": self._given.method.solver, **PRESETS[name]})
+        given = self._given.to_dict()["method"]
+        self._use(with_method(self.problem.replace({"method": given}), name))
 
     def advance(self, dt: float) -> bool:
         """Make one step of duration `dt`, s, towards what is wanted; return whether the arm moved.

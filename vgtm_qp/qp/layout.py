@@ -34,6 +34,11 @@ def with_angles(weights: Weights, arm: Arm) -> Weights:
     return weights.model_copy(update={"tangent": area * weights.tangent, "roll": area * weights.roll})
 
 
+def weights_of(count: int, nodes: Index, weights: Array) -> Array:
+    """Return (N,) the weights of all `count` nodes in the mean of some (K,) with `weights` (K,)."""
+    return np.asarray(np.bincount(nodes, weights, count), dtype=float)
+
+
 _REACH = 0.03
 """Share of the arm's unit by which a step draws such a gap back."""
 
@@ -142,11 +147,15 @@ class Layout:
 
     @cached_property
     def ends_at_tip(self) -> bool:
-        """Whether the curve ends in the end effector: if it has enough control vertices for that."""
-        tip, last = self.arm.end_effector.nodes, self.arm.stations.nodes[-1:]
-        return self.vertices >= _ENDS_AT_TIP and np.array_equal(last, [tip])
+        """Whether the curve ends in the end effector: if that is the last station, and there are enough vertices."""
+        tip, stations = self.arm.end_effector, self.arm.stations
+        if self.vertices < _ENDS_AT_TIP:
+            return False
+        poses = ((tip.nodes, tip.weights), (stations.nodes[-1], stations.weights[-1]))
+        first, second = (weights_of(len(self.arm.home), *pose) for pose in poses)
+        return np.array_equal(first > 0.0, second > 0.0) and np.allclose(first, second, rtol=0.0, atol=1e-12)
 
-    @property
+    @cached_property
     def ends_along_tip(self) -> bool:
         """Whether the curve ends along the tip's z-axis: if that is tracked and there is another control vertex."""
         turned = len(tip_axes(self.tip_rows)) < len(self.tip_rows)
@@ -242,14 +251,15 @@ class Layout:
     def ended(self, vertices: Array, position: Array, rotation: Array) -> Array:
         """Return (V, 3) control vertices, changed least, whose curve ends at the tip's `position` (3,), m.
 
-        The curve ends along the z-axis of the tip's `rotation` (3, 3) if the direction is tracked.
+        The curve ends along the z-axis of the tip's `rotation` (3, 3) if the direction is tracked, with its slope as
+        steep as it was: a projection would shrink it from step to step.
         """
         if not self.ends_at_tip:
             return vertices
         missing = [position - self.curve_weights[-1] @ vertices]
         if self.ends_along_tip:
             slope, axis = self.curve_slopes[-1] @ vertices, rotation[:, 2]
-            missing.append((slope @ axis) * axis - slope)
+            missing.append(math.copysign(float(np.linalg.norm(slope)), slope @ axis) * axis - slope)
         return np.asarray(vertices + self._end_gain @ np.array(missing))
 
     @cached_property
@@ -258,6 +268,16 @@ class Layout:
         last = self.vertices - 1
         legs = [(0, 1), (last - 1, last)][: int(last > 0) + self.ends_along_tip]
         return np.array(legs, dtype=np.int64).reshape(-1, 2)
+
+    def is_reversed(self, vertices: Array, normal: Array, rotation: Array) -> bool:
+        """Return whether a curve of vertices (V, 3) begins or ends against its direction.
+
+        That is the base's `normal` (3,) at its begin, and at its end the z-axis of the tip's `rotation` (3, 3) where it
+        ends along that.
+        """
+        if (vertices[1] - vertices[0]) @ normal < 0.0:
+            return True
+        return self.ends_along_tip and bool((vertices[-1] - vertices[-2]) @ rotation[:, 2] < 0.0)
 
     @property
     def least_leg(self) -> float:

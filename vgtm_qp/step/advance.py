@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.step.actuation import Actuation, Box
-from vgtm_qp.step.attempt import Attempt, Tracking
+from vgtm_qp.step.actuation import Actuation
+from vgtm_qp.step.attempt import FURTHER, Attempt, Tracking
 from vgtm_qp.step.braking import ANY_RANK, Brakes, Braking
 from vgtm_qp.step.setup import TOO_LONG
 from vgtm_qp.step.shaping import Shaping
@@ -33,7 +33,6 @@ _INSTANT = 1e-9
 _LEAST_HELD = 0.5
 """Least share of a piece of path for which stations stay on the curve, where they may leave it."""
 
-_HELD_BACK = "stations on the curve hold the arm back"
 _OFF_PATH = "the arm could brake after it only off its path"
 
 
@@ -86,51 +85,80 @@ class Advancer:
 
         With a limit on the displacement of nodes, pieces longer than that limit are not tried.
         """
-        box, limit = (target.lower, target.upper), self._step_limit
-        is_slow, first = self._tip_mode == "scaled", 1.0
-        if is_slow and limit < np.inf:
-            first = min(1.0, limit / max(self._asked(target), _INSTANT))
-        tracking = Tracking.EITHER
+        is_slow, first = self._tip_mode == "scaled", self.first_share(target)
         if is_slow and self._attempt.gives_way and self._actuation.starts_at_once:
-            # Stations leave the curve only if they do not stay on it on shorter pieces either. An arm that cannot stop
-            # at once must not be led into a corner in that way.
-            yield from self._pieces(state, target, dt, first, max(smallest, _LEAST_HELD), Tracking.HARD)
-            tracking = Tracking.ELASTIC
-        yield from self._pieces(state, target, dt, first, smallest if is_slow else first, tracking)
+            yield from self._held_or_free(state, target, dt, first, smallest)
+        else:
+            yield from self._pieces(state, target, dt, first, smallest if is_slow else first, Tracking.EITHER)
         if not self._actuation.starts_at_once:
-            slow = self._actuation.creeping(state, box, dt)
+            slow = self._actuation.creeping(state, (target.lower, target.upper), dt)
             if slow is not None:
                 yield self._try(state, replace(target, lower=slow[0], upper=slow[1]), dt)
+
+    def first_share(self, target: Target) -> float:
+        """Return the share of a target's piece that is tried first: less than all where nodes may not move as far."""
+        if self._tip_mode != "scaled" or not self._step_limit < np.inf:
+            return 1.0
+        return min(1.0, self._step_limit / max(self._asked(target), _INSTANT))
+
+    def _held_or_free(
+        self, state: State, target: Target, dt: float, first: float, smallest: float
+    ) -> Iterator[Advance]:
+        """Yield attempts with stations on the curve and then, if these get less than half as far, with others free.
+
+        Stations leave the curve only if the arm then gets a quarter further than on it. An arm that cannot stop at once
+        must not be led into a corner in that way.
+        """
+        held: Advance | None = None
+        for found in self._pieces(state, target, dt, first, max(smallest, _LEAST_HELD), Tracking.HARD):
+            if found.step.moved and found.step.progress < _LEAST_HELD * first:
+                held = found if held is None else max(held, found, key=_progress)
+            else:
+                yield found
+        share = first
+        for found in self._pieces(state, target, dt, first, smallest, Tracking.ELASTIC):
+            if found.step.moved and share < _LEAST_HELD * first:
+                on_curve = self._piece(state, target, dt, first, share, Tracking.HARD)
+                if on_curve.step.moved:
+                    held = on_curve if held is None else max(held, on_curve, key=_progress)
+            least = 0.0 if held is None else FURTHER * held.step.progress
+            if share <= least or (found.step.moved and found.step.progress <= least):
+                break
+            yield found
+            share /= 2.0
+        if held is not None:
+            yield held
 
     def _pieces(
         self, state: State, target: Target, dt: float, first: float, smallest: float, tracking: Tracking
     ) -> Iterator[Advance]:
         """Yield the attempts at the `first` share of a piece, and at halves of that down to its `smallest` share."""
-        values, box = self._actuation.values(state), (target.lower, target.upper)
-        longest = min(_TRUST * self._arm.unit, _LONGER * self._step_limit)
-        share, trust = first, longest / self._arm.levers / first
-        yield self._try_piece(state, target, dt, first, box, tracking)
+        share = first
+        yield self._piece(state, target, dt, first, share, tracking)
         while share > first * smallest:
             share /= 2
-            near, far = values - share * trust, values + share * trust
-            lower = np.minimum(np.maximum(box[0], near), box[1])
-            upper = np.maximum(np.minimum(box[1], far), box[0])
-            yield self._try_piece(state, target, dt, share, (lower, upper), tracking)
+            yield self._piece(state, target, dt, first, share, tracking)
+
+    def _piece(
+        self, state: State, target: Target, dt: float, first: float, share: float, tracking: Tracking
+    ) -> Advance:
+        """Return a step towards a `share` of a target; below the `first` share, actuators move less than they could."""
+        if share == 1.0:
+            return self._try(state, target, dt, tracking=tracking)
+        lower, upper = target.lower, target.upper
+        if share < first:
+            longest = min(_TRUST * self._arm.unit, _LONGER * self._step_limit)
+            values, trust = self._actuation.values(state), share * longest / self._arm.levers / first
+            lower = np.minimum(np.maximum(lower, values - trust), upper)
+            upper = np.maximum(np.minimum(target.upper, values + trust), target.lower)
+        piece = replace(target.part(share), lower=lower, upper=upper)
+        return self._try(state, piece, dt, share, tracking=tracking)
 
     def _asked(self, target: Target) -> float:
         """Return the displacement of the tip that a target asks for, m."""
         path, axes = target.path, self._shaping.setup.task.axes
         asked = path.at(target.end).position - path.at(target.start).position
         return float(np.linalg.norm(asked[axes]))
-
-    def _try_piece(
-        self, state: State, target: Target, dt: float, share: float, box: Box, tracking: Tracking
-    ) -> Advance:
-        """Return a step towards a `share` of a target with the limits `box`."""
-        if share == 1.0:
-            return self._try(state, target, dt, tracking=tracking)
-        piece = replace(target.part(share), lower=box[0], upper=box[1])
-        return self._try(state, piece, dt, share, tracking=tracking)
 
     def _try(
         self,
@@ -146,8 +174,6 @@ class Advancer:
         step = self._attempt.run(state, target, share, tracking=tracking, enough=enough)
         if not step.moved:
             return Advance(step, None)
-        if tracking is Tracking.HARD and step.progress * share < _LEAST_HELD:
-            return Advance(_blocked(step, state, _HELD_BACK), None)
         if step.progress < WHOLE and self._tip_mode != "scaled":
             # The tip must stay on time: a part of the path is not enough.
             return Advance(_blocked(step, state, "the tip cannot stay on time"), None)
@@ -165,6 +191,10 @@ class Advancer:
                 why = f"{CANNOT_BRAKE} in {dt:g} s, less than the last step took" if shorter else CANNOT_BRAKE
                 return Advance(_blocked(step, state, why), None)
         return Advance(step if share == 1.0 else step.over(share, None), braking)
+
+
+def _progress(advance: Advance) -> float:
+    return advance.step.progress
 
 
 def _blocked(step: Step, state: State, reason: str) -> Step:

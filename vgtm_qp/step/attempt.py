@@ -22,7 +22,7 @@ from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
-from vgtm_qp.step.target import QPInput, Target
+from vgtm_qp.step.target import QPInput, Target, base_frame
 
 _FREE_QPS = 3
 """Greatest number of QPs that may each go as far along the piece of path as they can."""
@@ -51,7 +51,7 @@ _SETTLING = 5e-3
 _NOTHING = 1e-9
 """Progress of a QP below which its corrections may go further than it did."""
 
-_FURTHER = 1.25
+FURTHER = 1.25
 """Least ratio of progresses for which stations leave the curve."""
 
 
@@ -136,7 +136,7 @@ class Attempt:
         if elastic is None or tracking is Tracking.HARD or (step.moved and step.progress >= enough):
             return step
         other = self._separated(*piece, elastic())
-        return other if not step.moved or other.progress > _FURTHER * step.progress else step
+        return other if not step.moved or other.progress > FURTHER * step.progress else step
 
     def _separated(
         self,
@@ -172,10 +172,10 @@ class Attempt:
         """Return whether stations with that gap are off the curve that exact tracking keeps them on."""
         return self.gives_way and not gap <= self.accuracy.tracking
 
-    def first_input(self, state: State, target: Target) -> QPInput:
-        """Return the input of the first QP of a step from `state`."""
+    def first_input(self, state: State, target: Target, share: float) -> QPInput:
+        """Return the input of the first QP of a step from `state`; see :meth:`run`."""
         short = self.separation.shortfall_of(state)
-        return self._first(state, target, 1.0, 0.0, short, self._recovery(short))[0]
+        return self._first(state, target, share, 0.0, short, self._recovery(short))[0]
 
     def _first(
         self, state: State, target: Target, share: float, progress: float, short: Shortfall, gain: float
@@ -259,6 +259,10 @@ class Attempt:
             q, closed = move.closed.q, move.closed
             # Linearised rows leave a small gap between the curve's end and the tip.
             vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
+            if len(engine.layout.legs) and engine.layout.is_reversed(
+                vertices, base_frame(self._arm, target.base)[:, 2], closed.tip_rotation
+            ):
+                return blocked("the curve would reverse where it begins or ends")
             gap = self._setup.gap(q, vertices, move.torsion, target.base)
             if engine.layout.hard_tracking and not gap <= self.accuracy.tracking:
                 continue

@@ -126,7 +126,9 @@ class QPResolver(Resolver, serves="qp"):
         share = self._until_jam(dt)
         limits = self._actuation.limits(self.state, share * dt, slowing=True)
         target = self._shaping.target(self.state, share * dt, path, 0.0, share, limits[:2])
-        return self.setup.engine.qp(self._attempt.first_input(self.state, target))
+        first = self._advancer.first_share(target)
+        target = target if first == 1.0 else target.part(first)
+        return self.setup.engine.qp(self._attempt.first_input(self.state, target, first))
 
     def _follow(self, path: Path, start: float, end: float, dt: float, whole: float) -> Step:
         """See :class:`Resolver`; pieces are halved until one is safe."""

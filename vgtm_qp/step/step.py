@@ -55,7 +55,8 @@ class Step:
         further that way, or brakes, or because a blocked arm stood there before.
     gap : float
         Greatest distance of a station from its curve node after the step, m; where turns are kept as well, at least the
-        greatest turn times the arm's unit. NaN if no station tracks a curve in it.
+        greatest turn times the arm's unit. NaN if no station tracks a curve in the QP of the step, and so with every
+        pseudoinverse.
     left_path : bool
         True if the tip left the path while braking, because it is elastic or its base moves on.
     solution, rows, limits

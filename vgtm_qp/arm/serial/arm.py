@@ -110,19 +110,15 @@ class SerialArm(JointSpaceArm):
         # Sums over the joints before each: of turns, of turns times ways, of slides.
         sums = np.zeros((3, len(turn) + 1))
         np.cumsum([turn, turn * self._ways[0], slide], axis=1, out=sums[:, 1:])
-        points, way, (first, last) = self.bodies.points, self._ways[1], self._movers
+        way, (first, last) = self._ways[1][self.bodies.points].max(axis=1), self._movers
 
         def bound(body: Index, other: Index | None = None) -> Array:
-            begin, end, furthest = (
-                np.zeros(len(body), dtype=np.int64),
-                last[body],
-                way[points[body]].max(axis=1),
-            )
+            begin, further = np.zeros(len(body), dtype=np.int64), body
             if other is not None:
-                begin, end = np.minimum(first[body], first[other]), np.maximum(end, last[other])
-                furthest = np.maximum(furthest, way[points[other]].max(axis=1))
-            turns, levers, slides = sums[:, end] - sums[:, begin]
-            return np.asarray(furthest * turns - levers + slides)
+                begin = np.minimum(first[body], first[other])
+                further = np.where(last[body] > last[other], body, other)
+            turns, levers, slides = sums[:, last[further]] - sums[:, begin]
+            return np.asarray(way[further] * turns - levers + slides)
 
         return bound
 
