@@ -53,6 +53,19 @@ def chain(links=5, *, prismatic=False, **arm):
     return {"joint": joints, "tip": [0.0, 0.0, 0.4], "link_radius": 0.03, **arm}
 
 
+def following(arm, **followers):
+    """The same arm with joints that follow others: each with a name, multiplier and offset."""
+    rules = {
+        name: dict(zip(("joint", "multiplier", "offset"), rule, strict=True))
+        for name, rule in followers.items()
+    }
+    joints = [
+        {**joint, "mimic": rules[joint["name"]]} if joint["name"] in rules else joint
+        for joint in arm["joint"]
+    ]
+    return {**arm, "joint": joints}
+
+
 def clothed(arm):
     """The same arm with bodies of its own: on the base, beside its links, and two that touch at home."""
     names = [joint["name"] for joint in arm["joint"]]
@@ -91,6 +104,9 @@ SERIAL = {
     "serial": chain(),
     "serial with a slide": chain(4, prismatic=True),
     "serial, locked": chain(5, locked=["p2", "y4"]),
+    "serial with followers": following(
+        chain(prismatic=True), y2=("p1", -0.5, 0.05), y4=("p1", 1.0, 0.0), slide=("p5", 0.1, 0.02)
+    ),
     "serial with bodies": clothed(chain(4, prismatic=True)),
 }
 
@@ -514,8 +530,8 @@ def test_bodies_come_no_nearer_than_the_bound_of_their_approach(rng):
             before = arm.home_configuration + 0.3 * rng.normal(size=joints + 6)
             motion = size * rng.normal(size=joints + 6) * rng.integers(0, 2, size=joints + 6)
             motion[joints:] = 0.0
-            before[:-6][slides] = rng.uniform(*arm.stroke[slides].T)
-            motion[:-6][slides] = rng.uniform(*arm.stroke[slides].T) - before[:-6][slides]
+            before[:-6][slides] = rng.uniform(*arm.values[slides].T)
+            motion[:-6][slides] = rng.uniform(*arm.values[slides].T) - before[:-6][slides]
             approach, bodies = arm.approach(motion), np.arange(len(arm.bodies))
             ends = np.stack(
                 [arm.nodes(before + s * motion)[arm.bodies.points] for s in np.linspace(0, 1, 21)]

@@ -319,6 +319,12 @@ ARM_CASES: dict[str, tuple[Changes, Changes]] = {
     "arm.joint.home": ({}, joints(home=0.2)),
     "arm.joint.rate": ({}, joints(rate=0.01)),
     "arm.joint.acceleration": ({}, joints(acceleration=0.01)),
+    "arm.joint.mimic.joint": (joints(mimic={"joint": "j2"}), joints(mimic={"joint": "j4"})),
+    "arm.joint.mimic.multiplier": (
+        joints(mimic={"joint": "j3"}),
+        joints(mimic={"joint": "j3", "multiplier": -1.0}),
+    ),
+    "arm.joint.mimic.offset": (joints(mimic={"joint": "j3"}), joints(mimic={"joint": "j3", "offset": 0.1})),
     "arm.urdf": (FILE, {"arm.urdf": "two.urdf"}),
     "arm.package_path": (FILE, {"arm.package_path": ["two"]}),
     "arm.base_link": (FILE, {"arm.base_link": "l1", "arm.home": [0.1] * 5}),

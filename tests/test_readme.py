@@ -31,6 +31,7 @@ TABLES = {
     "[[truss.base_motion]]": ("BasePose",),
     "[arm]": ("ArmTable",),
     "[[arm.joint]]": ("Joint",),
+    "[arm.joint.mimic]": ("Mimic",),
     "[[arm.body]]": ("ArmBody",),
     "[[arm.locked]]": ("JointLock",),
     "[curve]": ("BezierCurve", "BSplineCurve", "BetaSplineCurve"),

@@ -121,7 +121,15 @@ BROKEN: dict[str, tuple[str, str, str]] = {
     "mesh of nothing": ('<sphere radius="0.08"/>', '<mesh filename="empty.stl"/>', "<mesh> filename"),
     "scale of zero": ('<sphere radius="0.08"/>', '<mesh filename="wedge.stl" scale="1 0 1"/>', "<mesh> scale"),
     "scale of two": ('<sphere radius="0.08"/>', '<mesh filename="wedge.stl" scale="1 1"/>', "<mesh> scale"),
-    "mimic on the arm": ('<limit lower="-1"', '<mimic joint="turn"/><limit lower="-1"', "<mimic> joint"),
+    "mimic of a fixed joint": ('<limit lower="-1"', '<mimic joint="mount"/><limit lower="-1"', "<mimic> joint"),
+    "mimic of no joint": ('<limit lower="-1"', '<mimic joint="trun"/><limit lower="-1"', 'did you mean "turn"'),
+    "mimic of itself": ('<limit lower="-1"', '<mimic joint="lift"/><limit lower="-1"', 'joint "lift", <mimic> joint'),
+    "mimic without a name": ('<limit lower="-1"', '<mimic/><limit lower="-1"', "<mimic> joint"),
+    "mimic times zero": (
+        '<limit lower="-1"',
+        '<mimic joint="turn" multiplier="0"/><limit lower="-1"',
+        "<mimic> multiplier",
+    ),
     "misspelt link": ('<link name="rod"/>', '<lnk name="rod"/>', "<lnk>"),
     "misspelt collision": (
         '<collision><geometry><sphere radius="0.08"/></geometry></collision>',

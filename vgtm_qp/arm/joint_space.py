@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -18,6 +18,14 @@ from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants
 from vgtm_qp.arrays import Array, Mask
 from vgtm_qp.compiled import Compiling, Kernel
 from vgtm_qp.rotation import vector_near
+
+
+class Follower(NamedTuple):
+    """A joint whose value is `multiplier` times that of another, and a constant: a fixed quantity."""
+
+    joint: int
+    followed: int
+    multiplier: float
 
 
 @dataclass(frozen=True)
@@ -72,8 +80,13 @@ class JacobianRows:
 class JointSpaceArm(Arm):
     """See ``arm.Arm``; all that follows from the nodes as functions of the joints, base first.
 
+    A quantity is the value of a joint. That of a joint which follows another is the difference to what it would have
+    in proportion: it is fixed.
+
     Attributes
     ----------
+    followers : tuple of Follower
+        Joints that follow others, which move by themselves.
     functions : (casadi.Function, casadi.Function)
         (q, *constants) -> nodes (3, N), m; the same and their Jacobian (3 N, J).
     constants : mapping
@@ -86,6 +99,7 @@ class JointSpaceArm(Arm):
 
     bays = None
     leaves_chords = True
+    followers: tuple[Follower, ...] = ()
     functions: tuple[ca.Function, ca.Function]
     constants: Mapping[str, Array]
     revolute: Mask
@@ -139,18 +153,33 @@ class JointSpaceArm(Arm):
         return {}
 
     def measured(self, q: Array) -> Array:
-        return np.array(q[:-6])
+        values = np.array(q[:-6])
+        for joint, followed, multiplier in self.followers:
+            values[joint] -= multiplier * values[followed]
+        return values
+
+    def following(self, change: Any) -> Any:
+        """Return changes of the joints from those of the quantities, (J,) or (J, 1): followers move, too."""
+        for joint, followed, multiplier in self.followers:
+            change[joint] = change[joint] + multiplier * change[followed]
+        return change
+
+    def by_quantities(self, jacobian: Any) -> Any:
+        """Return derivatives (..., J) by the quantities from those by the joints."""
+        for joint, followed, multiplier in self.followers:
+            jacobian[..., followed] += multiplier * jacobian[..., joint]
+        return jacobian
 
     def based(self, q: Array, pose: Pose) -> Array:
         return np.concatenate([q[:-6], pose.position, vector_near(pose.rotation, q[-3:])])
 
     def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:  # noqa: ARG002
-        q = q.copy()
-        q[self.actuators] += strokes
-        return q
+        change = np.zeros(len(q))
+        change[self.actuators] = strokes
+        return np.asarray(q + self.following(change))
 
     def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
-        return np.concatenate([q[:-6] + missing, q[-6:]])
+        return np.concatenate([q[:-6] + self.following(missing.copy()), q[-6:]])
 
     def travel(self, motion: Array) -> float:
         turn, slide = self._motions(motion)
@@ -183,10 +212,10 @@ class JointSpaceArm(Arm):
         counts = self.segments, len(self.actuators), len(self.bodies), stations
         return JointSpaceDescription(self.kind, *counts, self.height, hard)
 
-    def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:  # noqa: ARG002
+    def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
         """See ``arm.Arm``: the base's pose follows from the problem."""
         names = {"joint_names": np.array(self.quantity_names), "body_names": np.array(self.bodies.names)}
-        return {"joints": quantities, **names}
+        return {"joints": q[:, : quantities.shape[1]], **names}
 
 
 class JointSpaceSymbols(ArmSymbols):
@@ -194,7 +223,7 @@ class JointSpaceSymbols(ArmSymbols):
 
     def __init__(self, arm: JointSpaceArm, constants: Constants) -> None:
         super().__init__(arm.home_quantities, arm.actuators, constants)
-        self._joints, self._free = len(arm.quantity_names), arm.free.tolist()
+        self._joints, self._free, self._arm = len(arm.quantity_names), arm.free.tolist(), arm
         self._nodes, self._moving = arm.functions
         self.shape, self.given = (self._joints + 6, 1), list(range(len(arm.home)))
         self._constants = [constants.add(name, value) for name, value in arm.constants.items()]
@@ -203,13 +232,18 @@ class JointSpaceSymbols(ArmSymbols):
         return self._nodes(q, *self._constants)
 
     def quantities(self, q: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``: the joints' values."""
-        return q[: self._joints]
+        """See ``arm.ArmSymbols``: the joints' values, less what followers have in proportion."""
+        values = q[: self._joints]
+        for joint, followed, multiplier in self._arm.followers:
+            values[joint] = values[joint] - multiplier * values[followed]
+        return values
 
     def motion(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> list[ca.MX]:  # noqa: ARG002
         """See ``arm.ArmSymbols``: K and r."""
         rows = [3 * node + axis for node in self._free for axis in range(3)]
         _, jacobian = self._moving(at, *self._constants)
+        for joint, followed, multiplier in self._arm.followers:
+            jacobian[:, followed] = jacobian[:, followed] + multiplier * jacobian[:, joint]
         return [jacobian[rows, self._actuators], ca.vec(moved[:, self._free])]
 
     def response(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
@@ -220,9 +254,11 @@ class JointSpaceSymbols(ArmSymbols):
         return strokes
 
     def along(self, q: ca.MX, coordinates: ca.MX) -> ca.MX:
-        q = q * 1.0
-        q[self._actuators] = q[self._actuators] + coordinates
-        return q
+        change = ca.MX.zeros(*q.shape)
+        change[self._actuators] = coordinates
+        moved: ca.MX = q + self._arm.following(change)
+        return moved
 
     def closed(self, q: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-        return ca.vertcat(self.aims(self.quantities(q), lower, upper), q[self._joints :])
+        aims = self.aims(self.quantities(q), lower, upper)
+        return ca.vertcat(self._arm.following(aims), q[self._joints :])

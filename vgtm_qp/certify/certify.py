@@ -81,7 +81,7 @@ class Certifier:
         from vgtm_qp.certify.truss_motion import TrussMotion
 
         began = time.perf_counter()
-        values = trajectory.filled(self.arm.home_quantities)
+        values = self._quantities(trajectory)
         wrong = list(beyond_limits(self.arm, self._table, trajectory.time, values))
         motion, doubt = self._motion(trajectory.time, values)
         decided = {} if motion is None else decide(motion, self._kept(motion))
@@ -104,6 +104,14 @@ class Certifier:
             notes=tuple(self._notes),
         )
 
+    def _quantities(self, trajectory: Trajectory) -> Array:
+        """Return (T, M) the arm's quantities at the rows; joints that follow others need not be given."""
+        values = trajectory.filled(self.arm.home_quantities)
+        if isinstance(self.arm, RecordedChain):
+            given = np.intersect1d(self.arm.followers[:, 0], trajectory.quantities)
+            values[:, given] = self.arm.quantities(values)[:, given]
+        return values
+
     def _motion(self, instants: Array, values: Array) -> tuple[GivenMotion | None, list[Finding]]:
         """Return the motion through the rows, and those where the base changes its, and what is not known of it."""
         from vgtm_qp.certify.motion import JointMotion
@@ -116,7 +124,7 @@ class Certifier:
         if len(knots) == 1:
             knots, at_knots = np.repeat(knots, 2), np.repeat(at_knots, 2, axis=0)
         if isinstance(self.arm, RecordedChain):
-            return JointMotion(self.arm, knots, at_knots, self._table), []
+            return JointMotion(self.arm, knots, self.arm.joints(at_knots), self._table), []
         from vgtm_qp.certify.truss_motion import truss_motion
 
         return truss_motion(self.arm, knots, at_knots, self._table)

@@ -130,6 +130,9 @@ class _Simulation:
         count, chain = len(maneuver.time), isinstance(self._arm, RecordedChain)
         self._is_chain = chain
         self._wanted = maneuver.member_lengths if maneuver.joints is None else maneuver.joints
+        self._quantities = self._wanted
+        if isinstance(self._arm, RecordedChain):
+            self._quantities = self._arm.quantities(self._wanted)
         # Equality constraints of tendons hold the difference to this length.
         self._held_from = np.zeros(self._model.nq) if chain else np.array(self._model.tendon_length0)
         self._mocap = np.array(self._model.key_mpos).reshape(count, -1, 3)
@@ -225,7 +228,7 @@ class _Simulation:
     def _command(self, state: int, share: float) -> None:
         """Ask for lengths or joints at a `share` of the motion from `state` to the next, and move what is given."""
         after = min(state + 1, len(self._mocap) - 1)
-        wanted = (1.0 - share) * self._wanted[state] + share * self._wanted[after]
+        wanted = (1.0 - share) * self._quantities[state] + share * self._quantities[after]
         self._model.eq_data[:, 0] = wanted - self._held_from
         self._data.mocap_pos[:] = (1.0 - share) * self._mocap[state] + share * self._mocap[after]
         # MuJoCo normalises quaternions.

@@ -39,6 +39,18 @@ FROM_URDF = ("joint", "tip", "tip_rotation_vector", "body")
 """Keys that are read from it."""
 
 
+class Mimic(Table, called="what a joint follows"):
+    """Another joint, whose value gives that of a joint which does not move by itself."""
+
+    joint: Name = Field(description="name of the joint that is followed")
+    multiplier: Number = Field(default=1.0, description="change of the value per change of that joint's")
+    offset: Number = Field(default=0.0, description="value where that joint's is 0, rad or m")
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        if self.multiplier == 0.0:
+            yield ("multiplier",), "a number other than 0"
+
+
 class Joint(Table, called="a joint"):
     """A joint of a serial arm, placed in the frame of the joint before it."""
 
@@ -55,13 +67,17 @@ class Joint(Table, called="a joint"):
     home: Number = Field(default=0.0, description="joint value of the home pose, rad or m")
     rate: Limit | None = Field(default=None, description="greatest speed, rad/s or m/s")
     acceleration: Limit | None = Field(default=None, description="greatest acceleration, rad/s^2 or m/s^2")
+    mimic: Mimic | None = Field(
+        default=None,
+        description="the joint that it follows: {joint, multiplier, offset}; its home and its drive are that joint's",
+    )
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         if self.limits is None:
             return
         if self.limits[0] >= self.limits[1]:
             yield ("limits",), "[least, greatest] with the least value first and below the greatest"
-        elif not self.limits[0] <= self.home <= self.limits[1]:
+        elif self.mimic is None and not self.limits[0] <= self.home <= self.limits[1]:
             yield ("home",), f"a value within the limits, {self.limits[0]:g} to {self.limits[1]:g}"
 
 
@@ -160,6 +176,7 @@ class ArmTable(Table, called="an arm"):
             yield ("joint",), "a list of joints [[arm.joint]], or a urdf in its place"
         yield from unique("joint", "name", [joint.name for joint in self.joint])
         names = {joint.name: joint for joint in self.joint}
+        yield from self._followed(names)
         for i, body in enumerate(self.body or ()):
             if body.joint is not None:
                 yield from known_names(("body", i), (body.joint,), names, key="joint")
@@ -170,6 +187,40 @@ class ArmTable(Table, called="an arm"):
                     yield (key,), "no such key without urdf; joints of a list have a home of their own"
         for i, lock in enumerate(self.locked):
             yield from known_names(("locked", i), (lock.joint,), names, key="joint")
+            mimic = names[lock.joint].mimic if lock.joint in names else None
+            if mimic is not None:
+                yield (
+                    ("locked", i, "joint"),
+                    f'a joint that moves by itself, such as "{mimic.joint}", which it follows',
+                )
+
+    def _followed(self, names: Mapping[str, Joint]) -> Iterator[tuple[Place, str]]:
+        """Yield what is wrong with joints that follow others."""
+        for i, joint in enumerate(self.joint):
+            if joint.mimic is None:
+                continue
+            followed = names.get(joint.mimic.joint)
+            yield from known_names(("joint", i, "mimic"), (joint.mimic.joint,), names, key="joint")
+            if followed is None:
+                continue
+            if followed.mimic is not None:
+                yield ("joint", i, "mimic", "joint"), "a joint that moves by itself"
+                continue
+            value = joint.mimic.multiplier * followed.home + joint.mimic.offset
+            if joint.limits is not None and not joint.limits[0] <= value <= joint.limits[1]:
+                yield (
+                    ("joint", i, "limits"),
+                    f"limits that hold {value:g}, what it has at home by what it follows",
+                )
+
+    def home_values(self) -> list[float]:
+        """Return the joints' values at home, rad or m."""
+        home = {joint.name: joint.home for joint in self.joint}
+        rules = [joint.mimic for joint in self.joint]
+        return [
+            own if rule is None else rule.multiplier * home[rule.joint] + rule.offset
+            for own, rule in zip(home.values(), rules, strict=True)
+        ]
 
 
 def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str, Any]:
@@ -189,13 +240,14 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
     except (TypeError, ValueError, RuntimeError):
         # What is wrong with the keys themselves is said of each by its own type.
         return {}
-    home = data.get("home")
+    home, own = data.get("home"), [joint for joint in arm.joints if joint.mimic is None]
     if home is None:
-        home = [_least_bent(joint.limits) for joint in arm.joints]
-    elif not isinstance(home, Sequence) or len(home) != len(arm.joints):
-        names = ", ".join(joint.name for joint in arm.joints)
-        raise _wrong([(("home",), home, f"{len(arm.joints)} joint values: {names}")])
-    joints = [_joint_keys(joint, value) for joint, value in zip(arm.joints, home, strict=True)]
+        home = [_least_bent(joint.limits) for joint in own]
+    elif not isinstance(home, Sequence) or len(home) != len(own):
+        names = ", ".join(joint.name for joint in own)
+        raise _wrong([(("home",), home, f"{len(own)} joint values: {names}")])
+    values = {joint.name: value for joint, value in zip(own, home, strict=True)}
+    joints = [_joint_keys(joint, values.get(joint.name, 0.0)) for joint in arm.joints]
     bodies = [
         {"name": body.name, "points": body.points.tolist(), "radius": body.radius}
         | ({} if body.joint == 0 else {"joint": arm.joints[body.joint - 1].name})
@@ -221,7 +273,10 @@ def _joint_keys(joint: UrdfJoint, home: Any) -> dict[str, Any]:
         "rotation_vector": _vector(joint.rotation),
         "home": home,
     }
-    limits = {"limits": joint.limits, "rate": joint.rate}
+    mimic = None
+    if joint.mimic is not None:
+        mimic = dict(zip(("joint", "multiplier", "offset"), joint.mimic, strict=True))
+    limits = {"limits": joint.limits, "rate": joint.rate, "mimic": mimic}
     return keys | {key: value for key, value in limits.items() if value is not None}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,10 @@ class RecordedChain:
     quantity_names, member_names : tuple of str
         Joints, and links.
     actuated, home_quantities, stroke, rate, acceleration : (J,), (J,), (J, 2), (J,), (J,)
-        Of the joints; infinite where there is no limit.
+        Of the joints; infinite where there is no limit. What a joint that follows another is off from a multiple of
+        that other's value is its quantity, and does not change.
+    followers, multipliers : (K, 2) int, (K,)
+        Joints that follow others, and those; and what they multiply the values by.
     base : (1,) int
         The point that the problem places.
     links, members : (B, 2) int
@@ -53,7 +56,11 @@ class RecordedChain:
         self.axis = table.numbers("axis", (joints, 3))
         self.position = table.numbers("position", (joints, 3))
         self.rotation = table.numbers("rotation", (joints, 3, 3))
-        self.home_quantities = table.numbers("home", (joints,))
+        home = table.numbers("home", (joints,))
+        follows = table.numbers("followers", (None, 3)) if table.has("followers") else np.zeros((0, 3))
+        self.followers, self.multipliers = follows[:, :2].astype(np.int64), follows[:, 2]
+        if ((self.followers < 0) | (self.followers >= joints)).any():
+            raise ResultError(f"manifest.arm.followers names a joint outside 0..{joints - 1}")
         self.stroke = table.numbers("stroke", (joints, 2), limits=True)
         self.stroke[np.isinf(self.stroke[:, 0]), 0] = -np.inf
         self.rate = table.numbers("rate", (joints,), limits=True)
@@ -74,8 +81,9 @@ class RecordedChain:
         self.stretches = np.zeros(links, dtype=np.bool_)
         self._way: tuple[bytes, bytes, Array, Array] | None = None
         """The way asked about last by :meth:`ends_between`: its ends, and the shares and links placed so far."""
-        home = np.concatenate([self.home_quantities, np.zeros(6)])[None]
-        points, _, frames = self.placed(home)
+        at_home = np.concatenate([home, np.zeros(6)])[None]
+        self._home_values, self.home_quantities = home, self.quantities(at_home)[0]
+        points, _, frames = self.placed(at_home)
         self.home, self._home_tip = points[0], frames[0]
         self.length = self.lengths(self.home)
 
@@ -90,6 +98,13 @@ class RecordedChain:
         if tuple(joints) != self.quantity_names:
             return [*found, "the joints of the arm record are not those of the problem"]
         origin = (0.0, 0.0, 0.0)
+        try:
+            expected = _driven(joints)
+        except KeyError:
+            return [*found, "a joint of the problem follows one that there is not"]
+        followers = np.column_stack([self.followers, self.multipliers])
+        if followers.shape != expected.followers.shape or not same(followers, expected.followers):
+            found.append("the joints that follow others in the arm record are not those of the problem")
         for k, (name, joint) in enumerate(joints.items()):
             axis = np.array(joint["axis"], dtype=float)
             turn = np.array(joint.get("rotation_vector") or origin, dtype=float)
@@ -97,10 +112,10 @@ class RecordedChain:
                 "axis": (self.axis[k], axis / np.linalg.norm(axis)),
                 "position": (self.position[k], joint.get("position") or origin),
                 "rotation": (self.rotation[k], rotation_matrix(turn)),
-                "home": (self.home_quantities[k], joint.get("home") or 0.0),
-                "limits": (self.stroke[k], joint.get("limits") or (-np.inf, np.inf)),
-                "rate": (self.rate[k], joint.get("rate") or np.inf),
-                "acceleration": (self.acceleration[k], joint.get("acceleration") or np.inf),
+                "home": (self._home_values[k], expected.home[k]),
+                "limits": (self.stroke[k], expected.stroke[k]),
+                "rate": (self.rate[k], expected.rate[k]),
+                "acceleration": (self.acceleration[k], expected.acceleration[k]),
                 "kind": (float(self.revolute[k]), float(joint.get("kind", "revolute") == "revolute")),
             }
             for key, (recorded, given) in wanted.items():
@@ -168,8 +183,16 @@ class RecordedChain:
         return np.asarray(np.linalg.norm(np.diff(self.ends(points), axis=-2)[..., 0, :], axis=-1))
 
     def quantities(self, q: Array) -> Array:
-        """Return (T, J) the joints' values at configurations (T, J + 6)."""
-        return q[:, : len(self.quantity_names)]
+        """Return (T, J) the quantities at configurations (T, J + 6), or joint values (T, J): see the class."""
+        values = np.array(q[:, : len(self.quantity_names)])
+        values[:, self.followers[:, 0]] -= self.multipliers * values[:, self.followers[:, 1]]
+        return values
+
+    def joints(self, quantities: Array) -> Array:
+        """Return (T, J) the joints' values at quantities (T, J)."""
+        values = quantities.copy()
+        values[:, self.followers[:, 0]] += self.multipliers * values[:, self.followers[:, 1]]
+        return values
 
     def tip_position(self, q: Array) -> Array:
         """Return (T, 3) the end effector's position, m."""
@@ -184,7 +207,9 @@ class RecordedChain:
         points, axes, _ = self.placed(q[None])
         joints = points[0, 1 : len(axes[0]) + 1]
         arms = np.cross(axes[0], points[0, len(joints) + 1] - joints)
-        jacobian = np.where(self.revolute[:, None], arms, axes[0])[self.actuated]
+        jacobian = np.where(self.revolute[:, None], arms, axes[0])
+        np.add.at(jacobian, self.followers[:, 1], self.multipliers[:, None] * jacobian[self.followers[:, 0]])
+        jacobian = jacobian[self.actuated]
         if not len(jacobian):
             return None
         return 1.0, *extreme_values(jacobian)
@@ -233,6 +258,35 @@ class RecordedChain:
         own = own + turning[..., self.carriers] * np.linalg.norm(self.points, axis=1)
         points = np.concatenate([origins, own], axis=-1)
         return np.asarray(points[..., self.links[link]].max(axis=-1))
+
+
+class _Driven(NamedTuple):
+    """What the joints of a problem's table are, where some follow others: see :class:`RecordedChain`."""
+
+    home: Array
+    stroke: Array
+    rate: Array
+    acceleration: Array
+    followers: Array
+
+
+def _driven(joints: Mapping[str, Mapping[str, Any]]) -> _Driven:
+    """Return what joints have at home, their limits, and who follows whom, from the tables of a problem."""
+    number, tables = {name: k for k, name in enumerate(joints)}, list(joints.values())
+    home = np.array([joint.get("home") or 0.0 for joint in tables], dtype=float)
+    stroke = np.array([joint.get("limits") or (-np.inf, np.inf) for joint in tables], dtype=float)
+    most = np.array([[joint.get(key) or np.inf for joint in tables] for key in ("rate", "acceleration")])
+    rules = [(k, joint["mimic"]) for k, joint in enumerate(tables) if joint.get("mimic")]
+    followers = [(k, number[rule["joint"]], float(rule.get("multiplier", 1.0))) for k, rule in rules]
+    for (k, rule), (_, other, factor) in zip(rules, followers, strict=True):
+        offset = float(rule.get("offset", 0.0))
+        home[k] = factor * home[other] + offset
+        own = np.sort((stroke[k] - offset) / factor)
+        stroke[other] = max(stroke[other, 0], own[0]), min(stroke[other, 1], own[1])
+        most[:, other] = np.minimum(most[:, other], most[:, k] / abs(factor))
+    for k, _ in rules:
+        stroke[k], most[:, k] = (-np.inf, np.inf), np.inf
+    return _Driven(home, stroke, most[0], most[1], np.array(followers, dtype=float).reshape(-1, 3))
 
 
 def _are_ends(recorded: Array, ends: Array, radius: float) -> bool:

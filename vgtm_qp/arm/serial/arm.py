@@ -11,12 +11,12 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Approach, Stations, Tip, has_full_rank
 from vgtm_qp.arm.frames import frames_along
-from vgtm_qp.arm.joint_space import JointSpaceArm
+from vgtm_qp.arm.joint_space import Follower, JointSpaceArm
 from vgtm_qp.arm.serial.chain import SerialChain
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.bodies import Bodies, capsules
 from vgtm_qp.geometry.clearance import Clearance
-from vgtm_qp.problem.arm import ArmTable
+from vgtm_qp.problem.arm import ArmTable, Joint
 
 _BENDS = (0.1, 0.3, -0.3)
 """Turns by which a home is bent where the tip cannot start in every direction, rad."""
@@ -26,6 +26,12 @@ class SerialArm(JointSpaceArm):
     """See ``arm.Arm``; joints of an ``[arm]`` table, of which those locked from the start stay at home.
 
     Its nodes are those of ``SerialChain.functions``.
+
+    Attributes
+    ----------
+    chain : SerialChain
+    values : (J, 2)
+        Least and greatest values of the joints, rad or m, those that follow others among them.
     """
 
     kind = "serial"
@@ -33,12 +39,10 @@ class SerialArm(JointSpaceArm):
     def __init__(self, spec: ArmTable) -> None:
         joints, stuck = spec.joint, {lock.joint for lock in spec.locked if lock.time == 0.0}
         self.segments, self.quantity_names = len(joints), tuple(joint.name for joint in joints)
-        self.home_quantities = np.array([joint.home for joint in joints], dtype=float)
-        self.home_configuration = np.concatenate([self.home_quantities, np.zeros(6)])
-        self.actuated = np.array([joint.name not in stuck for joint in joints])
-        self.stroke = np.array([joint.limits or (-np.inf, np.inf) for joint in joints], dtype=float)
-        self.rate = _or_infinite([joint.rate for joint in joints])
-        self.acceleration = _or_infinite([joint.acceleration for joint in joints])
+        self.home_configuration = np.array([*spec.home_values(), *[0.0] * 6], dtype=float)
+        self.actuated = np.array([joint.name not in stuck and joint.mimic is None for joint in joints])
+        self._limit(joints)
+        self.home_quantities = self.measured(self.home_configuration)
         chain = SerialChain.of(spec)
         self.chain = chain if spec.every else replace(chain, every=self._every(chain))
         self.functions, self.constants = self.chain.functions, self.chain.constants
@@ -47,12 +51,42 @@ class SerialArm(JointSpaceArm):
         self._place_stations(spec.tip_rotation_vector)
         self.bodies = self._links(spec.link_radius) if spec.body is None else self._apart(self._carried(spec))
 
+    def _limit(self, joints: Sequence[Joint]) -> None:
+        """Find followers and limits: those of a follower are limits of what it follows.
+
+        Raises
+        ------
+        ValueError
+            No value keeps the limits of a joint and of its followers.
+        """
+        number = {joint.name: k for k, joint in enumerate(joints)}
+        self.stroke = np.array([joint.limits or (-np.inf, np.inf) for joint in joints], dtype=float)
+        self.rate = _or_infinite([joint.rate for joint in joints])
+        self.acceleration = _or_infinite([joint.acceleration for joint in joints])
+        rules = [(k, joint.mimic) for k, joint in enumerate(joints) if joint.mimic is not None]
+        self.followers = tuple(Follower(k, number[rule.joint], rule.multiplier) for k, rule in rules)
+        for (k, rule), (_, other, factor) in zip(rules, self.followers, strict=True):
+            least, greatest = np.sort((self.stroke[k] - rule.offset) / factor)
+            self.stroke[other] = max(self.stroke[other, 0], least), min(self.stroke[other, 1], greatest)
+            self.rate[other] = min(self.rate[other], self.rate[k] / abs(factor))
+            self.acceleration[other] = min(self.acceleration[other], self.acceleration[k] / abs(factor))
+            self.rate[k] = self.acceleration[k] = np.inf
+        self.values = self.stroke.copy()
+        for (k, rule), (_, other, factor) in zip(rules, self.followers, strict=True):
+            self.values[k] = np.sort(factor * self.stroke[other] + rule.offset)
+            self.stroke[k] = -np.inf, np.inf
+
+    def _placed(self, chain: SerialChain, q: Array) -> tuple[Array, Array]:
+        """Return nodes (N, 3), m, and their derivatives (N, 3, J) by the quantities, at a configuration."""
+        nodes, jacobian = chain.at(q)
+        return nodes, self.by_quantities(jacobian)
+
     def _every(self, chain: SerialChain) -> int:
         """Return the least spacing of stations, in joints, with which all can stay on the curve at once at home.
 
         If there is none, as at the straight home of a snake, there is a station for every three actuators.
         """
-        joints, (_, jacobian) = len(chain), chain.at(self.home_configuration)
+        joints, (_, jacobian) = len(chain), self._placed(chain, self.home_configuration)
         for every in range(1, joints + 1):
             if self._can_hold(jacobian[[*range(1 + every, joints + 1, every), joints + 1]]):
                 return every
@@ -73,7 +107,7 @@ class SerialArm(JointSpaceArm):
         beside = tuple(f"{word} {axis}" for word in words for axis in "xy")
         points = tuple(f"point {k}" for k in range(len(self.chain.points)))
         self.node_names = ("base", *self.quantity_names, "tip", *points, *beside)
-        self.home, jacobian = self.chain.at(self.home_configuration)
+        self.home, jacobian = self._placed(self.chain, self.home_configuration)
         self.height = float(np.linalg.norm(np.diff(self.home[: count + 2], axis=0), axis=1).sum())
         self.unit = self.chain.mean_length
         origins = np.array([0, *(1 + j for j in tracked), count + 1])
@@ -86,7 +120,9 @@ class SerialArm(JointSpaceArm):
         frames = frames_along(self.home[origins])
         trackable = ("position",) if self._can_hold(jacobian[origins[1:]]) else ()
         self.stations = Stations(nodes, weights, frames, trackable, word="joint")
-        frame = frames[-1] if tip_turn is None else self.chain.attitude(self.home_quantities, tip_turn)
+        frame = (
+            frames[-1] if tip_turn is None else self.chain.attitude(self.home_configuration[:-6], tip_turn)
+        )
         self.end_effector = Tip(nodes[-1], weights[-1], frame)
 
     def _reaches(self) -> Array:
@@ -143,7 +179,7 @@ class SerialArm(JointSpaceArm):
 
     def _slides(self) -> Array:
         """Return (J,) the greatest extensions of slides, m; 0 for joints that turn."""
-        return np.where(self.chain.revolute, 0.0, np.abs(self.stroke).max(axis=1, initial=0.0))
+        return np.where(self.chain.revolute, 0.0, np.abs(self.values).max(axis=1, initial=0.0))
 
     def _links(self, radius: float) -> Bodies:
         """Return links between successive origins; those of joints in one place are joined as if they were one."""
@@ -184,12 +220,13 @@ class SerialArm(JointSpaceArm):
         """See ``arm.Arm``: with a bent home that the tip can leave in every direction, if there is one."""
         tip, turning = len(self.chain) + 1, self.revolute & self.actuated
         for turn in _BENDS:
-            further = self.home_quantities + np.where(turning, turn, 0.0)
+            further = self.home_configuration[:-6] + np.where(turning, turn, 0.0)
             within = (further >= self.stroke[:, 0]) & (further <= self.stroke[:, 1])
             q = self.home_configuration.copy()
-            q[:-6] = np.where(within, further, self.home_quantities)
-            if self._can_hold(self.chain.at(q)[1][[tip]]):
-                values = ", ".join(f"{value:.6g}" for value in q[:-6])
+            q[:-6] += self.following(np.where(turning & within, turn, 0.0))
+            if self._can_hold(self._placed(self.chain, q)[1][[tip]]):
+                own = np.setdiff1d(np.arange(len(q) - 6), [one.joint for one in self.followers])
+                values = ", ".join(f"{value:.6g}" for value in q[own])
                 return (f"the axes of its joints leave a direction out; it can with home values {values}",)
         return ()
 
@@ -205,16 +242,18 @@ class SerialArm(JointSpaceArm):
         """See ``arm.Arm``.
 
         Keys: ``kind``, ``joint_names``, ``revolute``, ``axis``, ``position``, ``rotation`` (in the frame of the one
-        before), ``home``, ``tip`` in the last frame and ``tip_frame`` at home; of the bodies ``body_names``, ``links``
-        (their points: base, joints, tip, then those of bodies) and ``joined`` (their ends; bodies with one in common
-        are neighbours), ``points`` of bodies in the frames of their ``carriers``, numbers of joints that move them, and
-        ``touching`` pairs, which are not kept apart.
+        before), ``home`` and ``followers`` (joint, that which it follows, multiplier), ``tip`` in the last frame and
+        ``tip_frame`` at home; of the bodies ``body_names``, ``links`` (their points: base, joints, tip, then those of
+        bodies) and ``joined`` (their ends; bodies with one in common are neighbours), ``points`` of bodies in the
+        frames of their ``carriers``, numbers of joints that move them, and ``touching`` pairs, which are not kept
+        apart.
         """
         chain, bodies = self.chain, self.bodies
         keys = ("revolute", "axis", "position", "rotation", "tip", "points", "carriers")
         geometry = {key: getattr(chain, key) for key in keys}
         arrays = {
-            "home": self.home_quantities,
+            "home": self.home_configuration[:-6],
+            "followers": np.array(self.followers, dtype=float).reshape(-1, 3),
             "tip_frame": self.end_effector.frame,
             "links": bodies.points,
             "joined": bodies.joints,

@@ -41,6 +41,8 @@ class UrdfJoint:
     limits : (float, float) or None
         rad or m; None for one that turns on and on.
     rate, effort : float or None
+    mimic : (str, float, float) or None
+        Name of the joint that it follows, multiplier and offset: that joint moves by itself, and is one of the arm.
     """
 
     name: str
@@ -51,6 +53,7 @@ class UrdfJoint:
     limits: tuple[float, float] | None
     rate: float | None
     effort: float | None
+    mimic: tuple[str, float, float] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,15 +251,45 @@ class _Tree:
             if joint.kind not in (*_MOVING, "fixed"):
                 expected = "a joint of the arm that turns or slides about one axis, or none"
                 self._mistakes.add(joint.element, f'joint "{joint.name}", type', joint.kind, expected)
-            mimic = joint.element.first("mimic")
-            if mimic is not None:
-                other = mimic.attributes.get("joint")
-                expected = "joints of the arm that move on their own: mimic is not served there"
-                self._mistakes.add(mimic, f'joint "{joint.name}", <mimic> joint', other, expected)
         if not any(joint.moves for joint in joints):
             self._wrong("<robot>", None, f'joints that move between "{base}" and "{tip}"')
         self._mistakes.stop()
+        moving = {joint.name for joint in joints if joint.moves}
+        for joint in joints:
+            rule = self._mimic(joint) if joint.moves else None
+            if rule is not None and rule[0] not in moving:
+                expected = f'a joint that moves between "{base}" and "{tip}", which this arm can drive'
+                self._mistakes.add(joint.element, f'joint "{joint.name}", <mimic> joint', rule[0], expected)
+        self._mistakes.stop()
         return joints[::-1]
+
+    def _mimic(self, joint: _Joint) -> tuple[str, float, float] | None:
+        """Return name, multiplier and offset of the joint that moves by itself and that a joint follows, if it does.
+
+        A joint may follow one that follows another.
+        """
+        multiplier, offset, seen, joints = 1.0, 0.0, [joint.name], {one.name: one for one in self._joints}
+        while True:
+            mimic = joint.element.first("mimic")
+            if mimic is None:
+                return (joint.name, multiplier, offset) if len(seen) > 1 else None
+            what = f'joint "{joint.name}"'
+            factor = (self._mistakes.numbers(mimic, what, "multiplier", 1, (1.0,)) or (1.0,))[0]
+            more = (self._mistakes.numbers(mimic, what, "offset", 1, (0.0,)) or (0.0,))[0]
+            other = mimic.attributes.get("joint")
+            if factor == 0.0:
+                self._mistakes.add(mimic, f"{what}, <mimic> multiplier", "0", "a number other than 0")
+            if other not in joints or other in seen:
+                expected = (
+                    "a joint that it follows" if other in seen else f"a joint{nearest(str(other), joints)}"
+                )
+                self._mistakes.add(mimic, f"{what}, <mimic> joint", other, expected)
+                self._mistakes.stop()
+            assert other is not None
+            # The value is multiplier * (factor * that of the other + more) + offset.
+            multiplier, offset = multiplier * factor, offset + multiplier * more
+            seen.append(other)
+            joint = joints[other]
 
     def moving(self, chain: Sequence[_Joint]) -> tuple[tuple[UrdfJoint, ...], Frame]:
         """Return the moving joints of the chain, each in the frame of the one before, and the tip in the last."""
@@ -332,7 +365,7 @@ class _Tree:
         direction = np.array(axis or (1.0, 0.0, 0.0)) / length
         limits, rate, effort = self._limits(joint, what)
         kind = "prismatic" if joint.kind == "prismatic" else "revolute"
-        return UrdfJoint(joint.name, kind, direction, *frame, limits, rate, effort)
+        return UrdfJoint(joint.name, kind, direction, *frame, limits, rate, effort, self._mimic(joint))
 
     def _limits(
         self, joint: _Joint, what: str
