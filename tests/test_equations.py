@@ -16,7 +16,7 @@ import vgtm_qp
 PACKAGE = Path(vgtm_qp.__file__).parent
 EQUATIONS = range(1, 40)
 
-# Those that README.md has no row for.
+# Those that vgtm_qp/README.md has no row for.
 UNUSED = {2, 31}
 
 
@@ -59,9 +59,9 @@ def _functions(tree: ast.AST, owner: str) -> Iterator[tuple[str, ast.FunctionDef
 
 
 def table() -> dict[int, set[str]]:
-    """Return which functions the table in README.md names for each equation."""
+    """Return which functions the table in vgtm_qp/README.md names for each equation."""
     found: dict[int, set[str]] = {}
-    lines = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8").splitlines()
+    lines = (Path(__file__).parent.parent / "vgtm_qp" / "README.md").read_text(encoding="utf-8").splitlines()
     for line in lines[lines.index("| equation | what | where |") + 2 :]:
         if not line.startswith("|"):
             break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 import shutil
@@ -10,88 +9,33 @@ import tomllib
 from functools import reduce
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import pytest
+from key_reference import TABLES, reference, written
 
 from vgtm_qp.cli import main
 from vgtm_qp.cli.app import app
-from vgtm_qp.problem import Problem, load_problem, problem_schema
+from vgtm_qp.problem import Problem, load_problem
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
-# What stands in each table of the problem-file reference.
-TABLES = {
-    "[truss]": ("ModuleTruss", "TetrahedralTruss", "GraphTruss"),
-    "[[truss.node]]": ("Node",),
-    "[[truss.member]]": ("Member",),
-    "[[truss.locked]]": ("Lock",),
-    "[[truss.base_motion]]": ("BasePose",),
-    "[arm]": ("ArmTable",),
-    "[[arm.joint]]": ("Joint",),
-    "[arm.joint.mimic]": ("Mimic",),
-    "[[arm.body]]": ("ArmBody",),
-    "[[arm.locked]]": ("JointLock",),
-    "[curve]": ("BezierCurve", "BSplineCurve", "BetaSplineCurve"),
-    "[[curve.control_vertex_goals]]": ("VertexGoal",),
-    "[end_effector]": ("EndEffector",),
-    "[maneuver]": ("WaypointManeuver", "PathManeuver"),
-    "[[maneuver.waypoint]]": ("Waypoint",),
-    "[[obstacle]]": ("Box", "Sphere", "Cylinder", "Mesh"),
-    "[clearance]": ("ClearanceTable",),
-    "[method]": ("Method",),
-    "[method.weights]": ("Weights",),
-    "[method.gains]": ("Gains",),
+DOCUMENTS = {
+    name: (ROOT / name).read_text(encoding="utf-8")
+    for name in ("README.md", "problems/README.md", "examples/README.md", "vgtm_qp/README.md")
 }
+README = DOCUMENTS["README.md"]
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+def blocks(language: str, document: str = "README.md") -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", DOCUMENTS[document], flags=re.MULTILINE | re.DOTALL)
 
 
 def table(first: str) -> list[str]:
-    """Return the rows of the table whose first column is headed `first`."""
-    head = re.escape(f"| {first} |")
-    (rows,) = re.findall(rf"^{head}[^\n]*\n\|[-|]+\|\n((?:\|[^\n]*\n)*)", README, flags=re.MULTILINE)
+    """Return the rows of the table, in whichever document, whose first column is headed `first`."""
+    head, everything = re.escape(f"| {first} |"), "\n".join(DOCUMENTS.values())
+    (rows,) = re.findall(rf"^{head}[^\n]*\n\|[-|]+\|\n((?:\|[^\n]*\n)*)", everything, flags=re.MULTILINE)
     return str(rows).splitlines()
-
-
-def reference(models: tuple[str, ...]) -> list[str]:
-    """Return the rows that the schema gives a table: key, default, meaning; the first model has the word."""
-    definitions = problem_schema()["$defs"]
-    found: dict[str, tuple[str, str, list[str]]] = {}
-    for model in models:
-        definition = definitions[model]
-        definition = definition if "properties" in definition else definition["anyOf"][1]
-        for key, value in definition["properties"].items():
-            if "$ref" in value:
-                continue
-            default = "required" if key in definition.get("required", ()) else _written(value["default"])
-            *_, choices = found.setdefault(key, (default, value.get("description", ""), []))
-            choices += value.get("enum", [value["const"]] if "const" in value else [])
-    ordered = sorted(found.items(), key=lambda item: item[0] not in ("module", "family", "shape"))
-    return [
-        f"| `{key}` | {default} | {_meaning(text, choices)} |" for key, (default, text, choices) in ordered
-    ]
-
-
-def _meaning(text: str, choices: list[str]) -> str:
-    """Return the description in a cell of Markdown, with the choices that it does not name."""
-    unnamed = list(dict.fromkeys(choice for choice in choices if choice not in text))
-    listed = ", ".join(f'"{choice}"' for choice in (dict.fromkeys(choices) if unnamed else ()))
-    return "; ".join(part for part in (text, listed) if part).replace("|", r"\|")
-
-
-def _written(default: Any) -> str:
-    if default is None:
-        return "-"
-    if isinstance(default, bool | str):
-        return f"`{json.dumps(default)}`"
-    if isinstance(default, list):
-        return f"`[{', '.join(f'{x:g}' if isinstance(x, float) else json.dumps(x) for x in default)}]`"
-    return f"{default:g}"
 
 
 @pytest.fixture
@@ -101,9 +45,27 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def test_the_front_page_is_short():
+    assert len(README.encode()) <= 12_000
+
+
 def test_every_block_is_of_a_kind_that_is_tried():
-    found = set(re.findall(r"^```(\w+)$", README, flags=re.MULTILINE))
+    found = set(re.findall(r"^```(\w+)$", "\n".join(DOCUMENTS.values()), flags=re.MULTILINE))
     assert found == {"sh", "console", "python", "toml", "text", "bibtex"}
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_links_lead_to_what_is_there(name: str):
+    links = re.findall(r"\]\(([^)#\s]*)(?:#([\w-]+))?\)", DOCUMENTS[name])
+    for file, anchor in links:
+        if file.startswith("https://"):
+            continue
+        place = (ROOT / name).parent / file if file else ROOT / name
+        assert place.exists(), file
+        if anchor:
+            heads = re.findall(r"^#+ (.*)$", place.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            known = [re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads]
+            assert anchor in known, anchor
 
 
 def test_set_up_is_what_continuous_integration_does():
@@ -131,30 +93,31 @@ def test_the_commands_do_what_they_say(folder: Path, capsys: pytest.CaptureFixtu
 
     capsys.readouterr()
     assert main(["verify", "five_bay_two_cubes.npz"]) == 0
-    (shown,) = blocks("text")
-    assert _measures(shown) == _measures(capsys.readouterr().out)
+    (shown,), (some,), told = blocks("text", "examples/README.md"), blocks("text"), capsys.readouterr().out
+    assert _measures(shown) == _measures(told)
+    assert len(_measures(some)) > 4
+    assert set(_measures(some)) < set(_measures(told))
 
 
 def _measures(certificate: str) -> list[tuple[str, ...]]:
     """Return verdict, name and bound of each line; values differ from machine to machine in their last digits."""
-    found = re.findall(
-        r"^ *(ok|FAIL) +(\w+(?: \w+)*)  .*?(\(at \w+ \S+\)|$)", certificate, flags=re.MULTILINE
-    )
-    assert len(found) > 10
-    return found
+    return re.findall(r"^ *(ok|FAIL) +(\w+(?: \w+)*)  .*?(\(at \w+ \S+\)|$)", certificate, flags=re.MULTILINE)
 
 
-def test_the_python_runs(folder: Path):
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_the_python_runs(name: str, folder: Path):
     names: dict[str, object] = {}
-    for block in blocks("python"):
-        exec(compile(block, "README.md", "exec"), names)
-    assert (folder / "maneuver.npz").is_file()
-    assert (folder / "frames.png").is_file()
+    for block in blocks("python", name):
+        exec(compile(block, name, "exec"), names)
+    if name == "README.md":
+        assert (folder / "maneuver.npz").is_file()
+        assert (folder / "frames.png").is_file()
 
 
 def test_the_problem_files_are_solved(folder: Path):
-    assert len(blocks("toml")) == 2
-    for block in blocks("toml"):
+    tables = blocks("toml") + blocks("toml", "problems/README.md")
+    assert len(tables) == 2
+    for block in tables:
         file = folder / "own.toml"
         file.write_text(block, encoding="utf-8")
         assert isinstance(load_problem(file), Problem)
@@ -164,6 +127,18 @@ def test_the_problem_files_are_solved(folder: Path):
 @pytest.mark.parametrize("name", TABLES)
 def test_the_reference_is_that_of_the_schema(name: str):
     assert table(f"`{name}`") == reference(TABLES[name])
+
+
+def test_the_reference_is_written_as_it_stands():
+    document = DOCUMENTS["problems/README.md"]
+    assert written(document.replace("| required |", "| 3 |")) == document
+
+
+def test_every_example_has_its_row():
+    rows = [re.match(r"\| `(\w+\.py)`", row) for row in table("script")]
+    assert sorted(row[1] for row in rows if row) == sorted(
+        file.name for file in (ROOT / "examples").glob("*.py")
+    )
 
 
 def test_every_command_has_its_row():

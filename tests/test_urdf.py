@@ -6,6 +6,7 @@ import json
 import os
 import re
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import numpy as np
@@ -162,22 +163,57 @@ def test_random_chains_and_what_is_fixed_to_them_are_where_the_file_puts_them(tm
         np.testing.assert_allclose(origin + turn @ body.points[0], wanted[body.name][:3, 3], atol=1e-11)
 
 
-def test_joints_are_where_pinocchio_puts_them(folder):
+PUBLISHED = {
+    "panda_description/urdf/panda.urdf": "panda_link8",
+    "ur_description/urdf/ur5_robot.urdf": "tool0",
+    "xarm_description/urdf/xarm7.urdf": "link7",
+    "z1_description/urdf/z1.urdf": "link06",
+    "kinova_description/robots/kinova.urdf": "j2s6s200_end_effector",
+    "tiago_description/robots/tiago.urdf": "arm_tool_link",
+}
+"""Arms of the package example-robot-data, and their last links."""
+
+
+def robot(file, folder):
+    """Return the path of a URDF file, its last link, and where its packages are."""
+    if file not in PUBLISHED:
+        return folder / "arm.urdf" if file == "small" else Path(file), "tool", []
+    try:
+        share = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share")))
+    except PackageNotFoundError:
+        pytest.skip("example-robot-data is not installed")
+    path = share / "example-robot-data/robots" / file
+    if ".dae" in path.read_text():
+        pytest.importorskip("collada")
+    return path, PUBLISHED[file], [str(share)]
+
+
+@pytest.mark.parametrize("file", ["small", "problems/station_arm.urdf", *PUBLISHED])
+def test_frames_and_jacobians_are_those_of_pinocchio(file, folder):
     pinocchio = pytest.importorskip("pinocchio")
-    for file, tip in ((folder / "arm.urdf", "tool"), (Path("problems/station_arm.urdf"), "tool")):
-        arm, model = read_urdf(file, tip_link=tip), pinocchio.buildModelFromUrdf(str(file))
-        data, rng = model.createData(), np.random.default_rng(3)
-        for _ in range(20):
-            values, q = rng.uniform(-1.0, 1.0, len(arm.joints)), pinocchio.neutral(model)
-            for one, value in zip(arm.joints, values, strict=True):
-                known = model.joints[model.getJointId(one.name)]
-                q[known.idx_q : known.idx_q + known.nq] = (
-                    value if known.nq == 1 else [np.cos(value), np.sin(value)]
-                )
-            pinocchio.framesForwardKinematics(model, data, q)
-            frame = data.oMf[model.getFrameId(tip)]
-            np.testing.assert_allclose(at(arm, values)[-1][0], frame.translation, atol=1e-12)
-            np.testing.assert_allclose(at(arm, values)[-1][1], frame.rotation, atol=1e-12)
+    path, tip, packages = robot(file, folder)
+    arm, model = read_urdf(path, tip_link=tip, package_path=packages), pinocchio.buildModelFromUrdf(str(path))
+    table = {"urdf": str(path.absolute()), "tip_link": tip, "package_path": packages}
+    waypoint = [{"time": 1.0, "position": [0.5, 0.0, 0.5]}]
+    made = make_arm(vq.Problem.from_dict({"arm": table, "maneuver": {"waypoint": waypoint}}))
+    known = [model.joints[model.getJointId(one.name)] for one in arm.joints]
+    data, rng = model.createData(), np.random.default_rng(3)
+    for _ in range(20):
+        values, q = rng.uniform(-1.0, 1.0, len(arm.joints)), pinocchio.neutral(model)
+        for joint, value in zip(known, values, strict=True):
+            turned = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+            q[joint.idx_q : joint.idx_q + joint.nq] = turned
+        pinocchio.computeJointJacobians(model, data, q)
+        pinocchio.framesForwardKinematics(model, data, q)
+        number = model.getFrameId(tip)
+        frame, along_world = data.oMf[number], pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        np.testing.assert_allclose(at(arm, values)[-1][0], frame.translation, atol=1e-12)
+        np.testing.assert_allclose(at(arm, values)[-1][1], frame.rotation, atol=1e-12)
+        nodes, jacobian = made.chain.at(np.concatenate([values, np.zeros(6)]))
+        np.testing.assert_allclose(made.end_effector.position(nodes), frame.translation, atol=1e-12)
+        wanted = pinocchio.getFrameJacobian(model, data, number, along_world)[:3]
+        of_tip = jacobian[made.end_effector.nodes[0]]
+        np.testing.assert_allclose(of_tip, wanted[:, [joint.idx_v for joint in known]], atol=1e-12)
 
 
 @pytest.mark.parametrize("what", BROKEN)
