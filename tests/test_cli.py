@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -264,7 +265,8 @@ def test_list_and_schema_and_doctor(capsys):
     assert code == 0
     assert found["ok"]
     assert "daqp" in found["solvers"]["says"]
-    assert set(found["extras"]) == {"view", "export", "mujoco", "cluster", "dae", "test"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert set(found["extras"]) == set(project["optional-dependencies"])
 
 
 def test_doctor_says_what_fails(capsys, monkeypatch):
@@ -358,7 +360,18 @@ def test_the_package_gives_its_names_and_keeps_the_function_verify():
     from vgtm_qp.verify.check import verify
 
     assert vq.verify is verify
-    assert set(vq.__all__) <= set(dir(vq))
+    assert set(dir(vq)) == {*vq.__all__, "__version__"}
     assert all(getattr(vq, name) is not None for name in vq.__all__)
     with pytest.raises(AttributeError, match="load_problem"):
         vq.no_such_name  # noqa: B018
+
+
+@pytest.mark.parametrize(("shell", "code"), [("bash", 0), ("zsh", 0), ("tcsh", 2)])
+def test_completion_is_installed_for_the_shell_that_is_named(shell, code, tmp_path):
+    program = "import sys; from vgtm_qp.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "--install-completion", "--shell", shell]
+    environment = {**ENVIRONMENT, "HOME": str(tmp_path)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, "Traceback" in done.stderr) == (code, False), done.stderr
+    written = [file for file in tmp_path.rglob("*") if file.is_file() and "vgtm" in file.read_text()]
+    assert bool(written) == (code == 0)

@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from vgtm_qp.notebook import html_table
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -112,6 +114,10 @@ class Verdict:
             "time": self.time,
             "notes": list(self.notes),
         }
+
+    def _repr_html_(self) -> str:
+        head, *lines = str(self).splitlines()
+        return html_table(head, [("note" if self.certified else "FAIL", line.strip()) for line in lines])
 
     def __str__(self) -> str:
         bounds = [

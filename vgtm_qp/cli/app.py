@@ -51,6 +51,9 @@ app = App(
     version=_version,
     suppress_keyboard_interrupt=False,
 )
+app.register_install_completion_command(
+    help="Complete commands and options of this shell, from the next one on."
+)
 _COMMANDS: dict[str, Callable[..., int | None]] = {
     "solve": solve,
     "verify": verify,

@@ -19,6 +19,8 @@ _EXTRAS = {
     "mujoco": ("mujoco",),
     "cluster": ("dask", "distributed"),
     "dae": ("pycollada",),
+    "pandas": ("pandas",),
+    "robots": ("pin", "example-robot-data", "pycollada"),
     "test": (
         "hypothesis",
         "import-linter",

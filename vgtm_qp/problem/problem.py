@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Self
 from pydantic import Field, PrivateAttr, WithJsonSchema
 
 from vgtm_qp.errors import Mistake, ProblemError, VgtmError
+from vgtm_qp.notebook import html_table
 from vgtm_qp.problem.arm import FROM_URDF, OF_URDF, ArmTable
 from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
@@ -65,6 +66,27 @@ class Problem(Table, called="a problem"):
     def source(self) -> Path | None:
         """The file that the problem was read from, if any."""
         return self._source
+
+    def _repr_html_(self) -> str:
+        method, ways = self.method, self.maneuver
+        arm = f"serial, {len(self.arm.joint)} joints" if self.arm is not None else "none"
+        if self.truss is not None:
+            arm = f"truss, {self.truss.module}"
+        way = (
+            f"{len(ways.waypoint)} waypoints, {ways.steps} steps"
+            if isinstance(ways, WaypointManeuver)
+            else str(ways.path)
+        )
+        rows = [
+            ("arm", arm),
+            ("curve", f"{self.curve.family}, {self.curve.control_vertices} control vertices"),
+            ("end effector", f"{', '.join(self.end_effector.track)}; {self.end_effector.mode}"),
+            ("maneuver", way),
+            ("obstacles", ", ".join(f"{one.name} ({one.shape})" for one in self.obstacle) or "none"),
+            ("clearance", f"{self.clearance.safe:g} m"),
+            ("method", f"{method.name}, {method.tracking}, {method.solver}"),
+        ]
+        return html_table(self.name, rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the whole problem, defaults included, as JSON data of the form of the problem file."""

@@ -9,6 +9,7 @@ from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any, Literal
 
 from vgtm_qp.errors import ResultError
+from vgtm_qp.notebook import html_table
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,16 @@ class Certificate:
         rows += [f"FAIL  {line}" for line in self.contradictions]
         rows += [f"note  {line}" for line in self.notes]
         return "\n".join(rows)
+
+    def _repr_html_(self) -> str:
+        told = {name: str(measure).split("  ") for name, measure in self.measures.items()}
+        rows = [
+            ("ok" if measure.ok else "FAIL", _label(name), *told[name])
+            for name, measure in self.measures.items()
+        ]
+        rows += [("FAIL", line) for line in self.contradictions]
+        rows += [("note", line) for line in self.notes]
+        return html_table("verified" if self.ok else "VERIFICATION FAILED", rows)
 
 
 def _lines(value: Any) -> tuple[str, ...]:

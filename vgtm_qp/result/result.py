@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import ResultError
+from vgtm_qp.errors import MissingExtraError, ResultError
 from vgtm_qp.result.certificate import Certificate
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.file import check_arrays, frozen, names_of, plain, read_result, write_result
 from vgtm_qp.result.manifest import WHOLE_PATH, check_manifest
 from vgtm_qp.result.poses import base_poses
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _LEFT_OUT: Any = None
 """Of a serial arm these follow from its joints."""
@@ -110,6 +114,30 @@ class Result:
     def __repr__(self) -> str:
         kind, share = type(self).__name__, 100.0 * self.reached
         return f"<{kind} {self._name!r}: {self.status}, {self.steps} steps, {share:.4g} %>"
+
+    def _repr_html_(self) -> str:
+        found = "" if self.certificate is None else self.certificate._repr_html_()
+        return f"<p>{escape(str(self))}</p>{found}"
+
+    def to_dataframe(self) -> DataFrame:
+        """Return a table of pandas with a row a state, by time, s.
+
+        Its columns are the actuators' values, the tip's position and its target's, m, and both least clearances, m.
+
+        Raises
+        ------
+        MissingExtraError
+            pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame, Index
+        except ImportError:
+            raise MissingExtraError("pandas", "pandas") from None
+        places = {"tip": self.tip_position, "target": self.tip_target_position}
+        columns = dict(zip(self.actuator_names, self.actuator_values.T, strict=True))
+        columns |= {f"{name} {axis}": at[:, k] for name, at in places.items() for k, axis in enumerate("xyz")}
+        columns |= {"clearance": self.clearance, "self clearance": self.self_clearance}
+        return DataFrame(columns, index=Index(self.time, name="time"))
 
     @property
     def _name(self) -> str:

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from vgtm_qp.notebook import html_table
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.numbers import ClearanceRows
@@ -88,6 +89,18 @@ class Step:
 
     def __repr__(self) -> str:
         return f"<Step {self}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("status", self.status),
+            ("progress", f"{100.0 * self.progress:.4g} %"),
+            ("time", f"{self.state.time:.6g} s"),
+            ("QPs", self.qps),
+            ("off the curve", f"{self.gap:.3g} m"),
+            *((("held by", ", ".join(self.blocked_by)),) if self.status is not StepStatus.REACHED else ()),
+            *((("reason", self.reason),) if self.reason else ()),
+        ]
+        return html_table("step", rows)
 
     def over(self, share: float, limits: Limits | None) -> Step:
         """Return the step as one over a longer piece of path, of which its own piece is a `share`."""
