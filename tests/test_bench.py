@@ -380,7 +380,8 @@ def test_scenes_have_names_of_their_own_and_the_bays_that_were_asked_for() -> No
 
 
 @pytest.mark.parametrize(
-    ("kind", "bays"), [("cubes", 10), ("cubes", 30), ("clutter", 50), ("tetrahedral", 14), ("serial", 7)]
+    ("kind", "bays"),
+    [("cubes", 10), ("cubes", 30), ("clutter", 50), ("tetrahedral", 14), ("serial", 7), ("snake", 30)],
 )
 def test_scenes_begin_clear_and_can_be_reached(kind: Any, bays: int) -> None:
     scene = scenes.make_scenes((kind,), (bays,), ("elastic",))[0]
@@ -388,7 +389,7 @@ def test_scenes_begin_clear_and_can_be_reached(kind: Any, bays: int) -> None:
     assert scene.bays == bays
     assert check_problem(scene.problem, setup) == []
     assert find_warnings(scene.problem, setup) == []
-    assert len(scene.problem.obstacle) == {"cubes": 2, "clutter": 100, "serial": 1}.get(kind, 0)
+    assert len(scene.problem.obstacle) == {"cubes": 2, "clutter": 100, "serial": 1, "snake": 3}.get(kind, 0)
 
 
 def test_every_step_of_a_longer_arm_has_a_cube_within_influence() -> None:

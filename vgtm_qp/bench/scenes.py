@@ -9,9 +9,12 @@ from typing import Any, NamedTuple, get_args
 
 from vgtm_qp.bench import DistanceName, SceneKind, TrackingName
 from vgtm_qp.problem import Problem, load_problem
+from vgtm_qp.problem.snake import snake
 
 KINDS: tuple[SceneKind, ...] = get_args(SceneKind)
 BAYS = (5, 20, 50, 200, 1000)
+_SNAKE = 30
+"""Joints of a snake."""
 CLUTTERED_BAYS = 50
 CLUTTER = 100
 
@@ -38,6 +41,7 @@ VARIANTS: dict[SceneKind, tuple[Variant, ...]] = {
     "clutter": (("exact", "fcl"),),
     "tetrahedral": (("exact", "fcl"),),
     "serial": (("exact", "fcl"), ("exact", "exact")),
+    "snake": (("exact", "fcl"),),
 }
 """Modes of tracking, and what gives the distances, that each kind is measured with if nothing else is asked for.
 
@@ -115,7 +119,12 @@ def _scene(
 
 def _count(kind: SceneKind) -> int:
     """Return the number of bays, or of joints, of a kind whose number is fixed."""
-    fixed: dict[SceneKind, int] = {"clutter": CLUTTERED_BAYS, "tetrahedral": 14, "serial": _JOINTS}
+    fixed: dict[SceneKind, int] = {
+        "clutter": CLUTTERED_BAYS,
+        "tetrahedral": 14,
+        "serial": _JOINTS,
+        "snake": _SNAKE,
+    }
     return fixed.get(kind, _BUNDLED_BAYS)
 
 
@@ -147,9 +156,29 @@ def _serial() -> Problem:
     )
 
 
+def _snake() -> Problem:
+    """Return a snake of fifteen universal joints, 4 m long, that leans over between three cubes."""
+    cubes = (((1.3, -0.2, 1.7), 0.6), ((-0.7, -0.6, 1.5), 0.5), ((0.3, 1.2, 3.0), 0.5))
+    return Problem.from_dict(
+        {
+            "name": "snake of 30 joints between three cubes",
+            "arm": snake(_SNAKE // 2),
+            "curve": {"control_vertices": 6},
+            "maneuver": {"steps": 100, "waypoint": [{"time": 10.0, "position": [2.6, -0.9, 2.2]}]},
+            "obstacle": [
+                {"name": f"cube {k}", "shape": "box", "center": center, "size": size}
+                for k, (center, size) in enumerate(cubes, start=1)
+            ],
+            "clearance": {"safe": 0.08, "influence": 0.5},
+        }
+    )
+
+
 def _problem(kind: SceneKind, bays: int) -> Problem:
     if kind == "serial":
         return _serial()
+    if kind == "snake":
+        return _snake()
     if kind == "tetrahedral":
         return load_problem(_BUNDLED[kind])
     problem = load_problem(_BUNDLED[kind])
