@@ -165,7 +165,7 @@ class Approach(Protocol):
     """How much nearer bodies can come to others, or to what rests."""
 
     def __call__(self, body: Index, other: Index | None = None) -> Array:
-        """Return (R,) bounds, m, for bodies (R,) and other bodies (R,); NaN or inf where there is none."""
+        """Return (R,) bounds, m, for bodies (R,) and other bodies (R,)."""
         ...
 
 

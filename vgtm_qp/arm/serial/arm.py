@@ -52,13 +52,7 @@ class SerialArm(JointSpaceArm):
         self.bodies = self._links(spec.link_radius) if spec.body is None else self._apart(self._carried(spec))
 
     def _limit(self, joints: Sequence[Joint]) -> None:
-        """Find followers and limits: those of a follower are limits of what it follows.
-
-        Raises
-        ------
-        ValueError
-            No value keeps the limits of a joint and of its followers.
-        """
+        """Find followers and limits: those of a follower are limits of what it follows, which keeps all at home."""
         number = {joint.name: k for k, joint in enumerate(joints)}
         self.stroke = np.array([joint.limits or (-np.inf, np.inf) for joint in joints], dtype=float)
         self.rate = _or_infinite([joint.rate for joint in joints])
