@@ -165,7 +165,7 @@ class Approach(Protocol):
     """How much nearer bodies can come to others, or to what rests."""
 
     def __call__(self, body: Index, other: Index | None = None) -> Array:
-        """Return (R,) bounds, m, for bodies (R,) and other bodies (R,)."""
+        """Return (R,) bounds, m, for bodies (R,) and other bodies (R,); NaN or inf where there is none."""
         ...
 
 
@@ -338,6 +338,13 @@ class Arm(ABC):
     @abstractmethod
     def travel(self, motion: Array) -> float:
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
+
+    def furthest(self, q: Array, lower: Array, upper: Array) -> Array | None:  # noqa: ARG002
+        """Return a displacement from `q` in which each actuator moves as far as boxes (n_a,) let it; None if unknown.
+
+        It is no motion, but :meth:`approach` of it bounds that of any motion within the boxes.
+        """
+        return None
 
     def approach(self, motion: Array) -> Approach | None:  # noqa: ARG002
         """Return how much nearer bodies come in a displacement of the configuration; None where that is unknown.

@@ -181,6 +181,10 @@ class JointSpaceArm(Arm):
     def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
         return np.concatenate([q[:-6] + self.following(missing.copy()), q[-6:]])
 
+    def furthest(self, q: Array, lower: Array, upper: Array) -> Array:
+        at = q[self.actuators]
+        return self.advanced(np.zeros(len(q)), q, np.maximum(upper - at, at - lower))
+
     def travel(self, motion: Array) -> float:
         turn, slide = self._motions(motion)
         return float(turn @ self.reaches + slide.sum() + np.abs(motion[-6:-3]).max(initial=0.0))

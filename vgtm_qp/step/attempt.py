@@ -184,8 +184,13 @@ class Attempt:
         q, arm, goal, guess = state.q, self._arm, target.goal(progress), share * state.motion
         reach, expected = self._influence, None
         if share >= 1.0:
-            reach, last = _MOTION_MARGIN * self._expected(target, goal, guess), arm.travel(guess)
-            expected = None if target.base is not None or last == 0.0 else reach / last * guess
+            reach = _MOTION_MARGIN * self._expected(target, goal, guess)
+        if target.base is None:
+            last = arm.travel(guess)
+            if share >= 1.0 and last > 0.0:
+                expected = reach / last * guess
+            elif (furthest := arm.furthest(q, target.lower, target.upper)) is not None:
+                expected = self.separation.spent(furthest)
         rows = self.separation.rows(q, state.time, target.duration, reach, short, gain, expected=expected)
         if target.base is not None:
             # The displacement of nodes with the base is known.
@@ -222,7 +227,8 @@ class Attempt:
                 covered = first.progress
                 q, target, move = first.q, target.part(covered), first._replace(progress=1.0)
             if move is not None:
-                near = separation.rows(q, target.time, 0.0, reach, short, gain)
+                furthest = None if target.base else self._arm.furthest(q, target.lower, target.upper)
+                near = separation.rows(q, target.time, 0.0, reach, short, gain, expected=furthest)
                 near = separation.with_rows_between(near, state, q, target.time, fractions)
                 at = q, q, move.vertices, move.torsion
                 asked = QPInput(*at, target, target.goal(move.progress), move.progress, near, False)

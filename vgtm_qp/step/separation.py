@@ -149,8 +149,8 @@ class Separation:
         short, gain
             Pairs that were too near at the start of the step, and the distance by which they are driven apart, m.
         expected
-            Displacement of the configuration that is as far as `reach`, if one is expected and the base rests: bodies
-            that move less or together then need fewer rows.
+            Displacement of the configuration, if one is known: pairs whose approach in it is less than their distance
+            from the floor need no rows.
         """
         kept, motion, monitor = self._setup, duration > 0.0, self._monitor
         reach += monitor.pieces.fastest * duration
@@ -170,8 +170,12 @@ class Separation:
             self._allow(rows, contacts, duration, short, gain)
         return rows.joined(self._angle_rows(q, motion=motion)) if len(self._corners) else rows
 
+    def spent(self, motion: Array) -> Array:
+        """Return the displacement whose approach a pair must have left to be free in a step by `motion`."""
+        return motion / self._approach
+
     def _wanted(self, expected: Array, duration: float) -> Wanted | None:
-        """Return which pairs can become active in an expected displacement; None for all."""
+        """Return which pairs can become active in a displacement; None for all."""
         approach = self._arm.approach(expected)
         if approach is None:
             return None
@@ -181,7 +185,8 @@ class Separation:
             floor, nearer = (
                 (kept.self_safe, approach(body, other)) if is_self else (kept.safe, approach(body) + drift)
             )
-            return distance < floor + nearer
+            # NaN fails the comparison.
+            return ~(distance >= floor + nearer)
 
         return wanted
 

@@ -139,7 +139,9 @@ class SerialArm(JointSpaceArm):
         turn, slide = (moved[1:] for moved in self._motions(motion))
         # Sums over the joints before each: of turns, of turns times ways, of slides.
         sums = np.zeros((3, len(turn) + 1))
-        np.cumsum([turn, turn * self._ways[0], slide], axis=1, out=sums[:, 1:])
+        # Without limits they are no numbers.
+        with np.errstate(invalid="ignore"):
+            np.cumsum([turn, turn * self._ways[0], slide], axis=1, out=sums[:, 1:])
         way, (first, last) = self._ways[1][self.bodies.points].max(axis=1), self._movers
 
         def bound(body: Index, other: Index | None = None) -> Array:
@@ -147,8 +149,9 @@ class SerialArm(JointSpaceArm):
             if other is not None:
                 begin = np.minimum(first[body], first[other])
                 further = np.where(last[body] > last[other], body, other)
-            turns, levers, slides = sums[:, last[further]] - sums[:, begin]
-            return np.asarray(way[further] * turns - levers + slides)
+            with np.errstate(invalid="ignore"):
+                turns, levers, slides = sums[:, last[further]] - sums[:, begin]
+                return np.asarray(way[further] * turns - levers + slides)
 
         return bound
 
