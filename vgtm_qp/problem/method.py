@@ -152,9 +152,9 @@ class Method(Table, called="[method]"):
     )
     tracking_mode: Literal["exact", "hard", "elastic"] = Field(
         default="exact",
-        description="exact: faces are on the curve, except in steps of which that leaves less than half and that get a "
-        "quarter further off it, where they stay as near as other rows let them; hard: in every step, or the arm "
-        "stops; elastic: as near as the weights tracking and tangent draw them",
+        description="exact: faces are on the curve, except in steps of which that leaves less than a tenth, or less "
+        "than half where they get a quarter further off it; there they stay as near as other rows let them; hard: in "
+        "every step, or the arm stops; elastic: as near as the weights tracking and tangent draw them",
     )
     hard_coordinates: tuple[HardCoordinate, ...] = Field(
         default=("position",),

@@ -33,6 +33,11 @@ _INSTANT = 1e-9
 _LEAST_HELD = 0.5
 """Least share of a piece of path for which stations stay on the curve, where they may leave it."""
 
+_LEAST_CRAWL = 0.1
+"""Least share of a piece that an arm must cover with stations on the curve to keep them there: next to a dead end the
+last digits decide where it goes on it.
+"""
+
 _OFF_PATH = "the arm could brake after it only off its path"
 
 
@@ -106,22 +111,23 @@ class Advancer:
     ) -> Iterator[Advance]:
         """Yield attempts with stations on the curve and then, if these get less than half as far, with others free.
 
-        Stations leave the curve only if the arm then gets a quarter further than on it. An arm that cannot stop at once
-        must not be led into a corner in that way.
+        Stations leave the curve only if the arm then gets a quarter further than on it, or hardly gets on there. An arm
+        that cannot stop at once must not be led into a corner in that way.
         """
         held: Advance | None = None
         for found in self._pieces(state, target, dt, first, max(smallest, _LEAST_HELD), Tracking.HARD):
-            if found.step.moved and found.step.progress < _LEAST_HELD * first:
-                held = found if held is None else max(held, found, key=_progress)
-            else:
+            if not found.step.moved or found.step.progress >= _LEAST_HELD * first:
                 yield found
+            elif found.step.progress >= _LEAST_CRAWL * first:
+                held = found if held is None else max(held, found, key=_progress)
         share = first
         for found in self._pieces(state, target, dt, first, smallest, Tracking.ELASTIC):
             if found.step.moved and share < _LEAST_HELD * first:
                 on_curve = self._piece(state, target, dt, first, share, Tracking.HARD)
-                if on_curve.step.moved:
+                if on_curve.step.moved and on_curve.step.progress >= _LEAST_CRAWL * first:
                     held = on_curve if held is None else max(held, on_curve, key=_progress)
-            least = 0.0 if held is None else FURTHER * held.step.progress
+            # An arm may wait: a step without progress is one, too.
+            least = -np.inf if held is None else FURTHER * held.step.progress
             if share <= least or (found.step.moved and found.step.progress <= least):
                 break
             yield found

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm
 from vgtm_qp.arm.build import make_arm
+from vgtm_qp.arm.serial.arm import SerialArm
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ProblemError
 from vgtm_qp.geometry import shapes
@@ -52,11 +52,12 @@ def _scene(random: np.random.Generator, name: str, steps: int) -> Problem:
         "clearance": {"safe": SAFE, "influence": 0.4},
     }
     arm = make_arm(Problem.from_dict({**data, "end_effector": {"track": ["position"]}}))
+    assert isinstance(arm, SerialArm)
     home, shape = arm.home_configuration, _shape(arm, random)
     reachable = bool(random.random() < 0.75)
-    kinematics = arm.kinematics()
+    kinematics = arm.kinematics(compiled=False)
     kinematics.evaluate(shape)
-    position, rotation = arm.end_effector.position(arm.nodes(shape)), kinematics.tip_rotation
+    position, rotation = arm.end_effector.position(placed(arm, shape)), kinematics.tip_rotation
     if not reachable:
         away = random.normal(size=3)
         position = position + away * (0.3 * arm.height * random.random() / np.linalg.norm(away))
@@ -127,7 +128,12 @@ def _joint(random: np.random.Generator, number: int) -> dict[str, Any]:
     return joint
 
 
-def _shape(arm: Arm, random: np.random.Generator) -> Array:
+def placed(arm: SerialArm, q: Array) -> Array:
+    """Return the nodes, always to the same digits: those of compiled functions have other last ones."""
+    return np.asarray(arm.chain.at(q)[0])
+
+
+def _shape(arm: SerialArm, random: np.random.Generator) -> Array:
     """Return the furthest configuration on a random way from home whose bodies keep apart."""
     home, actuators = arm.home_configuration, arm.actuators
     low, high = np.maximum(arm.stroke[actuators], -3.0), np.minimum(arm.stroke[actuators], 3.0)
@@ -138,15 +144,17 @@ def _shape(arm: Arm, random: np.random.Generator) -> Array:
     for share in np.arange(1, _SHARES + 1) / _SHARES:
         q = home.copy()
         q[actuators] = now + share * (wanted - now)
-        if own.least(arm.points(q))[0] < SAFE:
+        if own.least(placed(arm, q))[0] < SAFE:
             break
         good = q
     return good
 
 
-def _cubes(arm: Arm, random: np.random.Generator, states: list[Array], count: int) -> list[dict[str, Any]]:
+def _cubes(
+    arm: SerialArm, random: np.random.Generator, states: list[Array], count: int
+) -> list[dict[str, Any]]:
     """Return `count` cubes, or as many as find a place, near the arm and clear of it in all `states`."""
-    points = [arm.points(q) for q in states]
+    points = [placed(arm, q) for q in states]
     found: list[dict[str, Any]] = []
     for _ in range(_TRIES):
         if len(found) == count:
