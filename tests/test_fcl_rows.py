@@ -85,8 +85,8 @@ def test_every_row_agrees_with_the_closed_form_and_with_finite_differences(seed,
         assert monitor.fcl.refused == np.count_nonzero(~found.by_fcl)
     touching = exact.distance + np.where(exact.is_self, 2.0, 1.0) * RADIUS <= NORMAL_FROM
     assert not (found.by_fcl & touching).any()
-    # FCL errs at bodies parallel to edges on round coordinates, and at rims by some 2e-6 m now and then; elsewhere it has
-    # an answer to everything.
+    # FCL errs at bodies parallel to edges on round coordinates, and at rims by some 2e-6 m now and then; elsewhere it
+    # has an answer to everything.
     assert round_numbers or shape == "cylinder" or found.by_fcl[~touching].all()
     # The distance from a body of no length has no derivative with respect to its ends.
     assume((X[::2] != X[1::2]).any(axis=1).all())
