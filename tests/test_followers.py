@@ -96,15 +96,47 @@ def test_a_follower_that_does_not_follow_is_found(maneuver):
     assert any(
         "member" in line or "joint" in line for line in vq.verify(replace(maneuver, joints=joints)).failures()
     )
-    for change in (lambda rows: rows.clear(), lambda rows: rows[0].__setitem__(2, 0.5)):
-        manifest = copy.deepcopy(maneuver.manifest)
-        change(manifest["arm"]["followers"])
-        found = vq.verify(replace(maneuver, manifest=manifest))
-        assert any("follow" in line for line in found.contradictions)
+    for change in ({"followers": [], "multipliers": []}, {"multipliers": [-0.5, 0.5]}):
+        assert any("follow" in line for line in found_in(maneuver, **change).contradictions)
+    for change in (
+        {"followers": [[99, 0], [8, 0]]},
+        {"followers": [[5.5, 0], [8, 0]]},
+        {"multipliers": [1.0]},
+    ):
+        with pytest.raises(vq.VgtmError, match=r"followers|multipliers"):
+            found_in(maneuver, **change)
+
+
+def test_a_record_cannot_make_a_follower_or_a_locked_joint_free(maneuver):
+    """What is actuated is not held to its value."""
+    stuck = vq.solve(problem(**{"arm.locked": ["yaw-6", {"joint": "yaw-5", "time": 2.0}]}))
+    assert stuck.certificate.ok, stuck.certificate.failures()
+    for result, name in ((maneuver, "pitch-5"), (stuck, "yaw-6")):
+        k = result.joint_names.tolist().index(name)
+        actuated = list(result.manifest["arm"]["actuated"])
+        actuated[k] = True
+        joints = result.joints.copy()
+        joints[1:, k] += 1e-3
+        found = vq.verify(replace(changed(result, actuated=actuated), joints=joints))
+        assert any(f"drive of joint {name}" in line for line in found.contradictions)
+
+
+def changed(maneuver, **record):
+    """The maneuver with other values in the record of its arm."""
     manifest = copy.deepcopy(maneuver.manifest)
-    manifest["arm"]["followers"][0][0] = 99
-    with pytest.raises(vq.VgtmError, match="followers"):
-        vq.verify(replace(maneuver, manifest=manifest))
+    manifest["arm"] |= record
+    return replace(maneuver, manifest=manifest)
+
+
+def found_in(maneuver, **record):
+    return vq.verify(changed(maneuver, **record))
+
+
+def test_a_follower_of_no_joint_in_a_result_is_named(maneuver):
+    manifest = copy.deepcopy(maneuver.manifest)
+    manifest["problem"]["arm"]["joint"][5]["mimic"]["joint"] = "nobody"
+    found = vq.verify(replace(maneuver, manifest=manifest))
+    assert any("nobody" in line for line in found.contradictions)
 
 
 def test_a_trajectory_need_not_name_followers_and_may_not_contradict_them(maneuver):

@@ -159,15 +159,15 @@ class JointSpaceArm(Arm):
         return values
 
     def following(self, change: Any) -> Any:
-        """Return changes of the joints from those of the quantities, (J,) or (J, 1): followers move, too."""
+        """Return (J,) or (J, 1) changes of the joints from those of the quantities, which are overwritten."""
         for joint, followed, multiplier in self.followers:
             change[joint] = change[joint] + multiplier * change[followed]
         return change
 
     def by_quantities(self, jacobian: Any) -> Any:
-        """Return derivatives (..., J) by the quantities from those by the joints."""
+        """Return derivatives (R, J) by the quantities from those by the joints, which are overwritten."""
         for joint, followed, multiplier in self.followers:
-            jacobian[..., followed] += multiplier * jacobian[..., joint]
+            jacobian[:, followed] = jacobian[:, followed] + multiplier * jacobian[:, joint]
         return jacobian
 
     def based(self, q: Array, pose: Pose) -> Array:
@@ -246,8 +246,7 @@ class JointSpaceSymbols(ArmSymbols):
         """See ``arm.ArmSymbols``: K and r."""
         rows = [3 * node + axis for node in self._free for axis in range(3)]
         _, jacobian = self._moving(at, *self._constants)
-        for joint, followed, multiplier in self._arm.followers:
-            jacobian[:, followed] = jacobian[:, followed] + multiplier * jacobian[:, joint]
+        jacobian = self._arm.by_quantities(jacobian)
         return [jacobian[rows, self._actuators], ca.vec(moved[:, self._free])]
 
     def response(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:

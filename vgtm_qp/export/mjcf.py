@@ -163,13 +163,14 @@ def _carried(arm: RecordedChain, link: int) -> tuple[int, Array]:
 
 def _add_drives(root: Element, arm: RecordedChain) -> None:
     equalities, actuators = (_add(root, kind) for kind in ("equality", "actuator"))
+    pairs = zip(arm.followers.tolist(), arm.multipliers.tolist(), strict=True)
+    followed = {joint: (other, multiplier) for (joint, other), multiplier in pairs}
     for k, name in enumerate(arm.quantity_names):
-        held, followed = [float(arm.home_quantities[k]), 0.0, 0.0, 0.0, 0.0], {}
-        for (follower, other), multiplier in zip(arm.followers, arm.multipliers, strict=True):
-            if follower == k:
-                held[1], followed = float(multiplier), {"joint2": arm.quantity_names[other]}
+        other, multiplier = followed.get(k, (None, 0.0))
+        held = (float(arm.home_quantities[k]), multiplier, 0.0, 0.0, 0.0)
+        beside = {} if other is None else {"joint2": arm.quantity_names[other]}
         active = "false" if arm.actuated[k] else "true"
-        _add(equalities, "joint", name=name, joint1=name, **followed, polycoef=held, active=active, **_STIFF)
+        _add(equalities, "joint", name=name, joint1=name, **beside, polycoef=held, active=active, **_STIFF)
         if arm.actuated[k]:
             drive = _add(
                 actuators, "position", name=name, joint=name, kp=_TURNING, dampratio=1.0, group=ACTUATOR_GROUP

@@ -132,7 +132,7 @@ class Clearance:
                 found, pairs = both[k, which], rows[k]
                 candidates.count_unneeded(group, len(rows) - int(np.count_nonzero(which == 0)))
                 if wanted is not None:
-                    needed = group.wanted(wanted, pairs, found)
+                    needed = group.chosen(wanted, pairs, found)
                     found, pairs = found[needed], pairs[needed]
                 if group.shape == "triangle":
                     kept = self._distinct(group, pairs, found)

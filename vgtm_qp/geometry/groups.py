@@ -248,9 +248,9 @@ class Group:
                 rows = rows[rows >= _FIRST]
         return best, row, len(rows)
 
-    def wanted(self, wanted: Wanted, rows: Index, found: Array) -> Mask:
+    def chosen(self, by: Wanted, rows: Index, found: Array) -> Mask:
         """Return which of the contacts `found` (R, ``CONTACT``) of the pairs `rows` are wanted."""
-        return wanted(self.body[rows], self.other[rows], found[:, 0], is_self=self.is_self)
+        return by(self.body[rows], self.other[rows], found[:, 0], is_self=self.is_self)
 
     def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> Found:
         """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`, with `by_fcl` FCL's contacts instead.

@@ -110,7 +110,7 @@ class _WatchedGroup:
         near = (contacts[:, 0] < limit).nonzero()[0]
         rows, contacts = self._rows.take(near >> 1), contacts.take(near, axis=0)
         if wanted is not None:
-            kept = self.group.wanted(wanted, rows, contacts)
+            kept = self.group.chosen(wanted, rows, contacts)
             rows, contacts = rows[kept], contacts[kept]
         return self.group.contacts(X, 0.0, rows, contacts, by_fcl)
 

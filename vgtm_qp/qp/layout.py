@@ -34,11 +34,6 @@ def with_angles(weights: Weights, arm: Arm) -> Weights:
     return weights.model_copy(update={"tangent": area * weights.tangent, "roll": area * weights.roll})
 
 
-def weights_of(count: int, nodes: Index, weights: Array) -> Array:
-    """Return (N,) the weights of all `count` nodes in the mean of some (K,) with `weights` (K,)."""
-    return np.asarray(np.bincount(nodes, weights, count), dtype=float)
-
-
 _REACH = 0.03
 """Share of the arm's unit by which a step draws such a gap back."""
 
@@ -148,12 +143,8 @@ class Layout:
     @cached_property
     def ends_at_tip(self) -> bool:
         """Whether the curve ends in the end effector: if that is the last station, and there are enough vertices."""
-        tip, stations = self.arm.end_effector, self.arm.stations
-        if self.vertices < _ENDS_AT_TIP:
-            return False
-        poses = ((tip.nodes, tip.weights), (stations.nodes[-1], stations.weights[-1]))
-        first, second = (weights_of(len(self.arm.home), *pose) for pose in poses)
-        return np.array_equal(first > 0.0, second > 0.0) and np.allclose(first, second, rtol=0.0, atol=1e-12)
+        tip, last = self.arm.end_effector.nodes, self.arm.stations.nodes[-1:]
+        return self.vertices >= _ENDS_AT_TIP and np.array_equal(np.sort(last), np.sort([tip]))
 
     @cached_property
     def ends_along_tip(self) -> bool:

@@ -180,9 +180,8 @@ class Certificate:
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        told = {name: str(measure).split("  ") for name, measure in self.measures.items()}
         rows = [
-            ("ok" if measure.ok else "FAIL", _label(name), *told[name])
+            ("ok" if measure.ok else "FAIL", _label(name), *str(measure).split("  "))
             for name, measure in self.measures.items()
         ]
         rows += [("FAIL", line) for line in self.contradictions]

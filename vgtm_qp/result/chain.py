@@ -57,10 +57,12 @@ class RecordedChain:
         self.position = table.numbers("position", (joints, 3))
         self.rotation = table.numbers("rotation", (joints, 3, 3))
         home = table.numbers("home", (joints,))
-        follows = table.numbers("followers", (None, 3)) if table.has("followers") else np.zeros((0, 3))
-        self.followers, self.multipliers = follows[:, :2].astype(np.int64), follows[:, 2]
-        if ((self.followers < 0) | (self.followers >= joints)).any():
-            raise ResultError(f"manifest.arm.followers names a joint outside 0..{joints - 1}")
+        # Results of earlier versions have no followers.
+        follow = table.has("followers")
+        self.followers = (
+            table.integers("followers", (None, 2), joints) if follow else np.zeros((0, 2), dtype=np.int64)
+        )
+        self.multipliers = table.numbers("multipliers", (len(self.followers),)) if follow else np.zeros(0)
         self.stroke = table.numbers("stroke", (joints, 2), limits=True)
         self.stroke[np.isinf(self.stroke[:, 0]), 0] = -np.inf
         self.rate = table.numbers("rate", (joints,), limits=True)
@@ -98,13 +100,24 @@ class RecordedChain:
         if tuple(joints) != self.quantity_names:
             return [*found, "the joints of the arm record are not those of the problem"]
         origin = (0.0, 0.0, 0.0)
-        try:
-            expected = _driven(joints)
-        except KeyError:
-            return [*found, "a joint of the problem follows one that there is not"]
-        followers = np.column_stack([self.followers, self.multipliers])
-        if followers.shape != expected.followers.shape or not same(followers, expected.followers):
+        nobody = {str(joint["mimic"]["joint"]) for joint in joints.values() if joint.get("mimic")} - set(
+            joints
+        )
+        if nobody:
+            return [
+                *found,
+                f"joints of the problem follow {', '.join(sorted(nobody))}, which is none of them",
+            ]
+        expected = _driven(joints)
+        if not np.array_equal(self.followers, expected.followers) or not same(
+            self.multipliers, expected.multipliers
+        ):
             found.append("the joints that follow others in the arm record are not those of the problem")
+        stuck = {
+            lock if isinstance(lock, str) else str(lock["joint"])
+            for lock in table.get("locked") or ()
+            if isinstance(lock, str) or not lock.get("time")
+        }
         for k, (name, joint) in enumerate(joints.items()):
             axis = np.array(joint["axis"], dtype=float)
             turn = np.array(joint.get("rotation_vector") or origin, dtype=float)
@@ -112,6 +125,7 @@ class RecordedChain:
                 "axis": (self.axis[k], axis / np.linalg.norm(axis)),
                 "position": (self.position[k], joint.get("position") or origin),
                 "rotation": (self.rotation[k], rotation_matrix(turn)),
+                "drive": (float(self.actuated[k]), float(name not in stuck and not joint.get("mimic"))),
                 "home": (self._home_values[k], expected.home[k]),
                 "limits": (self.stroke[k], expected.stroke[k]),
                 "rate": (self.rate[k], expected.rate[k]),
@@ -267,7 +281,8 @@ class _Driven(NamedTuple):
     stroke: Array
     rate: Array
     acceleration: Array
-    followers: Array
+    followers: Index
+    multipliers: Array
 
 
 def _driven(joints: Mapping[str, Mapping[str, Any]]) -> _Driven:
@@ -277,8 +292,9 @@ def _driven(joints: Mapping[str, Mapping[str, Any]]) -> _Driven:
     stroke = np.array([joint.get("limits") or (-np.inf, np.inf) for joint in tables], dtype=float)
     most = np.array([[joint.get(key) or np.inf for joint in tables] for key in ("rate", "acceleration")])
     rules = [(k, joint["mimic"]) for k, joint in enumerate(tables) if joint.get("mimic")]
-    followers = [(k, number[rule["joint"]], float(rule.get("multiplier", 1.0))) for k, rule in rules]
-    for (k, rule), (_, other, factor) in zip(rules, followers, strict=True):
+    followers = np.array([(k, number[rule["joint"]]) for k, rule in rules], dtype=np.int64).reshape(-1, 2)
+    multipliers = np.array([rule.get("multiplier", 1.0) for _, rule in rules], dtype=float)
+    for (k, rule), other, factor in zip(rules, followers[:, 1], multipliers, strict=True):
         offset = float(rule.get("offset", 0.0))
         home[k] = factor * home[other] + offset
         own = np.sort((stroke[k] - offset) / factor)
@@ -286,7 +302,7 @@ def _driven(joints: Mapping[str, Mapping[str, Any]]) -> _Driven:
         most[:, other] = np.minimum(most[:, other], most[:, k] / abs(factor))
     for k, _ in rules:
         stroke[k], most[:, k] = (-np.inf, np.inf), np.inf
-    return _Driven(home, stroke, most[0], most[1], np.array(followers, dtype=float).reshape(-1, 3))
+    return _Driven(home, stroke, most[0], most[1], followers, multipliers)
 
 
 def _are_ends(recorded: Array, ends: Array, radius: float) -> bool:

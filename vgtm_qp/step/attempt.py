@@ -185,12 +185,10 @@ class Attempt:
         reach, expected = self._influence, None
         if share >= 1.0:
             reach = _MOTION_MARGIN * self._expected(target, goal, guess)
-        if target.base is None:
-            last = arm.travel(guess)
-            if share >= 1.0 and last > 0.0:
-                expected = reach / last * guess
-            elif (furthest := arm.furthest(q, target.lower, target.upper)) is not None:
-                expected = self.separation.spent(furthest)
+        if share >= 1.0 and target.base is None and (last := arm.travel(guess)) > 0.0:
+            expected = reach / last * guess
+        elif (furthest := self._furthest(q, target)) is not None:
+            expected = _MOTION_MARGIN * furthest
         rows = self.separation.rows(q, state.time, target.duration, reach, short, gain, expected=expected)
         if target.base is not None:
             # The displacement of nodes with the base is known.
@@ -227,7 +225,7 @@ class Attempt:
                 covered = first.progress
                 q, target, move = first.q, target.part(covered), first._replace(progress=1.0)
             if move is not None:
-                furthest = None if target.base else self._arm.furthest(q, target.lower, target.upper)
+                furthest = self._furthest(q, target)
                 near = separation.rows(q, target.time, 0.0, reach, short, gain, expected=furthest)
                 near = separation.with_rows_between(near, state, q, target.time, fractions)
                 at = q, q, move.vertices, move.torsion
@@ -290,6 +288,10 @@ class Attempt:
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")
         return blocked("no convergence")
+
+    def _furthest(self, q: Array, target: Target) -> Array | None:
+        """Return ``Arm.furthest`` within the boxes of a target; None if the base moves."""
+        return None if target.base is not None else self._arm.furthest(q, target.lower, target.upper)
 
     def _is_cut_short(self, move: Move) -> bool:
         """Return whether the answer of a first QP covers a part of the piece, and not the whole of it."""

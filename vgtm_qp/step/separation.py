@@ -170,10 +170,6 @@ class Separation:
             self._allow(rows, contacts, duration, short, gain)
         return rows.joined(self._angle_rows(q, motion=motion)) if len(self._corners) else rows
 
-    def spent(self, motion: Array) -> Array:
-        """Return the displacement whose approach a pair must have left to be free in a step by `motion`."""
-        return motion / self._approach
-
     def _wanted(self, expected: Array, duration: float) -> Wanted | None:
         """Return which pairs can become active in a displacement; None for all."""
         approach = self._arm.approach(expected)
@@ -182,9 +178,8 @@ class Separation:
         kept, drift = self._setup, self._monitor.pieces.fastest * duration
 
         def wanted(body: Index, other: Index, distance: Array, *, is_self: bool) -> Mask:
-            floor, nearer = (
-                (kept.self_safe, approach(body, other)) if is_self else (kept.safe, approach(body) + drift)
-            )
+            floor = kept.margin + (kept.self_safe if is_self else kept.safe)
+            nearer = approach(body, other) if is_self else approach(body) + drift
             # NaN fails the comparison.
             return ~(distance >= floor + nearer)
 

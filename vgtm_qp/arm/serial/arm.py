@@ -73,7 +73,7 @@ class SerialArm(JointSpaceArm):
     def _placed(self, chain: SerialChain, q: Array) -> tuple[Array, Array]:
         """Return nodes (N, 3), m, and their derivatives (N, 3, J) by the quantities, at a configuration."""
         nodes, jacobian = chain.at(q)
-        return nodes, self.by_quantities(jacobian)
+        return nodes, self.by_quantities(jacobian.reshape(-1, len(chain))).reshape(jacobian.shape)
 
     def _every(self, chain: SerialChain) -> int:
         """Return the least spacing of stations, in joints, with which all can stay on the curve at once at home.
@@ -121,14 +121,14 @@ class SerialArm(JointSpaceArm):
 
     def _reaches(self) -> Array:
         """Return (J + 1,) the :attr:`reaches`: all slides fully extended, all links in one line."""
-        chain, slide = self.chain, self._slides()
+        chain, (to_places, to_frames) = self.chain, self._ways
         beside = np.full(len(chain) + 1, np.sqrt(2.0) * chain.spread)
+        tip = to_places[-1] + beside[-1]
         np.maximum.at(beside, chain.carriers, np.linalg.norm(chain.points, axis=1))
-        reaches, beyond = np.empty(len(chain) + 1), np.sqrt(2.0) * chain.spread
-        # A joint reaches the points that move with it, and the next origin and what is beyond that.
-        for k in range(len(chain), 0, -1):
-            reaches[k] = beyond = slide[k - 1] + max(beside[k], chain.lengths[k] + beyond)
-        reaches[0] = max(beside[0], chain.lengths[0] + beyond)
+        furthest = to_frames + beside
+        furthest[-1] = max(furthest[-1], tip)
+        reaches = np.maximum.accumulate(furthest[::-1])[::-1]
+        reaches[1:] -= to_places[:-1]
         return reaches
 
     def approach(self, motion: Array) -> Approach:
@@ -141,8 +141,8 @@ class SerialArm(JointSpaceArm):
         sums = np.zeros((3, len(turn) + 1))
         # Without limits they are no numbers.
         with np.errstate(invalid="ignore"):
-            np.cumsum([turn, turn * self._ways[0], slide], axis=1, out=sums[:, 1:])
-        way, (first, last) = self._ways[1][self.bodies.points].max(axis=1), self._movers
+            np.cumsum([turn, turn * self._ways[0][:-1], slide], axis=1, out=sums[:, 1:])
+        way, (first, last) = self._extents, self._movers
 
         def bound(body: Index, other: Index | None = None) -> Array:
             begin, further = np.zeros(len(body), dtype=np.int64), body
@@ -156,6 +156,14 @@ class SerialArm(JointSpaceArm):
         return bound
 
     @cached_property
+    def _extents(self) -> Array:
+        """(B,) lengths of the ways from the base to the furthest points of bodies, m."""
+        chain, (to_places, to_frames) = self.chain, self._ways
+        to_points = to_frames[chain.carriers] + np.linalg.norm(chain.points, axis=1)
+        extents: Array = np.concatenate([[0.0], to_places, to_points])[self.bodies.points].max(axis=1)
+        return extents
+
+    @cached_property
     def _movers(self) -> tuple[Index, Index]:
         """(B,) numbers of joints that move a body as a whole, and that move a part of it."""
         places = np.concatenate([[0], np.arange(len(self.chain) + 1), self.chain.carriers])
@@ -166,13 +174,12 @@ class SerialArm(JointSpaceArm):
 
     @cached_property
     def _ways(self) -> tuple[Array, Array]:
-        """Lengths (J,) of the way along the links, slides fully extended, to each joint; and to the same, m."""
-        chain, slide = self.chain, self._slides()
-        steps = chain.lengths + np.concatenate([[0.0], slide])
-        to_joints = np.cumsum(steps)
-        before = np.concatenate([[0.0], to_joints[:-1] + slide])
-        to_points = before[chain.carriers] + np.linalg.norm(chain.points, axis=1)
-        return to_joints[:-1], np.concatenate([[0.0], to_joints, to_points])
+        """Lengths (J + 1,) of the ways along the links, slides fully extended, m.
+
+        They lead to the joints and the tip, and to the origins of the frames: the base's, and those of the joints.
+        """
+        to_places = np.cumsum(self.chain.lengths + np.concatenate([[0.0], self._slides()]))
+        return to_places, np.concatenate([[0.0], to_places[:-1] + self._slides()])
 
     def _slides(self) -> Array:
         """Return (J,) the greatest extensions of slides, m; 0 for joints that turn."""
@@ -239,18 +246,19 @@ class SerialArm(JointSpaceArm):
         """See ``arm.Arm``.
 
         Keys: ``kind``, ``joint_names``, ``revolute``, ``axis``, ``position``, ``rotation`` (in the frame of the one
-        before), ``home`` and ``followers`` (joint, that which it follows, multiplier), ``tip`` in the last frame and
-        ``tip_frame`` at home; of the bodies ``body_names``, ``links`` (their points: base, joints, tip, then those of
-        bodies) and ``joined`` (their ends; bodies with one in common are neighbours), ``points`` of bodies in the
-        frames of their ``carriers``, numbers of joints that move them, and ``touching`` pairs, which are not kept
-        apart.
+        before), ``home``, ``followers`` (joint, and that which it follows) and their ``multipliers``, ``tip`` in the
+        last frame and ``tip_frame`` at home; of the bodies ``body_names``, ``links`` (their points: base, joints, tip,
+        then those of bodies) and ``joined`` (their ends; bodies with one in common are neighbours), ``points`` of
+        bodies in the frames of their ``carriers``, numbers of joints that move them, and ``touching`` pairs, which are
+        not kept apart.
         """
         chain, bodies = self.chain, self.bodies
         keys = ("revolute", "axis", "position", "rotation", "tip", "points", "carriers")
         geometry = {key: getattr(chain, key) for key in keys}
         arrays = {
             "home": self.home_configuration[:-6],
-            "followers": np.array(self.followers, dtype=float).reshape(-1, 3),
+            "followers": np.array([one[:2] for one in self.followers], dtype=np.int64).reshape(-1, 2),
+            "multipliers": np.array([one.multiplier for one in self.followers]),
             "tip_frame": self.end_effector.frame,
             "links": bodies.points,
             "joined": bodies.joints,
