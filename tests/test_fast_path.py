@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
+from vgtm_qp.compiled import compiler, finish_compiling
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.step.build import build_arm
@@ -18,18 +19,38 @@ SCENES = [
     ("five_bay_two_cubes_pointing", {}),
     ("hexapod_past_a_cube", {}),
     ("tetrahedral_past_a_cube", {}),
+    ("snake_past_a_cube", {}),
+    ("snake_past_a_cube", {"arm.joint": "followers"}),
+    # At the rim of its cylinder FCL's last digits are the machine's.
+    ("station_arm_past_a_module", {"clearance.distance": "exact"}),
+    ("twelve_joints_past_a_crate", {}),
 ]
 
 
+def with_followers(problem):
+    """The joints of a problem, of which two follow others."""
+    rules = {5: {"joint": "yaw-1", "multiplier": 0.5, "offset": 0.04}, 12: {"joint": "pitch-1"}}
+    joints = problem.to_dict()["arm"]["joint"]
+    return [{**joint, "mimic": rules[k]} if k in rules else joint for k, joint in enumerate(joints)]
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize(("name", "changes"), SCENES)
 def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, changes):
-    problem = vq.load_problem(name).replace(changes)
+    problem = vq.load_problem(name)
+    if changes.get("arm.joint") == "followers":
+        changes = {"arm.joint": with_followers(problem)}
+    problem = problem.replace(changes)
     slow = build_arm(problem, compiled=False, plain=True)
     monitor = slow.monitor
     options = {key: getattr(monitor, key) for key in ("safe", "influence", "self_collision")}
-    listed = Clearance(monitor.bodies, monitor.obstacles, watch=False, **options)
+    by_fcl = monitor.fcl is not None
+    listed = Clearance(monitor.bodies, monitor.obstacles, watch=False, by_fcl=by_fcl, **options)
     fast, plain = vq.Resolver(problem), vq.Resolver(replace(slow, monitor=listed))
     assert isinstance(fast.setup.engine, FusedEngine)
+    # Until it is compiled both are the same.
+    finish_compiling()
+    assert fast.setup.engine.is_ready
     assert isinstance(plain.setup.engine, GeneralEngine)
     assert fast.setup.monitor.is_watched == (fast.setup.monitor.self_collision or bool(problem.obstacle))
     assert not plain.setup.monitor.is_watched

@@ -36,7 +36,9 @@ typedef struct {
     const int *hard_at;            /* (H) columns of the stack */
     const double *curve_hessian;   /* (D, D) */
     const double *goal_pull, *goal_weight;     /* (V, 3), (V) of the control vertices' goals */
-    const int *place;              /* where each coordinate of the motion is in q */
+    int places;
+    const int *place, *of;         /* (E): which coordinates of q change by the shares of which of the motion's */
+    const double *share;
 
     const Index *near_nodes;       /* (R, slots) */
     const double *near_rows;       /* (R, slots, 3) */
@@ -214,8 +216,8 @@ static void advance(Fused *f, const double *x, int whole)
         /* NaN stays. */
         if (fabs(moved[k]) > f->furthest || moved[k] != moved[k]) f->furthest = fabs(moved[k]);
     }
-    for (int k = 0; k < (f->by_nodes ? f->nodes : count); k++)
-        f->q[f->place[k]] += f->by_nodes ? moved[k] : x[k];
+    const double *coordinates = f->by_nodes ? moved : x;
+    for (int k = 0; k < f->places; k++) f->q[f->place[k]] += f->share[k] * coordinates[f->of[k]];
     if (!f->vertices) return;
     const double *free = x + count;
     if (whole)

@@ -346,7 +346,7 @@ class _Workspace:
             out[6].reshape(-1, 3),
             out[7],
         )
-        place, by_nodes = _places(layout)
+        place, of, share, by_nodes = _places(layout)
         work = nodes + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
         self._program, arm = Program(SOURCE, "Fused"), layout.arm
         self._program.set(
@@ -380,7 +380,10 @@ class _Workspace:
             leg_rows=out[8],
             leg_lower=out[9],
             hard_at=(nodes + layout.hard).astype(np.int32),
+            places=len(place),
             place=place,
+            of=of,
+            share=share,
             node_column=layout.node_column.astype(np.int32),
             hessian=self.hessian,
             gradient=self.gradient,
@@ -433,13 +436,18 @@ class _Workspace:
         )
 
 
-def _places(layout: Layout) -> tuple[NDArray[np.int32], bool]:
-    """Return where in q the coordinates of a motion are, and whether these are displacements of nodes."""
+def _places(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32], Array, bool]:
+    """Return which coordinates (E,) of q change by which (E,) of a motion, by what shares (E,).
+
+    The last is whether the coordinates of a motion are displacements of nodes.
+    """
     arm = layout.arm
     symbols, strokes = arm.symbols(Constants()), ca.MX.sym("strokes", len(arm.actuators))
     q, nodes = ca.MX.sym("q", *symbols.shape), ca.MX.sym("nodes", layout.node_columns)
     moved = symbols.coordinates(nodes, strokes)
     by_nodes = moved.name() == nodes.name()
-    places = ca.jacobian(symbols.along(q, moved), nodes if by_nodes else strokes).sparsity()
-    assert places.colind() == list(range(moved.numel() + 1))
-    return np.array(places.row(), dtype=np.int32), by_nodes
+    jacobian = ca.jacobian(symbols.along(q, moved), nodes if by_nodes else strokes)
+    assert not ca.depends_on(jacobian, ca.veccat(q, nodes, strokes))
+    shares = ca.Function("shares", [], [jacobian])()["o0"]
+    rows, columns = (np.array(places, dtype=np.int32) for places in shares.sparsity().get_triplet())
+    return rows, columns, np.array(shares.nonzeros()), by_nodes
