@@ -73,7 +73,7 @@ class Problem(Table, called="a problem"):
         if self.truss is not None:
             arm = f"truss, {self.truss.module}"
         way = (
-            f"{len(ways.waypoint)} waypoints, {ways.steps} steps"
+            f"waypoints: {len(ways.waypoint)}, steps: {ways.steps}"
             if isinstance(ways, WaypointManeuver)
             else str(ways.path)
         )

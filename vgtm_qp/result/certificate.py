@@ -51,10 +51,14 @@ class Measure:
             return True
         return self.value <= self.bound if self.side == "most" else self.value >= self.bound
 
-    def __str__(self) -> str:
+    @property
+    def words(self) -> tuple[str, str, str]:
+        """Value with unit, bound and place as text; empty where there is none."""
         value = "-" if self.value is None else f"{self.value:.6g} {self.unit}".rstrip()
-        bound = "" if self.bound is None else f"  (at {self.side} {self.bound:.9g})"
-        return f"{value}{bound}{'  ' + self.where if self.where else ''}"
+        return value, "" if self.bound is None else f"(at {self.side} {self.bound:.9g})", self.where
+
+    def __str__(self) -> str:
+        return "  ".join(filter(None, self.words))
 
 
 @dataclass(frozen=True)
@@ -181,7 +185,7 @@ class Certificate:
 
     def _repr_html_(self) -> str:
         rows = [
-            ("ok" if measure.ok else "FAIL", _label(name), *str(measure).split("  "))
+            ("ok" if measure.ok else "FAIL", _label(name), *measure.words)
             for name, measure in self.measures.items()
         ]
         rows += [("FAIL", line) for line in self.contradictions]

@@ -96,7 +96,7 @@ class Step:
             ("progress", f"{100.0 * self.progress:.4g} %"),
             ("time", f"{self.state.time:.6g} s"),
             ("QPs", self.qps),
-            ("off the curve", f"{self.gap:.3g} m"),
+            ("off the curve", "-" if math.isnan(self.gap) else f"{self.gap:.3g} m"),
             *((("held by", ", ".join(self.blocked_by)),) if self.status is not StepStatus.REACHED else ()),
             *((("reason", self.reason),) if self.reason else ()),
         ]
