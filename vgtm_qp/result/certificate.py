@@ -184,7 +184,7 @@ class Certificate:
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        rows = [
+        rows: list[tuple[str, ...]] = [
             ("ok" if measure.ok else "FAIL", _label(name), *measure.words)
             for name, measure in self.measures.items()
         ]
