@@ -298,7 +298,7 @@ def test_condensed_answer_satisfies_the_full_qp(name, curve, rng):
         clearance += int(np.sum(y > 1e-6))
         strokes += int(np.sum(np.abs(w) > 1e-6))
         fixed = qp.P @ z @ z / 2 + qp.q @ z
-        nearby = exact_point(qp, z, 1e-9)  # as active as asserted above: a free row may be within 1e-6 of its bound
+        nearby = exact_point(qp, z, 1e-9)  # a free row may lie within 1e-6 of its bound
         assert fixed == pytest.approx(qp.P @ nearby @ nearby / 2 + qp.q @ nearby, abs=1e-10)
     assert strokes > 0
     assert clearance > 0
