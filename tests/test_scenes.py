@@ -42,6 +42,8 @@ def test_the_study_tells_what_was_solved_and_what_stopped_the_rest():
         {"seed": 5, "steps": 30, "arms": "trusses", "number": number, "compiler": compiler}
         for number, compiler in ((0, True), (0, False), (1, True), (2, True))
     ]
+    both = [True, False, True, True, False]
+    assert [task["compiler"] for task in tasks(False, scenes=3, without_compiler=2)] == both
     rows = [{**task, **run(**task)} for task in tasks(True, scenes=2, seed=0)]
     assert all(not row["failures"] for row in rows)
     assert all((row["status"] == "solved") != bool(row["stop"]) for row in rows)

@@ -112,6 +112,10 @@ def study(
         Literal["trusses", "serial"] | None,
         Parameter(help="arms of the random scenes, of robustness and loops: trusses by default"),
     ] = None,
+    without_compiler: Annotated[
+        int | None,
+        Parameter(help="solve one scene in so many without a compiler, too, of robustness: 10 by default"),
+    ] = None,
     output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
     json: Json = False,
 ) -> int:
@@ -129,10 +133,11 @@ def study(
 
     wanted = list(STUDIES) if names == ["all"] else names
     titles = {name: find_study(name).title for name in wanted}
-    for option, value in (("--workers", workers), ("--scenes", scenes)):
+    counts = {"--workers": workers, "--scenes": scenes, "--without-compiler": without_compiler}
+    for option, value in counts.items():
         if value is not None and value < 1:
             raise GoalError(f"{option} must be 1 or more, not {value}")
-    given = {"scenes": scenes, "seed": seed, "arms": arms}
+    given = {"scenes": scenes, "seed": seed, "arms": arms, "without_compiler": without_compiler}
     options = {key: value for key, value in given.items() if value is not None}
     for name in titles:
         study_tasks(name, short=short, **options)

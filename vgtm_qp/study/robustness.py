@@ -24,15 +24,21 @@ _APART = 10
 
 
 def tasks(
-    short: bool, *, scenes: int | None = None, seed: int = SEED, steps: int = 30, arms: Arms = "trusses"
+    short: bool,
+    *,
+    scenes: int | None = None,
+    seed: int = SEED,
+    steps: int = 30,
+    arms: Arms = "trusses",
+    without_compiler: int = _APART,
 ) -> list[Task]:
-    """Return one task a scene, and for every tenth scene another one without a compiler."""
+    """Return one task a scene, and for one scene in so many `without_compiler` another one."""
     count = scenes if scenes is not None else 10 if short else 1000
     scene = {"seed": seed, "steps": steps, "arms": arms}
     return [
         {**scene, "number": k, "compiler": compiler}
         for k in range(count)
-        for compiler in ([True, False] if k % _APART == 0 else [True])
+        for compiler in ([True, False] if k % without_compiler == 0 else [True])
     ]
 
 
