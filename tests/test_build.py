@@ -64,6 +64,19 @@ def test_building_moves_nothing(resolver):
     assert not np.array_equal(first.A.data, second.A.data)
 
 
+def test_a_qp_stays_as_it_is_when_another_is_built(resolver):
+    goal = [0.05, 0.05, 4.45]
+    first = resolver.build(position=goal)
+    kept = [first.P.copy(), first.A.copy(), first.q.copy(), first.row_lower.copy()]
+    for dt in (0.9, 1.1):
+        resolver.step(position=goal, dt=dt)
+        resolver.build(position=goal, dt=dt)
+    for now, before in zip((first.P, first.A), kept, strict=False):
+        assert (now != before).nnz == 0
+    assert np.array_equal(first.q, kept[2])
+    assert np.array_equal(first.row_lower, kept[3])
+
+
 @pytest.mark.parametrize(
     ("goal", "message"),
     [

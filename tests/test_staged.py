@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from steps import MOVED_BASE
 
+from vgtm_qp.arm.truss import lengths as lengths_module
 from vgtm_qp.arm.truss.build import lock_members
 from vgtm_qp.arm.truss.kinematics import LengthRows
+from vgtm_qp.arm.truss.lengths import LengthSolver
 from vgtm_qp.errors import SolverError
 from vgtm_qp.problem.method import Weights
-from vgtm_qp.qp import lengths as lengths_module
 from vgtm_qp.qp.condensed import CondensedSolver
-from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.long import working_set
 from vgtm_qp.qp.long.chain import find_chain

@@ -306,10 +306,12 @@ class Arm(ABC):
         """Return the configuration after consistent displacements of nodes (N, 3) and actuators (n_a,)."""
 
     @abstractmethod
-    def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:
-        """Return the configuration after one Newton step that changes the quantities by `missing` (M,).
+    def newton(self, tracked: Index | None = None) -> Newton:
+        """Return the Newton step that changes the quantities by what they miss, (M,).
 
-        `solve` returns the displacements (N - N_c, 3) of the free nodes, for arms that need them.
+        If the indices of `tracked` stations (K,) are given, which must determine the configuration together with the
+        fixed quantities, those are followed by the displacements (3K,) that the stations miss, and actuators are free.
+        The step raises SolverError in a singular pose.
         """
 
     @abstractmethod
@@ -386,6 +388,10 @@ class Arm(ABC):
     @abstractmethod
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
         """Return the arrays of a result file for configurations (T, ...) and quantities (T, M)."""
+
+
+Newton = Callable[[Array, Array, "Kinematics"], Array]
+"""(q, what is missing there, kinematics evaluated there) -> the next configuration."""
 
 
 class Kinematics:

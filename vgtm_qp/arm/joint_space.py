@@ -5,7 +5,7 @@ A configuration q (J + 6,) holds the joints' values, rad or m, then position, m,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, between
+from vgtm_qp.arm.arm import Arm, Kinematics, Label, MotionPattern, Newton, Pose, between
 from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants
-from vgtm_qp.arrays import Array, Mask
+from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.compiled import Compiling, Kernel
 from vgtm_qp.rotation import vector_near
 
@@ -178,8 +178,11 @@ class JointSpaceArm(Arm):
         change[self.actuators] = strokes
         return np.asarray(q + self.following(change))
 
-    def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
-        return np.concatenate([q[:-6] + self.following(missing.copy()), q[-6:]])
+    def newton(self, tracked: Index | None = None) -> Newton:  # noqa: ARG002
+        def step(q: Array, missing: Array, _: Kinematics) -> Array:
+            return np.concatenate([q[:-6] + self.following(missing.copy()), q[-6:]])
+
+        return step
 
     def furthest(self, q: Array, lower: Array, upper: Array) -> Array:
         at = q[self.actuators]

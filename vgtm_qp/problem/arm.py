@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, ValidationInfo, model_validator
 from pydantic_core import InitErrorDetails
@@ -113,6 +113,8 @@ class ArmBody(Table, called="a body"):
 
 class ArmTable(Table, called="an arm"):
     """A serial arm."""
+
+    thickness: ClassVar[Place] = ("arm", "link_radius")
 
     urdf: File | None = Field(
         default=None, description="URDF file, relative to the problem file: gives joints, tip and bodies"

@@ -119,6 +119,11 @@ class Weights(Table, called="[method.weights]"):
         description="share of a step's path that is given up in mode scaled, squared; times the square of its length",
     )
 
+    @property
+    def actuators(self) -> float:
+        """Weight of the squared changes of actuators, by which they move and depart from home."""
+        return self.actuator_rate + self.stroke_centring
+
 
 class Gains(Table, called="[method.gains]"):
     """Gains of the null-space vector of eq. (38), where the curve is solved before the truss."""

@@ -67,6 +67,13 @@ class Problem(Table, called="a problem"):
         """The file that the problem was read from, if any."""
         return self._source
 
+    @property
+    def arm_table(self) -> Truss | ArmTable:
+        """The table that describes the arm; `thickness` is the place of what makes its bodies thick."""
+        table = self.truss or self.arm
+        assert table is not None
+        return table
+
     def _repr_html_(self) -> str:
         method, ways = self.method, self.maneuver
         arm = f"serial, {len(self.arm.joint)} joints" if self.arm is not None else "none"

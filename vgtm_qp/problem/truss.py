@@ -80,6 +80,8 @@ class BasePose(Table, called="a base pose"):
 
 
 class _Truss(Table):
+    thickness: ClassVar[Place] = ("truss", "member_radius")
+
     rate: Limit | None = Field(
         default=None, description="greatest |d length / dt| of an actuated member, m/s"
     )

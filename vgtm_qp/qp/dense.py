@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.qp.numbers import beyond, norm
-from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, refuse_large, relative
+from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, loose, refuse_large, relative
 
 EQUALITY = 5
 """DAQP's mark for a row that is always active."""
@@ -87,8 +87,7 @@ def residuals(
 ) -> tuple[float, float]:
     """Return the primal residual of an answer, m or rad, and the dual one, relative to the objective's forces.
 
-    The dual residual is the greater one of |H x + g + multipliers| and of the norm of |multiplier| times the distance
-    from its bound, at most 1. A multiplier of the wrong sign has the distance from the other bound.
+    The dual residual is the greater one of |H x + g + multipliers| and of what is :func:`loose`.
     """
     x, y = answer.x, answer.multipliers
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
@@ -99,9 +98,7 @@ def residuals(
     stationarity += gradient
     stationarity[:bounded] += y[:bounded]
     stationarity += y[bounded:] @ constraint
-    apart = np.where(y > 0.0, upper - values, values - lower)
-    complementarity = norm(np.abs(y) * np.minimum(np.maximum(apart, 0.0), 1.0))
-    dual = relative(max(norm(stationarity), complementarity), gradient, y)
+    dual = relative(max(norm(stationarity), loose(y, values, lower, upper)), gradient, y)
     return norm(beyond(values, lower, upper)), dual
 
 

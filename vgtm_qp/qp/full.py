@@ -27,7 +27,7 @@ from vgtm_qp.rows.tip import unit
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StepQP:
-    """A step's QP as data. Its builder owns the arrays: they are valid until the next ``build``.
+    """A step's QP as data. Its builder owns P and A: they are valid until the next ``FullBuilder.build``.
 
     Attributes
     ----------

@@ -150,11 +150,12 @@ static void constrain(Fused *f)
     }
 }
 
-/* Norm of what the answer is beyond its bounds, and of the stationarity, relative to the forces. */
+/* Norm of what the answer is beyond its bounds; relative to the forces, the greater one of the norm of the
+   stationarity and of that of the multipliers times their distances from their bounds. */
 static void residuals(Fused *f, int rows)
 {
     int n = f->unknowns;
-    double beyond = 0.0, off = 0.0, *force = f->work;
+    double beyond = 0.0, off = 0.0, loose = 0.0, *force = f->work;
     const double *y = f->multipliers;
     for (int k = 0; k < n; k++) force[k] = dot(f->hessian + k * n, f->x, n) + f->gradient[k] + y[k];
     for (int k = 0; k < n + rows; k++) {
@@ -163,12 +164,15 @@ static void residuals(Fused *f, int rows)
         double out = fmax(value - f->upper[k], f->lower[k] - value);
         /* A comparison with NaN fails. */
         if (!(out <= 0.0)) beyond += out * out;
+        double slack = y[k] * fmin(fmax(y[k] > 0.0 ? f->upper[k] - value : value - f->lower[k], 0.0), 1.0);
+        loose += slack * slack;
         if (k >= n && y[k] != 0.0)
             for (int i = 0; i < n; i++) force[i] += y[k] * row[i];
     }
     for (int k = 0; k < n; k++) off += force[k] * force[k];
     f->primal = sqrt(beyond);
-    f->dual = sqrt(off) / (1.0 + norm(f->gradient, n) + norm(y, n + rows));
+    /* NaN stays. */
+    f->dual = sqrt(loose > off ? loose : off) / (1.0 + norm(f->gradient, n) + norm(y, n + rows));
 }
 
 /* Condense the QP at the state that was loaded, and solve it. */

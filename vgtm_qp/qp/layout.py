@@ -197,7 +197,7 @@ class Layout:
     @cached_property
     def actuator_weights(self) -> Array:
         """(n_a,) weights of the squares of all changes of the actuators: by their rate, and by centring."""
-        return np.asarray(self.weights.actuator_rate * self.arm.levers**2 + self.centring_weights)
+        return np.asarray(self.weights.actuators * self.arm.levers**2)
 
     @property
     def torsion_weight(self) -> float:

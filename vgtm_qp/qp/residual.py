@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.numbers import norm
@@ -48,6 +50,15 @@ class AnswerError(FailedStepError):
 
 class NoAnswerError(AnswerError, InfeasibleStepError):
     """A solver found no answer, and does not say whether there is one."""
+
+
+def loose(multipliers: Array, values: Array, lower: Array, upper: Array) -> float:
+    """Return the norm of multipliers times the distances of `values` from their bounds, each at most 1.
+
+    A positive multiplier belongs to an upper, a negative one to a lower bound.
+    """
+    apart = np.where(multipliers > 0.0, upper - values, values - lower)
+    return norm(multipliers * np.minimum(np.maximum(apart, 0.0), 1.0))
 
 
 def relative(stationarity: float, *forces: Array) -> float:

@@ -62,9 +62,8 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
         task = TipTask(problem.end_effector.track, arm)
     with problem.blaming(("curve",), "a curve that starts in this arm's home pose"):
         home = home_curve(problem, arm, task)
-    clearance, spec = problem.clearance, problem.truss or problem.arm
+    clearance, spec = problem.clearance, problem.arm_table
     solver, tracking = problem.method.solver, problem.method.tracking
-    assert spec is not None
     options: dict[str, Any] = {
         "obstacles": list(_obstacles(problem)),
         "safe": clearance.safe,

@@ -113,7 +113,7 @@ def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
         distance, body = float(pairs.distance[k]), bodies.called(int(pairs.body[k]))
         place: Place
         if index < 0:
-            place = ("arm", "link_radius") if problem.truss is None else ("truss", "member_radius")
+            place = problem.arm_table.thickness
             first, second = bodies.names[int(pairs.body[k])], bodies.names[int(pairs.other[k])]
             needed, what = self_safe, f"{bodies.kind}s {first} and {second}, which share no node,"
         else:

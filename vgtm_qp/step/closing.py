@@ -7,12 +7,11 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Kinematics
+from vgtm_qp.arm.arm import Kinematics, Newton
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.answer import Closed
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.lengths import LengthSolver
 from vgtm_qp.qp.settle import MOST_STEPS, TOO_FAR, enough_length
 
 Correct = Callable[[], Array]
@@ -46,16 +45,12 @@ class Closing:
         self._actuators, self._fixed = layout.arm.actuators, ~layout.arm.actuated
 
     @cached_property
-    def _lengths(self) -> LengthSolver:
-        assert self._arm.bays is not None
-        return LengthSolver(self._arm.bays)
+    def _by_quantities(self) -> Newton:
+        return self._arm.newton()
 
     @cached_property
-    def _stations(self) -> LengthSolver:
-        assert self._arm.bays is not None
-        stations, tracked = self._arm.stations, self._layout.tracked
-        held = stations.nodes[tracked], stations.weights[tracked]
-        return LengthSolver(self._arm.bays, np.flatnonzero(self._fixed), held)
+    def _by_stations(self) -> Newton:
+        return self._arm.newton(self._layout.tracked)
 
     def close(
         self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float | None = None
@@ -71,10 +66,8 @@ class Closing:
             wanted[self._actuators] = np.clip(kinematics.quantities[self._actuators], lower, upper)
             return np.asarray(wanted - kinematics.quantities)
 
-        def solve(error: Array) -> Array:
-            return self._lengths.solve(kinematics.gradient, error)
-
-        return self._newton(q, missing, solve, tolerance, self._too_far if too_far is None else too_far)
+        too_far = self._too_far if too_far is None else too_far
+        return self._close(q, missing, self._by_quantities, tolerance, too_far)
 
     def close_on_curve(
         self, q: Array, points: Array, lower: Array, upper: Array, tolerance: float
@@ -90,19 +83,11 @@ class Closing:
             gap = points - arm.stations.centres(arm.nodes(q))[tracked]
             return np.concatenate([home - kinematics.quantities[self._fixed], gap.reshape(-1)])
 
-        def solve(error: Array) -> Array:
-            return self._stations.solve(kinematics.gradient, error)
-
-        closed = self._newton(q, missing, solve, tolerance, np.inf)
+        closed = self._close(q, missing, self._by_stations, tolerance, np.inf)
         return self.close(closed.q, lower, upper, tolerance) if closed.error < np.inf else None
 
-    def _newton(
-        self,
-        q: Array,
-        missing: Callable[[Array], Array],
-        solve: Callable[[Array], Array],
-        tolerance: float,
-        too_far: float,
+    def _close(
+        self, q: Array, missing: Callable[[Array], Array], step: Newton, tolerance: float, too_far: float
     ) -> Closed:
         arm, kinematics, enough = self._arm, self._kinematics, enough_length(q, tolerance)
 
@@ -110,7 +95,7 @@ class Closing:
             kinematics.evaluate_quantities(q)
             error = missing(q)
             worst = float(np.abs(error).max())
-            return worst, None if worst <= enough else partial(arm.corrected, q, error, partial(solve, error))
+            return worst, None if worst <= enough else partial(step, q, error, kinematics)
 
         q, worst = converge(q, measure, too_far)
         position = arm.end_effector.position(arm.nodes(q))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -49,7 +50,8 @@ class Engine(ABC):
     def qp(self, asked: QPInput) -> StepQP:
         """Return the whole QP of an input, every row and column with a name, in new arrays."""
         numbers = self._linearisation.numbers(asked.linear(self.layout), asked.rows)
-        return self._builder.build(numbers)
+        qp = self._builder.build(numbers)
+        return replace(qp, P=qp.P.copy(), A=qp.A.copy())
 
     @cached_property
     def _builder(self) -> FullBuilder:
@@ -61,7 +63,7 @@ class Engine(ABC):
         return Linearisation(self.layout, compiled=False)
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
-        """Return where the answer of a QP leads.
+        """Return where the answer of a QP leads; ``asked.rows`` then hold the bounds that it was solved with.
 
         Raises
         ------
@@ -95,7 +97,10 @@ class Engine(ABC):
         return Move(solution, q, *curve, progress, furthest, closed)
 
     def _least(self, asked: QPInput) -> StepSolution:
-        """Return the QP's answer; if the margin forbids even a zero step, the answer without the margin."""
+        """Return the QP's answer; if the margin forbids even a zero step, the answer without the margin.
+
+        Then the bounds in ``asked.rows`` are overwritten by those of the QP that was solved.
+        """
         rows = asked.rows
         try:
             return self.solve(asked)

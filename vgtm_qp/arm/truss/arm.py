@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Label, MotionPattern, Pose, Stations, Tip
+from vgtm_qp.arm.arm import Arm, Kinematics, Label, MotionPattern, Newton, Pose, Stations, Tip
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_paths
 from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
+from vgtm_qp.arm.truss.lengths import LengthSolver
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.symbols import TrussSymbols
 from vgtm_qp.arm.truss.truss import Truss
@@ -78,10 +78,19 @@ class TrussArm(Arm):
     def advanced(self, q: Array, nodes: Array, strokes: Array) -> Array:  # noqa: ARG002
         return q + nodes
 
-    def corrected(self, q: Array, missing: Array, solve: Callable[[], Array]) -> Array:  # noqa: ARG002
-        q = q.copy()
-        q[self.truss.free] += solve()
-        return q
+    def newton(self, tracked: Index | None = None) -> Newton:
+        given, held = None, None
+        if tracked is not None:
+            given = np.flatnonzero(~self.actuated)
+            held = self.stations.nodes[tracked], self.stations.weights[tracked]
+        lengths = LengthSolver(self.truss, given, held)
+
+        def step(q: Array, missing: Array, kinematics: Kinematics) -> Array:
+            q = q.copy()
+            q[self.truss.free] += lengths.solve(kinematics.gradient, missing)
+            return q
+
+        return step
 
     def points(self, q: Array) -> Array:
         """Return the nodes; in offset joints the ends of all members, two of each."""

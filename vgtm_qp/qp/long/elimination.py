@@ -28,6 +28,7 @@ from vgtm_qp.qp.long.sparse_symbols import (
     symmetric,
 )
 from vgtm_qp.rows import curve as curve_rows
+from vgtm_qp.rows import members
 
 NewtonStep = Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ca.SX]]
 """From displacements before (3w,), positions (3w + 3m,) and lengths (3m,) to displacements (3w + 3m,) and errors."""
@@ -196,9 +197,8 @@ class Elimination:
         H[own, own] += weights.node_rate * ca.SX.eye(len(own))
         if self.actuated:
             J = inputs.jacobian[self.actuated, :]
-            stiffness = weights.actuator_rate + weights.stroke_centring
-            H += symmetric(stiffness * (J.T @ J))
-            V[:, -1] += J.T @ (inputs.actuator_gradient - stiffness * inputs.rhs[self.actuated])
+            H += symmetric(weights.actuators * (J.T @ J))
+            V[:, -1] += J.T @ (inputs.actuator_gradient - weights.actuators * inputs.rhs[self.actuated])
         for k in range(self.chain.stations.shape[1]):
             centre, tangent = self.centre_row(k), self.tangent_row(k)
             point, turned = self.curve_columns(k)
@@ -358,4 +358,4 @@ def member_lengths(chain: Chain, points: ca.SX) -> ca.SX:
     """Return (3m,) the lengths of a period's members with nodes at `points` (3, w + m)."""
     if chain.member_places is None:
         raise ValueError("the periods of this chain are not alike")
-    return ca.vertcat(*[ca.norm_2(points[:, a] - points[:, b]) for a, b in chain.member_places.tolist()])
+    return ca.vertcat(*[members.length(points[:, a], points[:, b]) for a, b in chain.member_places.tolist()])

@@ -16,9 +16,9 @@ from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import ChainClosing
 from vgtm_qp.qp.long.working_set import Answer, Key, Moved, RowTable, solve_rows
 from vgtm_qp.qp.numbers import RowNumbers, StepNumbers, beyond, norm
-from vgtm_qp.qp.residual import refuse_large, relative
+from vgtm_qp.qp.residual import loose, refuse_large, relative
 
-SINGULAR = "the QP is singular: the truss is in a singular pose, or a term that it needs has weight zero"
+SINGULAR = "the QP is singular: the arm is in a singular pose, or a term that it needs has weight zero"
 
 _PRESSES = 1e-9
 """Least multiplier of a row that the next QP starts with. Interior-point solvers leave some of each row."""
@@ -119,16 +119,15 @@ class ChainSolver(ABC):
         strokes = values[table.actuators]
         forces = np.zeros(self.chain.bays.member_count)
         forces[self._strokes_at] = (
-            (weights.actuator_rate + weights.stroke_centring) * strokes
-            + table.numbers.actuator_gradient
-            + multipliers[table.actuators]
+            weights.actuators * strokes + table.numbers.actuator_gradient + multipliers[table.actuators]
         )
         forces[self._held_at] = multipliers[table.locked]
         left, dual = self._residuals(nodes, vertices, strokes, nodal, forces.reshape(self.chain.periods, -1))
         if self._curve:
             dual[-self._curve :] += table.curve_forces(multipliers)
         primal = norm(np.concatenate([left, beyond(values, table.lower, table.upper)]))
-        refuse_large(primal, relative(norm(dual), forces, multipliers), "the elimination")
+        off = max(norm(dual), loose(multipliers, values, table.lower, table.upper))
+        refuse_large(primal, relative(off, forces, multipliers), "the elimination")
 
     @abstractmethod
     def closing(self) -> ChainClosing:

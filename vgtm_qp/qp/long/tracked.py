@@ -144,7 +144,7 @@ class TrackedSolver(ChainSolver):
         weights, moved, strokes, angles = self.layout.weights, self._moved, self._strokes, self._angles
         hessian, gradient = self.data.polygon_terms()
         whole = weights.node_rate * (moved.T @ moved) + weights.tangent * (angles.T @ angles)
-        whole += (weights.actuator_rate + weights.stroke_centring) * (strokes.T @ strokes)
+        whole += weights.actuators * (strokes.T @ strokes)
         try:
             self._factor = np.linalg.cholesky(hessian + whole[:-1, :-1])
         except np.linalg.LinAlgError as error:

@@ -202,7 +202,7 @@ def dual_solution(
     norm = np.sqrt(np.maximum(np.diag(gram), 0.0))
     multipliers = np.zeros(len(norm))
     if not np.all(np.isfinite(norm)):
-        raise SolverError("the QP is singular: the truss is in a singular pose, or all weights are zero")
+        raise SolverError("the QP is singular: the arm is in a singular pose, or all weights are zero")
     empty = norm < _NO_ROW
     if empty.any():
         outside = np.maximum(lower - values, values - upper)[empty]
