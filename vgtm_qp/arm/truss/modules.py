@@ -92,9 +92,9 @@ def tetrahedral(spec: TetrahedralTruss) -> Truss:
 
     A bay is three nodes, and every node is a stage of its own. Members (i, i-1) and (i, i-2) are the battens
     ``B`` and ``D``, members (i, i-3) the longerons ``L``. The home pose is a helix about z, theta its turn a
-    node, cos theta = -1/2 - L^2 / (6 b^2). Three successive nodes with the weights w, 1 - 2 w, w, where w = 1
-    / (2 (1 - cos theta)), have their mean on its axis (w = 0.3 where L = b). No face, not even the base, is
-    normal to the axis; the base's point on the axis is the origin.
+    node, cos theta = -1/2 - L^2 / (6 b^2). Three successive nodes with the weights w, 1 - 2 w, w, where
+    w = 1 / (2 (1 - cos theta)), have their mean on its axis (w = 0.3 where L = b). No face, not even the
+    base, is normal to the axis; the base's point on the axis is the origin.
 
     Raises
     ------
