@@ -30,7 +30,7 @@ _BULGES = (
     ("curve bulged towards it", 2, _BULGE),
     ("curve bulged a little away from what blocks it", 0, 0.1),
 )
-"""Name, side and size of each: sides in quarter turns about the arm from the direction off the obstacle."""
+"""Name, side and size: sides in quarter turns about the arm, from the direction away from the obstacle."""
 _FIRM_TRACKING = 1.0
 """Least weight of tracking in a retry with a bulged curve."""
 _MORE_VERTICES = "more control vertices"

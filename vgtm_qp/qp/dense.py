@@ -2,7 +2,7 @@
 
     minimise  1/2 x' H x + g' x   subject to   lower <= [x; C x] <= upper
 
-The bounds are those of the first unknowns, then those of the rows C. Not always do all unknowns have bounds.
+The bounds are those of the first unknowns, usually of all, then those of the rows C.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def residuals(
     """Return the primal residual of an answer, m or rad, and the dual one, relative to the objective's forces.
 
     The dual residual is the greater of two norms: of H x + g + multipliers; and of each |multiplier| times
-    the distance from its bound, at most 1. For a multiplier of the wrong sign it is the distance from the
+    the distance from its bound, counted as 1 at most. For a multiplier of the wrong sign it is that from the
     other bound.
     """
     x, y = answer.x, answer.multipliers

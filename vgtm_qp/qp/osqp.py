@@ -75,7 +75,8 @@ class Osqp:
         check_question("osqp", hessian, gradient, constraint, lower, upper)
         qp = hessian, gradient, constraint, lower, upper
         workspace = self._workspace_for(len(gradient), len(lower) - len(constraint), len(constraint))
-        # A workspace is used again only after an accurate answer: a poor one would start the next QP far off.
+        # A workspace is used again only after an accurate answer, or a proof that there is none: a poor
+        # answer would start the next QP far off.
         self._workspace = None
         try:
             answer = workspace.solved(*qp)

@@ -146,7 +146,7 @@ class Attempt:
         progress: float,
         engine: Engine,
     ) -> Step:
-        """Return an engine's step that drives apart pairs too near each other, or else keeps them so."""
+        """Return an engine's step that drives apart pairs too near, or if that fails keeps their distance."""
         short = self.separation.shortfall_of(state)
         for gain in (self._recovery(short), 0.0) if short else (0.0,):
             asked, reach = self._first(state, target, share, progress, short, gain)

@@ -45,7 +45,8 @@ class Limit(NamedTuple):
     kind : str
         ``"clearance"`` from an obstacle, between ``"members"``, ``"angle"``, ``"stroke"`` or ``"rate"``.
     name : str
-        The obstacle or actuator; empty for a limit of all actuators, of members or of angles.
+        The obstacle, or the actuator of a stroke; empty for a stroke of all actuators, and for the other
+        kinds, which have one limit for all.
     upper : bool
         True for the upper end of a stroke.
     """

@@ -53,7 +53,7 @@ class Step:
         cannot leave it at once.
     gave_way : bool
         True if stations are off the curve after the step although ``method.tracking_mode`` is exact: because
-        the arm got further off it, or brakes, or is blocked where they were off it before.
+        the arm got further that way, or brakes, or is blocked in a state with stations off the curve.
     gap : float
         Greatest distance of a station from its curve node after the step, m; if turns are kept as well, at
         least the greatest turn times the arm's unit. NaN if no station tracks a curve in a QP, as with every
