@@ -1,10 +1,11 @@
 """The process that compiles kernels: it reads functions from its input and leaves shared libraries in the cache.
 
-It is a process of its own, in a session of its own. The one that computes hands over its functions and goes on: it
-waits neither for generated code nor for the C compiler, and it may end before the libraries are there.
+It is a process of its own, in a session of its own. The process that computes hands over its functions and
+goes on: it waits neither for generated code nor for the C compiler, and may end before the libraries are
+there.
 
-A library is made in a folder beside it, ``NAME.so.new``, and moved to its place when it is whole. Who makes that folder
-makes the library; other processes that want the same one wait for it.
+A library is made in a folder beside it, ``NAME.so.new``, and moved to its place when it is complete. The
+process that makes this folder makes the library; other processes wait for it.
 """
 
 from __future__ import annotations
@@ -30,19 +31,19 @@ import casadi as ca
 from vgtm_qp.compiled import FLAGS, HUNG, QUICK, digest_file, is_sound
 
 _LONG = 100_000
-"""Length of a source text, in characters, from which compiling lasts seconds."""
+"""Length of a source text, in characters, above which compiling takes seconds."""
 
 _MOST_COMPILERS, _MOST_LINKERS = 4, 64
 """Processes at a time; most linkers only wait for their objects."""
 
 _NICENESS = 5
-"""What the compilers are behind other work."""
+"""Niceness of the compilers, which lets other work go first."""
 
 _TICK = 0.05
 """Seconds after which a file that another process makes is looked for again."""
 
 _ABANDONED = 3.0
-"""Ratio of the age of a folder that nobody works in any more to the time after which a compiler counts as hung."""
+"""Age at which a folder counts as abandoned, over the time after which a compiler counts as hung."""
 
 _WORTH_IT = 100
 """Number of lines below which functions are not compiled separately."""
@@ -66,10 +67,10 @@ def source_of(function: ca.Function) -> str:
 
 
 def split(source: str) -> tuple[str, dict[str, str]]:
-    """Return `source` with its long straight-line functions left out but declared, and those by their new names.
+    """Return `source` with its long straight-line functions only declared, and their texts by new names.
 
-    A function that calls no other, and uses nothing but one-line helpers, has a name made of its text: what is mapped
-    over faces or bays is one function in however many kernels.
+    A straight-line function calls nothing but one-line helpers. Its new name is a hash of its text: a
+    function that is mapped over faces or bays is compiled once for all kernels.
     """
     helpers = {match.group(1): match.group(0) for match in _HELPER.finditer(source)}
     units: dict[str, str] = {}
@@ -94,7 +95,7 @@ def split(source: str) -> tuple[str, dict[str, str]]:
 
 
 def _with_fast_helpers(source: str) -> str:
-    """Return `source` with all before its first function, matrix products among it, compiled as the rest is not."""
+    """Return `source` with the helpers before its first function, such as matrix products, set to -O2."""
     head = re.search(r"^/\* \w+:\(", source, flags=re.MULTILINE)
     if head is None:
         return source
@@ -142,7 +143,7 @@ class Builder:
             flags = QUICK if len(rest) > _LONG else ()
             rest = _with_fast_helpers(rest) if flags else rest
         texts[main] = rest
-        # The longest first: nothing waits for it at the end.
+        # The longest first, so that at the end nothing waits for it alone.
         objects = {
             path: self._compile(
                 cc, texts[path], path, flags if path == main else (), library if path == main else None
@@ -169,7 +170,7 @@ class Builder:
     ) -> Future[bool]:
         """Begin to compile `text` into the object `target`, unless that is done or being done.
 
-        If the object is for one `library` alone, it is not needed once that is there or being linked.
+        An object for one `library` alone is not needed once this library is there or being linked.
         """
         begun = self._objects.get(target)
         if begun is None or (begun.done() and not is_sound(target)):
@@ -225,7 +226,7 @@ class Builder:
         return is_sound(target)
 
     def _is_being_made(self, target: Path) -> bool:
-        """Whether a process makes `target`; one that was killed while it did left a folder that grows old."""
+        """Whether a process makes `target`; the folder of a killed process counts until it is too old."""
         folder = _folder_of(target)
         return folder.exists() and _age(folder) <= _ABANDONED * self.patience
 
@@ -238,7 +239,8 @@ class Builder:
                 command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                # Its end is seen at once, where a process without a pipe is asked twenty times a second.
+                # With a pipe the end of the process is seen at once; without one it is polled twenty times a
+                # second.
                 stderr=subprocess.PIPE,
                 env={**os.environ, "TMPDIR": str(folder)},
                 start_new_session=True,
@@ -274,7 +276,7 @@ def _publish(made: Path, target: Path) -> None:
     digest = digest_file(made)
     digest.write_text(hashlib.sha256(made.read_bytes()).hexdigest())
     digest.chmod(0o644)
-    # A file whose digest is not there yet would be made again by others.
+    # Other processes would make a file again whose digest is not there yet.
     digest.replace(digest_file(target))
     made.replace(target)
 

@@ -56,7 +56,7 @@ FLAGS = (
     '-DCASADI_SYMBOL_EXPORT=__attribute__((visibility("default")))',
 )
 QUICK = ("-O1",)
-"""Flags for long code that calls the straight-line functions: half the compile time, at little cost in speed."""
+"""Flags for long code that calls straight-line functions: half the compile time, little slower code."""
 
 OWN = ("-O3", "-fno-signed-zeros", "-fassociative-math")
 """Flags for our own C: sums may be vectorised; NaN and infinity keep their meaning."""
@@ -65,12 +65,12 @@ HUNG = 3
 """Exit code of a builder whose compiler hung."""
 
 _FORM = "1"
-"""Form of the libraries that builders make of a function: another number makes all of them anew."""
+"""Version of the libraries that builders make: with another number all of them are made anew."""
 
 OFTEN, SELDOM = 8, 600
 """Number of calls from which on a kernel is compiled while another core is idle, and while none is.
 
-A compiler takes about as much time as so many interpreted calls.
+A compiler takes about as much time as that many interpreted calls.
 """
 
 _often = OFTEN
@@ -82,7 +82,7 @@ _LINGER = 1.0
 """Seconds for which a builder waits for further functions."""
 
 _TICK = 0.005
-"""Seconds between two looks for a library, for those who wait."""
+"""Seconds between two looks for a library that is waited for."""
 
 _BUILDER = (
     "import sys, pickle; sys.path[:] = pickle.load(sys.stdin.buffer); "
@@ -91,7 +91,7 @@ _BUILDER = (
 
 
 def compiler() -> str | None:
-    """Return the command of the C compiler, as a shell reads it; None where there is none.
+    """Return the command of the C compiler, as a shell reads it; None without a compiler.
 
     It is ``$VGTM_CC``, a program or one with flags, else the first of cc, gcc, clang. ``VGTM_CC=none`` asks for the
     virtual machine.
@@ -186,7 +186,7 @@ class _Builder:
         threading.Thread(target=self._serve, daemon=True, name="vgtm-builder").start()
 
     def take(self, job: dict[str, Any]) -> bool:
-        """Accept a job, in no time; False if the process takes no more."""
+        """Accept a job without waiting; False if the process takes no more."""
         with _lock:
             if self._is_open:
                 self._jobs.put(job)
@@ -217,7 +217,7 @@ class _Builder:
         with contextlib.suppress(OSError), process.stdin as pipe:
             job: Any = True
             while job is not None:
-                # The last one is None: the pipe has no end where a forked process has it too.
+                # The last job is None: while a forked process holds the pipe open, it has no end.
                 job = self._next()
                 text = memoryview(pickle.dumps(job))
                 while text:
@@ -238,7 +238,7 @@ class _Builder:
             self._process.terminate()
 
     def forget(self) -> None:
-        """Let go of the process in one that was forked."""
+        """Give up the builder process in a process that was forked from its owner."""
         self.is_lost, self._is_open = True, False
         if self._process is not None:
             self._process.returncode = 0
@@ -260,7 +260,7 @@ def _hand_over(job: dict[str, Any]) -> _Builder:
 
 
 def stop_compilers() -> None:
-    """End all compilers of this process at once, as an interrupt does; kernels that are wanted later begin anew."""
+    """End all compilers of this process at once, as an interrupt does; later kernels begin anew."""
     global _builder
     with _lock:
         stopped, _builder = _builder, None
@@ -320,20 +320,20 @@ class Building:
                 _waiting.add(self)
 
     def ask(self) -> bool:
-        """Return whether it is settled, without waiting; what is asked for often enough is made."""
+        """Return whether it is settled, without waiting; begin to make it once it was asked for often."""
         if not self.is_settled:
             self.calls += 1
             if self._builder is not None:
                 self._look()
             else:
-                # Resolvers of arms alike count together.
+                # Resolvers of equal arms share one count.
                 _asked[self._target] += 1
                 if _asked[self._target] >= _often:
                     self.begin()
         return self.is_settled
 
     def begin(self) -> None:
-        """Begin to make it, unless that was done."""
+        """Begin to make it, if that has not been done."""
         with _lock:
             if self.is_settled or self._builder is not None:
                 return
@@ -358,12 +358,12 @@ class Building:
         return self.library
 
     def _look(self) -> None:
-        """Load the library if it is there by now; settle for none if there will be none."""
+        """Load the library if it is there by now; settle without one if there will be none."""
         with _lock:
             builder = self._builder
             if self.is_settled or builder is None:
                 return
-            # In this order, for a library may come just before the end.
+            # Asked before the look at the file, because a library may come just before the end.
             has_ended = builder.ended.is_set()
             if self._target.exists() and self._load():
                 return
@@ -424,7 +424,7 @@ _hanging: set[str] = set()
 
 
 def compile_after(calls: int) -> None:
-    """Let this process compile a kernel from so many calls on: ``OFTEN``, or ``SELDOM`` where it is one of many."""
+    """Set the calls after which this process compiles a kernel: ``OFTEN``; ``SELDOM`` for one of many."""
     global _often
     _often = calls
 
@@ -434,7 +434,7 @@ def finish_compiling() -> bool:
 
     Each begins to run compiled at its next call.
     """
-    # What is only kept by a circle of references is not worth waiting for.
+    # Kernels that only reference cycles keep alive are not worth waiting for.
     gc.collect()
     with _lock:
         used = [one for one in _waiting if one.calls and not one.is_settled]
@@ -446,12 +446,12 @@ def finish_compiling() -> bool:
 
 @cache
 def _warn(text: str) -> None:
-    """Warn once of what makes kernels slow."""
+    """Warn once that kernels are slow, and why."""
     warnings.warn(text, stacklevel=2)
 
 
 def _warned_of(folder: Path) -> bool:
-    """Return whether nothing is loaded from the cache at `folder`, and warn of the reason."""
+    """Return whether the cache at `folder` must not be used, and if so warn of the reason."""
     hindrance = ""
     with contextlib.suppress(OSError):
         hindrance = distrust(folder)
@@ -503,7 +503,7 @@ class Kernel:
             self._buffer.set_res(i, array.reshape(-1).data)
 
     def _settle(self) -> None:
-        """Go on with what became of the compilation, if that is settled."""
+        """Use the result of the compilation, once it is settled."""
         compiling = self._compiling
         if compiling is not None and compiling.is_settled:
             self._compiling, self.library = None, compiling.library
@@ -511,7 +511,7 @@ class Kernel:
                 self._use(compiling.found)
 
     def prepare(self) -> None:
-        """Count a call: what is called often enough is compiled, and changes over when that is there."""
+        """Count a call: a kernel called often is compiled, and runs as machine code once that is there."""
         if self._compiling is not None:
             self._compiling.ask()
             self._settle()
@@ -537,7 +537,8 @@ class Kernel:
     def __call__(self) -> None:
         """Evaluate: read `inputs`, overwrite `outputs`.
 
-        EvaluationError, with all outputs NaN, where the function could not be evaluated, at a singular matrix say.
+        Raises EvaluationError, with all outputs NaN, if the function could not be evaluated, as at a singular
+        matrix.
         """
         if self._compiling is not None:
             self.prepare()

@@ -1,4 +1,4 @@
-"""The one exception tree of the package; every message names the choices there were."""
+"""The one exception tree of the package; every message names the possible choices."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class ResultError(VgtmError):
 
 
 class AlteredResultError(ResultError):
-    """A result file whose content was changed: it is one, but not as it was written."""
+    """A result file whose content was changed after it was written."""
 
 
 class ExportError(VgtmError):
@@ -88,7 +88,8 @@ class MissingExtraError(VgtmError):
 def closest(name: str, choices: Iterable[str], *, alike: float = 0.55) -> str | None:
     """Return the one of `choices` that `name` is probably meant for, or None.
 
-    They have to be `alike` by so much, 0 to 1; in names as short as "box" one wrong letter is already a large part.
+    `alike` is the least similarity, 0 to 1; in names as short as "box" one wrong letter is already a large
+    part.
     """
     return next(iter(difflib.get_close_matches(name, list(choices), n=1, cutoff=alike)), None)
 

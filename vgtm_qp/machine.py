@@ -28,7 +28,7 @@ _TIMED = ("vgtm-qp", "numpy", "scipy", "casadi", "daqp")
 
 
 def pin_threads() -> bool:
-    """Hold BLAS and OpenMP to one thread here and in child processes; False where BLAS was loaded before.
+    """Hold BLAS and OpenMP to one thread, here and in child processes; False if BLAS is loaded already.
 
     The matrices of a step are small: with a second thread a pseudoinverse of ten bays takes a hundred times
     as long.
@@ -40,7 +40,7 @@ def pin_threads() -> bool:
 
 @contextmanager
 def environment(changes: Mapping[str, str]) -> Iterator[None]:
-    """Change variables of the environment, of processes started meanwhile too, and put them back."""
+    """Change variables of the environment, also for processes started meanwhile, and put them back."""
     before = {name: os.environ.get(name) for name in changes}
     os.environ.update(changes)
     try:
@@ -55,9 +55,9 @@ def environment(changes: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def noting_interrupts(noted: threading.Event) -> Iterator[None]:
-    """Set `noted` at each interrupt, which has its usual effect too, as long as the main thread is in here.
+    """Set `noted` at each interrupt while the main thread is in here; KeyboardInterrupt is raised as usual.
 
-    Whoever catches every exception swallows that effect, as CasADi does while it is imported.
+    Code that catches every exception would swallow the interrupt, as CasADi does while it is imported.
     """
     before: Any = None
 

@@ -1,4 +1,4 @@
-/* What all our C begins with; native.py puts it before each source. */
+/* The beginning of all our C sources: native.py puts it before each. */
 
 #include <math.h>
 #include <string.h>

@@ -1,7 +1,7 @@
-"""Our own C: sources that lie beside their Python, compiled once, called with structures of numbers and addresses.
+"""Our own C: sources beside their Python, compiled once, called with structures of numbers and addresses.
 
-A source declares the structures that its functions take. :func:`structure` reads their fields from it, so that the C is
-their only definition.
+A source declares the structures that its functions take. :func:`structure` reads their fields from the
+source, which so is their only definition.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ INCLUDES = Path(ca.__file__).parent / "include"
 
 
 class CompiledKernel(ctypes.Structure):
-    """A function of CasADi as C calls it, its arguments, results and workspaces."""
+    """A CasADi function for C: its address, arguments, results and workspaces."""
 
     _fields_ = [(name, ctypes.c_void_p) for name in ("eval", "arg", "res", "iw", "w")]
 
@@ -67,7 +67,7 @@ def _building(source: Path, *_: object) -> Building:
 
 
 class Program:
-    """Functions of a C source that share one structure, and what its pointers point to.
+    """Functions of a C source that share one structure, and the arrays and kernels that it points to.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ _EVALUATION = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_in
 
 
 def _interpreted(kernel: Kernel) -> tuple[CompiledKernel, list[Any]]:
-    """Return a kernel that C calls back, and what must live as long as that."""
+    """Return a kernel that C calls back, and the objects that must live as long as it does."""
 
     def evaluate(*_: object) -> int:
         try:
@@ -141,7 +141,7 @@ def _interpreted(kernel: Kernel) -> tuple[CompiledKernel, list[Any]]:
 
 
 def _compiled(kernel: Kernel) -> tuple[CompiledKernel, list[Any]]:
-    """Return a compiled kernel as C calls it, and the arrays that must live as long as that."""
+    """Return a compiled kernel as C calls it, and the arrays that must live as long as it does."""
     library = ctypes.CDLL(str(kernel.library))
     sizes = [ctypes.c_longlong() for _ in range(4)]
     library[f"{kernel.name}_work"](*map(ctypes.byref, sizes))

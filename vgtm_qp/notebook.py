@@ -1,4 +1,4 @@
-"""What a notebook shows of an object: a table in HTML."""
+"""The picture of an object in a notebook: a table in HTML."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ def rotation_from_vector(vector: ArrayLike) -> Array:
 
 
 def vector_from_rotation(rotation: Array) -> Array:
-    """Return the rotation vector (3,), rad, of a (3, 3) rotation; right up to and at half a turn."""
+    """Return the rotation vector (3,), rad, of a (3, 3) rotation; accurate up to half a turn inclusive."""
     twist = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )
@@ -35,9 +35,9 @@ def vector_from_rotation(rotation: Array) -> Array:
 
 
 def vector_near(rotation: Array, near: Array) -> Array:
-    """Return of all rotation vectors (3,), rad, of a (3, 3) rotation the one nearest to another's, `near` (3,).
+    """Return the rotation vector (3,), rad, of a (3, 3) rotation that is nearest to the vector `near` (3,).
 
-    So the vector of what turns on and on does not jump at half a turn.
+    So the vector of a continuing rotation does not jump at half a turn.
     """
     vector = vector_from_rotation(rotation)
     angle = float(np.linalg.norm(vector))
@@ -46,7 +46,7 @@ def vector_near(rotation: Array, near: Array) -> Array:
 
 
 def turn_between(start: Array, end: Array) -> Array:
-    """Return the rotation vector (3,), rad, that takes unit vector `start` to unit vector `end` the short way."""
+    """Return the least rotation vector (3,), rad, that takes unit vector `start` to unit vector `end`."""
     axis = np.cross(start, end)
     sine = float(np.linalg.norm(axis))
     angle = float(np.arctan2(sine, float(start @ end)))

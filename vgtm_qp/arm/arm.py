@@ -1,11 +1,12 @@
 """`Arm`, the interface of all arms: everything that a step may use of one.
 
-An arm is a configuration q that places points in space, its *nodes* X = p(q) of shape (N, 3): the joints of a truss,
-which are its configuration themselves, or the joints of a serial arm. *Bodies* are spanned by points of the arm,
-*stations* are poses made of nodes: they track the reference curve, and the last of all is the end effector.
+An arm is a configuration q that places points in space, its *nodes* X = p(q) of shape (N, 3). The nodes of a
+truss are its joints, and their positions are q itself; the nodes of a serial arm are the origins of its
+frames. *Bodies* are spanned by points of the arm. *Stations* are poses made of nodes: they track the
+reference curve, and the last station is the end effector.
 
-An arm is moved by its *quantities* [c; a]: fixed ones, c(q) = const, and actuated ones a(q), which have boxes. They are
-as many as the coordinates of q, so that to first order the nodes move by K d_a + r.
+An arm is moved by its *quantities* [c; a]: fixed ones, c(q) = const, and actuated ones a(q), which have
+boxes. There are as many quantities as coordinates of q, so that to first order the nodes move by K d_a + r.
 
 Nothing outside the folder ``arm`` depends on the kind of arm.
 """
@@ -33,7 +34,7 @@ RANK_TOLERANCE = 1e-8
 """Singular values of a Jacobian below this fraction of the greatest one count as zero."""
 
 _FEW_STATIONS = 20
-"""Number of stations up to which a second compiled function without stations is not worth its compilation."""
+"""Up to this many stations, a second compiled function without stations costs more than it saves."""
 
 
 class Label(NamedTuple):
@@ -112,7 +113,7 @@ class Tip:
 
 
 class Description(Protocol):
-    """A dataclass of counts, whose text is for people."""
+    """A dataclass of counts that prints as text for people."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
@@ -162,10 +163,10 @@ class LengthRowsLike(Protocol):
 
 
 class Approach(Protocol):
-    """How much nearer bodies can come to others, or to what rests."""
+    """Bounds of how much nearer bodies can come to other bodies, or to something at rest."""
 
     def __call__(self, body: Index, other: Index | None = None) -> Array:
-        """Return (R,) bounds, m, for bodies (R,) and other bodies (R,); NaN or inf where there is none."""
+        """Return (R,) bounds, m, for bodies (R,) and other bodies (R,); NaN or inf if none is known."""
         ...
 
 
@@ -223,7 +224,7 @@ class Arm(ABC):
     actuator_units : (n_a,) str
         ``"m"`` or ``"rad"``.
     stroke, rate, acceleration : (M, 2), (M,), (M,)
-        Least and greatest value, and greatest rates; inf without a limit.
+        Least and greatest values; greatest rates; greatest accelerations; inf without a limit.
     stations : Stations
         Empty where nothing tracks a curve.
     end_effector : Tip
@@ -265,7 +266,7 @@ class Arm(ABC):
 
     @cached_property
     def levers(self) -> Array:
-        """(n_a,) lengths, m, that compare changes of the actuators: 1 for lengths, :attr:`unit` for angles."""
+        """(n_a,) lengths, m, to compare changes of actuators by: 1 for lengths, :attr:`unit` for angles."""
         return np.array([self.unit if unit == "rad" else 1.0 for unit in self.actuator_units])
 
     @property
@@ -323,35 +324,35 @@ class Arm(ABC):
         return self.nodes(q)
 
     def ways(self, start: Array, end: Array, pieces: int) -> Array:
-        """Return (K + 1, P, 3) the points, m, where K `pieces` of a straight motion of the configuration meet."""
+        """Return (K + 1, P, 3) the points, m, at the ends of K equal `pieces` of a straight motion of q."""
         return np.stack([self.points(q) for q in between(start, end, pieces)])
 
     def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:  # noqa: ARG002
-        """Return nodes (R, S) and coefficients (R, S, 3) of rows over the displacements of points.
+        """Return rows over displacements of points as rows over displacements of nodes.
 
-        Given are `points` (R, 4) and `coefficients` (R, 4, 3).
+        Takes `points` (R, 4) and `coefficients` (R, 4, 3); returns nodes (R, S) and coefficients (R, S, 3).
         """
         return points, coefficients
 
     @abstractmethod
     def deviation(self, start: Array, end: Array) -> float:
-        """Return a bound of how much nearer two points come than their chords, m, when q moves straight."""
+        """Return a bound, m, of how much nearer two points come than their chords when q moves straight."""
 
     @abstractmethod
     def travel(self, motion: Array) -> float:
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
 
     def furthest(self, q: Array, lower: Array, upper: Array) -> Array | None:  # noqa: ARG002
-        """Return a displacement from `q` in which each actuator moves as far as boxes (n_a,) let it; None if unknown.
+        """Return a displacement with the greatest move of each actuator in its box (n_a,); None if unknown.
 
-        It is no motion, but :meth:`approach` of it bounds that of any motion within the boxes.
+        The arm need not be able to move so. Its :meth:`approach` bounds that of any motion within the boxes.
         """
         return None
 
     def approach(self, motion: Array) -> Approach | None:  # noqa: ARG002
-        """Return how much nearer bodies come in a displacement of the configuration; None where that is unknown.
+        """Return how much nearer bodies come in a displacement of the configuration; None if unknown.
 
-        The base rests.
+        The base is at rest.
         """
         return None
 
@@ -369,7 +370,7 @@ class Arm(ABC):
 
     @abstractmethod
     def describe(self) -> Description:
-        """Return the arm's counts, and what they allow."""
+        """Return the arm's counts, and what its stations or its tip can do."""
 
     def record(self) -> dict[str, Any]:
         """Return the arm as JSON data for verification.
@@ -460,7 +461,7 @@ class Kinematics:
 
 
 def between(start: Array, end: Array, pieces: int) -> Array:
-    """Return (K + 1, ...) the configurations where K `pieces` of a straight motion meet; both ends without rounding."""
+    """Return (K + 1, ...) configurations at the ends of K equal `pieces` of a motion; its ends are exact."""
     shares = (np.arange(pieces + 1) / pieces).reshape(-1, *[1] * start.ndim)
     return np.asarray((1.0 - shares) * start + shares * end)
 

@@ -20,8 +20,8 @@ def make_arm(problem: Problem) -> Arm:
     Raises
     ------
     ProblemError
-        A locked member is not actuated, the joints make no arm that can be moved, or the truss is not statically
-        determinate.
+        A locked member is not actuated, the joints make an arm that cannot move, or the truss is not
+        statically determinate.
     """
     if problem.arm is not None:
         mistakes = list(_beyond_serial(problem, problem.arm))
@@ -40,7 +40,7 @@ def make_arm(problem: Problem) -> Arm:
 
 
 def _beyond_serial(problem: Problem, spec: ArmTable) -> Iterator[Mistake]:
-    """Yield the mistakes of joints that leave a serial arm without an extent or without a bound of its reach."""
+    """Yield the mistakes of joints with which a serial arm has no extent, or no bound of its reach."""
     if not any(any(joint.position) for joint in spec.joint[1:]) and not any(spec.tip):
         expected = "a position away from the last joint, since all joints are in one place"
         yield problem.mistake(("arm", "tip"), expected)

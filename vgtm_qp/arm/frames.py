@@ -15,7 +15,7 @@ def fitted_frame(nodes: ca.SX, cosines: ca.SX, sines: ca.SX) -> ca.SX:
     """Return the rotation (3, 3) that fits the reference polygon with the given polar angles best to (3, K) `nodes`.
 
     z is the unit area vector; x is the closed solution of the two-dimensional orthogonal Procrustes problem in the
-    plane normal to it. No node is preferred, so a variable triangle gains no false authority over roll.
+    plane normal to it. No node is preferred: otherwise a change of the triangle's shape would count as roll.
     """
     count = nodes.shape[1]
     centred = nodes - ca.repmat(ca.sum2(nodes) / count, 1, count)
@@ -33,16 +33,17 @@ def fitted_frame(nodes: ca.SX, cosines: ca.SX, sines: ca.SX) -> ca.SX:
 def turning(fitted: ca.SX, nodes: ca.SX, axes: ca.SX) -> ca.SX:
     """Return (R, 3K) the components along `axes` (R, 3) of a fitted frame's angular velocity, by those of its nodes.
 
-    Half the sum of r x dr over the frame's axes r, by one sweep backwards for each row.
+    Half the sum of r x dr over the frame's axes r, by one reverse sweep for each row.
     """
     across = [-ca.skew(fitted[:, c]) @ axes.T / 2 for c in range(3)]
     return ca.jtimes(ca.vec(fitted), ca.vec(nodes), ca.vertcat(*across), True).T
 
 
 def frames_along(points: Array) -> Array:
-    """Return (F, 3, 3) frames at `points` (F, 3) of a polyline, the first upright; each turns only with its z-axis.
+    """Return (F, 3, 3) frames at `points` (F, 3) of a polyline; the first is the identity.
 
-    The z-axes point from the point before. Of two points in one place the second has the attitude of the first.
+    Each z-axis points from the previous point to its own; the least rotation leads from one frame to the
+    next. A point in the place of the previous one has that point's frame.
     """
     frames = [np.eye(3)]
     for before, after in pairwise(points):

@@ -21,7 +21,7 @@ from vgtm_qp.rotation import vector_near
 
 
 class Follower(NamedTuple):
-    """A joint whose value is `multiplier` times that of another, and a constant: a fixed quantity."""
+    """A joint whose value is `multiplier` times another joint's value, plus a constant: a fixed quantity."""
 
     joint: int
     followed: int
@@ -78,17 +78,17 @@ class JacobianRows:
 
 
 class JointSpaceArm(Arm):
-    """See ``arm.Arm``; all that follows from the nodes as functions of the joints, base first.
+    """See ``arm.Arm``; everything that follows from the nodes as functions of the joints, base first.
 
-    A quantity is the value of a joint. That of a joint which follows another is the difference to what it would have
-    in proportion: it is fixed.
+    Each joint has one quantity, its value. The quantity of a follower is fixed: its value less `multiplier`
+    times the value of the joint that it follows.
 
     Attributes
     ----------
     followers : tuple of Follower
-        Joints that follow others, which move by themselves.
+        Joints that follow others; a follower follows no follower.
     functions : (casadi.Function, casadi.Function)
-        (q, *constants) -> nodes (3, N), m; the same and their Jacobian (3 N, J).
+        (q, *constants) -> nodes (3, N), m; and (q, *constants) -> nodes and their Jacobian (3 N, J).
     constants : mapping
         Arguments of these besides the configuration, the columns of each as rows.
     revolute : (J,) bool
@@ -149,7 +149,7 @@ class JointSpaceArm(Arm):
 
     @cached_property
     def _kernels(self) -> dict[int, Kernel]:
-        """Kernels for so many configurations at once."""
+        """Kernels, by the number of configurations that each evaluates at once."""
         return {}
 
     def measured(self, q: Array) -> Array:
@@ -159,13 +159,13 @@ class JointSpaceArm(Arm):
         return values
 
     def following(self, change: Any) -> Any:
-        """Return (J,) or (J, 1) changes of the joints from those of the quantities, which are overwritten."""
+        """Return (J,) or (J, 1) changes of the joints; overwrites `change`, the changes of the quantities."""
         for joint, followed, multiplier in self.followers:
             change[joint] = change[joint] + multiplier * change[followed]
         return change
 
     def by_quantities(self, jacobian: Any) -> Any:
-        """Return derivatives (R, J) by the quantities from those by the joints, which are overwritten."""
+        """Return derivatives (R, J) by the quantities; overwrites `jacobian`, those by the joints."""
         for joint, followed, multiplier in self.followers:
             jacobian[:, followed] = jacobian[:, followed] + multiplier * jacobian[:, joint]
         return jacobian
@@ -193,10 +193,10 @@ class JointSpaceArm(Arm):
         return float(turn @ self.reaches + slide.sum() + np.abs(motion[-6:-3]).max(initial=0.0))
 
     def deviation(self, start: Array, end: Array) -> float:
-        """See ``arm.Arm``: an eighth of a bound of the nodes' second derivative on the way, for both of a pair.
+        """See ``arm.Arm``: for each of two points, an eighth of a bound of a node's second derivative.
 
-        A point's velocity is sum w_j a_j x (X - o_j) + sum d_j a_j. The axes a_j turn with all joints before them, and
-        X - o_j changes only by the joints from there on.
+        A point's velocity is sum w_j a_j x (X - o_j) + sum d_j a_j. The axes a_j turn with all joints before
+        them; X - o_j changes only by joint j and those beyond it.
         """
         turn, slide = self._motions(end - start)
         before = np.concatenate([[0.0], np.cumsum(turn)[:-1]])
@@ -205,13 +205,13 @@ class JointSpaceArm(Arm):
         return 2.0 * float(bend) / 8.0
 
     def _motions(self, motion: Array) -> tuple[Array, Array]:
-        """Return turns (J + 1,), rad, the base's first and counted twice, and slides (J + 1,), m."""
+        """Return turns (J + 1,), rad, and slides (J + 1,), m; the base comes first, with twice its turn."""
         joints, base = np.abs(motion[:-6]), 2.0 * float(np.linalg.norm(motion[-3:]))
         turn, slide = np.where(self.revolute, joints, 0.0), np.where(self.revolute, 0.0, joints)
         return np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
 
     def reach(self) -> Array:
-        """See ``arm.Arm``: only that from the base's origin, its first node, is bounded."""
+        """See ``arm.Arm``: only the distance from the base's origin, its first node, is bounded."""
         return np.array([self.reaches[0], *[np.inf] * (int(self.base.sum()) - 1)])
 
     def describe(self) -> JointSpaceDescription:
@@ -239,7 +239,7 @@ class JointSpaceSymbols(ArmSymbols):
         return self._nodes(q, *self._constants)
 
     def quantities(self, q: ca.MX) -> ca.MX:
-        """See ``arm.ArmSymbols``: the joints' values, less what followers have in proportion."""
+        """See ``arm.ArmSymbols``, and :class:`JointSpaceArm` for the quantities of followers."""
         values = q[: self._joints]
         for joint, followed, multiplier in self._arm.followers:
             values[joint] = values[joint] - multiplier * values[followed]

@@ -69,7 +69,7 @@ class BarePseudoinverse:
 
 
 class ResolverStep:
-    """A resolver of the package by a `method` of that name, or by the problem's own with another `solver`."""
+    """A resolver of the package: by another `method`, or by the problem's method with another `solver`."""
 
     def __init__(self, problem: Problem, *, method: str | None = None, solver: str | None = None) -> None:
         changed = problem if method is None else with_method(problem, method)
@@ -115,7 +115,7 @@ def make_baseline(name: BaselineName, problem: Problem, bays: int) -> Contestant
     Raises
     ------
     VgtmError
-        It cannot serve that problem, or the arm is longer than it is tried on.
+        The baseline cannot serve that problem, or the arm is longer than the longest that it is tried on.
     """
     baseline = BASELINES[name]
     if bays > baseline.most_bays:

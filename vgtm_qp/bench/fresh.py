@@ -1,7 +1,8 @@
-"""What a fresh process takes: start of the command, the way to the first step with a warm or an empty cache, memory.
+"""Time and memory of a fresh process: start of the command, first step with a warm or an empty cache.
 
-Run as ``python -m vgtm_qp.bench.fresh`` it is that process: a problem in JSON on stdin, the measures on
-stdout. With a file as its argument it solves the problem and writes the result there.
+Run as ``python -m vgtm_qp.bench.fresh``, this module is that process: it reads a problem in JSON from stdin
+and writes the measures to stdout. With a file as its argument it solves the problem and writes the result
+there.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _HELP = "from vgtm_qp.cli import main; main(['--help'])"
 def measure_start() -> dict[str, float]:
     """Return CPU seconds of a bare interpreter, of one that imports the package, and of ``vgtm --help``.
 
-    Each is the least of three, since only what disturbs them makes them differ.
+    Each is the least of three runs, since disturbances only add to it.
     """
     scripts = {"python": "pass", "import": "import vgtm_qp", "help": _HELP}
     return {name: min(_cpu_seconds_of(script) for _ in range(_REPEATS)) for name, script in scripts.items()}
@@ -37,17 +38,17 @@ def measure_start() -> dict[str, float]:
 def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> dict[str, float]:
     """Return what a fresh process takes to set up a problem in the form of ``Problem.to_dict`` and take a few steps.
 
-    Keys: ``imports``, s, of what a resolver needs; ``setup`` and ``setup_cpu``, s from the problem to a resolver that
-    can take its first step, by the clock and of the processor; ``first_step``, s; ``to_first_step``, s by the clock
-    from the start of the process to the end of its first accepted step; ``peak_memory`` and ``imported_memory``, the
-    greatest resident memory after some steps and after the imports alone, bytes. Where it is `cold`, the cache of
-    kernels is an empty one in the place of the user's, and ``to_result`` is there: s by the clock from the start of
-    another such process until the whole maneuver is solved, verified and written.
+    Keys: ``imports``, s, of what a resolver needs; ``setup`` and ``setup_cpu``, s from the problem to a
+    resolver that can take its first step, by the clock and as CPU time; ``first_step``, s; ``to_first_step``,
+    s by the clock from the start of the process to the end of its first accepted step; ``peak_memory`` and
+    ``imported_memory``, the greatest resident memory after some steps and after the imports alone, bytes. If
+    `cold`, an empty cache of kernels replaces the user's, and there is one more key, ``to_result``: s by the
+    clock from the start of another such process until the whole maneuver is solved, verified and written.
 
     Raises
     ------
     SolverError
-        That process failed; the message has the last line that it said.
+        That process failed; the message has the last line of its stderr.
     """
     found = _run(problem, cold=cold)
     found["to_first_step"] -= found.pop("began")
@@ -59,8 +60,8 @@ def measure_fresh(problem: dict[str, Any], *, cold: bool = False) -> dict[str, f
 
 
 def _run(problem: dict[str, Any], *result: str, cold: bool) -> dict[str, float]:
-    """Return what a fresh process says; it has nothing to say if it solves the problem into a file `result`."""
-    # The process that compiles for it may outlive it.
+    """Return the measures of a fresh process; none if it writes the solved problem to a file `result`."""
+    # Its compiling process may outlive it, and still write into the folder.
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         environment = _environment() | ({"VGTM_CACHE": str(Path(folder) / "cache")} if cold else {})
         began = time()

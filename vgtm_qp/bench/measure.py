@@ -1,14 +1,16 @@
 """Timing: one resolver by itself over whole maneuvers, then in turn with a baseline, by blocks of steps.
 
-A step is ``Resolver.step(position=...)``, with ``pointing`` where a direction is tracked, as a control loop calls it:
-to the next mark of the maneuver, there and back, from the state that the last one left; an arm that is stuck goes on
-from home. All is warm: the kernels are compiled, and nothing is done for the first time.
+A step is ``Resolver.step(position=...)``, with ``pointing`` where a direction is tracked, as a control loop
+calls it: from the state of the last step to the next mark of the maneuver, there and back. An arm that is
+stuck goes home and on from there. All is warm: the kernels are compiled, and nothing is done for the first
+time.
 
-In turn, both take the same steps from the states that the resolver reached: it takes ten, then the baseline those ten,
-and at the end it takes ten more. A machine that slows down slows both, and the ratio of their medians holds. Steps of
-one block are as warm as in a control loop: right after a large baseline a step may take twice as long, because the
-processor's caches are filled with other things. Ratios are those of the thread's CPU time, because longer steps are
-interrupted more often. Garbage is collected as usual.
+In turn, both take the same steps from the states that the resolver reached: the resolver takes ten, then the
+baseline those ten, and at the end the resolver ten more. A machine that slows down slows both, and the ratio
+of their medians stays the same. Steps of one block are as warm as in a control loop: right after a large
+baseline a step may take twice as long, because the processor's caches are filled with other things. Ratios
+are those of the thread's CPU time, because longer steps are interrupted more often. Garbage is collected as
+usual.
 """
 
 from __future__ import annotations
@@ -96,7 +98,7 @@ class Steps:
 
 @dataclass
 class Pairs:
-    """Times of a baseline and of the resolver; `failed` counts steps that are left out: the baseline has no answer."""
+    """Times of a baseline and of the resolver over the same steps; `failed` counts steps without answer."""
 
     theirs: list[Spent] = field(default_factory=list)
     ours: list[Spent] = field(default_factory=list)
@@ -131,16 +133,17 @@ class _Walk:
         self.tour.restart()
 
     def step(self) -> tuple[Spent, Step]:
-        """Take a step; return what it took, and the step."""
+        """Take a step; return its time, and the step."""
         take, goal = self._resolver.step, self.tour.goal
         spent, step = _timed(lambda: take(position=goal.pose.position, pointing=goal.pointing))
         self.tour.advance(step)
         return spent, step
 
     def repeat(self, seconds: float, steps: int) -> Iterator[int]:
-        """Count steps to take until there are so many or `seconds` have passed; an arm that is stuck goes home.
+        """Count up to `steps` steps until `seconds` have passed; an arm that is stuck goes home.
 
-        A few are counted at least, unless they are too slow; an arm that is stuck at home takes no other.
+        ``_LEAST_STEPS`` are counted even after `seconds`, up to ``_OVERRUN`` times as long. The count ends at
+        an arm that is stuck at home.
         """
         started = perf_counter()
         for count in range(steps):
@@ -179,7 +182,7 @@ def run_alone(resolver: Resolver, goals: list[Goal], *, seconds: float, steps: i
 def run_in_turn(
     resolver: Resolver, baseline: Contestant, goals: list[Goal], *, seconds: float, steps: int
 ) -> Pairs:
-    """Return the times of a baseline and of the resolver over the same steps, by blocks in turn; the last is ours."""
+    """Return the times of baseline and resolver over the same steps, by blocks in turn, a resolver's last."""
     walk, found = _Walk(resolver, goals), Pairs()
     _take(baseline, resolver.state, walk.tour.goal)
     finish_compiling()
@@ -197,7 +200,7 @@ def run_in_turn(
 
 
 def _take(contestant: Contestant, state: State, goal: Goal) -> tuple[Spent, bool]:
-    """Let a baseline take a step from a state; return what it took and whether it found an answer."""
+    """Let a baseline take a step from a state; return its time and whether it found an answer."""
     contestant.place(state)
 
     def answers() -> bool:

@@ -1,8 +1,8 @@
 """Other packages that move arms by one QP a step: mink, on MuJoCo, and pink, on Pinocchio.
 
-Both get the serial arm of a problem with its limits and rates, its links as capsules, its boxes, and the tip's
-position with a slight pull to the home pose. Distances enter as rows at the state where a step begins. Neither checks
-the state that it leads to, nor the way.
+Both get the serial arm of a problem with its limits and rates, its links as capsules, its boxes, and the
+tip's position with a slight pull to the home pose. Distances enter as rows at the state where a step begins.
+Neither package checks the new state, or the motion to it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class JointScene(NamedTuple):
         Raises
         ------
         SolverError
-            There is more in it than these models have.
+            The problem has parts that these models lack.
         """
         setup = build_arm(problem.replace({"method.solver": "piqp"}))
         arm = setup.arm
@@ -159,7 +159,7 @@ class PinkStep:
             task.set_target_from_configuration(self._configuration)
         self._tasks, self._dt, self._barriers = [self._tip, posture], scene.setup.dt, []
         if pairs := len(shapes.collisionPairs):
-            # Its barrier has one least distance for all pairs: the greater one.
+            # pink's barrier has one least distance for all pairs: here the greater of the two.
             least = max(scene.setup.safe, scene.setup.self_safe) + scene.setup.margin
             barrier = pink.barriers.SelfCollisionBarrier(
                 pairs, gain=_APPROACH / self._dt, safe_displacement_gain=0.0, d_min=least
@@ -207,7 +207,7 @@ def mjcf(scene: JointScene) -> str:
     for j, name in enumerate(arm.quantity_names):
         place = _mjcf_place(chain.position[j], chain.rotation[j])
         parent = ElementTree.SubElement(parent, "body", {"name": name} | place)
-        # A body needs a mass, although nothing here has any forces.
+        # A body needs a mass, although no forces are computed.
         ElementTree.SubElement(parent, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
         joint = {"name": name, "type": "hinge", "axis": _numbers(chain.axis[j])}
         if np.isfinite(arm.stroke[j]).all():

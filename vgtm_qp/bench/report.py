@@ -28,7 +28,7 @@ SCHEMA_VERSION = 2
 """In version 1 a step was ``Resolver.follow``, and CPU time that of the process."""
 _ALONE = 30.0
 LEAST_BAYS = 50
-"""Growth with the bays is fitted from here on: below, what every step costs hides it."""
+"""Least number of bays in the fit of growth: below it, the constant cost of a step hides the growth."""
 
 
 def measure_scene(
@@ -40,11 +40,11 @@ def measure_scene(
     ``members`` (bodies of any arm), ``actuators`` and ``obstacles``; ``covered``, the share of the maneuver that the
     arm covered, 0 to 1; ``stopped_by``, what stopped it, empty where nothing did; ``step`` and ``breakdown``, see
     `measure.py`; ``qps``, QPs a step; ``fcl_rows`` and ``exact_rows``, clearance rows a step by FCL and by closed
-    forms; ``warm`` and ``cold``, what `measure_fresh` returns, ``cold`` None where it was not asked for;
+    forms; ``warm`` and ``cold``, what `measure_fresh` returns, with ``cold`` None if it was not asked for;
     ``baselines``, what `_against` returns, by name.
 
-    Each run ends after so many `steps`. Those in turn with a baseline end when so many `seconds` have passed, the one
-    alone when 30 times as many have.
+    Each run ends after so many `steps`, or earlier: in turn with a baseline after `seconds`, alone after 30
+    times as long.
     """
     problem = scene.problem
     resolver = Resolver(problem)
@@ -85,8 +85,8 @@ def _against(
 ) -> dict[str, Any]:
     """Return a baseline's ``step``, see `timing`, and its ``ratio`` to ``ours``, median CPU times of the same steps, s.
 
-    These are None where it was not measured, and ``skipped`` says why; ``failed`` counts steps that it found no answer
-    to, which are not in the times.
+    These are None if the baseline was not measured, and ``skipped`` says why; ``failed`` counts the steps
+    without its answer, which are not in the times.
     """
     missing = {"step": None, "ours": None, "ratio": None, "failed": 0, "skipped": ""}
     try:
@@ -136,7 +136,7 @@ def measure(
 def growth(scenes: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the exponent of the bays in the CPU time of a step between two cubes, by method and tracking, with FCL.
 
-    Fitted by least squares of the logarithms over arms of 50 bays and more, where there are two at least.
+    Fitted by least squares of the logarithms over arms of 50 bays and more, if there are at least two.
     """
     points: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for scene in scenes:
@@ -164,7 +164,7 @@ def load_document(path: Path) -> dict[str, Any]:
     Raises
     ------
     ResultError
-        The file cannot be read, or is something else.
+        The file cannot be read, or is not such a document.
     """
     wrong = f"{path} is not what vgtm bench --json prints"
     try:
@@ -211,5 +211,5 @@ def compare(new: dict[str, Any], old: dict[str, Any]) -> dict[str, Any]:
 
 
 def _ratio(scene: dict[str, Any], name: str) -> float:
-    """Return a baseline's ratio on a scene, 0 where it has none."""
+    """Return a baseline's ratio on a scene; 0 if it was not measured."""
     return float(scene["baselines"].get(name, {}).get("ratio") or 0.0)

@@ -29,7 +29,7 @@ _BUNDLED_BAYS = 5
 _BAY = math.sqrt(2.0 / 3.0)
 """Height of an octahedral bay whose members are all 1 m long, m."""
 _SHIFT, _SINK = 1.6, 0.78
-"""What the tip is moved by sideways, and down for five bays, m."""
+"""Displacement of the tip, m: sideways, and downwards for five bays."""
 _EDGE = 0.9
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -43,10 +43,10 @@ VARIANTS: dict[SceneKind, tuple[Variant, ...]] = {
     "serial": (("exact", "fcl"), ("exact", "exact")),
     "snake": (("exact", "fcl"),),
 }
-"""Modes of tracking, and what gives the distances, that each kind is measured with if nothing else is asked for.
+"""Modes of tracking, and sources of distances, with which each kind is measured by default.
 
-Between the cubes a direction of the tip needs elastic tracking all the way: an arm that keeps to its curve while it can
-is blocked half way.
+Between the cubes a direction of the tip needs elastic tracking all along: with exact tracking the arm is
+blocked half way.
 """
 MORE_BETWEEN_CUBES: dict[int, tuple[Variant, ...]] = {
     5: (("hard", "fcl"), ("exact", "exact")),
@@ -58,7 +58,7 @@ _WITHOUT_CURVE = ("tetrahedral", "serial")
 _JOINTS = 7
 _JOINT_AXES = ((0, 0, 1), (0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1))
 _JOINT_HEIGHTS = (0.36, 0.0, 0.0, 0.42, 0.0, 0.4, 0.0)
-"""Shoulder, elbow and wrist of a KUKA LBR iiwa 14, m above the joint before; limits, deg, and speeds, deg/s, too."""
+"""Of a KUKA LBR iiwa 14: heights of the joints, m, each above the one before; limits, deg; speeds, deg/s."""
 _JOINT_LIMITS = (170, 120, 170, 120, 170, 120, 175)
 _JOINT_SPEEDS = (85, 85, 100, 75, 130, 135, 135)
 _JOINT_HOME = (0.0, 0.4, 0.0, -1.4, 0.0, 0.6, 0.0)
@@ -86,8 +86,8 @@ def make_scenes(
 ) -> list[BenchScene]:
     """Return the scenes of these kinds; `bays` are those of the arms between two cubes.
 
-    Without `trackings` and `distances` each has its `VARIANTS`; otherwise each mode with each kind of distance, by
-    default exact tracking and FCL.
+    Without `trackings` and `distances` each kind has its `VARIANTS`. Otherwise every mode is combined with
+    every source of distances; the default of either is exact tracking, and FCL.
     """
     scenes = []
     for kind in dict.fromkeys(kinds):
@@ -129,7 +129,7 @@ def _count(kind: SceneKind) -> int:
 
 
 def _serial() -> Problem:
-    """Return an arm of seven joints, as mink and pink are made for, whose elbow moves out of the way of a cube."""
+    """Return an arm of seven joints, as mink and pink are made for; its elbow has to avoid a cube."""
     numbers = zip(_JOINT_AXES, _JOINT_HEIGHTS, _JOINT_LIMITS, _JOINT_SPEEDS, _JOINT_HOME, strict=True)
     joints = [
         {
@@ -194,7 +194,8 @@ def _scaled(problem: Problem, bays: int) -> Problem:
     """Return the maneuver of the five-bay arm for another one, with steps of the same length.
 
     The cubes keep their distance from the arm and stand at the same parts of its height, so that it has to
-    bend round them; the tip goes sideways by as much, and down by what an arm of that height loses.
+    bend round them. The tip goes sideways as far as that of the five-bay arm, and down by less in proportion
+    to the bays.
     """
     height, stretch = bays * _BAY, bays / _BUNDLED_BAYS
     cubes = problem.to_dict()["obstacle"]
@@ -212,13 +213,14 @@ def _scaled(problem: Problem, bays: int) -> Problem:
 
 
 def _clutter(bays: int, count: int) -> list[dict[str, Any]]:
-    """Return cubes in a spiral round the arm, near it below and as far away above as the tip will go."""
+    """Return cubes in a spiral round the arm; their distance grows upwards, with the motion of the arm."""
     height = bays * _BAY
     cubes: list[dict[str, Any]] = []
     for k in range(count):
         part = (k + 1.0) / (count + 1.0)
         angle = k * _GOLDEN_ANGLE
-        # Half a diagonal of the cube and the nodes' circle of 0.58 m stay apart whichever way the cube lies.
+        # Beyond half a cube's diagonal plus the nodes' circle of 0.58 m, so that cube and arm are apart
+        # however it is turned.
         distance = 1.45 + 1.2 * _SHIFT * part**1.5
         center = [distance * math.cos(angle), distance * math.sin(angle), part * height]
         pose = {"center": center, "rotation_vector": [0.0, 0.0, angle]}

@@ -94,7 +94,7 @@ def _baselines(document: dict[str, Any]) -> str:
 
 
 def _legend(document: dict[str, Any]) -> Iterator[str]:
-    """Yield what each baseline is, and why one of them has no column."""
+    """Yield what each baseline is, and why a baseline has no column."""
     for name, title in document["baselines"].items():
         found = [scene["baselines"][name] for scene in document["scenes"]]
         missing = "" if any(entry["step"] for entry in found) else found[-1]["skipped"] if found else ""

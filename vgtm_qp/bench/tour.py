@@ -14,7 +14,7 @@ from vgtm_qp.step.step import Step, StepStatus
 
 
 class Goal(NamedTuple):
-    """Where a step leads: a pose, and the direction ``pointing`` (3,) to ask a resolver for, None if there is none."""
+    """Where a step leads: a pose, and the direction ``pointing`` (3,) to ask a resolver for, or None."""
 
     pose: TipGoal
     pointing: Array | None
@@ -32,7 +32,7 @@ def make_goals(problem: Problem, resolver: Resolver) -> list[Goal]:
 
 
 class Tour:
-    """The way from goal to goal, to the last and back to the first, again and again.
+    """A tour from goal to goal, to the last and back to the first, again and again.
 
     A goal that a step did not reach is asked for again. ``stuck`` names what stopped the arm, empty if nothing did.
     """

@@ -1,4 +1,4 @@
-"""Angles between bodies that share an end, which a problem may not let become too small, at every instant."""
+"""Least angles between bodies that share an end, at every instant."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ _GREATEST_COUNT = 200_000
 def keep_angles(motion: GivenMotion, least: float) -> Decision:
     """Return whether bodies that share an end keep an angle of `least`, rad.
 
-    A direction turns no faster than its vector's ends move over its length, so that an angle that is a at one end
-    of an interval and b at the other is at least (a + b - t) / 2 between them, where t is how far both turn in all.
+    The direction of a vector turns no faster than its ends move, over its length. An angle that is a at one
+    end of an interval and b at the other is therefore at least (a + b - t) / 2 between, where t is the sum of
+    both turns.
     """
     decision, pairs = Decision(), joined_ends(motion.arm.members)
     names, floor = motion.arm.member_names, least - DIRECTION_TOLERANCE
@@ -61,7 +62,7 @@ def keep_angles(motion: GivenMotion, least: float) -> Decision:
 
 
 def _leaving(motion: GivenMotion, segment: Index, pair: Index, share: Array) -> Array:
-    """Return (P, 2, 3) the vectors along both bodies of pairs of ends (P, 2), away from what they share, m."""
+    """Return (P, 2, 3) the vectors along both bodies of pairs of ends (P, 2), away from the shared end, m."""
     instants, which = np.unique(segment + share, return_inverse=True)
     number = np.minimum(instants.astype(np.int64), len(motion.time) - 2)
     ends = motion.ends_at(number, instants - number)
@@ -73,7 +74,7 @@ def _leaving(motion: GivenMotion, segment: Index, pair: Index, share: Array) -> 
 def _turned(
     motion: GivenMotion, segment: Index, pair: Index, first: Array, last: Array, width: float
 ) -> Array:
-    """Return (P,) how far both directions of pairs turn at most, in all, rad; infinite where a vector may vanish."""
+    """Return (P,) bounds of the sum of both directions' turns, rad; infinite where a vector may vanish."""
     # Both ends of a body may leave their chords.
     bend = 2.0 * motion.bends[segment[:, None], pair // 2] * width**2
     path = np.linalg.norm(last - first, axis=2) + bend / 2.0

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 def certify(problem: Problem, times: ArrayLike, joints: ArrayLike | Mapping[str, ArrayLike]) -> Verdict:
     """Prove or refute a trajectory for the problem's arm and scene, over the whole time and not at its rows alone.
 
-    Joints, or the lengths of a truss's actuators, move linearly between rows. What has to hold at every instant are
-    their limits, rates, accelerations and locks, and the clearances of the problem, also of a moving base and to moving
-    obstacles. The trajectory may start anywhere.
+    Joints, or the lengths of a truss's actuators, move linearly between rows. At every instant their limits,
+    rates, accelerations and locks have to hold, and the clearances of the problem. A moving base and moving
+    obstacles are taken into account. The trajectory may start anywhere.
 
     Parameters
     ----------
     problem
-        Of its keys those of the arm, the obstacles and ``[clearance]`` count.
+        Only its keys of the arm, the obstacles and ``[clearance]`` are used.
     times
         (T,) s, increasing, from 0 or later. One row alone is a pose.
     joints
@@ -41,7 +41,7 @@ def certify(problem: Problem, times: ArrayLike, joints: ArrayLike | Mapping[str,
     Raises
     ------
     ProblemError
-        The arm cannot be made, a mesh cannot be read, or the arrays are no trajectory.
+        The arm cannot be made, a mesh cannot be read, or the arrays do not form a trajectory.
     """
     return Certifier(problem).certify(times, joints)
 
@@ -92,7 +92,7 @@ class Certifier:
             doubt += decision.undecided
         if isinstance(motion, TrussMotion):
             doubt += motion.doubts()
-        # What is not known of the motion may be anywhere.
+        # Where the motion is unknown, bodies may be anywhere.
         least = -np.inf if any(finding.kind == "motion" for finding in doubt) else np.inf
         bounds = {kind: min(decision.bound, least) for kind, decision in decided.items()}
         return Verdict(
@@ -113,7 +113,7 @@ class Certifier:
         return values
 
     def _motion(self, instants: Array, values: Array) -> tuple[GivenMotion | None, list[Finding]]:
-        """Return the motion through the rows, and those where the base changes its, and what is not known of it."""
+        """Return the motion through all rows and changes of the base, and findings where it is unknown."""
         from vgtm_qp.certify.motion import JointMotion
 
         table = self._table.get("truss") or self._table.get("arm") or {}

@@ -1,8 +1,8 @@
 """Whether bodies keep their clearances all along a motion: proven, refuted, or neither.
 
-The proof is that of ``verify.clearance``: a plane that separates two bodies at both ends of an interval separates them
-through it, but for how far their ways bend. It is held against what the bodies have to keep, for all segments of the
-motion at once, and an interval is halved only until that is decided.
+The proof is that of ``verify.clearance``: a plane that separates two bodies at both ends of an interval
+separates them throughout, except for the bend of their paths. The proven bound is compared with the clearance
+to keep, for all segments of the motion at once; an interval is halved only until that decides.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from vgtm_qp.verify.clearance import CLEARANCE_TOLERANCE, Pairs
 
 _GREATEST_DEPTH = 30
 _GREATEST_COUNT = 200_000
-"""Numbers of halvings, and of intervals at a time, from which on nothing more is decided."""
+"""Greatest numbers of halvings, and of intervals at a time; what is open then stays undecided."""
 _NEAR_ENOUGH = 1e-3
 _REPORT_DEPTH = 10
-"""How near a bound is brought to the least clearance, over the mean link, and with how many halvings at most."""
+"""Greatest gap between proven bound and least clearance, over the mean link, and halvings to reach it."""
 _INSTANTS = 17
-"""Instants of a segment at which a pair that is too near there is looked at."""
+"""Number of instants of a segment at which a pair is measured if it comes too near in the segment."""
 _CHUNK = 500_000
 
 
 @dataclass
 class Decision:
-    """What is decided of pairs: a proven lower bound of their clearances, m, and what is wrong or in doubt."""
+    """What is decided of pairs: a proven lower bound of their clearances, m, and the findings."""
 
     bound: float = np.inf
     violations: list[Finding] = field(default_factory=list)
@@ -40,7 +40,7 @@ class Decision:
 
 
 def decide(motion: GivenMotion, kept: Sequence[Kept]) -> dict[str, Decision]:
-    """Return by kind what is decided of the pairs of `kept`, of which those of one kind have one floor."""
+    """Decide the pairs, kind by kind; pairs of one kind have one floor."""
     found = {pairs.kind: Decision() for pairs in kept}
     for kind, decision in found.items():
         Bisection(motion, [pairs for pairs in kept if pairs.kind == kind]).run(decision)
@@ -76,7 +76,7 @@ class _Edge:
         return _Edge(*(array[rows] for array in self.arrays()))
 
     def arrays(self) -> tuple[Array, ...]:
-        """Return all four."""
+        """Return the four arrays."""
         return self.points, self.distance, self.normal, self.held
 
 
@@ -111,10 +111,10 @@ class Bisection:
         # Times, s: of the least distance found, and the first and the last at which it is too small.
         self.at, self.since, self.until = np.full((3, len(everything)), np.nan)
         self.left: list[tuple[Index, Array, Array, Array]] = []
-        """Intervals that are in doubt: pairs, where they start and how wide they are, and what is proven, m."""
+        """Undecided intervals: pairs, starts and widths as shares of a segment, and proven bounds, m."""
 
     def _candidates(self) -> tuple[list[Near], float]:
-        """Return the pairs that may come too near, or the nearest, and a bound of the clearances of the others."""
+        """Return pairs that may come too near, or else the nearest; and a bound of the others' clearances."""
         nearest = np.inf
         for own in self.kept:
             one = own.nearest()
@@ -126,7 +126,7 @@ class Bisection:
         return [near for near, _ in found], min((rest for _, rest in found), default=np.inf)
 
     def run(self, decision: Decision) -> None:
-        """Halve intervals until each is decided, and note what came out."""
+        """Halve intervals until each is decided, and add the results to `decision`."""
         pair = np.arange(len(self.segment))
         edges = [self._edge(pair, np.full(len(pair), share)) for share in (0.0, 1.0)]
         start, width = np.zeros(len(pair)), 1.0
@@ -164,7 +164,7 @@ class Bisection:
         return np.asarray(open_)
 
     def _are_proven(self, proven: Array) -> NDArray[np.bool_]:
-        """Return (I,) where bounds, m, are such that a pair keeps clear; never where one is no number."""
+        """Return (I,) where proven bounds, m, keep a pair clear; False for NaN."""
         return np.asarray(proven >= self.most)
 
     def _note_undecided(
@@ -175,7 +175,7 @@ class Bisection:
             self.left.append((pair[left], start[left], np.full(int(left.sum()), width), proven[left]))
 
     def _across(self, pair: Index, first: _Edge, last: _Edge) -> Array:
-        """Return (I,) the gap, m, that one of the planes of both edges holds at both."""
+        """Return (I,) the gap, m, that the better of the two edges' planes holds at both edges."""
         others = self._apart(
             np.repeat(pair, 2),
             np.stack([last.points, first.points], axis=1).reshape(-1, 4, 3),
@@ -185,7 +185,7 @@ class Bisection:
         return np.asarray(held.max(axis=1))
 
     def _edge(self, pair: Index, share: Array) -> _Edge:
-        """Return pairs (P,) at shares (P,) of their segments, and keep what is the least so far."""
+        """Return pairs (P,) at shares (P,) of their segments, and record the least distances so far."""
         x = self.segment[pair] + share
         instants, which = np.unique(x, return_inverse=True)
         if len(instants) > 1 and len(instants) * len(self.motion.arm.radius) > _CHUNK:
@@ -204,7 +204,7 @@ class Bisection:
         return edge
 
     def _keep(self, pair: Index, distance: Array, time: Array) -> None:
-        """Keep the least distance of each pair, its time, and the first and last time at which it is too small."""
+        """Record each pair's least distance and its time, and from when to when the pair is too near."""
         np.minimum.at(self.found, pair, distance)
         least = distance <= self.found[pair]
         self.at[pair[least]] = time[least]
@@ -216,7 +216,7 @@ class Bisection:
         return self.first[rows], self.second[rows]
 
     def _groups(self, pair: Index) -> Iterator[tuple[Kept, slice]]:
-        """Yield what pairs (P,), in order, belong to, and which of them do."""
+        """Yield each `Kept` with the slice of the pairs (P,), in order, that belong to it."""
         edges = np.searchsorted(pair, self.starts)
         for own, first, last in zip(self.kept, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             if last > first:
@@ -233,13 +233,13 @@ class Bisection:
         )
 
     def _look_closer(self) -> None:
-        """Look at pairs that are too near at some more instants, for when they are and how near."""
+        """Measure pairs that come too near at more instants: from when to when, and how near."""
         broken = np.flatnonzero(self.found < self.least)[:_GREATEST_COUNT]
         share = np.linspace(0.0, 1.0, _INSTANTS)
         self._edge(np.repeat(broken, len(share)), np.tile(share, len(broken)))
 
     def _tell(self, decision: Decision) -> None:
-        """Note what came out; what is found of the same bodies in successive segments is one finding."""
+        """Add the results to `decision`; the same bodies in successive segments make one finding."""
         decision.bound = float(np.minimum(self.rest, self.proven.min(initial=np.inf)))
         floor, kind = self.kept[0].floor, self.kept[0].kind
         broken = np.flatnonzero(self.found < self.least)
@@ -260,7 +260,7 @@ class Bisection:
             decision.undecided.append(Finding(*found))
 
     def _enclosed(self, decision: Decision) -> Iterator[Finding]:
-        """Yield the bodies that are within a surface, from the first to the last state at which they are."""
+        """Yield a finding for each body inside a closed surface, from the first to the last such state."""
         floor, kind, time = self.kept[0].floor, self.kept[0].kind, self.motion.time
         for own in self.kept:
             states: dict[tuple[int, int], list[int]] = {}
@@ -273,7 +273,7 @@ class Bisection:
                 yield Finding(start, end, kind, own.names((first, second)), depth, floor, start)
 
     def _runs(self, pair: Index) -> Iterator[tuple[tuple[str, str], Index]]:
-        """Yield the names of pairs, and those of them (R,) that are in one segment or in successive ones."""
+        """Yield the names of each pair of bodies with its pairs (R,) in successive segments."""
         named: dict[tuple[str, str], list[int]] = {}
         for own, rows in self._groups(pair):
             for k in pair[rows].tolist():
@@ -286,7 +286,7 @@ class Bisection:
 
 
 def _edge_of(own: Kept, pair: Pairs, ends: Array, time: Array, which: Index) -> _Edge:
-    """Return pairs (P,) at instants `which` (P,) of those of `ends` (U, B, 2, 3), m, and `time` (U,), s."""
+    """Return pairs (P,), each at the instant `which` (P,) of `ends` (U, B, 2, 3), m, and `time` (U,), s."""
     points = own.points(pair, lambda member: ends[which, member], time[which])
     distance, normal = own.separation(points, pair)
     return _Edge(points, distance, normal, own.apart(points, normal, pair))

@@ -17,9 +17,9 @@ from vgtm_qp.verify.check import INSTANT, LIMIT_TOLERANCE, MEMBER_TOLERANCE, cha
 def beyond_limits(arm: Arm, problem: Mapping[str, Any], time: Array, values: Array) -> Iterator[Finding]:
     """Yield what is wrong with the values (T, M) of the arm's quantities at times (T,), s.
 
-    Rates and accelerations are those of ``verify``: the mean over a step, and the change of the rate from step to step
-    over the time between their middles, neither beyond its limit by what rounding makes of it. A rate that ends because
-    its actuator locks is no acceleration.
+    Rates and accelerations are those of ``verify``: the mean over a step, and the change of the rate from
+    step to step over the time between their middles. Rounding is allowed beyond both limits. A rate that ends
+    because its actuator locks does not count as an acceleration.
     """
     names, free = arm.quantity_names, arm.actuated
     locks = [(names.index(name), since) for name, since in locks_of(problem) if name in names]
@@ -50,7 +50,7 @@ def _out_of_range(arm: Arm, time: Array, values: Array) -> Iterator[Finding]:
 
 
 def _crossing(time: Array, excess: Array, row: int, step: int) -> float:
-    """Return when, before or after a row, what is in excess there comes back to its bound, s."""
+    """Return the time, s, before or after a row at which its excess has come back to zero."""
     other = row + step
     if not 0 <= other < len(time):
         return float(time[row])
@@ -59,8 +59,8 @@ def _crossing(time: Array, excess: Array, row: int, step: int) -> float:
 
 
 def _moved(arm: Arm, locks: list[tuple[int, float]], time: Array, values: Array) -> Iterator[Finding]:
-    """Yield what is locked and moves, or is not at home where it is locked from the start."""
-    # What is not actuated is locked from the start.
+    """Yield locked quantities that move, and those locked from the start that are not at home."""
+    # Quantities without an actuator are locked from the start.
     kept = [(k, -np.inf, float(arm.home_quantities[k])) for k in np.flatnonzero(~arm.actuated).tolist()]
     kept += [(k, t, float(np.interp(t, time, values[:, k]))) for k, t in locks if arm.actuated[k]]
     for k, since, value in kept:
@@ -73,7 +73,7 @@ def _moved(arm: Arm, locks: list[tuple[int, float]], time: Array, values: Array)
 
 
 def _runs(wrong: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield each column and the successive rows (R,) in which it is wrong (K, M)."""
+    """Yield the columns of `wrong` (K, M), each with runs (R,) of successive rows in which it is True."""
     for k in np.flatnonzero(wrong.any(axis=0)).tolist():
         rows = np.flatnonzero(wrong[:, k])
         for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):

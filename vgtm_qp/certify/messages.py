@@ -10,7 +10,7 @@ from vgtm_qp.errors import MissingExtraError, ProblemError
 from vgtm_qp.problem.table import shown
 
 Points = list[tuple[str, float, Sequence[Any]]]
-"""Where a point stands, in words, its time, s, and the positions of the joints, rad or m."""
+"""Of each point the place in words, the time, s, and the positions of the joints, rad or m."""
 
 _TRAJECTORY, _STATE = "JointTrajectory", "JointState"
 _GREATEST_BYTES = 500_000_000
@@ -22,7 +22,7 @@ def read_bag(file: Path) -> tuple[list[str], Points]:
     Raises
     ------
     ProblemError
-        It is no such file, or has no trajectory, or several.
+        The file is not a bag, or it holds no trajectory or several.
     MissingExtraError
         The reader is not installed.
     """
@@ -83,7 +83,7 @@ def read_message(file: Path) -> tuple[list[str], Points]:
     Raises
     ------
     ProblemError
-        It is no such text.
+        The file does not hold such a text.
     MissingExtraError
         The reader of YAML is not installed.
     """
@@ -128,7 +128,7 @@ def _entry(file: Path, table: Any, key: str, place: str) -> Sequence[Any]:
 
 
 def _seconds(stamp: Any) -> float:
-    """Return a stamp or a duration, s; a duration is an instant by the decoder's own type in some versions."""
+    """Return a stamp or a duration, s; some versions of the decoder give a duration as an instant."""
     whole = getattr(stamp, "sec", getattr(stamp, "secs", 0))
     return float(whole) + 1e-9 * float(getattr(stamp, "nanosec", getattr(stamp, "nsecs", 0)))
 

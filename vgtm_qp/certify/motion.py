@@ -1,4 +1,4 @@
-"""Where the bodies of an arm are at every instant of a trajectory, and how much their ways bend."""
+"""Where the bodies of an arm are at every instant of a trajectory, and how much their paths bend."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class GivenMotion(RecordedMotion):
     Attributes
     ----------
     bends : (S, B)
-        Bounds of |d2 r / d share2| of any point of the bodies in each segment, m; infinite where there is none.
+        Bounds of |d2 r / d share2| of any point of the bodies in each segment, m; infinite if unknown.
     rounding : float
-        What rounding may make of a distance, m.
+        Bound of the rounding error of a distance, m.
     """
 
     bends: Array

@@ -18,7 +18,7 @@ _CHUNK = 1_000_000
 
 
 class Near(NamedTuple):
-    """Pairs (P,), (P,) in segments (P,) and lower bounds (P,) of their distances there, m."""
+    """Pairs, as two arrays (P,), in segments (P,), and lower bounds (P,) of their distances there, m."""
 
     segment: Index
     pair: Pairs
@@ -33,9 +33,9 @@ class Near(NamedTuple):
 
 
 class Kept(ABC):
-    """Pairs that keep at least `floor`, m, from surface to surface; `kind` is what a finding calls their clearance.
+    """Pairs that keep at least `floor`, m, from surface to surface.
 
-    `rounding` is what rounding may make of their distances, m.
+    `kind` is the kind of their findings; `rounding` bounds the rounding error of their distances, m.
     """
 
     def __init__(self, motion: GivenMotion, kind: str, floor: float) -> None:
@@ -70,7 +70,7 @@ class Kept(ABC):
 
     @abstractmethod
     def depth(self, pair: Pairs) -> Array:
-        """Return (P,) how far at most surfaces are in one another by this measure, m: the radii."""
+        """Return (P,) the greatest depth of penetration that distances can have, m: the radii."""
 
     @abstractmethod
     def bend(self, segment: Index, pair: Pairs) -> Array:
@@ -81,14 +81,14 @@ class Kept(ABC):
         """Return the names of the two bodies."""
 
     def enclosed(self) -> Iterator[tuple[int, tuple[int, int]]]:
-        """Yield each state and pair whose first body is within a surface that it may be far from."""
+        """Yield each state and pair whose first body is inside a closed surface, however far from it."""
         yield from ()
 
     def near(self, limit: float) -> tuple[Near, float]:
         """Return the pairs that may come nearer than `limit`, m, and a bound of the distances of all the others."""
         found, rest = [], np.inf
         for first, gaps in self._chunks():
-            # What is no number may be anywhere.
+            # NaN bounds nothing: such a pair may be near.
             near = ~(gaps >= limit)
             rest = min(rest, float(gaps[~near].min(initial=np.inf)))
             row, column = np.nonzero(near)
@@ -96,7 +96,7 @@ class Kept(ABC):
         return Near.joined(found), min(rest, limit) if self._divides else rest
 
     def nearest(self) -> Near:
-        """Return one pair whose bound is the least of all, or no pair where there is none."""
+        """Return the pair with the least bound of all; empty without pairs."""
         best = Near(*_nothing())
         for first, gaps in self._chunks():
             if gaps.size and (not len(best.gap) or gaps.min() < best.gap[0]):
@@ -137,7 +137,7 @@ class KeptBodies(Kept):
         )
         self._sizes = np.concatenate([body.shape.sizes for body in bodies])
         corners = np.concatenate([body.corners() for body in bodies])
-        # Where an obstacle starts and how far it goes may cancel, but not their rounding.
+        # An obstacle's start and its travel may cancel; their rounding errors do not.
         gone = np.abs(self._center) + np.abs(self._velocity) * float(motion.time[-1])
         self.rounding += 64.0 * float(np.finfo(float).eps) * float(gone.max())
         self._piece_low, self._piece_high = corners.min(axis=1), corners.max(axis=1)
@@ -219,7 +219,7 @@ class KeptBodies(Kept):
 
 
 class KeptMembers(Kept):
-    """Bodies of the arm against one another; those that share an end, or may touch, are no pair."""
+    """Bodies of the arm against one another, except those that share an end or may touch."""
 
     def __init__(self, motion: GivenMotion, floor: float) -> None:
         super().__init__(motion, "self-clearance", floor)

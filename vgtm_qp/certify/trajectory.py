@@ -67,13 +67,13 @@ class Columns:
 
     @cached_property
     def keys(self) -> tuple[str, ...]:
-        """What the columns of a table are called: their names, but for a joint that is called as the time is."""
+        """Headers of a table's columns: the names; one that is "t", like the time, with its unit."""
         named = zip(self.names, self.units, strict=True)
         return tuple(f"{name} [{unit}]" if name == "t" else name for name, unit in named)
 
     @cached_property
     def spellings(self) -> dict[str, str]:
-        """The keys of the columns of a table, by what may stand in its header; rates are as exports name them."""
+        """The keys of the columns by the spellings that a header may use; rates are spelt as in exports."""
         found = {"t": "t", "time [s]": "t"}
         for name, unit, key in zip(self.names, self.units, self.keys, strict=True):
             rate = f"d {name}/dt [{unit}/s]"
@@ -85,7 +85,7 @@ class Columns:
         return tuple(name for name, needed in zip(self.names, self.needed, strict=True) if needed)
 
     def expected(self) -> str:
-        """Return in words what names there are."""
+        """Return the possible names in words."""
         known = self.names
         more = f" and {len(known) - 8} more" if len(known) > 8 else ""
         return f"{', '.join(known[:8])}{more}"
@@ -100,7 +100,7 @@ class Trajectory:
     quantities: NDArray[np.int64]
 
     def filled(self, home: Array) -> Array:
-        """Return (T, M) all quantities of the arm: those that are not given are those of `home` (M,)."""
+        """Return (T, M) all quantities of the arm; those not given are as in `home` (M,)."""
         found = np.tile(home, (len(self.time), 1))
         found[:, self.quantities] = self.values
         return found
@@ -115,7 +115,7 @@ def read_trajectory(file: str | Path, columns: Columns) -> Trajectory:
     Raises
     ------
     ProblemError
-        With one mistake per mistake, each with its line and column.
+        With one :class:`Mistake` for each fault, which names its place.
     MissingExtraError
         The package that reads bags, or YAML, is not installed.
     """
@@ -164,7 +164,7 @@ def _read_header(columns: Columns, cells: list[str], mistakes: list[Mistake]) ->
         elif key in header[: number - 1]:
             mistakes.append(Mistake(place, shown(cell), f'each column once; "{key}" stands before it'))
     needed = ("t", *(key for key, wanted in zip(columns.keys, columns.needed, strict=True) if wanted))
-    # What is misspelt is told as such, not as missing too.
+    # A misspelt name is reported as misspelt, not as missing too.
     absent = [
         key for key in needed if key not in header and not any(_meant(cell, (key,)) for cell in unknown)
     ]
@@ -186,7 +186,7 @@ def _from_points(
     points: Sequence[tuple[str, float, Sequence[Any]]],
     columns: Columns,
 ) -> Trajectory:
-    """Return the trajectory of points of joints `names`: the place of each in words, its time, s, and its positions."""
+    """Return the trajectory of joints `names` from points: place in words, time, s, and positions of each."""
     mistakes = list(_wrong_names(names, columns))
     before = -math.inf
     for place, time, positions in points:
@@ -230,7 +230,7 @@ def _wrong_names(names: Sequence[str], columns: Columns) -> Iterator[Mistake]:
 def given_trajectory(
     times: ArrayLike, joints: ArrayLike | Mapping[str, ArrayLike], columns: Columns
 ) -> Trajectory:
-    """Return the trajectory of arrays: (T,) and (T, K), or (T,) by name; ProblemError where they are none."""
+    """Return the trajectory of arrays (T,) and (T, K), or (T,) by name; ProblemError if they do not fit."""
     mistakes: list[Mistake] = []
     time = _array("times", times, mistakes)
     if isinstance(joints, Mapping):

@@ -23,14 +23,14 @@ from vgtm_qp.verify.arm import RecordedArm
 
 _GREATEST_DEPTH = 12
 _GREATEST_COUNT = 100_000
-"""Numbers of halvings of a segment, and of intervals at a time, from which on the motion counts as unknown."""
+"""Greatest numbers of halvings of a segment, and of intervals at a time; beyond, the motion is unknown."""
 _ROUNDS = 8
 _SLACK = 1e-3
-"""How often bounds are brought nearer to reproducing themselves, and what they then have to spare."""
+"""Number of iterations towards bounds that reproduce themselves, and the relative slack asked of these."""
 _NEWTON_STEPS = 30
 _CHUNK = 4_000_000
 _INFLATED = 1.0 + 1e-6
-"""What the rounding of solutions of linear equations may add to a bound."""
+"""Factor of bounds that covers the rounding of solutions of linear equations."""
 
 
 class TrussSolver:
@@ -60,7 +60,7 @@ class TrussSolver:
         for _ in range(_NEWTON_STEPS):
             missing = lengths[open_] - self.arm.lengths(nodes[open_])
             worst = np.abs(missing).max(axis=1)
-            # The last digits are as good as they get once they no longer improve.
+            # Once the residual no longer halves, the last digits are as good as they get.
             going = np.isfinite(worst) & ((worst > tolerance) | (worst < 0.5 * before[open_]))
             before[open_] = worst
             open_, missing = open_[going], missing[going]
@@ -91,18 +91,18 @@ class TrussSolver:
 
 @dataclass
 class Tube:
-    """What is proven of motions (U,) that start from known states, while a share goes from 0 to 1.
+    """Proven bounds of motions (U,) that start from known states, while a share goes from 0 to 1.
 
     Attributes
     ----------
     closed : (U,) bool
         Whether the bounds hold.
     apart : (U, M)
-        How far at most the vector between a member's ends changes, m.
+        Bounds of the change of the vector between a member's ends, m.
     speed, bend : (U, N)
         Bounds of |x'| and |x''| of the nodes, m.
     sensitivity : (U,)
-        How far at most a node moves for an error in each length, anywhere within the bounds, m/m.
+        Bound of a node's displacement per error in each length, anywhere within the bounds, m/m.
     """
 
     closed: NDArray[np.bool_]
@@ -115,7 +115,7 @@ class Tube:
 # Near singular states numbers overflow, and then prove nothing.
 @np.errstate(all="ignore")
 def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube:
-    """Return what is proven from states (U, N, 3) of lengths `start` (U, M) that change by `change` (U, M), m."""
+    """Return the tube from states (U, N, 3) of lengths `start` (U, M) that change by `change` (U, M), m."""
     arm, count = solver.arm, len(nodes)
     inverse = solver.inverse(nodes)
     singular = np.array([not np.isfinite(each).all() for each in inverse], dtype=np.bool_)
@@ -132,7 +132,7 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     for _ in range(_ROUNDS):
         system = eye - of_members * _turned(apart, start)[:, None, :]
         apart = _solved(system, wider)
-        # Once bounds are useless they stay so.
+        # Bounds that have become useless stay so.
         apart = np.where((apart >= wider) & (apart < start), apart, 0.999 * start)
     turned = _turned(apart, start)
     again = first + np.einsum("umk,uk->um", of_members, turned * apart) * _INFLATED
@@ -141,7 +141,7 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     curved = np.maximum(apart * apart - change * change, 0.0) / np.maximum(least, 1e-300)
     system = eye - of_members * turned[:, None, :]
     bends = _solved(system, np.einsum("umk,uk->um", of_members, curved))
-    # Rounding leaves small numbers, of either sign, where there are zeros.
+    # Rounding turns zeros into small numbers of either sign.
     largest = 1e-9 * np.abs(bends).max(axis=1, keepdims=True)
     closed &= np.isfinite(bends).all(axis=1) & (bends >= -largest).all(axis=1) & (least > 0.0).all(axis=1)
     bends = np.where(closed[:, None], np.maximum(bends, 0.0) * _INFLATED + largest, 0.0)
@@ -191,7 +191,7 @@ class TrussMotion(GivenMotion):
         self.lost: set[int] = set()
 
     def ends_at(self, segment: Index, share: Array) -> Array:
-        """Return the ends of the members; the nodes are found from their lengths, next to the chords of their ways."""
+        """Return the ends of the members; nodes are solved for from the lengths, starting on their chords."""
         share = share[:, None]
         before, after = self._nodes[segment], self._nodes[segment + 1]
         chord = before + share[..., None] * (after - before)
@@ -217,10 +217,10 @@ class TrussMotion(GivenMotion):
 def truss_motion(
     arm: RecordedArm, time: Array, lengths: Array, problem: Mapping[str, Any]
 ) -> tuple[TrussMotion | None, list[Finding]]:
-    """Return the motion of a truss through rows of lengths (T, M) at times (T,), s, and what is not known of it.
+    """Return the motion of a truss through rows of lengths (T, M) at times (T,), s, and findings.
 
-    It goes on from home in a straight line of lengths to the first row. It ends where it can no longer be followed, and
-    is None where that is before the first row.
+    From home the lengths go to the first row in a straight line. The motion ends where no tube is found; None
+    if that is before the first row. A finding says from when on it is unknown.
     """
     start, end = float(time[0]), float(time[-1])
     if not arm.has_pin_joints:
@@ -243,7 +243,7 @@ def _doubt(start: float, end: float, reason: str) -> Finding:
 
 
 def _rows(solver: TrussSolver, lengths: Array) -> Array:
-    """Return (R, N, 3) nodes of rows of lengths (R, M), one after another from home; fewer where one is not found."""
+    """Return (R, N, 3) nodes of rows of lengths (R, M), home first, up to the first unsolved row."""
     found = [solver.arm.home]
     for k in range(1, len(lengths)):
         nodes, solved = solver.solve(found[-1][None], lengths[k : k + 1])
@@ -262,7 +262,7 @@ class _Followed:
         self.error = 0.0
 
     def follow(self) -> int:
-        """Return through how many rows, home not counted, the motion is known."""
+        """Return the number of rows, without home, through which the motion is known."""
         segment = np.arange(len(self.rows) - 1)
         start, width = np.zeros(len(segment)), 1.0
         first, last = self.rows[:-1], self.rows[1:]
@@ -297,7 +297,7 @@ class _Followed:
     def _prove(
         self, segment: Index, start: Array, width: float, first: Array, last: Array
     ) -> NDArray[np.bool_]:
-        """Return in which intervals (P,) the motion from `first` is proven to lead to `last`, and keep these."""
+        """Return the intervals (P,) in which a tube proves that `first` leads to `last`, and store these."""
         begin, end = (self._lengths_at(segment, start + step) for step in (0.0, width))
         found = tube(self.solver, first, begin, end - begin)
         closed = np.asarray(found.closed & (self.solver.apart(last - first) <= found.apart).all(axis=1))
@@ -340,6 +340,6 @@ class _Followed:
         return self._with_rounding(TrussMotion(self.solver, time, nodes, bends, apart[order], problem))
 
     def _with_rounding(self, motion: TrussMotion) -> TrussMotion:
-        """Return the motion with what the lengths' rounding makes of positions."""
+        """Return the motion, its `rounding` increased by the effect of the lengths' rounding on positions."""
         motion.rounding += 2.0 * self.error * 64.0 * float(np.finfo(float).eps) * self.solver.size
         return motion

@@ -16,18 +16,18 @@ class Finding:
     Attributes
     ----------
     start, end : float
-        Times, s. Between them, but not always all the time, it is so.
+        Interval, s, in which the limit is violated at least once, or is in doubt.
     kind : str
         ``limit``, ``rate``, ``acceleration``, ``lock``, ``clearance``, ``self-clearance``, ``angle`` or ``motion``.
     names : tuple of str
         The joint or actuator; the body and the obstacle; or the two bodies.
     value, bound : float
-        The worst value that was found, or what is proven where it is in doubt, and what it has to keep to. Lengths and
-        clearances in m, joints in rad or m, rates and accelerations of these over s and s^2. NaN if there is none.
+        Worst value found, or the proven bound if undecided; and the limit. Lengths and clearances in m,
+        joints in rad or m, rates and accelerations of these over s and s^2. NaN for kind ``motion``.
     at : float
-        Time of that value, s; NaN where it is in doubt.
+        Time of that value, s; NaN if undecided.
     reason : str
-        Why it is in doubt, if there is more to say than that the proof did not come to an end.
+        Why it is undecided; empty if the proof merely did not come to an end.
     """
 
     start: float
@@ -40,7 +40,7 @@ class Finding:
     reason: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON data; what is not finite is null."""
+        """Return the finding as JSON data; NaN and infinity become null."""
         found = {
             "from": self.start,
             "to": self.end,
@@ -74,9 +74,9 @@ class Verdict:
         is at least the one asked for, to 1e-9 m.
     clearance, self_clearance : float
         Proven lower bounds over the whole trajectory of the clearance to obstacles and of that between bodies of the
-        arm, m: infinite where there is nothing to keep clear of, minus infinite where the motion is not known.
+        arm, m: infinite without anything to keep clear of, minus infinite if the motion is unknown.
     violations, undecided : tuple of Finding
-        What is wrong; and what was neither proven nor refuted.
+        What was refuted; and what was neither proven nor refuted.
     time : float
         Duration of the proof, s.
     notes : tuple of str
@@ -103,7 +103,7 @@ class Verdict:
         return "violated" if self.violations else "undecided"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON data; what is not finite is null."""
+        """Return the verdict as JSON data; NaN and infinity become null."""
         return {
             "certified": self.certified,
             "answer": self.answer,

@@ -1,4 +1,4 @@
-"""The application: its commands, and what becomes of every way in which one can fail."""
+"""The application: its commands, and the exit code and message of every failure."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vgtm_qp.errors import AlteredResultError, ProblemError, VgtmError, nearest
 from vgtm_qp.machine import noting_interrupts
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
-"""What the system says of a disk that takes no more."""
+"""Error numbers of the system for a disk that is full or fails."""
 
 _EPILOGUE = (
     "Exit codes: 0 solved and verified; 1 internal error; 2 wrong usage or problem file; "
@@ -76,7 +76,7 @@ for order, (name, command) in enumerate(_COMMANDS.items()):
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run one command line, that of the process by default, and return its exit code."""
     given = list(sys.argv[1:] if tokens is None else tokens)
-    # What it logs of a damaged file is a traceback; the errors that it raises are said in a line.
+    # trimesh logs a traceback for a damaged file; the error that it raises is printed in one line.
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     try:
         asked_to_end.clear()
@@ -100,7 +100,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
 
 
 def _stop_compilers() -> None:
-    """End what compiles behind this process; otherwise it goes on, for the next one."""
+    """End the compilers of this process; otherwise they go on, for the next process."""
     if compiled := sys.modules.get("vgtm_qp.compiled"):
         compiled.stop_compilers()
 
@@ -126,7 +126,7 @@ def _outcome(error: BaseException) -> tuple[ExitCode, str]:
 
 
 def _lacks_room(error: BaseException | None) -> bool:
-    """Return whether a disk that takes no more is behind an error."""
+    """Return whether a full or failing disk caused an error."""
     while error is not None and getattr(error, "errno", None) not in _NO_ROOM:
         error = error.__context__
     return error is not None
@@ -149,7 +149,7 @@ def _plain_warnings() -> Iterator[None]:
 
 
 def _explained(error: CycloptsError) -> str:
-    """Return what was wrong with the command line, with all the choices there were."""
+    """Return what was wrong with the command line, and all the possible choices."""
     command = " ".join(("vgtm", *(error.command_chain or ())))
     said = str(error)
     if isinstance(error, UnknownCommandError) and error.unused_tokens:

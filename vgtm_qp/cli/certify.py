@@ -25,8 +25,8 @@ def certify(
 ) -> int:
     """Prove or refute a trajectory for a problem's arm and obstacles, over the whole time and not at its rows alone.
 
-    Joints and actuators move linearly between the rows. Proven are limits, rates, accelerations and clearances: exit
-    code 0; 4 if one is violated or cannot be decided.
+    Joints and actuators move linearly between the rows. Exit code 0 means that limits, rates, accelerations
+    and clearances are proven; 4 that one is violated or cannot be decided.
     """
     from vgtm_qp.certify.certify import Certifier
     from vgtm_qp.problem import load_problem

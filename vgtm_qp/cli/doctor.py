@@ -1,4 +1,4 @@
-"""``vgtm doctor``: what this machine has of what the package can use."""
+"""``vgtm doctor``: which parts of what the package can use this machine has."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from vgtm_qp.cli.output import ExitCode, Json, answer, table, why_not_writable
 
 _CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
 _SPEED = "five_bay_free"
-"""Problem by whose steps kernels are compared,"""
+"""Problem for the comparison of kernels."""
 _STEPS = 30
-"""and how many of them are timed of each kind."""
+"""Number of its steps that are timed with each kind of kernel."""
 _EXTRAS = {
     "view": ("viser",),
     "export": ("viser", "mcap", "mcap-ros2-support", "imageio-ffmpeg", "pillow", "pyyaml"),
@@ -38,7 +38,8 @@ _EXTRAS = {
 def doctor(*, json: Json = False) -> int:
     """Show versions, solvers, the C compiler and its cache, whether kernels and FCL work, and how long a step takes.
 
-    Where kernels can be compiled, those of a small arm are, and a step with them is compared with one without.
+    If kernels can be compiled, those of a small arm are compiled, and a step with them is compared with one
+    without.
 
     Exit code 1 if something fails that every maneuver needs.
     """
@@ -96,7 +97,7 @@ def _report(found: dict[str, Any]) -> str:
 
 
 def _tried(trial: Callable[[], str]) -> dict[str, Any]:
-    """Return what a trial says, or how it failed: a broken library can raise anything, and is to be named."""
+    """Return the text of a trial, or its error: a broken library can raise anything, and has to be named."""
     try:
         return {"ok": True, "says": trial()}
     except Exception as error:
@@ -132,7 +133,7 @@ def _kernels() -> str:
 
 
 def _speed(can_compile: bool) -> str:
-    """Return how long a step of a small arm takes with interpreted kernels, and with compiled ones in turn."""
+    """Return how long a step of a small arm takes: with interpreted and with compiled kernels in turn."""
     from time import thread_time
 
     import numpy as np

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 Output = partial(Parameter, name=["--output", "-o"])
 Switch = partial(Parameter, negative="")
-"""An option that is given or not: it has no opposite."""
+"""An option without a negative form."""
 Json = Annotated[bool, Switch(show_default=False, help="print exactly one JSON document on stdout")]
 ProblemName = Annotated[str, Parameter(help="problem file, or the name of a bundled problem (vgtm list)")]
 ResultFile = Annotated[Path, Parameter(name="RESULT", help="result file, .npz")]
 
 
 class ExitCode(IntEnum):
-    """What the exit code of ``vgtm`` says."""
+    """Exit codes of ``vgtm``."""
 
     SOLVED = 0
     INTERNAL = 1
@@ -74,7 +74,7 @@ def table(rows: Iterable[Sequence[str]], *, indent: str = "") -> str:
 
 
 def _write(stream: TextIO | None, text: str) -> None:
-    """Write and flush; no stream, or a reader that has gone away as ``head`` does, is no reason to fail."""
+    """Write and flush; a missing stream, or a reader that has ended, as ``head`` does, is not an error."""
     if stream is None:
         return
     encoding = stream.encoding or "utf-8"
@@ -115,10 +115,10 @@ asked_to_end = threading.Event()
 
 @contextmanager
 def following(title: str, *, shown: bool) -> Iterator[Progress]:
-    """Give what ``solve`` calls after each step: it moves a bar on stderr, where that is a terminal.
+    """Give the function that ``solve`` calls after each step: it moves a bar if stderr is a terminal.
 
-    The first interrupt after the first step takes effect when the step under way is done, so that the states
-    which were solved are whole; a second one takes effect at once.
+    The first interrupt after the first step takes effect when the step under way is done, so that all solved
+    states are whole; a second one takes effect at once.
     """
     interrupted = threading.Event()
     before: Any = None
@@ -146,9 +146,9 @@ def following(title: str, *, shown: bool) -> Iterator[Progress]:
 
 @contextmanager
 def bar(title: str, *, shown: bool, counted: bool = False) -> Iterator[Callable[[float, float], None]]:
-    """Give what moves a bar on stderr to what is done of the total, if that is a terminal.
+    """Give the function of done and total that moves a bar if stderr is a terminal.
 
-    The bar has a percentage beside it, or where things are `counted` their number.
+    Beside the bar is a percentage or, if things are `counted`, their number.
     """
     if not shown or not sys.stderr.isatty():
         yield lambda _done, _total: None

@@ -21,7 +21,7 @@ def check(problem: ProblemName, /, *, json: Json = False) -> None:
     if mistakes:
         raise loaded.error(mistakes)
     if loaded.method.name != "qp":
-        # Other methods ask more of an arm.
+        # Other methods have further requirements of an arm.
         Resolver(loaded)
     warnings = find_warnings(loaded, setup)
     for warning in warnings:

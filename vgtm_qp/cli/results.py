@@ -30,7 +30,7 @@ FormatName = Literal["html", "gif", "mp4", "pdf", "png", "csv", "mcap", "ros", "
 
 _SHOWN = "problem file, name of a bundled problem, or result file, .npz"
 
-# With several results the first of these that any of them earned is the exit code.
+# Of several results' exit codes, the one that comes first here is the command's.
 _WORST_FIRST = (ExitCode.USAGE, ExitCode.UNVERIFIED, ExitCode.BLOCKED, ExitCode.SOLVED)
 
 
@@ -158,7 +158,7 @@ def export(
 
 @contextmanager
 def _about(result: Path) -> Iterator[None]:
-    """Name the result file in what is raised about its content, and tell one that was altered from other files."""
+    """Name the result file in errors about its content; if it is an archive, they say that it was altered."""
     from vgtm_qp.errors import AlteredResultError, ExportError, ResultError
 
     try:

@@ -67,7 +67,7 @@ def solve(
 
     with following(loaded.name, shown=not json) as progress:
         maneuver = run(loaded, progress=progress, verify=False)
-    # Written before it is verified, so that an interrupt of the verification loses nothing.
+    # Saved before it is verified, so that an interrupt of the verification loses nothing.
     maneuver.save(result)
     maneuver = maneuver.with_certificate(certify(maneuver))
     maneuver.save(result)

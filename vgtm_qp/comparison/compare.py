@@ -34,7 +34,7 @@ _NUMBERS = {
     "travel [m]": ("actuator_travel", 1.0, ".2f"),
     "step [ms]": ("step_time", 1e3, ".2f"),
 }
-"""Columns of the table: the number of the row, its factor, and its format."""
+"""Columns of the table: the attribute of :class:`Row`, its factor, and its format."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,7 +63,7 @@ class Report:
 
     @property
     def interrupted(self) -> bool:
-        """True if an interrupt ended the comparison; the methods without their turn have rows that say so."""
+        """True if an interrupt ended the comparison; methods that were not run have rows that say so."""
         return any(row.status == INTERRUPTED for row in self.rows)
 
     def row(self, method: str) -> Row:
@@ -141,7 +141,7 @@ def compare(
 
 
 def missing_row(problem: Problem, name: str) -> Row:
-    """Return the row of a method that an interrupt left without its turn."""
+    """Return the row of a method that was not run because of an interrupt."""
     return Row(problem.name, name, False, False, INTERRUPTED, 0.0, 0, "interrupted before its first step")
 
 

@@ -113,7 +113,7 @@ def _outlines(maneuver: Maneuver) -> list[Array]:
 def _limits(maneuvers: list[Maneuver]) -> tuple[Array, Array]:
     points = [maneuver.nodes[:, :, [0, 2]].reshape(-1, 2) for maneuver in maneuvers]
     stacked = np.concatenate(points) if points else np.zeros((1, 2))
-    # A method that breaks down may throw nodes far away; the view is that of nearly all of them.
+    # A method that breaks down may throw nodes far away: the view shows nearly all points, not all.
     low, high = np.percentile(stacked, (0.5, 99.5), axis=0)
     for outline in (outline for maneuver in maneuvers for outline in _outlines(maneuver)):
         low, high = np.minimum(low, outline.min(axis=0)), np.maximum(high, outline.max(axis=0))

@@ -1,4 +1,4 @@
-"""Markdown tables, and what they say of measurements: growth exponents and confidence intervals."""
+"""Markdown tables, and two statistics of measurements: growth exponents and confidence intervals."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], *, righ
 def crossed_table(
     titles: Sequence[str], columns: Mapping[Any, str], lines: Mapping[Any, Mapping[Any, str]]
 ) -> str:
-    """Return a Markdown table of `lines`: cells by the keys of their columns, by the names that the line begins with.
+    """Return a Markdown table of `lines`: by the names that a line begins with, its cells by column key.
 
-    `titles` stand over these names, those of `columns` over the cells; "-" is where a line has none, and a line without
+    `titles` head the names, the values of `columns` the cells. A missing cell is "-", and a line without
     cells is left out.
     """
     rows = [(*names, *(cells.get(key, "-") for key in columns)) for names, cells in lines.items() if cells]

@@ -16,7 +16,7 @@ from vgtm_qp.errors import CurveError
 
 _ROUNDING = 1e-14
 _NEARLY_REAL = 1e-2
-"""Imaginary part up to which a root counts as real: rounding of a multiple root; an extra root does no harm."""
+"""Imaginary part up to which a root counts as real: multiple roots are rounded; extra roots do no harm."""
 _LEVEL = 1e-13
 """Distances that differ by less, relative to the curve's size, are the same."""
 
@@ -48,10 +48,11 @@ def closest_to_box(
 ) -> ClosestPoints:
     """Find all local minima of the signed distance along the curve to a box, turned by `rotation` (3, 3) if given.
 
-    The box has its `center` (3,), m, and one or three edges, `size`, m. Outside the signed distance is the distance;
-    inside it is minus the depth below the nearest face. The curve is cut where it passes a face's plane and where the
-    face nearest to it from inside changes. On each piece the distance, or its square, is one polynomial. Of a stretch
-    at constant distance one end is returned. CurveError for a number that is not finite or an edge not positive.
+    The box has its `center` (3,), m, and one or three edges, `size`, m. Outside the signed distance is the
+    distance; inside it is minus the depth below the nearest face. The curve is cut where it passes a face's
+    plane, and where inside the box the nearest face changes. On each piece the distance, or its square, is
+    one polynomial. Of a stretch at constant distance one end is returned. CurveError for a number that is not
+    finite or an edge not positive.
     """
     middle = _vector("the center", center)
     half = _vector("the size", np.broadcast_to(np.asarray(size, dtype=float), 3)) / 2

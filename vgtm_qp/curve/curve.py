@@ -19,7 +19,7 @@ _NO_STEP = 1e-9
 _NEWTON_STEPS = 100
 _CONVERGED = 1e-13
 _DIP, _GRADES = 0.1, 40
-"""Speed, as a share of the mean, below which cells are graded towards where it is least; halvings of their widths."""
+"""Share of the mean speed below which cells are graded towards the least speed; number of their halvings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class Curve:
             excess, speed = self.length(s) - goal, np.linalg.norm(self.derivative(s), axis=-1)
             low, high = np.where(excess < 0, s, low), np.where(excess < 0, high, s)
             newton = np.clip(s - excess / np.maximum(speed, np.finfo(float).tiny), low, high)
-            # A step as small as rounding must not throw the root back to the middle of its bracket.
+            # A step as small as rounding must not lead to a bisection, which would throw the root back.
             is_slow = np.abs(newton - s) > np.maximum(step / 2, _CONVERGED)
             new = np.where(is_slow, (low + high) / 2, newton)
             step, s = np.abs(new - s), new
@@ -328,7 +328,7 @@ def _spread(weights: Array) -> Array:
 def _running_products(turns: Array) -> Array:
     """(n + 1, 3, 3) products of the first 0..n of (n, 3, 3) rotations, later ones on the left."""
     products = np.concatenate([np.eye(3)[None], turns])
-    # Doubling spans takes log2 n batched products in the place of n single ones.
+    # Doubling spans takes log2 n batched products instead of n single ones.
     span = 1
     while span < len(products):
         products[span:] = products[span:] @ products[:-span]

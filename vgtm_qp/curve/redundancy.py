@@ -20,7 +20,7 @@ _SAMPLES = 1000
 
 
 class Refit(NamedTuple):
-    """A curve that stands for another one: with its ends, direction of the base tangent, torsion and base frame."""
+    """A curve fitted to another one, with the same ends, base tangent's direction, torsion and base frame."""
 
     curve: Curve
     change: float
@@ -49,8 +49,9 @@ def excess_freedom(curve_dof: int, arm_dof: int) -> str | None:
 def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
     """Give a curve more control vertices where it is.
 
-    A Bezier curve is raised in degree, a B-spline gets knots, each in the middle of the longest span: they move by
-    rounding alone. A uniform Beta-spline has no exact way and moves by `change`. CurveError where `count` is negative.
+    A Bezier curve is raised in degree; a B-spline gets knots, each in the middle of the longest span. Both
+    move by rounding alone. A uniform Beta-spline cannot keep its shape exactly, and moves by `change`.
+    CurveError where `count` is negative.
     """
     _require_count(count)
     family = curve.family
@@ -71,8 +72,9 @@ def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
 def remove_control_vertices(curve: Curve, count: int = 1) -> Refit:
     """Give a curve fewer control vertices, by least squares; `change` says how far it moved.
 
-    A B-spline loses the knots that it misses least; once it has no more interior knots, its degree falls. CurveError
-    where `count` is negative, or fewer than three control vertices would be left for both ends and the base tangent.
+    A B-spline loses the knots whose loss changes it least; without interior knots its degree falls.
+    CurveError where `count` is negative, or fewer than three control vertices would be left for both ends and
+    the base tangent.
     """
     _require_count(count)
     lowered = curve
@@ -135,7 +137,7 @@ def _greatest_change(old: Curve, new: Curve) -> float:
 
 
 def _lower_families(family: CurveFamily) -> list[CurveFamily]:
-    """Families with one control vertex less to choose from."""
+    """Candidate families with one control vertex less."""
     vertices = family.control_vertices - 1
     if vertices < _LEAST_VERTICES:
         raise CurveError(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Format(NamedTuple):
-    """One form of a maneuver: the suffix of its files, and the function, of a module here, that returns their content.
+    """One form of a maneuver: suffix of its files, module in this folder, and the function for the content.
 
     The module is imported when the format is written.
     """
@@ -45,7 +45,7 @@ FORMATS = {
 
 
 def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None) -> Path:
-    """Write a maneuver in another form and return the path of the file: the old one or the whole new one.
+    """Write a maneuver in another form and return the file's path; an error leaves an old file as it was.
 
     Parameters
     ----------
@@ -54,12 +54,12 @@ def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None
     path
         File to write.
     to
-        Name of the format, one of `FORMATS`; by default the one that the suffix of `path` belongs to.
+        Name of the format, one of `FORMATS`; by default that of the suffix of `path`.
 
     Raises
     ------
     ExportError
-        There is no such format, the maneuver has no such form, or the file cannot be written.
+        There is no such format, the maneuver cannot have that form, or the file cannot be written.
     MissingExtraError
         A package that the format needs is not installed.
     """

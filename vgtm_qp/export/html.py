@@ -16,15 +16,15 @@ _FRAMES = 200
 
 
 def html_text(maneuver: Result) -> str:
-    """Return a page that needs neither a network nor a server, played in its own time, or in 20 s where it is longer.
+    """Return a page that needs no network and no server; it plays in real time, longer maneuvers in 20 s.
 
-    Between the states the nodes move on straight lines, as the certificate has it.
+    Between states the nodes move on straight lines, as the certificate assumes.
     """
     drawing = drawing_of_maneuver(maneuver)
     time, nodes, vertices = maneuver.time, maneuver.nodes, maneuver.control_vertices
     at = np.linspace(time[0], time[-1], _FRAMES) if len(time) > 1 else time
     moving, curves = resampled(time, nodes, at), resampled(time, vertices, at)
-    # Of the last state: between two states it is not on the line between their clearances.
+    # The clearance shown is that of the last state: between states it does not change linearly.
     rows = np.searchsorted(time, at + 1e-9, side="right") - 1
     off = off_curve(maneuver)
     tip = maneuver.tip_position

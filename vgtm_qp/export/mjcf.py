@@ -36,26 +36,28 @@ _STIFFNESS, _TURNING = 2.0e5, 2.0e4
 _LEAST_MASS = 1e-6
 """kg and kg m^2 of bodies between joints in one place."""
 _STIFF = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}
-"""How firmly equality constraints hold lengths and joints."""
+"""Stiffness of the equality constraints that hold lengths and joints."""
 _THINNEST = 1e-6
-"""Least radius of what is drawn, m: MuJoCo takes none that is zero."""
+"""Least radius of what is drawn, m: MuJoCo refuses a radius of zero."""
 
 
 def mjcf(maneuver: Result) -> str:
     """Return the MuJoCo model of a maneuver as XML, which opens in MuJoCo's own viewer.
 
-    Of a truss free nodes are bodies with three slide joints, so ``qpos`` is their displacement from the home pose. Each
-    member is a tendon called by its name. Members have mass but do not collide; nodes collide with obstacles. Of a
-    serial arm ``qpos`` are the joints' values, and its links are capsules that collide with obstacles.
+    Free nodes of a truss are bodies with three slide joints, so that ``qpos`` is their displacement from the
+    home pose. Each member is a tendon of the same name. Members have mass but do not collide; nodes collide
+    with obstacles. For a serial arm ``qpos`` holds the joints' values, and the links are capsules that
+    collide with obstacles.
 
-    Base and moving obstacles are mocap bodies, meshes their convex hulls. Every member and joint has an equality
-    constraint of the same name that holds its length or value; those of actuated ones are off, since position actuators
-    drive them: ``ctrl`` is a length, m, or a joint's value, rad or m.
+    Base and moving obstacles are mocap bodies; meshes are replaced by their convex hulls. Every member and
+    joint has an equality constraint of the same name that holds its length or value. The constraints of
+    actuated ones are off, since position actuators drive them: ``ctrl`` is a length, m, or a joint's value,
+    rad or m.
 
     Raises
     ------
     ExportError
-        A truss has offset joints, whose attitude point masses cannot have, or a link of a serial arm stretches.
+        A truss has offset joints, which point masses cannot orient, or a link of a serial arm stretches.
     """
     arm = modelled_arm(maneuver)
     is_chain = isinstance(arm, RecordedChain)
@@ -88,7 +90,7 @@ def mjcf(maneuver: Result) -> str:
 
 
 def modelled_arm(maneuver: Result) -> Arm:
-    """Return the arm of a maneuver; ExportError where a MuJoCo model of it would not be the same."""
+    """Return the arm of a maneuver; ExportError if a MuJoCo model would differ from it."""
     arm = arm_of(maneuver)
     if isinstance(arm, RecordedArm) and not arm.has_pin_joints:
         raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
@@ -145,7 +147,8 @@ def _add_joints(world: Element, arm: RecordedChain) -> None:
 def _carried(arm: RecordedChain, link: int) -> tuple[int, Array]:
     """Return the number of the joint that moves a link, 0 for the base, and its ends (2, 3) in that frame, m."""
     count, places = len(arm.quantity_names), np.vstack([arm.position, arm.tip])
-    # Each point stays in place in one frame or in two: an origin in those before and after a joint that turns.
+    # Each point is fixed in one frame, or in two: the origin of a revolute joint in those before and after
+    # it.
     known: list[dict[int, Array]] = []
     for point in arm.links[link].tolist():
         if point > count + 1:
@@ -189,7 +192,7 @@ def _quaternion(rotation: Array) -> Array:
 def _add_obstacle(
     asset: Element, world: Element, mesh: ObstacleMesh, table: Mapping[str, Any], time: float
 ) -> None:
-    """Add an obstacle by its ``[[obstacle]]`` table, where it is at `time`, s."""
+    """Add an obstacle by its ``[[obstacle]]`` table, at its place at `time`, s."""
     name, shape = f"obstacle {mesh.name}", str(table["shape"])
     body = _add(world, "body", name=name, pos=mesh.position(time))
     if mesh.velocity.any():
@@ -238,14 +241,14 @@ def _add_keyframes(root: Element, maneuver: Result, arm: Arm, moving: Sequence[O
 
 
 class _GivenPoses(NamedTuple):
-    """Positions (T, G, 3), m, and quaternions (T, G, 4) of what a maneuver moves by itself: base, then obstacles."""
+    """Positions (T, G, 3), m, and quaternions (T, G, 4) of what has a given motion: base, then obstacles."""
 
     position: Array
     quaternion: Array
 
     @classmethod
     def of(cls, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> _GivenPoses:
-        """Return those of a maneuver at its states; of a truss the base nodes, which do not turn."""
+        """Return the poses at a maneuver's states; a truss has base nodes, which do not turn, as its base."""
         time = maneuver.time
         if isinstance(arm, RecordedChain):
             poses = base_poses(maneuver.manifest["problem"], time)

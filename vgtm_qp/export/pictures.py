@@ -33,7 +33,7 @@ def png(maneuver: Result) -> bytes:
 
 
 def gif(maneuver: Result) -> bytes:
-    """Return the maneuver as an animation, in its own time, or in 12 s where it is longer."""
+    """Return the maneuver as an animation in real time, in 12 s if it is longer."""
     try:
         from PIL import Image
     except ImportError:
@@ -55,7 +55,7 @@ def gif(maneuver: Result) -> bytes:
 
 
 def mp4(maneuver: Result) -> bytes:
-    """Return the same as a video."""
+    """Return the animation of :func:`gif` as a video."""
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -76,7 +76,7 @@ def mp4(maneuver: Result) -> bytes:
 
 
 def _pictures(maneuver: Result) -> tuple[list[NDArray[np.uint8]], float]:
-    """Return (H, W, 3) pictures, H and W even as video wants them, and how long they are to take, s."""
+    """Return (H, W, 3) pictures, H and W even as video needs them, and the duration of all, s."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     count = len(maneuver.time)
@@ -92,7 +92,7 @@ def _pictures(maneuver: Result) -> tuple[list[NDArray[np.uint8]], float]:
 
 
 def _written(suffix: str, write: Callable[[Path], object]) -> bytes:
-    """Return what `write` writes into a file with that suffix, which says what is written."""
+    """Return the bytes that `write` writes; the suffix selects the format."""
     with TemporaryDirectory() as folder:
         path = Path(folder, f"maneuver{suffix}")
         write(path)

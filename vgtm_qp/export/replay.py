@@ -1,4 +1,4 @@
-"""Replays a maneuver in MuJoCo, exactly and under gravity, beside what the certificate says."""
+"""Replays a maneuver in MuJoCo, exactly and under gravity, and compares it with the certificate."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PROBED_STATES = 51
 
 @dataclass(frozen=True, eq=False)
 class ReplayRun:
-    """How a replay followed a maneuver, over its states; all but the contacts are (T,), m, of joints rad or m."""
+    """How a replay followed a maneuver. All but `contacts` are (T,), one a state: m; of joints rad or m."""
 
     length_error: Array
     """Greatest error of a member's length, or of a joint's value."""
@@ -59,9 +59,9 @@ class Replay:
     tip_error_per_millimetre: float
     """mm at the tip for actuator errors whose squares sum to 1 mm^2, found by pushing each actuator."""
     probed_state: int
-    """The state at which that was measured: the one where it is greatest."""
+    """The state at which that was measured: the one where the Jacobian predicts the greatest value."""
     certified_tip_error_per_millimetre: float
-    """The same from the Jacobian, as the certificate has it."""
+    """The same from the Jacobian, as in the certificate."""
     of_joints: bool = False
     """Whether actuators are joints: mm at the tip are then for errors of 1 mrad or 1 mm."""
 
@@ -84,7 +84,7 @@ class Replay:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the same as strict JSON data; lengths in m."""
+        """Return all of it as strict JSON data; lengths in m."""
         runs = {"kinematic": self.kinematic.to_dict(), "physics": self.physics.to_dict()}
         return {**vars(self), **runs}
 
@@ -110,7 +110,7 @@ def replay(maneuver: Result) -> Replay:
 
 
 class _Simulation:
-    """The MuJoCo model of one maneuver, its data, and where the maneuver's parts are in them."""
+    """The MuJoCo model of one maneuver, its data, and the places of the maneuver's parts in them."""
 
     def __init__(self, maneuver: Result) -> None:
         try:
@@ -139,7 +139,7 @@ class _Simulation:
         self._turned = np.array(self._model.key_mquat).reshape(count, -1, 4)
 
     def recorded(self, move: Callable[[int], int]) -> ReplayRun:
-        """Return how the arm followed where `move` takes it to each state, and counts the time steps with a contact."""
+        """Return how the arm followed; `move` takes it to a state and returns its time steps in contact."""
         maneuver, arm = self._maneuver, self._arm
         states, values = np.array(maneuver.configurations), np.empty_like(self._wanted)
         tips, contacts = np.empty_like(maneuver.tip_position), 0
@@ -148,7 +148,7 @@ class _Simulation:
             values[k] = self._data.qpos if self._is_chain else self._data.ten_length
             tips[k] = self._tip_now()
             if self._is_chain:
-                # Its base is where the problem has it.
+                # The base is where the problem moves it.
                 states[k, : values.shape[1]] = values[k]
             else:
                 states[k] = self._data.site_xpos
@@ -165,13 +165,13 @@ class _Simulation:
         )
 
     def place(self, state: int) -> int:
-        """Put the arm where it should be."""
+        """Put the arm exactly into a state."""
         self._mujoco.mj_resetDataKeyframe(self._model, self._data, state)
         self._mujoco.mj_forward(self._model, self._data)
         return int(self._data.ncon > 0)
 
     def drive(self, state: int) -> int:
-        """Let lengths or joints be constraints that move from the state before, and gravity pull."""
+        """Simulate the motion to a state: under gravity, with lengths or joints as moving constraints."""
         if state == 0:
             self._hold(0)
             self._settle()
@@ -196,10 +196,11 @@ class _Simulation:
         return int(states[worst]), float(values[worst])
 
     def measured_sensitivity(self, state: int, expected: float) -> float:
-        """Return the same by moving one actuator after another and waiting for the tip.
+        """Return that displacement as measured, by moving one actuator after another and waiting for the tip.
 
-        Without gravity, whose sag takes a nearly singular pose away from its singularity, and each by so
-        little that the tip should move a tenth of a millimetre: there it soon moves less than in proportion.
+        Gravity is off: sag would take a nearly singular pose away from its singularity. Each actuator moves
+        so little that the tip should move by a tenth of a millimetre: near a singularity it soon moves less
+        than in proportion.
         """
         data, probe = self._data, _PROBED_TIP_MOTION / max(expected, 1.0)
         gravity = self._model.opt.gravity.copy()
@@ -219,14 +220,14 @@ class _Simulation:
         return float(np.linalg.norm(np.array(moved), ord=2)) if moved else 0.0
 
     def _hold(self, state: int) -> None:
-        """Rest at a state with every length or joint a constraint."""
+        """Put the arm at rest in a state, with a constraint on every length or joint."""
         self._mujoco.mj_resetDataKeyframe(self._model, self._data, state)
         self._model.opt.disableactuator |= 1 << ACTUATOR_GROUP
         self._data.eq_active[:] = 1
         self._command(state, 0.0)
 
     def _command(self, state: int, share: float) -> None:
-        """Ask for lengths or joints at a `share` of the motion from `state` to the next, and move what is given."""
+        """Set lengths or joints, base and obstacles to a `share` of the motion from `state` to the next."""
         after = min(state + 1, len(self._mocap) - 1)
         wanted = (1.0 - share) * self._quantities[state] + share * self._quantities[after]
         self._model.eq_data[:, 0] = wanted - self._held_from

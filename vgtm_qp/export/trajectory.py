@@ -43,16 +43,16 @@ uint32 nanosec"""
 
 
 def step_rates(maneuver: Result) -> Array:
-    """Return (T, n_a) mean rates over the step that led to each state, m/s, as the rate limit has them."""
+    """Return (T, n_a) mean rates over the step that led to each state, m/s, as rate limits define them."""
     rates = np.zeros_like(maneuver.actuator_values)
     rates[1:] = np.diff(maneuver.actuator_values, axis=0) / np.diff(maneuver.time)[:, None]
     return rates
 
 
 def through_rates(maneuver: Result) -> Array:
-    """Return (T, n_a) rates with which a controller passes the states, m/s: central, and rest at both ends.
+    """Return (T, n_a) rates with which a controller passes the states, m/s: central, and zero at both ends.
 
-    A central rate lies between the mean rates of its two steps, so it keeps the limits that they keep.
+    A central rate lies between the mean rates of its two steps, and so within the limits that these keep.
     """
     rates = np.zeros_like(maneuver.actuator_values)
     steps, durations = step_rates(maneuver)[1:], np.diff(maneuver.time)[:, None]
@@ -61,7 +61,7 @@ def through_rates(maneuver: Result) -> Array:
 
 
 def csv_text(maneuver: Result) -> str:
-    """Return a CSV row a state: time, value of each actuator, rate of each over the step before; m or rad, and s."""
+    """Return CSV, a row a state: time, s, actuators' values, m or rad, and rates over the step before."""
     names = list(zip(maneuver.actuator_names, maneuver.actuator_units, strict=True))
     values = [f"{name} [{unit}]" for name, unit in names]
     rates = [f"d {name}/dt [{unit}/s]" for name, unit in names]

@@ -19,7 +19,7 @@ _compilings: dict[tuple[str, str | None, Path], Compiling] = {}
 class Batch:
     """A CasADi function of column vectors with one output, evaluated on rows.
 
-    It is compiled for one row, once for all batches of a process. Not for two threads at once.
+    It is compiled for one row, once for all batches of a process. Two threads must not use it at once.
 
     Attributes
     ----------

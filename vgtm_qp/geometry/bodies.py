@@ -18,7 +18,7 @@ class Bodies:
     Attributes
     ----------
     points : (B, 2) int
-        The two points that span each capsule: rows of the positions (P, 3) that a clearance is asked at.
+        The two points that span each capsule: rows of the positions (P, 3).
     radius : (B,)
         m.
     joints : (B, 2) int
@@ -27,7 +27,7 @@ class Bodies:
     kind : str
         Word for such a body in names, as in ``"member L3-2"``.
     touching : (K, 2) int
-        Other pairs that may touch, too.
+        Further pairs that may touch.
     """
 
     points: Index

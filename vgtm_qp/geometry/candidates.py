@@ -1,4 +1,4 @@
-"""Lists of pairs that may come near, valid until bodies have moved too far or the arm has bent too much."""
+"""Lists of pairs that may come near, which hold until bodies moved too far or the arm bent too much."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Motion = tuple[Displacement, Displacement, Displacement]
 _TO_PIECES, _RIGID, _BENDING = range(3)
 
 _FEW_PAIRS = 20_000
-"""Greatest number of pairs for which a scene lists all of them."""
+"""Greatest number of pairs of a scene that lists all of them."""
 
 _MOST_BENDING = 0.5
-"""Share of bending parts above which all bodies are compared again."""
+"""Share of bending pairs of parts above which all bodies are compared again."""
 
 
 class _PairList:
     """Pairs that share a reference: the positions (P, 3), m, and the time, s, at which they were compared.
 
-    Pairs of this kind that are not listed were at least the horizon, m, apart there; `unneeded` counts the pairs that
-    were evaluated since and turned out to be far.
+    Pairs of the same kind that are not listed were at least the horizon, m, apart at the reference.
+    `unneeded` counts the pairs that have been evaluated since and were far.
     """
 
     def __init__(self, reference: Array, time: float) -> None:
@@ -49,10 +49,10 @@ class _PairList:
 class Candidates:
     """All pairs nearer than a horizon at a reference configuration, with their exact distances there.
 
-    There are three lists, each with a reference. The first is of bodies and pieces. The other two are of pairs of
-    bodies in rigid and in bending parts of the arm: bodies that moved together keep their distance, however far they
-    moved, and are compared again only if the arm has bent. By default pairs are listed that are nearer than
-    `influence` to obstacles or than `self_influence` to other bodies, m.
+    There are three lists, each with a reference: pairs of a body and a piece, pairs of bodies in rigid parts
+    of the arm, and pairs of bodies in bending parts. Bodies that moved together keep their distance, however
+    far they moved, and are compared again only if the arm has bent. Pairs nearer than `influence` to
+    obstacles, or than `self_influence` to other bodies, m, are listed by default.
     """
 
     def __init__(self, scene: Scene, influence: float, self_influence: float) -> None:
@@ -75,7 +75,7 @@ class Candidates:
     ) -> Motion:
         """List every pair nearer than the reaches, and return the displacements from the references.
 
-        With an `end` both hold on the whole straight path there.
+        With an `end`, list and displacements hold on the whole straight path from `X` to there.
 
         Raises
         ------
@@ -98,7 +98,7 @@ class Candidates:
         horizon = max(reach, self._influence) + self._influence + travel + drift
         self_horizon = max(self_reach, self._self_influence) + self._influence + 2.0 * travel
         if len(bodies) * (len(bodies) + len(pieces)) <= _FEW_PAIRS:
-            # A list of all pairs never needs another broad phase: that would cost more than its far pairs do.
+            # A list of all pairs never needs another broad phase, which would cost more than its far pairs.
             horizon = self_horizon = FAR
         if not self._lists:
             self._lists = _PairList(X, time), _PairList(X, time), _PairList(X, time)
@@ -142,7 +142,7 @@ class Candidates:
         change = parts.distance_changes(X - rigid.reference)
         parts.update_beyond(X)
         slack = rigid.horizon - reach - 2.0 * travel
-        # At half of the slack: parts that bend further would soon have to be compared again.
+        # Half of the slack: parts that bend further would soon have to be compared again.
         now_bending = ~self._is_bending & (change > 0.5 * slack)
         is_bending = self._is_bending | now_bending
         if (
@@ -228,7 +228,8 @@ class Candidates:
         far = to_pieces.horizon - motion[_TO_PIECES].greatest
         if not self._scene.has_self:
             return far, np.inf
-        # Pairs in near parts came nearer by no more than the arm bent there; other pairs are bounded by their parts.
+        # Pairs in near parts came nearer by no more than these bent; all other pairs are bounded by their
+        # parts.
         since = motion[_RIGID].greatest - self._bent
         far_self = min(rigid.horizon - self._bent, self._parts.beyond) - since
         return far, min(far_self, bending.horizon - motion[_BENDING].greatest)
@@ -242,7 +243,7 @@ def every_pair(scene: Scene, X: Array) -> list[Group]:
 
 
 def _moved(states: tuple[Array, ...], reference: Array) -> Array:
-    """Return how far each point (P,) is from its reference (P, 3), at most, m, in one or more states (P, 3)."""
+    """Return (P,) the greatest distance, m, of each point from its reference in one or more states (P, 3)."""
     shift = states[0] - reference
     square = np.einsum("ic,ic->i", shift, shift)
     for state in states[1:]:
@@ -257,7 +258,7 @@ def _near_pieces(X: Array, scene: Scene, time: float, horizon: float) -> tuple[I
     centers = pieces.center + time * pieces.velocity
     middle, half, longest = _axes(X, scene.bodies.points, radius)
     tree = cKDTree(middle, leafsize=BODIES)
-    # In the tree's order, so that pairs at equal distances keep it.
+    # In the tree's order, so that pairs at equal distances keep that order.
     found = tree.query_ball_point(centers, pieces.radius + longest + horizon, return_sorted=False)
     piece = np.repeat(np.arange(len(pieces)), [len(bodies) for bodies in found])
     body = np.concatenate([np.zeros(0), *found]).astype(np.int64)
@@ -285,17 +286,17 @@ def _near_bodies(X: Array, bodies: Bodies, among: Index, horizon: float) -> tupl
 
 
 def _axes(X: Array, points: Index, radius: Array) -> tuple[Array, Array, float]:
-    """Return middles (B, 3) and halves (B, 3) of the axes of bodies, and how far a body reaches at most, m."""
+    """Return middles (B, 3) and halves (B, 3) of the axes of bodies, and a bound of a body's reach, m."""
     ends = X[points]
     half = 0.5 * (ends[:, 1] - ends[:, 0])
     return ends.mean(axis=1), half, float(np.max(np.linalg.norm(half, axis=1) + radius))
 
 
 def _inseparable(apart: Array, span: Array, room: Array) -> Mask:
-    """Return which pairs may be nearer than their `room` (K,) from one center line to the other, m.
+    """Return (K,) which pairs may be nearer than `room` (K,), m, from one center line to the other.
 
-    `apart` (K, 3) is from center to center, and `span` (K,) how far both reach along it, times its length: that may be
-    zero.
+    `apart` (K, 3) leads from center to center; `span` (K,) is the reach of both along it, times its length.
+    The length may be zero.
     """
     distance = np.sqrt(np.einsum("kc,kc->k", apart, apart))
     return np.asarray(distance * (distance - np.minimum(room, FAR)) <= span)

@@ -92,8 +92,8 @@ class Clearance:
     ) -> Contacts:
         """Return all contacts of surfaces nearer than `reach`, exact; to 1e-6 m where FCL supplies them.
 
-        A pair has two rows where the nearest point of a body is not unique. Of the triangles of a mesh
-        only those stay that differ in normal or in the part of the body they face.
+        A pair has two rows where the nearest point of a body is not unique. Triangles of a mesh have rows of
+        their own only if they differ in normal, or face different parts of the body.
 
         Parameters
         ----------
@@ -102,12 +102,12 @@ class Clearance:
         time : float
             s.
         reach, self_reach : float or None
-            m; by default `influence`, and for two bodies no more than twice `safe` and the largest radius together.
+            m; by default `influence`, for two bodies at most twice the sum of `safe` and the largest radius.
         by_fcl : bool
-            Whether python-fcl supplies the contacts, each proven; see ``Contacts.by_fcl`` for those that it did not.
+            Whether python-fcl supplies contacts, each proven; see ``Contacts.by_fcl`` for the others.
         tracked : bool
-            Whether `X` is an accepted state, from which :meth:`between` goes on. A watched scene is then evaluated from
-            state to state. Trial positions would make the watch go there and back.
+            Whether `X` is an accepted state, at which the next motion begins. A watched scene is then
+            evaluated from state to state; trial positions would make the watch go there and back.
         wanted : Wanted or None
             Which of the pairs nearer than `reach` have contacts; all by default.
         """
@@ -142,7 +142,7 @@ class Clearance:
         return self.scene.contacts(self._solids.with_enclosed(parts, X, time))
 
     def _distinct(self, group: Group, rows: Index, found: Array) -> Index:
-        """Return the nearest of the contacts alike in body, mesh, normal and place on the body."""
+        """Return the nearest contact of each group with the same body, mesh, normal and place on the body."""
         order = np.argsort(found[:, 0], kind="stable")
         bodies, meshes = group.body[rows], self.pieces.obstacle[group.other[rows]]
         normal, place = np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2])
@@ -152,9 +152,9 @@ class Clearance:
     def least(self, X: Array, time: float = 0.0, *, among: str = "all") -> tuple[float, Pair | None]:
         """Return the exact least clearance, m, and its pair; ``(inf, None)`` where there is no pair.
 
-        The clearance of a pair is the distance of the body's axis from the solid obstacle, or from the other axis, less
-        the radius or radii: where an axis reaches into what it should keep away from, it is minus the radius, and no
-        deeper. The contacts of :meth:`near` are signed by the depth there, since they lead the way out.
+        The clearance of a pair is the distance of the body's axis from the solid obstacle, or from the other
+        axis, less the radius or radii. It is never less than minus the radius or radii, even if an axis
+        reaches into the other. The contacts of :meth:`near` have the depth there, since they lead out.
 
         Parameters
         ----------
@@ -228,11 +228,12 @@ class Clearance:
         *,
         thorough: bool = True,
     ) -> BetweenReport:
-        """Prove that no surface distance falls below its floor on a way in straight pieces, one as long as the other.
+        """Prove that no surface distance falls below its floor on straight pieces of equal duration.
 
-        The watch is tried first, then for each piece bounds of the motion, then separating planes, then halves of the
-        time for the remaining pairs. What is not proven after twelve halvings is refused: a false alarm, never a false
-        proof. The pieces after one that is not proven are not looked at.
+        The watch is tried first, then for each piece bounds of the motion, then separating planes, then
+        halves of the time for the remaining pairs. A pair that is not proven after twelve halvings is
+        refused: a false alarm is possible, a false proof is not. Pieces after one that is not proven are not
+        examined.
 
         Parameters
         ----------
@@ -241,10 +242,10 @@ class Clearance:
         start_time, end_time : float
             s; the obstacles move meanwhile.
         floor, self_floor : float
-            For obstacles and, if it differs, between bodies, m. Below zero, where surfaces overlap already, only
-            the watch can prove them; without it they count as zero.
+            For obstacles and, if it differs, between bodies, m. Floors below zero are for surfaces that
+            overlap already. Only the watch can prove them; without it they count as zero.
         thorough : bool
-            False if the watch, where there is one, is enough of a try.
+            False if nothing is tried after the watch, where there is one.
 
         Raises
         ------

@@ -1,10 +1,10 @@
-"""Functions of CasADi of one pair of a body and a piece: its contacts, and bounds of its distance over a motion.
+"""CasADi functions of one pair: its contacts, and bounds of its distance over a motion.
 
-A pair is one vector: both ends of the body's axis (6), the piece (15) or the ends of the other body (6), and the radius
-of the body or the sum of both radii. Distances are from surface to surface, m. A contact is ``CONTACT`` numbers: signed
-distance, weights (4) of the four ends in its change (of the body, then of the other body, zero for a piece), the
-unit normal (3) from the piece to the body, or the way out where the two intersect, and 1 where it is the only contact
-of its pair, else 0.
+A pair is a body and a piece, or two bodies. It is one vector: both ends of the body's axis (6), the piece
+(15) or the ends of the other body (6), and the radius of the body or the sum of both radii. Distances are
+from surface to surface, m. A contact is ``CONTACT`` numbers: signed distance; weights (4) of the four ends in
+its change (of the body, then of the other body, zero for a piece); the unit normal (3) from the piece to the
+body, which leads out where the two intersect; and 1 if it is the only contact of its pair, else 0.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ CONTACT = 9
 """Numbers that describe a contact."""
 
 NORMAL = slice(5, 8)
-"""Which of them are its normal."""
+"""The numbers of a contact that are its normal."""
 
 PROOF = 1e-6
-"""An answer of FCL holds if its flaw is no greater, over the unit of length."""
+"""Greatest flaw, over the unit of length, of an answer of FCL that counts as proven."""
 
 NORMAL_FROM = 1e-3
-"""Distance of two axes, over the unit of length, below which the normal would be mostly rounding."""
+"""Distance of two axes, over the unit of length, below which the normal is mostly rounding."""
 
 SECOND_CONTACT = 0.2
 """Two contacts of a body with one piece are apart by at least this fraction of the body's length."""
@@ -47,11 +47,11 @@ def width(shape: str) -> int:
 def distance_function(shape: str) -> ca.Function:
     """Return the exact contacts of a pair.
 
-    Input ``pair``, output ``contacts (18,)``: the nearest points, and those at the other end of a contact interval,
-    where the distance is larger by less than ``PARALLEL`` times the body's length. The second distance is ``FAR`` where
-    that contact needs no row. Where axis and piece intersect, the distance of the axis is minus the depth (the least
-    translation that parts them) for boxes and spheres, zero for the other shapes. It changes by no more than the
-    ends move.
+    Input ``pair``, output ``contacts (18,)``: the nearest points, and those at the other end of a contact
+    interval, where the distance is larger by less than ``PARALLEL`` times the body's length. The second
+    distance is ``FAR`` if that contact needs no row. Where axis and piece intersect, the distance of the axis
+    is minus the depth (the least translation that parts them) for boxes and spheres, zero for the other
+    shapes. A distance changes by no more than the ends move.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def _weights(shape: str, t: Any, s: Any) -> Any:
 
 @cache
 def proof_function(shape: str) -> ca.Function:
-    """Return the contact of an answer of FCL, and the flaw by which it is not proven.
+    """Return the contact of an answer of FCL, and its flaw: the error that cannot be excluded.
 
     Inputs ``pair``, whose body may be a point, and ``answer (7,)``: a distance d, a point of the body and one of the
     other. Output ``contact (9,)``, whose last number is the flaw, m; NaN where a number is not finite or the two
@@ -111,7 +111,7 @@ def proof_function(shape: str) -> ca.Function:
 
 
 def _projected(x: Any, segment: Any) -> tuple[Any, Any]:
-    """Return the parameter of the point of a segment that is nearest to x (3,), and how far that is."""
+    """Return the parameter of the point of a segment that is nearest to x (3,), and its distance."""
     along = segment[3:] - segment[:3]
     t = clip(ratio(ca.dot(x - segment[:3], along), ca.dot(along, along)))
     return t, norm(x - (1.0 - t) * segment[:3] - t * segment[3:])
@@ -119,13 +119,13 @@ def _projected(x: Any, segment: Any) -> tuple[Any, Any]:
 
 @cache
 def sweep_function(shape: str) -> ca.Function:
-    """Return a lower bound of the distance of a pair while the ends move on straight lines, all at once.
+    """Return a lower bound of the distance of a pair while its ends move simultaneously on straight lines.
 
-    Inputs ``start`` and ``end``, the pair before and after; a piece rests. Output ``bounds (3,)``: that of the motion,
-    and the exact distances before and after it.
+    Inputs ``start`` and ``end``, the pair before and after; a piece is at rest. Output ``bounds (3,)``: the
+    bound over the motion, and the exact distances before and after it.
 
-    The bound is the best of two: the planes of :func:`_turning_gap` between the contacts at both ends, and that a
-    distance changes by no more than the ends of the segments move.
+    The bound is the better of two: that of :func:`_turning_gap` between the contacts at both ends, and the
+    fact that a distance changes by no more than the ends of the segments move.
     """
     pairs = [ca.SX.sym(name, 7 + width(shape)) for name in ("start", "end")]
     bodies, others = [pair[:6] for pair in pairs], [pair[6:-1] for pair in pairs]
@@ -149,13 +149,14 @@ def _travel(a: Any, b: Any) -> Any:
 def follow_function(shape: str) -> ca.Function:
     """Return the contacts of a pair after a straight motion, and a lower bound of its distance meanwhile.
 
-    Inputs ``ends (24,)``, both of the body and both of the other body (ignored for an obstacle, which rests) before it,
-    then after it; and ``known (19,)``: the piece (15; ignored for two bodies), the radius or sum of radii, and
-    a unit normal (3), best that of the contact before.
+    Inputs ``ends (24,)``: two of the body and two of the other body before the motion, then the same after
+    it; those of the other are ignored for an obstacle, which is at rest. And ``known (19,)``: the piece (15;
+    ignored for two bodies), the radius or sum of radii, and a unit normal (3), preferably that of the contact
+    before the motion.
 
-    Output ``contacts (19,)``: those of :func:`distance_function` after the motion, and the bound over the motion of
-    :func:`_turning_gap`. Where axis and piece intersect, the distance is minus the radius and the other numbers mean
-    nothing.
+    Output ``contacts (19,)``: those of :func:`distance_function` after the motion, and the bound of
+    :func:`_turning_gap` over the motion. Where axis and piece intersect, the distance is minus the radius and
+    the other numbers have no meaning.
     """
     both, known = ca.SX.sym("ends", 24), ca.SX.sym("known", WIDTH + 4)
     states = both[:12], both[12:]
@@ -176,9 +177,10 @@ def _turning_gap(shape: str, bodies: list[Any], others: list[Any], normals: list
 
         n.x - S(n) >= (1 - s) (n_0.x_0 - S(n_0)) + s (n_1.x_1 - S(n_1)) - w (n_1 - n_0).(x_1 - x_0),   w = s (1 - s),
 
-    since S is convex, and |n|^2 = 1 - w |n_1 - n_0|^2. With m the lesser of both gaps and c the last product where it
-    is positive, the distance along n/|n| is at least the least of (m - c w) / |n| over 0 <= w <= 1/4. Where the normals
-    are those of the contacts at both ends, m is the lesser of the two distances.
+    since S is convex, and |n|^2 = 1 - w |n_1 - n_0|^2. Let m be the lesser of both gaps and c the last
+    product, or 0 if that is negative. Then the distance along n/|n| is at least the least value of
+    (m - c w) / |n| over 0 <= w <= 1/4. If the normals are those of the contacts at both ends, m is the lesser
+    of the two distances.
     """
     turn = normals[1] - normals[0]
     square = ca.dot(turn, turn)

@@ -1,9 +1,9 @@
 """Distances and nearest points by python-fcl, for many pairs at once; nothing here checks its answers.
 
-FCL's distance from a capsule to a box is always too large, and for bodies parallel to edges on round coordinates too
-large by up to a metre (FCL issue 508). So a body is a capsule of radius zero here, and the caller has to prove each
-answer. For axes that touch, FCL's penetration depth is not the least one; its signed distance, which is never used, can
-crash the process.
+FCL's distance from a capsule to a box is always too large: by up to a metre for bodies parallel to edges on
+round coordinates (FCL issue 508). So a body is a capsule of radius zero here, and the caller has to prove
+each answer. For axes that touch, FCL's penetration depth is not the least one. Its signed distance can crash
+the process, and is never used.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.shapes import ObstaclePieces
 
 _UNITS = 1e5
-"""FCL's units in a unit of length. Its iterations end at 1e-6 of its units; that would turn normals by 1e-3 rad."""
+"""FCL's units in a unit of length; its iterations end at 1e-6, which of 1 m turns normals by 1e-3 rad."""
 
 _TRIANGLE = np.array([3, 0, 1, 2, 3, 0, 2, 1])
-"""Both sides of a triangle as faces: FCL has no distance to its own triangles, but to a convex set of three points."""
+"""Both sides of a triangle as faces: FCL measures distances to convex sets, but not to its own triangles."""
 
 
 class _Axis:
-    """The axis of a body, or of a part of one, as FCL sees it: a capsule of radius zero, or a point; moved in place."""
+    """The axis of a body or of its part, for FCL: a capsule of radius zero or a point, moved in place."""
 
     def __init__(self) -> None:
         self._capsule = fcl.Capsule(0.0, 1.0)
@@ -34,7 +34,7 @@ class _Axis:
         self._point = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform())
 
     def placed(self, middle: Array, span: list[float]) -> fcl.CollisionObject:
-        """Return it with its middle (3,) there, and `span` (3) from end to end; in FCL's units."""
+        """Return the axis with the middle (3,) and the `span` (3) from end to end, in FCL's units."""
         x, y, z = span
         length = sqrt(x * x + y * y + z * z)
         if not length > 0.0:
@@ -65,16 +65,16 @@ class FclQueries:
         self._result.nearest_points = [np.full(3, np.nan)] * 2
 
     def answers(self, pairs: Array, pieces: list[int] | None, time: float) -> Array:
-        """Return FCL's distance of each of K pairs, m, and its nearest points (3) of the body and of the other: (K, 7).
+        """Return (K, 7) FCL's distance of each pair, m, and its nearest points of the body and of the other.
 
         Parameters
         ----------
         pairs : (K, 6 or more)
             Ends of the body's axis, or twice the same point, m; for two bodies then those of the other.
         pieces : list of int or None
-            Which pieces the others are; None for two bodies.
+            The pieces that are the others; None for two bodies.
         time : float
-            s, at which moving pieces are where they are asked about.
+            s; the pieces are where they are at that time.
         """
         self.asked += len(pairs)
         ends, body = self._scale * pairs[:, :12], self._body
@@ -85,7 +85,7 @@ class FclQueries:
             others = map(self._piece, pieces, repeat(time))
         found, request, result, ask = list[float](), self._request, self._result, fcl.distance
         for middle, span, other in zip(middles, spans, others, strict=True):
-            # Values that FCL does not overwrite are no answer.
+            # A value that FCL does not overwrite must not pass for an answer.
             result.min_distance = inf
             found.append(ask(body.placed(middle, span), other, request, result))
             here, there = result.nearest_points
@@ -94,7 +94,7 @@ class FclQueries:
         return np.array(found).reshape(len(pairs), 7) / self._scale
 
     def _piece(self, piece: int, time: float) -> fcl.CollisionObject:
-        """Return the object of a piece, where it is at `time`, s."""
+        """Return the object of a piece at its place at `time`, s."""
         known = self._objects.get(piece)
         if known is None:
             shape, row = self._pieces.shape[piece], self._pieces.parameters[piece]

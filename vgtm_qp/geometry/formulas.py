@@ -1,8 +1,9 @@
 """Exact distance from a segment to each shape: a closed form, or Newton's iteration in a bracket.
 
-Vectors are columns of CasADi SX, and choices are without branches. A segment is its two ends (6,), a piece is the
-vector that :class:`vgtm_qp.geometry.shapes.Obstacle` describes, or the ends of another segment. Squared distance to a
-convex set is convex along a segment, so its derivative changes sign once: between two break points of that derivative.
+Vectors are columns of CasADi SX, and choices are without branches. A segment is its two ends (6,). A piece is
+the vector that :class:`vgtm_qp.geometry.shapes.Obstacle` describes, or the ends of another segment. Squared
+distance to a convex set is convex along a segment, so that its derivative changes sign once, between two of
+its break points.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ PARALLEL = 0.02
 FAR = 1e30
 
 FURTHEST = 1e60
-"""Positions this far away, m, are not finite numbers: their fourth powers overflow, and no bound holds."""
+"""Positions this far away, m, count as infinite: their fourth powers overflow, and no bound holds."""
 
 _TINY = 1e-13
 """Shorter vectors have no direction."""
@@ -30,7 +31,7 @@ _AXES = ca.DM.ones(3, 3) * ca.DM.eye(3)
 class SymbolicContact(NamedTuple):
     """Nearest points of a segment and a piece: signed distance, parameter, unit normal (3,) from piece to segment.
 
-    The last number is the parameter on the piece where that is a segment too.
+    The last number is the parameter on the piece if the piece is a segment too.
     """
 
     distance: Any
@@ -40,7 +41,7 @@ class SymbolicContact(NamedTuple):
 
 
 Formula = Callable[[Any, Any], tuple[SymbolicContact, SymbolicContact]]
-"""From a segment and a piece to their contact and that at the other end of a contact interval, or the same again."""
+"""From a segment and a piece to their contact, and that at the other end of an interval, or the same."""
 
 
 def clip(t: Any) -> Any:
@@ -82,12 +83,12 @@ def _perpendicular(u: Any) -> Any:
 
 
 def _blend(a: Any, b: Any, t: Any) -> Any:
-    """Return (1 - t) a + t b, which is `a` and `b` without rounding at the ends."""
+    """Return (1 - t) a + t b; exactly `a` and `b` at t = 0 and 1."""
     return (1.0 - t) * a + t * b
 
 
 def _second(t: Any, distance: Any, length: Any, candidates: list[tuple[Any, Any]]) -> Any:
-    """Return the parameter farthest from `t` of the candidates (t, distance) that are almost as near."""
+    """Return the parameter farthest from `t` among the candidates (t, distance) that are almost as near."""
     best = t
     for other, other_distance in candidates:
         near = other_distance <= distance + PARALLEL * length
@@ -97,7 +98,7 @@ def _second(t: Any, distance: Any, length: Any, candidates: list[tuple[Any, Any]
 
 
 def _bracket(slopes: list[tuple[Any, Any]]) -> tuple[Any, Any]:
-    """Return the last of the parameters where the slope is negative and the first where it is not."""
+    """Return the last parameter at which the slope is negative and the first at which it is not."""
     low: Any = 0.0
     high: Any = 1.0
     for t, slope in slopes:
@@ -173,11 +174,11 @@ def _segment_box(ends: Any, piece: Any, *, apart: bool = False) -> tuple[Symboli
 def _solid_contacts(
     u: Any, turn: Any, excess: Callable[[Any], Any], t_outside: Any, depth: Any | None, breaks: list[Any]
 ) -> tuple[SymbolicContact, SymbolicContact]:
-    """Return the contacts of a segment along `u`, (3,), in the frame of a solid piece, which `turn` leads out of.
+    """Return the contacts of a segment along `u` (3,) in a solid piece's frame; `turn` turns vectors back.
 
-    `excess` is the vector from the piece to the segment at a parameter, zero inside; `t_outside` the parameter of the
-    nearest point where the two do not intersect; `depth` the depth, parameter and exit normal (5,) where they do, or
-    None where that is not wanted. A contact interval may end at the parameters `breaks`.
+    `excess` is the vector from the piece to the segment at a parameter, zero inside. `t_outside` is the
+    parameter of the nearest point if the two do not intersect; `depth` is depth, parameter and exit normal
+    (5,) if they do, or None if these are not wanted. A contact interval may end at the parameters `breaks`.
     """
     gap = excess(t_outside)
     outside = norm(gap)
@@ -210,8 +211,8 @@ def _segment_cylinder(
 ) -> tuple[SymbolicContact, SymbolicContact]:
     """Return the contacts for a solid cylinder with flat ends.
 
-    Only over the rim is the derivative not linear or of known sign; there Newton's iteration runs inside the
-    bracket, by halves where it leaves it.
+    The derivative is linear or of known sign everywhere but over the rim. There Newton's iteration runs
+    inside a bracket, with bisection where it would leave the bracket.
     """
     a, b, turn = _in_frame(ends, piece)
     radius, half, u = piece[12], piece[13], b - a
@@ -370,4 +371,4 @@ APART: dict[str, Formula] = FORMULAS | {
     "box": partial(_segment_box, apart=True),
     "cylinder": partial(_segment_cylinder, apart=True),
 }
-"""The same, without depths: where segment and piece intersect, the contacts mean nothing but that."""
+"""The same without depths: where segment and piece intersect, the contacts say only that."""

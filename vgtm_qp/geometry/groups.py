@@ -26,13 +26,13 @@ from vgtm_qp.geometry.pairs import Contacts, PairNames, Wanted
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 
 Found = tuple[Index, Array]
-"""Contacts (R, ``CONTACT``) and before them the ``Group.numbers`` (R, 8) of their pairs."""
+"""The ``Group.numbers`` (R, 8) of pairs, and their contacts (R, ``CONTACT``)."""
 
 _FIRST = 16
-"""Number of pairs, the nearest at the reference, among which the least distance is searched for first."""
+"""Number of pairs, nearest at the reference, that are searched first for the least distance."""
 
 _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
-"""From the shifts of both ends of two bodies to that of one middle from the other, and half the turns of both."""
+"""From the shifts of both ends of two bodies to the shift between their middles, and half turns of both."""
 
 
 class Scene:
@@ -49,7 +49,7 @@ class Scene:
     nothing : Contacts
         No rows.
     shapes : list of str
-        Of the others in its pairs; ``"segment"`` is a body.
+        Shapes of the others in the pairs; ``"segment"`` is a body.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Scene:
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
 
     def prepare(self) -> None:
-        """Make the functions of steps, so that no step has to."""
+        """Make the functions that steps use, so that no step has to make them."""
         for make in (distance_function, sweep_function, *((proof_function,) if self.fcl else ())):
             for shape in self.shapes:
                 self.batch(make, shape)
@@ -136,7 +136,7 @@ class Group:
     points : (C, 4) int
         The points that span `body`, then those of `other`, or the same again for a piece.
     numbers : (C, 8) int
-        These, `body`, `other`, `is_self`, and zero: 1 in those of a contact that FCL supplied.
+        `points`, `body`, `other`, `is_self`, and 0; the last is 1 for a contact that FCL supplied.
     radius : (C,)
         Of the body less the obstacle's allowance, or the sum of both radii, m.
     distance : (C,)
@@ -182,9 +182,9 @@ class Group:
         self._set(self.body[kept], self.other[kept], self.distance[kept])
 
     def lower(self, motion: Sequence[Displacement], limit: float) -> tuple[Array, float]:
-        """Return lower bounds of the surface distances of the first pairs, and one of all the others, m.
+        """Return lower bounds of the surface distances of the first pairs, and one bound of all others, m.
 
-        The others cannot have come nearer than `limit`, m. `motion` is that of each list of candidates.
+        The other pairs cannot have come nearer than `limit`, m. `motion` holds the displacement of each list.
         """
         displacement = motion[self.place]
         # The motion can matter only near the head of the sorted list.
@@ -199,10 +199,10 @@ class Group:
         return bound, float(self.distance[count] - displacement.greatest) if count < len(self) else np.inf
 
     def _nearer(self, displacement: Displacement, count: int) -> Array:
-        """Return bounds of how much nearer the first pairs of bodies came, (count,), m.
+        """Return (count,) bounds of how much nearer the first pairs of bodies came, m.
 
-        A bound is the relative displacement of the two middles plus the turns of both bodies about these. On a straight
-        path it is greatest at an end.
+        A bound is the relative displacement of the two middles plus the turns of both bodies about their
+        middles. On a straight path it is greatest at an end.
         """
         points = self.points[:count]
         reference = displacement.reference.take(points, axis=0)
@@ -231,9 +231,9 @@ class Group:
     def nearest(
         self, motion: Sequence[Displacement], X: Array, time: float, best: float
     ) -> tuple[float, int, int]:
-        """Return the least clearance below `best`, m, its row, and how many pairs were evaluated after the first few.
+        """Return the least clearance below `best`, m, its row, and a count of evaluated pairs.
 
-        The row is -1 where no clearance is below.
+        The row is -1 if no clearance is below `best`. The first few pairs do not count.
         """
         # The nearest pairs at the reference are probably the nearest still; they make `best` small for the others.
         rows, row = np.arange(min(len(self), _FIRST)), -1
@@ -253,7 +253,7 @@ class Group:
         return by(self.body[rows], self.other[rows], found[:, 0], is_self=self.is_self)
 
     def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> Found:
-        """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`, with `by_fcl` FCL's contacts instead.
+        """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`; if `by_fcl`, replaced by FCL's.
 
         For a pair with two contacts FCL is given the two points of the body. A contact stays as it was found if the
         axes touch or FCL's answer is not proven, see ``proof_function``.

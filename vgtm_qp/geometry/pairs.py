@@ -48,8 +48,8 @@ class Contacts:
     points : (R, 4) int
         The points that span the body, then those of the other body, or the same again for an obstacle.
     weights : (R, 4)
-        Of the velocities of `points` in that of the body's witness point relative to the other body's; the last
-        two are zero for an obstacle.
+        Of the velocities of `points` in the velocity of the body's witness point relative to the other
+        witness point; the last two are zero for an obstacle.
     is_self : (R,) bool
         Whether the other is a body of the arm too.
     normal_speed : (R,)
@@ -57,7 +57,7 @@ class Contacts:
     body, other : (R,) int
         `other` is a piece of an obstacle or, where ``is_self``, a body.
     by_fcl : (R,) bool
-        Whether FCL supplied the row; a closed form did otherwise.
+        True if FCL supplied the row, False if a closed form did.
     names : PairNames
         Names of bodies and obstacles, for :meth:`name`.
     """
@@ -86,7 +86,7 @@ class Contacts:
 
 
 class Wanted(Protocol):
-    """Which pairs of bodies and pieces, or bodies, are wanted at their distances."""
+    """Says which pairs are wanted, from their distances."""
 
     def __call__(self, body: Index, other: Index, distance: Array, *, is_self: bool) -> Mask:
         """Return (R,) for pairs (R,), (R,) at surface distances (R,), m; all are of one kind."""
@@ -95,7 +95,7 @@ class Wanted(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class BetweenReport:
-    """The proof about a motion from one state to the next.
+    """The proof of a motion from one state to the next.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class BetweenReport:
     clearance : float
         Proven lower bound of the surface distances over the motion; the least distance found where not certified.
     fraction : (F,)
-        For each failing pair, where on the motion (0 < s <= 1) the least distance was found.
+        For each failing pair the place on the motion (0 < s <= 1) of the least distance found.
     failing : Contacts
         The failing pairs there, one row each.
     """
@@ -115,7 +115,7 @@ class BetweenReport:
     failing: Contacts
 
     def failing_parameters(self, apart: float = 0.05) -> list[float]:
-        """Return the fractions, worst pair first, without those nearer than `apart` to a worse one."""
+        """Return the fractions, worst pair first, except those nearer than `apart` to a worse one."""
         chosen: list[float] = []
         for k in np.argsort(self.failing.distance, kind="stable"):
             s = float(self.fraction[k])

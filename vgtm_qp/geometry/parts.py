@@ -1,7 +1,7 @@
 """Parts of an arm, groups of neighbouring bodies: relative motion of parts, and pairs of parts that come near.
 
-However far an arm has moved, neighbouring bodies have moved together. Bounds of their distances hold as long as the arm
-has not bent there.
+However far an arm has moved, neighbouring bodies have moved together. Bounds of their distances hold as long
+as the arm has not bent near them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Parts:
         every = np.arange(len(first))
         self._thickness = np.zeros(len(every))
         np.maximum.at(self._thickness, self._of, bodies.radius)
-        # A point is in each part that one of its bodies is in, once.
+        # A point is in each part that has one of its bodies, once.
         points = np.unique(np.repeat(self._of, 2) * len(X) + bodies.points.reshape(-1))
         self._part, self._points = np.divmod(points, len(X))
         self._start = np.searchsorted(self._part, every)
@@ -47,11 +47,11 @@ class Parts:
         self._codes = self._codes_of(*self.near.T)
 
     def among(self, chosen: Mask, first: Index, second: Index) -> Mask:
-        """Return which pairs of bodies (K,) are in pairs of parts that are `chosen` of the rows of :attr:`near`."""
+        """Return (K,) which pairs of bodies are in the pairs of parts that `chosen` picks from `near`."""
         return np.isin(self._codes_of(self._of[first], self._of[second]), self._codes[chosen])
 
     def _codes_of(self, first: Index, second: Index) -> Index:
-        """Return a number for each pair of parts (K,), whichever is first."""
+        """Return (K,) a number for each pair of parts, the same in either order."""
         return np.asarray(np.minimum(first, second) * len(self._start) + np.maximum(first, second))
 
     def inside(self, parts: Index) -> tuple[Index, Index]:
@@ -85,9 +85,10 @@ class Parts:
         self.beyond = min(self._horizon, float(gaps[close][unlisted].min(initial=np.inf)))
 
     def distance_changes(self, displacement: Array) -> Array:
-        """Return by how much the distances of points in near parts have changed at most, m, for each row of `near`.
+        """Return (K,) bounds of the change of distances between points of near parts, m, one a row of `near`.
 
-        A point of a body is displaced by a mean of its ends' displacements (P, 3), m, which is in the ball of its part.
+        The displacement of a point is a mean of its body's ends' displacements (P, 3), m, and so in the
+        part's ball.
         """
         center, radius = self._balls(displacement)
         first, second = self.near.T

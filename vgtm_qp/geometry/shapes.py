@@ -40,7 +40,7 @@ class Obstacle:
     solid : bool
         Whether the triangles of a mesh bound a volume; the other shapes are solid.
     allowance : float
-        How much nearer than to others bodies may come to it, m: its distances are greater by that.
+        How much nearer bodies may come to it than to other obstacles, m: its distances are greater by that.
     """
 
     name: str

@@ -24,7 +24,7 @@ class Solids:
         self._meshes = [(k, t, t.min(axis=(0, 1)), t.max(axis=(0, 1))) for k, t in meshes.items()]
 
     def enclosed(self, X: Array, time: float) -> list[Found]:
-        """Return the bodies with an end inside a closed mesh, at minus their distance to its surface."""
+        """Return contacts of the bodies with an end inside a closed mesh; their distances are negative."""
         bodies, pieces = self._scene.bodies, self._scene.pieces
         parts: list[Found] = []
         for obstacle, triangles, low, high in self._meshes:
@@ -42,13 +42,13 @@ class Solids:
             found, radius = found[nearest], group.radius[nearest]
             depth = found[:, 0] + radius
             found[:, 0] = -depth - radius
-            # The way out, where the axis does not touch the surface.
+            # Turned to lead out, unless the axis touches the surface.
             found[:, NORMAL] *= np.where(depth > 0.0, -1.0, 1.0)[:, None]
             parts.append((group.numbers[nearest], found))
         return parts
 
     def with_enclosed(self, parts: list[Found], X: Array, time: float) -> list[Found]:
-        """Return contacts with one that leads out for each body inside a closed mesh."""
+        """Return the contacts, with one that leads out for each body inside a closed mesh."""
         enclosed = self.enclosed(X, time)
         if not enclosed:
             return parts

@@ -1,4 +1,4 @@
-"""Proof of clearance over a straight motion: swept bounds, then halves of the time for the remaining pairs."""
+"""Proof of clearance over a straight motion: bounds over it, then over halves of it for remaining pairs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SweepResult(NamedTuple):
     rows : (F,) int
         Rows of the group that were not certified.
     fraction : (F,)
-        Where on the motion each of those was found nearest, 0 < s <= 1.
+        Place on the motion, 0 < s <= 1, of each such pair's least distance found.
     contacts : (F, CONTACT)
         Their contacts there.
     """
@@ -37,7 +37,7 @@ class SweepResult(NamedTuple):
 
 
 class _Sweep:
-    """Some pairs over a motion, each in the frame of its obstacle, which rests there."""
+    """Some pairs over a motion, each in the frame of its obstacle, where the obstacle is at rest."""
 
     def __init__(
         self, group: Group, rows: Index, start: Array, end: Array, start_time: float, end_time: float
@@ -59,7 +59,7 @@ class _Sweep:
         return sweep(self.at(k, left), self.at(k, right))
 
     def nearest(self, chosen: Index, worst: Array, fraction: Array) -> Array:
-        """Return where the `chosen` pairs are nearest: the better of the point known and of even samples."""
+        """Return where the `chosen` pairs are nearest: at the known place, or at one of even samples."""
         pairs = self.at(np.repeat(chosen, len(_SAMPLES)), np.tile(_SAMPLES, len(chosen)))
         distance = self.group.evaluate(pairs)[:, 0, 0].reshape(len(chosen), -1)
         best = distance.argmin(axis=1)
@@ -70,10 +70,10 @@ class _Sweep:
 def sweep_group(
     group: Group, rows: Index, start: Array, end: Array, start_time: float, end_time: float, floor: float
 ) -> SweepResult:
-    """Return which of the pairs `rows` stay above `floor` over the motion, provably."""
+    """Return which of the pairs `rows` are proven to stay above `floor` over the motion."""
     sweep = _Sweep(group, rows, start, end, start_time, end_time)
     count = len(rows)
-    # The motion of few pairs is cut at once, as finely as one call allows at no extra cost.
+    # The motion of few pairs is cut at once, as finely as a call allows at no extra cost.
     pieces = max(_PIECES // count, 1)
     k = np.repeat(np.arange(count), pieces)
     cuts = np.arange(pieces + 1) / pieces

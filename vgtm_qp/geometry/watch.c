@@ -1,12 +1,12 @@
 /* Pairs of bodies and pieces over straight motions: which may have come near, and the contacts of these. */
 
-/* Numbers of the ends of a pair before and after a motion; of what is known of it, of which the last three are a normal;
-   and of its two contacts, of which the sixth to eighth are a normal: see follow_function. */
+/* Lengths of the arrays of follow_function: ends of a pair before and after a motion; known, whose last three
+   numbers are a normal; the two contacts, whose normals are numbers 5 to 7 of each, from 0. */
 enum { ENDS = 24, KNOWN = 19, KNOWN_NORMAL = 16, CONTACTS = 18, NORMAL = 5 };
 
 enum { DONE, NO_VALUE, TOO_FAR, NOT_PROVEN };
 
-/* The lesser of two numbers; NaN if one of them is, for ever. */
+/* The lesser of two numbers; NaN if either is NaN. */
 static double least_of(double a, double b)
 {
     return b >= a || a != a ? a : b;
@@ -24,29 +24,29 @@ typedef struct {
     int count, is_self;
     const int *body, *other, *points;    /* (C), (C), (C, 4) */
     double *lower, *known;               /* (C), (C, 19): see follow_function */
-    double next;                         /* ratio to the limit below which pairs are evaluated if none is near */
+    double next;                         /* if no pair is near, pairs below next * limit are evaluated too */
 
     Kernel contact;                      /* (ends 24, known 19) -> 18 numbers of contacts, and a bound */
     double *ends, *pair;
     const double *found;
 
     int near, is_close, overlaps;
-    double lowest;                       /* least lower bound on the way of the pairs that were evaluated */
-    Index *rows;                         /* (C): these pairs */
+    double lowest;                       /* least lower bound over the motion of the evaluated pairs */
+    Index *rows;                         /* (C): the evaluated pairs */
     double *contacts;                    /* (2 C, 9): two for each */
 } Pairs;
 
-/* The way of an arm in pieces, each straight from one place of all its points to the next. */
+/* The path of an arm in straight pieces, each from one place of all its points to the next. */
 typedef struct {
     int pieces, points, bodies, groups;
     const int *ends;                 /* (B, 2) points */
     const double *places;            /* (K + 1, P, 3) */
     double furthest;                 /* bound of the sum of the squares of displacements */
     Pairs **group;                   /* (G) */
-    const double *floors, *limits;   /* (G): distance to prove on the way; pairs nearer than the other are evaluated */
+    const double *floors, *limits;   /* (G): distance to prove; at the end, distance to evaluate below */
 
-    double *middle, *turned, *moved; /* (B, 3), (B), (B): of each body's axis in the present piece the displacement of
-                                        its middle, half that of one end from the other, the greatest of its ends' */
+    double *middle, *turned, *moved; /* (B, 3), (B), (B): of each axis in the present piece the displacement
+                                        of its middle, half that between its ends, the greater of its ends' */
     int done;                        /* number of pieces that were followed */
 } Way;
 
@@ -68,7 +68,7 @@ static void move(Way *w, const double *before, const double *after)
     }
 }
 
-/* Evaluate pair k on a straight motion, with a plane at its begin that is known. */
+/* Evaluate pair k over a straight motion, from the known normal at its start. */
 static int contact(Pairs *p, int k, const double *before, const double *after)
 {
     for (int i = 0; i < 4; i++) {
@@ -81,8 +81,8 @@ static int contact(Pairs *p, int k, const double *before, const double *after)
     return DONE;
 }
 
-/* Lower the bounds by what the bodies moved, and evaluate the pairs that may be nearer than the limit; if there are any
-   and none was near before, all nearer than the reach. */
+/* Lower the bounds by what the bodies moved, and evaluate the pairs that may be nearer than the limit. If
+   there are any, and none was near before, evaluate all that may be nearer than the reach. */
 static int evaluate(const Way *w, Pairs *p, double floor, double limit, double reach, const double *before,
                     const double *after)
 {
@@ -104,7 +104,7 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
     for (int k = 0; k < p->count; k++) {
         if (p->lower[k] >= reach) continue;
         if (contact(p, k, before, after)) return NO_VALUE;
-        /* The known plane may be one of long ago: that of the place before proves more. */
+        /* The known normal may be of long ago: that at the start of this motion proves more. */
         if (p->found[CONTACTS] < floor && p->lower[k] < floor
             && (contact(p, k, before, before) || contact(p, k, before, after)))
             return NO_VALUE;
@@ -121,7 +121,7 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
     return DONE;
 }
 
-/* Follow the way to its end, or to the end of the first piece that is not proven to keep the floors. */
+/* Follow the path to its end, or to the end of the first piece that is not proven to keep the floors. */
 EXPORT int follow(Way *w)
 {
     int step = 3 * w->points, is_proven = 1;
@@ -135,7 +135,7 @@ EXPORT int follow(Way *w)
         move(w, before, after);
         for (int g = 0; g < w->groups; g++) {
             Pairs *pairs = w->group[g];
-            /* On the way only what it has to keep matters. */
+            /* Before the last place only the floor matters. */
             double floor = w->floors[g], limit = is_last ? w->limits[g] : floor;
             double reach = is_last ? fmax(limit, pairs->next * limit) : limit;
             if (evaluate(w, pairs, floor, limit, reach, before, after)) return NO_VALUE;

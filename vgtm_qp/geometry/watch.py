@@ -1,9 +1,10 @@
 """All pairs of a scene at rest, evaluated only when they may have come near.
 
-Each pair keeps a lower bound of its distance: its distance at the last evaluation, less a bound of the approach of its
-bodies since. A distance from an obstacle changes by no more than an end of the body moves. That of two bodies changes
-by no more than their middles do, and both turn about those. If the bound falls below the limit, the pair is evaluated,
-and its distance on the way from the state before is bounded: ``watch.c``.
+Each pair keeps a lower bound of its distance: its distance at the last evaluation, less a bound of the
+approach of its bodies since. A body's distance from an obstacle changes by no more than an end of the body
+moves. The distance of two bodies changes by no more than the relative displacement of their middles plus the
+turns of both about these. If the bound falls below the limit, the pair is evaluated, and its distance on the
+motion from the state before is bounded: ``watch.c``.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ _MOST_PAIRS = 8000
 """Greatest number of pairs of a scene that can be watched."""
 
 _AHEAD = 1.2
-"""Ratio of the distance below which pairs are evaluated to the last limit: the next limit may be larger."""
+"""Distance below which pairs are evaluated, over the last limit: the next limit may be larger."""
 
 _NEXT = 2.0
-"""If no pair is near, ratio to the limit below which pairs are evaluated all the same, in one call."""
+"""If no pair is near: distance below which pairs are still evaluated, in one call, over the limit."""
 
 
 class _Code(IntEnum):
@@ -55,13 +56,13 @@ def can_be_watched(scene: Scene) -> bool:
 
 @cache
 def _contact(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
-    """Return the function that evaluates one pair, and what compiles it, once for all scenes and each compiler."""
+    """Return the function that evaluates one pair, and its compilation, once for each compiler."""
     function = follow_function(shape)
     return function, Compiling(function)
 
 
 def is_ready(shapes: Iterable[str]) -> bool:
-    """Whether scenes of these shapes can be watched: false for ever where nothing can be compiled."""
+    """Whether scenes of these shapes can be watched; always false if nothing can be compiled."""
     source = building(SOURCE)
     if not source.ask():
         for shape in shapes:
@@ -100,7 +101,7 @@ class _WatchedGroup:
         self.data = self._program.data
 
     def address(self) -> int:
-        """Return where C finds the pairs; what was compiled since is used from now on."""
+        """Return the address of the pairs for C; uses the kernels compiled meanwhile."""
         self._program.refresh()
         return self._program.address
 
@@ -116,7 +117,7 @@ class _WatchedGroup:
 
 
 class Watch:
-    """Keeps all pairs of a scene that :func:`can_be_watched`; one thread at a time."""
+    """Holds all pairs of a scene that :func:`can_be_watched`; one thread at a time."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -138,8 +139,8 @@ class Watch:
     ) -> Contacts | None:
         """Return the contacts nearer than `limit`, or `self_limit` between bodies, m; None where surfaces overlap.
 
-        `X` (P, 3) are positions of the points; `by_fcl` says whether FCL supplies the contacts, and `wanted` of which
-        pairs.
+        `X` (P, 3) are positions of the points; `by_fcl` says whether FCL supplies the contacts, `wanted`
+        which pairs have any.
         """
         if limit > self._reach[0] or self_limit > self._reach[1] or not self._is_at(X):
             self._move_to(X, (limit, self_limit))
@@ -152,10 +153,10 @@ class Watch:
         )
 
     def follow(self, places: Array, floor: float, self_floor: float) -> bool:
-        """Return whether no surface distance falls below its floor, m, on a way in straight pieces.
+        """Return whether no surface distance falls below its floor, m, on a path of straight pieces.
 
-        False may also mean that this was not proven. The way leads from one of the `places` of the points (K + 1, P, 3)
-        to the next, m; the last that was come to is the present state.
+        False may also mean that this was not proven. The path leads from one of the `places` of the points
+        (K + 1, P, 3), m, to the next. The last place reached becomes the present state.
         """
         reach = max(self._wanted[0], floor), max(self._wanted[1], self_floor)
         if not self._is_at(places[0]):
@@ -167,20 +168,20 @@ class Watch:
         return X.tobytes() == self._at
 
     def _move_to(self, X: Array, reach: tuple[float, float]) -> None:
-        """Make `X` the present state, and evaluate the pairs that may be nearer than the `reach`, m, there."""
+        """Make `X` the present state, and evaluate the pairs that may be nearer than `reach`, m, there."""
         before = X if self._way is None else self._place
         self._go(np.stack([before, X]), (-np.inf, -np.inf), reach)
 
     def _go(self, places: Array, floors: tuple[float, float], reach: tuple[float, float]) -> bool:
-        """Go from place to place as long as the floors, m, are proven, and return whether they all are.
+        """Go from place to place as long as the floors, m, are proven, and return whether all are.
 
-        Where that ends is the present state. At the last place the pairs that may be nearer than the `reach`, m, are
-        evaluated.
+        The last place reached becomes the present state. At the last of `places` the pairs that may be nearer
+        than `reach`, m, are evaluated.
 
         Raises
         ------
         GeometryError
-            A position is not finite; nothing has changed.
+            A position is not finite; the present state stays as it was.
         """
         way = self._start(places[0]) if self._way is None else self._way
         places = np.ascontiguousarray(places)

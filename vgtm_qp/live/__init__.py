@@ -1,1 +1,1 @@
-"""The live page: an arm that follows a hand, in a browser on this machine."""
+"""The live page: an arm that follows the mouse, in a browser on this machine."""

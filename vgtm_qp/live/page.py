@@ -56,9 +56,10 @@ def view(
 ) -> None:
     """Serve the live page of a problem or a result until interrupted, by default to this machine alone.
 
-    The `port` is the next free one from there on, 0 for any. Who reaches another `host` than the default can move the
-    arm; a page of another origin cannot. `ready` is called with the page's address once it can be opened; `stop` ends
-    the page when it is set. MissingExtraError where viser is not installed, GoalError where host or port do not serve.
+    The page uses the first free port from `port` on, any port for 0. Whoever reaches a `host` other than the
+    default can move the arm; a page of another origin cannot. `ready` is called with the page's address once
+    it can be opened; `stop` ends the page when it is set. MissingExtraError if viser is not installed,
+    GoalError if host or port cannot be used.
     """
     if not is_loopback(host):
         warnings.warn(
@@ -67,7 +68,7 @@ def view(
         )
     maneuver = shown if isinstance(shown, Maneuver) else None
     if maneuver:
-        # Refused before a page is opened that could not show it.
+        # Refuse a maneuver that the page could not show before it is opened.
         arm_of(maneuver)
     problem = stored_problem(maneuver.manifest["problem"]) if maneuver else shown
     assert isinstance(problem, Problem)
@@ -88,7 +89,7 @@ class Page:
     moment : float
         Time up to which a solved maneuver was played, s.
     message : str
-        What the page says last, errors of its widgets among it.
+        The last message of the page; errors of its widgets are messages too.
     """
 
     def __init__(self, server: Any, session: Session, maneuver: Maneuver | None) -> None:
@@ -106,7 +107,7 @@ class Page:
             "/tip target", session.target, 0.085, _TARGET_COLOUR, lambda place, _: session.want_tip(place)
         )
         colour = tuple(round(255 * channel) for channel in CURVE_COLOUR)
-        # The first vertex belongs to the base, and the tip has a ball of its own at the last.
+        # The first vertex belongs to the base; the last one has the ball of the tip.
         inner = range(1, len(state.control_vertices) - 1) if session.vertices_can_be_wanted else ()
         self._vertices = {
             i: self._add_handle(
@@ -144,11 +145,11 @@ class Page:
             self.draw()
 
     def post(self, action: Callable[[], None]) -> None:
-        """Let the loop do an action, as widgets do."""
+        """Put an action into the inbox, for the loop to do."""
         self._inbox.put(action)
 
     def set(self, key: str, value: Any) -> None:
-        """Let the loop change a key of the problem."""
+        """Put a change of a key of the problem into the inbox."""
         self._settings[key] = value
 
     def read_inbox(self) -> bool:
@@ -166,7 +167,7 @@ class Page:
         self._survive(action)
 
     def _survive(self, action: Callable[[], None]) -> None:
-        """Run what a widget asks for; whatever that raises is shown, and the page goes on."""
+        """Run the action of a widget; any error is shown, and the page goes on."""
         try:
             action()
         except VgtmError as error:
@@ -174,7 +175,7 @@ class Page:
         except Exception as error:
             said = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
             if said != self.message:
-                # Once, not thirty times a second.
+                # The traceback is printed once, not thirty times a second.
                 traceback.print_exc()
             self._pause()
             self.message = said
@@ -188,7 +189,7 @@ class Page:
             handle.position = session.vertex_goals.get(i, session.control_vertices[i])
 
     def _add_handle(self, name: str, position: Array, radius: float, colour: Any, moved: Any) -> Any:
-        """Draw a ball; `moved` is called with the place to which it is dragged, and whether it was released there."""
+        """Draw a ball; `moved` is called with the place it is dragged to, and whether it was released."""
         handle = self._server.scene.add_icosphere(name, radius=radius, color=colour, position=position)
 
         def dragged(event: Any) -> None:
@@ -248,7 +249,7 @@ class Page:
         self._set_by(slider, f"method.weights.{name}", lambda x: 10.0**x if x > _LEAST_EXPONENT else 0.0)
 
     def _set_by(self, widget: Any, key: str, meaning: Callable[[Any], Any]) -> None:
-        """Let a key of the problem be what the value of a widget means."""
+        """Set a key of the problem to the `meaning` of a widget's value."""
         self._on(widget.on_update, lambda _: self.set(key, meaning(widget.value)))
 
     def _on(self, register: Any, act: Callable[[Any], Any]) -> None:
@@ -267,7 +268,7 @@ class Page:
             self._scene.add_path("/tip path", maneuver.tip_position, thickness=0.02)
 
     def solve(self) -> None:
-        """Solve the session's problem from home, and play what comes of it."""
+        """Solve the session's problem from home, and play the maneuver."""
         self._pause()
         self.message = "solving ..."
         self._tell()
@@ -308,13 +309,13 @@ class Page:
             self._pause()
 
     def _scrub(self, event: Any) -> None:
-        """Follow the hand on the slider; what the page itself sets there has no client."""
+        """Follow the mouse on the slider; a value set by the page itself has no client."""
         if event.client is not None:
             self._pause()
             self._put(float(self._slider.value))
 
     def _put(self, moment: float) -> None:
-        """Show the arm at `moment` on the straight line between two states, from where it can be dragged."""
+        """Show the arm at `moment`, on the straight line between two states; it can be dragged from there."""
         maneuver = self._maneuver
         if maneuver is None:
             return
@@ -362,7 +363,7 @@ def read_out(session: Session, message: str) -> str:
 
 
 def _why_off(reading: Reading) -> str:
-    """Return what the page says of stations that exact tracking let leave the curve."""
+    """Return the page's text on stations that left the curve although tracking is exact."""
     return "the curve gave way" if reading.gave_way else ""
 
 

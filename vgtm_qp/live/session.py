@@ -1,4 +1,4 @@
-"""An arm that follows a hand: where its tip and control vertices are wanted, and steps towards that."""
+"""An arm that follows the mouse: goals of its tip and control vertices, and steps towards these."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _RETRY_AFTER = 10
 class Reading(NamedTuple):
     """What the page shows: one of `OUTCOMES` or ``"at rest"``, and what holds the arm back, most decisive first.
 
-    Then all active rows of the last QP, the least distances to obstacles and between members that share no node, m, the
-    pair nearest to an obstacle, the greatest gap between stations and curve, m, NaN without a curve, whether
-    exact tracking gave way in the last step, and the computing time of that step, s.
+    Then all active rows of the last QP; the least distances to obstacles and between members that share no
+    node, m; the pair nearest to an obstacle; the greatest gap between stations and curve, m, NaN without a
+    curve; whether exact tracking gave way in the last step; and the computing time of that step, s.
     """
 
     outcome: str
@@ -48,7 +48,7 @@ class Reading(NamedTuple):
 
 
 class Session:
-    """One arm, its resolver, and what is wanted of it. Not to be shared by threads."""
+    """One arm, its resolver, and its goals. Threads must not share a session."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = self._given = problem
@@ -64,7 +64,7 @@ class Session:
 
     @property
     def nodes(self) -> Array:
-        """(N, 3) the nodes that are drawn, m: a serial arm has others beside its stations."""
+        """(N, 3) the nodes that are drawn, m: without those beside the stations of a serial arm."""
         return self.state.nodes[: len(self.drawing.arm.home)]
 
     @property
@@ -74,7 +74,7 @@ class Session:
 
     @property
     def control_vertices(self) -> Array:
-        """(V, 3) those that are drawn, m: fitted to the stations while the method has no curve."""
+        """(V, 3) the drawn control vertices, m: fitted to the stations if the method has no curve."""
         return _with_curve(self.state, self._drawn).control_vertices
 
     @property
@@ -105,11 +105,11 @@ class Session:
         self._waiting = 0
 
     def go_home(self) -> None:
-        """Put the arm into its home pose, at rest, and want nothing else."""
+        """Put the arm into its home pose, at rest, and drop all goals."""
         self._put(self._resolver.setup.home_state())
 
     def put_at(self, time: float, q: Array, control_vertices: Array) -> None:
-        """Put the arm at rest in configuration `q` and at `control_vertices` (V, 3), m; want nothing else."""
+        """Put the arm at rest in configuration `q` with `control_vertices` (V, 3), m, and drop all goals."""
         arm = self._resolver.setup.arm
         state = replace(
             self._resolver.setup.home_state(),
@@ -132,7 +132,7 @@ class Session:
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change values of the problem, by key path, and go on from the same state.
 
-        VgtmError, and no change, where a value is wrong or the method cannot serve this problem.
+        VgtmError, and no change, if a value is wrong or the method cannot serve this problem.
         """
         self._use(self.problem.replace(settings))
 
@@ -144,17 +144,17 @@ class Session:
         self._waiting, self._held_by = 0, ()
 
     def use_method(self, name: str) -> None:
-        """Change to the method called `name`, with the keys of the problem that was given as far as it has them.
+        """Change to the method called `name`, with those keys of the original problem that it has.
 
-        VgtmError, and no change, where it cannot move this arm.
+        VgtmError, and no change, if the method cannot move this arm.
         """
         given = self._given.to_dict()["method"]
         self._use(with_method(self.problem.replace({"method": given}), name))
 
     def advance(self, dt: float) -> bool:
-        """Make one step of duration `dt`, s, towards what is wanted; return whether the arm moved.
+        """Make one step of duration `dt`, s, towards the goals; return whether the arm moved.
 
-        A blocked arm tries again after a moment, so that obstacles that move away let it go.
+        A blocked arm tries again after a moment, since obstacles may have moved away.
         """
         away = self.target - self.tip
         distance = float(np.linalg.norm(away))
@@ -202,7 +202,7 @@ class Session:
 
 
 def _with_curve(state: State, setup: Setup) -> State:
-    """Return a state with as many control vertices as a setup has, where need be of a curve fitted to the stations."""
+    """Return a state with a setup's number of control vertices, fitted to the stations if that differs."""
     layout, stations = setup.layout, setup.arm.stations
     if len(state.control_vertices) == layout.vertices:
         return state

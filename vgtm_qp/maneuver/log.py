@@ -20,7 +20,7 @@ from vgtm_qp.step.stops import Stop
 
 
 class Log:
-    """The states of a resolver from now on, each with the pose that its tip was to have.
+    """The states of a resolver from now on, each with the pose asked of its tip.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Log:
         self._phases = [total - known[name] for name, total in resolver.phases.items()]
 
     def add(self, step: Step, target: Pose, progress: float) -> None:
-        """Add the state after a step that was to bring the tip to `target`."""
+        """Add the state after a step whose goal was the pose `target` of the tip."""
         self._clearance_rows["fcl"] += step.fcl_rows
         self._clearance_rows["exact"] += step.exact_rows
         self.progress = progress
@@ -74,10 +74,10 @@ class Log:
             self._rows.setdefault(name, []).append(value)
 
     def maneuver(self, problem: Problem, stop: Stop | None = None, **told: Any) -> Maneuver:
-        """Return the maneuver of a problem that these rows are, not certified yet.
+        """Return the rows as the maneuver of a problem, not certified yet.
 
-        `told` is what the manifest holds besides, see ``result.manifest``: of the problem's files, the way out and the
-        set-up.
+        `told` has the other keys of the manifest, see ``result.manifest``: digests of the problem's files,
+        the retry that led out of a dead end, and the time of the set-up.
         """
         resolver, setup = self._resolver, self._resolver.setup
         meshes = {
@@ -91,7 +91,7 @@ class Log:
             "arm": setup.arm.record(),
             "curve": setup.layout.record(),
             "status": "solved" if stop is None else "blocked",
-            # That of the last whole row: an interrupt may have come before the next.
+            # From the last whole row: an interrupt may have come before the next one.
             "reached": float(self._rows["progress"][-1]),
             "blocked_by": [] if stop is None else list(stop.names),
             "stop": None if stop is None else stop.to_dict(),
@@ -123,7 +123,7 @@ class Log:
 
 
 def _too_near(resolver: Resolver) -> dict[str, float]:
-    """Return the pairs below their clearance in the home pose that the method drives apart, and their distances, m."""
+    """Return the pairs that are too near at home and that the method drives apart, with distances, m."""
     names, kind = resolver.setup.monitor.names, resolver.setup.arm.bodies.kind
     found: dict[str, float] = {}
     for pair, distance in resolver.too_near(resolver.setup.home_state()).items():

@@ -18,7 +18,7 @@ _SMALL_REST = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Where the tip goes, in steps."""
+    """The path of the tip, and the marks at which steps end."""
 
     path: Path
     """Poses over time, from the home pose at time 0, s."""

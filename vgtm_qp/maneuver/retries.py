@@ -30,12 +30,12 @@ _BULGES = (
     ("curve bulged towards it", 2, _BULGE),
     ("curve bulged a little away from what blocks it", 0, 0.1),
 )
-"""Name, side and size: sides in quarters of a turn about the arm, from the direction away from the obstacle."""
+"""Name, side and size: sides in quarter turns about the arm, from the direction away from the obstacle."""
 _FIRM_TRACKING = 1.0
 """Least weight of tracking in a retry with a bulged curve."""
 _MORE_VERTICES = "more control vertices"
 _MORE = 3
-"""So many more."""
+"""Number of control vertices that are added."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,19 +44,20 @@ class DeadEnd:
 
     stop: Stop
     control_vertices: Array
-    """(V, 3) those of the curve there, m; V = 0 without one."""
+    """(V, 3) of the curve where the arm stopped, m; V = 0 without one."""
     height: float
     """Of the arm at home, m."""
     heading: Array
-    """(3,) direction of the path from there on."""
+    """(3,) direction of the path beyond that place."""
 
 
 def retries(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, Problem]]:
     """Yield name and changed problem of each retry that applies; nothing if retries are off.
 
-    Where stations gave way on demand and that was not enough, the curve first becomes more flexible. Then tracking is
-    elastic from the start, and all other retries are those of that problem, from where it stops: so no path is lost
-    that elastic tracking finds. Hard tracking and a solver by bays have no elastic tracking.
+    If stations could give way and that was not enough, there are two retries: a more flexible curve, then
+    tracking that is elastic from the start. The retries of the elastic problem follow where it stops in turn,
+    so that no path is lost that elastic tracking finds. Hard tracking and a solver by bays have no elastic
+    tracking.
     """
     if not problem.method.retries or dead_end.stop.kind in _HOPELESS:
         return
@@ -86,7 +87,7 @@ def _changes(problem: Problem, dead_end: DeadEnd) -> Iterator[tuple[str, dict[st
     if isinstance(problem.maneuver, WaypointManeuver):
         yield "shorter steps", {"maneuver.steps": 3 * problem.maneuver.steps}
     yield "actuator rates as the metric", {"method.weights.actuator_rate": rate}
-    # Hard tracking asks for the curve, so there is no retry without it either.
+    # Hard tracking needs the curve, and so has no retry without one.
     if method.tracking == "coupled" and method.tracking_mode != "hard":
         yield "no curve", {"method": method.kept_by("qp", "none"), "curve.control_vertex_goals": []}
     if vertices:
@@ -113,7 +114,7 @@ def bulge(dead_end: DeadEnd, quarter: int, size: float = _BULGE) -> Array:
 
 
 def _across(axis: Array, *wanted: Array) -> Array:
-    """Return (3,) the unit vector across `axis` nearest to the first direction of `wanted` not along `axis`."""
+    """Return (3,) the unit vector across `axis` nearest to the first of `wanted` that is not along `axis`."""
     for direction in (*wanted, *np.eye(3)):
         across = direction - axis * (axis @ direction)
         length = float(np.linalg.norm(across))

@@ -28,16 +28,16 @@ from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.verify import verify as check
 
 STALLED_PROGRESS = 1e-2
-"""Progress of a step, as a share of it, below which the arm hardly moves; it gives up after so many such steps."""
+"""Share of a step below which its progress counts as stalled; the arm gives up after so many such steps."""
 STALLED_STEPS = 5
 _NOTHING_LEFT = 1e-9
-"""Share of the path that is left of a piece of which nothing is left to cover."""
+"""Share of the path below which a piece counts as covered."""
 _FURTHER = 1e-3
-"""Share of the whole path by which a retry must get further than another to be the better one."""
+"""Share of the whole path by which a retry must get further than the best so far to replace it."""
 
 _TRIED_STEPS = 10
 _PART = 0.25
-"""Share of the progress that a remedy promises to first order, from which on the arm goes on with it."""
+"""Share of a remedy's progress to first order from which on the arm counts as going on with it."""
 _MORE = (1.0, 2.0, 4.0)
 """Factors of a remedy's amounts that are tried."""
 
@@ -64,7 +64,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     """
     check_is_problem(problem)
     started = perf_counter()
-    # The files as they are when they are read, not as they may be at the end.
+    # Digests of the files as they were read: they may have changed by the end.
     files = {"file": problem.source, "path": getattr(problem.maneuver, "path", None)}
     digests = problem_digests(
         problem.to_dict(), **files, urdf=None if problem.arm is None else problem.arm.urdf
@@ -128,9 +128,9 @@ def solve_many(
 
 
 def compile_steps(problem: Problem) -> None:
-    """Compile the kernels of a problem's steps and wait for it, so that times are not those of interpreted ones.
+    """Compile the kernels of a problem's steps and wait for it, so that no time is measured without them.
 
-    The first step is taken for it by a resolver of its own.
+    A resolver of its own takes the first step for this.
 
     Raises
     ------
@@ -171,7 +171,7 @@ class _Attempt:
                 return self._explain(aim, dt, step)
             stop = self._explain(aim, dt, step, before) if self._gives_up(step) else None
             if stop is not None and step.left_path:
-                # Further braking leaves the path: those states do not belong to the maneuver.
+                # Further braking would leave the path: its states do not belong to the maneuver.
                 return stop
             self._advance(aim, step)
             if stop is not None:
@@ -185,7 +185,7 @@ class _Attempt:
         return None
 
     def goes_on(self, remedy: Remedy) -> bool:
-        """Return whether the arm gets past where it stopped with a remedy; the attempt stays as it is."""
+        """Return whether a remedy takes the arm past the place of its stop; the attempt stays as it is."""
         resolver, plan, value = self.resolver.relaxed(remedy), self.plan, self.value
         if resolver is None:
             return False
@@ -204,15 +204,16 @@ class _Attempt:
         return self.resolver.explain(self.plan.path, self.value, aim, dt=dt, last=step, state=state)
 
     def _gives_up(self, step: Step) -> bool:
-        """Return whether the maneuver ends with a step because the arm braked in it.
+        """Return whether a step in which the arm braked ends the maneuver.
 
-        A hard tip may not be late, so braking ends it; any tip but an elastic one ends when it leaves the path.
+        With a hard tip, which may not be late, any braking does. With a scaled one it does if the tip left
+        the path.
         """
         mode = self.resolver.setup.tip_mode
         return step.braked and (mode == "hard" or (mode != "elastic" and step.left_path))
 
     def _come_to_rest(self) -> None:
-        """Do the steps in which the arm comes to rest on its path."""
+        """Take the steps in which the arm comes to rest on its path."""
         path = self.plan.path
         while self.value < path.end:
             with self.log.clock():
@@ -224,7 +225,7 @@ class _Attempt:
     def _advance(self, aim: float, step: Step) -> None:
         """Record a step towards `aim`."""
         path, rest = self.plan.path, (1.0 - step.progress) * (aim - self.value)
-        # An arm that covers a half of what is left in each step would never be there.
+        # An arm that covers half of the rest in each step would never arrive.
         is_there = step.status is StepStatus.REACHED or rest <= _NOTHING_LEFT * (path.end - path.start)
         self.value = aim if is_there else self.value + step.progress * (aim - self.value)
         self.log.add(step, path.pose(self.value), self.progress)
@@ -254,6 +255,6 @@ def _retry(
 
 
 def _tried(attempt: _Attempt, stop: Stop) -> tuple[Remedy, ...]:
-    """Return the remedies of a stop with which the arm goes on, by as much as it takes."""
+    """Return the remedies of a stop with which the arm goes on, enlarged as far as needed."""
     enough = (next(filter(attempt.goes_on, map(remedy.times, _MORE)), None) for remedy in stop.remedies)
     return tuple(remedy for remedy in enough if remedy is not None)

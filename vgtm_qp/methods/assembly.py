@@ -75,7 +75,8 @@ class SegmentKinematics:
 class SegmentGroup:
     """The equations of K segments of one shape, stacked: r rows over c own columns and b columns before them.
 
-    ``numbers`` (K,) are the numbers of the segments, ``columns`` (K, c) the columns of their nodes in the layout.
+    ``numbers`` (K,) are those of the segments; ``columns`` (K, c) are the columns of their nodes in the
+    layout.
     """
 
     def __init__(
@@ -158,7 +159,7 @@ class SegmentGroup:
         return np.concatenate([lengths, moved, self._tracked(turned[:, :, None])[:, :, 0]], axis=1)
 
     def _tracked(self, turns: Array) -> Array:
-        """Return the tracked components (K, t, n) of turns (K, 3, n): none, all, or those along the face's axes."""
+        """Return the tracked rows (K, t, n) of turns (K, 3, n): t = 0, 3, or 2 about the face's x and y."""
         if self._tracks == "position":
             return turns[:, :0]
         if self._tracks == "orientation":
@@ -178,7 +179,7 @@ def rotation_vectors(rotations: Array) -> Array:
 
 
 def _turns_between(start: Array, end: Array) -> Array:
-    """Return the rotation vectors (K, 3), rad, that take unit vectors `start` (K, 3) to `end` the short way."""
+    """Return the least rotation vectors (K, 3), rad, that take unit vectors `start` (K, 3) to `end`."""
     return _along(np.cross(start, end), np.einsum("kc,kc->k", start, end))
 
 

@@ -90,7 +90,7 @@ class DenseSolution:
         self.rank: int | None = None
 
     def hold(self, members: Index, held: Mask) -> None:  # noqa: ARG002
-        """Let some actuated members (h,), which `held` (n_a,) marks, count as fixed ones after those."""
+        """Count some actuated members (h,), True in `held` (n_a,), as fixed ones, after the fixed members."""
         self._fixed = np.concatenate([self._truss.fixed, members])
 
     def displacement(self, system: Linear, terms: Terms) -> Array:
@@ -209,7 +209,7 @@ class SparseSolution:
 class BandedSystem:
     """A symmetric sparse system of constant pattern, ordered to a narrow band, whose values change.
 
-    An entry of `rows` and `columns` (E,) stands in the mirrored place too; entries of one place are added up.
+    An entry at `rows` and `columns` (E,) counts at the mirrored place too; entries at one place are added up.
     """
 
     def __init__(self, rows: Index, columns: Index) -> None:
@@ -303,7 +303,7 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
         return Moved(q, state.control_vertices, state.torsion)
 
     def _carried(self, system: Linear, before: Array, after: Array) -> Linear:
-        """Return the system of what is left to do when the base has moved, and with it nodes (N, 3), m."""
+        """Return the rest of the system after the base has moved its nodes, among nodes (N, 3), m."""
         motion = after - before
         if self._has_bays:
             base_rate = truss_of(self.setup.arm).scatter.base_rate(system.gradient, motion)
@@ -324,8 +324,8 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
     def _linear(self, q: Array, goal: TipGoal) -> Linear:
         """Return the system at a configuration whose base rests, J d = x, eqs. (25) and (27).
 
-        The right-hand side is the `goal`'s rates over the step, and zero for fixed quantities; with corrections, the
-        errors of these and of the tip against the goal.
+        The right-hand side is the `goal`'s rates over the step, and zero for fixed quantities. With
+        corrections it is the errors of tip and fixed quantities.
         """
         setup, kinematics = self.setup, self.setup.kinematics
         kinematics.evaluate(q)
@@ -339,7 +339,7 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
     def _newton(self, q: Array, goal: TipGoal) -> Array:
         """Return `q` with fixed quantities and tip corrected.
 
-        By Newton's method with the same pseudoinverse, without gradients.
+        By Newton's method with the same pseudoinverse, without gradients of the null-space terms.
         """
         terms = self._terms.without_gradients()
         for _ in range(MAX_CORRECTIONS):
@@ -354,7 +354,7 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
 
 
 def _tip_columns(layout: Layout) -> tuple[Index, NDArray[np.bool_]]:
-    """Return the columns of the tip's free nodes, and which columns of the tip's Jacobian those are."""
+    """Return the columns of the tip's free nodes, and a mask of these in the tip's Jacobian."""
     first = layout.node_column[layout.arm.end_effector.nodes]
     present = np.repeat(first >= 0, 3)
     return (first[:, None] + np.arange(3)).reshape(-1)[present], present

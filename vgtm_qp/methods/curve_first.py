@@ -62,7 +62,7 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
         return replace(self.motion.home, control_vertices=vertices, torsion=torsion)
 
     def lock(self, name: str) -> None:  # noqa: ARG002
-        """Refuse: a bay whose nodes its rows determine has no motion to spare, and keeps off the curve without one."""
+        """Refuse: a bay with as many rows as motions could not follow the curve with a locked actuator."""
         self._refuse("hold an actuator", '"qp", "pseudoinverse"')
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:  # noqa: ARG002

@@ -21,11 +21,11 @@ from vgtm_qp.step.setup import Setup
 DEFAULT_TERMS = ("curve_rate", "spacing", "smoothness")
 
 _SAMPLES = 400
-"""Number of pieces of the curve whose ends are assigned to nodes, as their nearest points."""
+"""Number of pieces of the curve; the nearest point to a node is searched among their ends."""
 
 
 class CurveMotion:
-    """Moves a reference curve, with curve nodes at parameters `s` (F,), one a face, so that its end follows the path.
+    """Moves a reference curve so that its end follows the path; its nodes are at `s` (F,), one a face.
 
     Raises
     ------
@@ -74,10 +74,10 @@ class CurveMotion:
         self._node_s = s[np.argmin(squares, axis=1)]
 
     def follow(self, curve: Curve, goal: TipGoal, time: float, X: Array, *, correct: bool) -> Curve:
-        """Return the curve after a step by eq. (38) to a goal, whose rates are the displacement to it.
+        """Return the curve after a step by eq. (38) to a goal; the goal's rates are the displacement to it.
 
-        Without `correct` the end moves by that displacement, as in the paper; with it the step ends at the goal
-        exactly. `X` (N, 3) are the truss's nodes, for the obstacle potential alone.
+        Without `correct` the end moves by that displacement to first order, as in the paper; with it the step
+        ends exactly at the goal. `X` (N, 3) are the truss's nodes, for the obstacle potential alone.
 
         Raises
         ------
@@ -103,7 +103,7 @@ class CurveMotion:
         Raises
         ------
         SolverError
-            It does not converge.
+            Newton's method does not converge.
         """
         for _ in range(MAX_CORRECTIONS):
             error, _, across = self._missing(curve, goal)

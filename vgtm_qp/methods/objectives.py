@@ -11,7 +11,7 @@ from vgtm_qp.problem.method import Weights
 from vgtm_qp.step.setup import Setup
 
 DEFAULT_TERMS = ("actuator_rate",)
-"""Weight of node displacements beside other terms: with these alone, long arms collapse their battens."""
+"""Weight of node displacements beside other terms; without it the battens of long arms collapse."""
 
 _TRACE = 1e-6
 _NEAREST = 0.05
@@ -43,7 +43,7 @@ class NamedTerms:
         actuator = self._centring + (weights.actuator_rate if "actuator_rate" in names else 0.0)
         node = weights.node_rate if "node_rate" in names else 0.0
         # Without terms of displacements the objective is their norm, which J^+ minimises. Beside other terms a small
-        # weight of that norm makes the Hessian regular off the null space too, as the weighted inverse needs.
+        # weight of the norm makes the Hessian regular off the null space too, as the weighted inverse needs.
         self._node = node or (_TRACE * actuator if actuator else 1.0)
         self._actuator = actuator
 
@@ -78,7 +78,7 @@ def potential_slope(distance: Array, influence: float) -> Array:
 
 
 def potential_curvature(distance: Array, influence: float) -> Array:
-    """Return the second derivative of that potential, 1/m^2; 0 beyond `influence`."""
+    """Return the second derivative of the same potential, 1/m^2; 0 beyond `influence`."""
     d = np.maximum(distance, _NEAREST * influence)
     ratio = influence / d
     return np.asarray(np.where(distance < influence, (3.0 * ratio - 2.0) * ratio / d**2, 0.0))
@@ -87,9 +87,10 @@ def potential_curvature(distance: Array, influence: float) -> Array:
 def potential_field(setup: Setup, q: Array, time: float) -> tuple[Array, Array]:
     """Return the potential's gradient (N, 3), 1/m, by the nodes, and blocks (N, 3, 3), 1/m^2, above its Hessian.
 
-    By the gradient alone, steps grow without bound as a distance shrinks. With the curvature along the normals, the
-    step of each pair is a share of its own distance. One block per node bounds the Hessian: the square of a mean of two
-    displacements is at most the mean of their squares, and that of a difference at most twice their sum.
+    With the gradient alone, steps grow without bound as a distance shrinks. With the curvature along the
+    normals, the step of each pair is a share of its own distance. One block per node bounds the Hessian: the
+    square of a mean of two displacements is at most the mean of their squares, and the square of a difference
+    at most twice their sum.
     """
     influence, count = setup.influence, len(setup.arm.node_names)
     pairs = setup.monitor.near(setup.arm.points(q), time, influence)

@@ -64,7 +64,7 @@ _PLAIN = {
 }
 
 PRESETS = MappingProxyType({name: {**_PLAIN, **changes} for name, changes in _CHANGES.items()})
-"""What each name changes. ``-plain`` has no null-space vector; ``-corrected`` and ``-obstacles`` correct the drift.
+"""Changes by name. ``-plain`` has no null-space vector; ``-corrected`` and ``-obstacles`` correct the drift.
 
 All solve their QPs by the problem's own solver, ``-osqp`` excepted."""
 
@@ -83,7 +83,7 @@ DEFAULT_METHODS = (
 
 
 def with_method(problem: Problem, name: str) -> Problem:
-    """Return the problem with the method `name`; its weights, gains and keys stay as far as that method has them.
+    """Return the problem with the method `name`; weights, gains and keys stay if that method has them.
 
     Raises
     ------
@@ -108,14 +108,14 @@ def methods_for(problem: Problem) -> dict[str, Problem]:
 
 
 def method_name(problem: Problem) -> str:
-    """Return the name of a problem's method; that of ``method.name`` if its keys are those of no other name."""
+    """Return the preset with the keys of a problem's method, or ``method.name`` if there is none."""
     own = problem.method
     same = [name for name, other in methods_for(problem).items() if other.method == own]
     return next(reversed(same), own.name)
 
 
 def check_methods(names: Sequence[str]) -> None:
-    """Raise GoalError where there is no name, one text in the place of a list, or a name that is not a method's."""
+    """Raise GoalError if `names` is empty, is one text and not a list, or has a name that no method has."""
     if isinstance(names, str):
         raise GoalError(f'methods must be a list of names, not one text: ["{names}"]')
     if not names:

@@ -30,8 +30,8 @@ class Objective(NamedTuple):
 def moore_penrose(J: Array, *, truncation: float = RANK_TOLERANCE) -> Inverse:
     """Return J^+ (n, m), eq. (6), by singular values; those below `truncation` times the greatest count as zero.
 
-    J J^+ = 1 holds at full row rank only; with a `truncation` that is not small the inverse is the
-    truncated one, which gives up the directions that would take large displacements.
+    J J^+ = 1 holds at full row rank only. A `truncation` that is not small gives the truncated inverse, which
+    leaves out the directions of large displacements.
     """
     u, sigma, vt = np.linalg.svd(J, full_matrices=False)
     kept = sigma > truncation * max(float(sigma[0]), np.finfo(float).tiny)
@@ -73,8 +73,8 @@ def null_space_vector(N: Array, start: Array, objective: Objective) -> Array:
     """Return the null-space vector v whose image N v minimises `objective` at start + N v.
 
     ``v = (N'HN + c (1 - N))^-1 N' (-gradient - H start)``; the second term, with c the scale of H, makes the
-    matrix regular and, for an orthogonal projector N, leaves N v as it is. So J^+ x + N v is the minimiser of
-    `objective` under J d = x: what a quadratic program with these rows alone would return.
+    matrix regular and, for an orthogonal projector N, does not change N v. So J^+ x + N v is the minimiser of
+    `objective` under J d = x: the answer of a quadratic program with these rows alone.
     """
     H = objective.hessian
     scale = float(np.trace(H)) / len(H)

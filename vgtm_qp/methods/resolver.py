@@ -1,4 +1,4 @@
-"""Base class of the resolvers of all other methods: state, phases of time, and the reason of a failure."""
+"""Base class of the resolvers of all methods without a QP: state, phases of time, reason of a failure."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Moved(NamedTuple):
 
 
 class MethodResolver(Resolver, ABC):
-    """Moves an arm step by step by one of the other methods.
+    """Moves an arm step by step by a method without a QP.
 
     Its steps do not brake, drive pairs apart or follow goals of control vertices.
     """
@@ -83,7 +83,7 @@ class MethodResolver(Resolver, ABC):
         """Return where the step leads, or raise SolverError."""
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:
-        """Raise SolverError where nodes (N, 3) are so far away, m, that the linear step means nothing."""
+        """Raise SolverError if nodes (N, 3), m, have moved too far for a linear step."""
         arm = self.setup.arm
         members = None if arm.bays is None else truss_of(arm).members
         shortest = arm.unit if members is None else float(arm.home_quantities.min())

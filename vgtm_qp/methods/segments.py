@@ -1,4 +1,4 @@
-"""Partition of a truss into segments (figure 6): the nodes that each places, and the coordinates it tracks."""
+"""Partition of a truss into segments (figure 6), with the nodes and tracked coordinates of each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vgtm_qp.qp.layout import Layout
 _ROWS = {"position": 3, "pointing": 5, "orientation": 6}
 
 _JOINED = 3
-"""Bays of a segment that turns its end face: one or two straight octahedral bays also move it, three do not."""
+"""Bays of a segment that turns its end face: one or two straight octahedral bays would also move it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +66,9 @@ class Segment:
 def make_segments(layout: Layout, turns: str | None) -> tuple[Segment, ...]:
     """Return the segments of a truss whose end effector tracks `turns` ("pointing", "orientation" or None).
 
-    A face tracks all that the module can (``Truss.trackable``), every ``face_stride``-th where that takes several
-    bays; bays that are left over track positions, next to the base. Where the end effector turns but a single bay
-    cannot, the last bays are joined until they can.
+    Every ``face_stride``-th face tracks all that the module can, see ``Truss.trackable``. Bays that are left
+    over are next to the base, and track positions. If the end effector has to turn and a single bay cannot,
+    the last bays are joined until they can.
 
     Raises
     ------

@@ -22,10 +22,11 @@ _STILL = 1e-11
 class Tracker:
     """Moves the nodes of a truss so that its segments meet the curve nodes.
 
-    A segment with more motions than equations moves by the least sum of squares of its nodes' displacements over
-    the step; the others have one answer. Recursive and parallel solve the same equations: *recursive* converges
-    each segment before it goes on to the next; *parallel* factorises all segments at the present configuration at
-    once, and a chain of small products passes on what each does to the next (block condensation).
+    A segment with more motions than equations moves by the least sum of squares of its nodes' displacements
+    over the step; the others have one answer. Recursive and parallel tracking solve the same equations.
+    *Recursive* converges each segment before the next. *Parallel* factorises all segments at once at the
+    present configuration, and a chain of small products gives the effect of each on the next (block
+    condensation).
     """
 
     def __init__(
@@ -53,7 +54,8 @@ class Tracker:
     def rates(self, X: Array, moved: Array, turned: Array) -> Array:
         """Return node positions (N, 3), m, after a step from `X` that follows the curve nodes to first order.
 
-        It solves eq. (39) for displacements `moved` (S, 3), m, and rotation vectors `turned` (S, 3), rad, of those.
+        It solves eq. (39) for the curve nodes' displacements `moved` (S, 3), m, and rotation vectors `turned`
+        (S, 3), rad.
 
         Raises
         ------
@@ -72,12 +74,12 @@ class Tracker:
         """Return node positions (N, 3), m, with end faces at the curve nodes and exact lengths, by Newton from `X`.
 
         The Jacobian is that of eq. (39). A step of a segment with spare motions is A^+ (residual + A t) - t, with t its
-        displacement from `X` so far: its fixed point is the least displacement, whatever the iterates were.
+        displacement from `X` so far. Its fixed point is the least displacement, whatever the iterates are.
 
         Raises
         ------
         SolverError
-            It does not converge; the segment is named.
+            Newton's method does not converge; the message names the segment.
         """
         start, X = X, np.array(X)
         travelled, step = np.zeros((2, self._columns))
@@ -88,8 +90,9 @@ class Tracker:
     def _converge(
         self, chain: _Chain, start: Array, X: Array, travelled: Array, step: Array, nodes: CurveNodes
     ) -> None:
-        """Move the nodes of a chain to their places, in `X` and in their displacements so far, `travelled`."""
-        # The first step starts from the old configuration of the bays below, whose displacement is its input.
+        """Move the nodes of a chain to their places; updates `X` and their displacements, `travelled`."""
+        # The first step starts at the old configuration of the bays below, and has their displacement as
+        # input.
         at, step[chain.before] = start, travelled[chain.before]
         for _ in range(MAX_CORRECTIONS + 1):
             chain.evaluate(at)
@@ -114,8 +117,8 @@ class Tracker:
 class _Chain:
     """Segments that are solved at once, as one block-bidiagonal system.
 
-    Each segment's matrix is factorised independently; sequentially there remains, for each segment, the product of a
-    small matrix with the displacement of the nodes that it stands on.
+    Each segment's matrix is factorised independently. One sequential product a segment remains: of a small
+    matrix with the displacement of the nodes that the segment stands on.
 
     `evaluate` evaluates the kinematics of all ``groups`` at node positions (N, 3); `failure` is the format of the error
     message. The segments place ``nodes``, columns ``own``, and stand on nodes with the columns ``before``.

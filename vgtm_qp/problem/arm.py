@@ -1,4 +1,4 @@
-"""``[arm]``: a serial arm in the place of a truss, from a URDF file or from a list of joints."""
+"""``[arm]``: a serial arm instead of a truss, from a URDF file or from a list of joints."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 OF_URDF = ("urdf", "package_path", "base_link", "tip_link", "home", "bodies")
-"""Keys that say which arm is read from a URDF file, and how."""
+"""Keys that say which arm is read from a URDF file, and how it is read."""
 FROM_URDF = ("joint", "tip", "tip_rotation_vector", "body")
-"""Keys that are read from it."""
+"""Keys that are read from the URDF file."""
 
 
 class Mimic(Table, called="what a joint follows"):
-    """Another joint, whose value gives that of a joint which does not move by itself."""
+    """The joint that another one follows: the follower's value is a multiple of its value, plus an offset."""
 
     joint: Name = Field(description="name of the joint that is followed")
     multiplier: Number = Field(default=1.0, description="change of the value per change of that joint's")
@@ -92,14 +92,14 @@ class JointLock(LockTable, called="a locked joint"):
     @model_validator(mode="before")
     @classmethod
     def _from_member(cls, data: Any) -> Any:
-        """Read `member`, the key of a truss, which files of serial arms had."""
+        """Read `member`, the key of a truss, which older files of serial arms have."""
         if not isinstance(data, Mapping) or "member" not in data or "joint" in data:
             return data
         return {"joint" if key == "member" else key: value for key, value in data.items()}
 
 
 class ArmBody(Table, called="a body"):
-    """A capsule, or a ball, that moves with a joint: what is kept clear of obstacles."""
+    """A capsule or ball that moves with a joint and is kept clear of obstacles."""
 
     name: Name = Field(description="name of the body")
     joint: Name | None = Field(
@@ -161,7 +161,7 @@ class ArmTable(Table, called="an arm"):
     def _from_urdf(cls, data: Any, info: ValidationInfo) -> Any:
         """Read joints, tip and bodies from the URDF file, unless they were read before."""
         context = info.context or {}
-        # What a result names is not read: it may be any file.
+        # A file that a result names is not read: it may be any file.
         if not isinstance(data, Mapping) or data.get("urdf") is None or context.get("of_result"):
             return data
         if "joint" not in data:
@@ -240,7 +240,7 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
     except ProblemError as error:
         raise _wrong([_of_file(mistake) for mistake in error.mistakes]) from None
     except (TypeError, ValueError, RuntimeError):
-        # What is wrong with the keys themselves is said of each by its own type.
+        # The types of the keys themselves report what is wrong with these.
         return {}
     home, own = data.get("home"), [joint for joint in arm.joints if joint.mimic is None]
     if home is None:
@@ -290,14 +290,14 @@ def _vector(rotation: NDArray[np.float64]) -> list[float]:
 
 
 def _least_bent(limits: tuple[float, float] | None) -> float:
-    """Return 0 if it is within the limits, and else their middle."""
+    """Return 0 if the limits allow it, else their middle."""
     if limits is None or limits[0] <= 0.0 <= limits[1]:
         return 0.0
     return 0.5 * (limits[0] + limits[1])
 
 
 def _wrong(found: Sequence[tuple[Place, Any, str]]) -> ValidationError:
-    """Return the error of places, values and what was expected there."""
+    """Return the error of mistakes: place, value, and what was expected."""
     details = [
         InitErrorDetails(type=unexpected(expected), loc=place, input=value)
         for place, value, expected in found

@@ -1,4 +1,4 @@
-"""The kinds of values that a problem file holds, each with the words that say what was expected."""
+"""The kinds of values in a problem file, each with the words for what was expected."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from vgtm_qp.errors import ProblemError, nearest
 
-# Beyond these a square overflows the tolerances of the certificate; no arm is that long or that fine.
+# Beyond these, squares of lengths exceed the certificate's tolerances; no arm is that long or that fine.
 LEAST_LENGTH = 1e-6
 GREATEST_LENGTH = 1e6
 SHORTEST_STEP, LONGEST_STEP = 1e-7, 5e7
@@ -31,12 +31,12 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 
 def unexpected(phrase: str, *, reserved: bool = False) -> PydanticCustomError:
-    """Return the error of a value that is not what `phrase` says, or of one that this version has `reserved`."""
+    """Return the error of a value that is not as in `phrase`, or that is `reserved` in this version."""
     return PydanticCustomError("reserved" if reserved else "expected", phrase)
 
 
 def expect(phrase: str) -> WrapValidator:
-    """Return an annotation that answers every wrong value of a type by `phrase`."""
+    """Return an annotation whose message for every wrong value of a type is `phrase`."""
 
     def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
         try:
@@ -53,7 +53,7 @@ def quoted(names: Iterable[str]) -> str:
 
 
 class Within:
-    """Annotation of an integer, or of a finite number, with bounds as ``ge=0``: `phrase` answers all others."""
+    """Annotation of an integer or finite number with bounds such as ``ge=0``; `phrase` is the message."""
 
     def __init__(self, phrase: str, **bounds: Any) -> None:
         self.phrase, self.bounds = phrase, bounds
@@ -70,10 +70,11 @@ def count(least: int, greatest: int) -> Within:
 
 
 class ByKey:
-    """Annotation of a union of tables: the value of one key, a ``Literal`` of strings in each of them, picks the table.
+    """Annotation of a union of tables, of which the value of one key picks one.
 
-    A table in which it has a default needs no key. Where given, `pick` returns the table for a value, or None, instead.
-    Values `later` are reserved: messages say that this version does not serve them.
+    The key is a ``Literal`` of strings in each table; it may be missing if a table has a default for it. If
+    given, `pick` returns the table for a value, or None, instead. Values `later` are reserved: messages say
+    that this version does not serve them.
     """
 
     def __init__(
@@ -109,19 +110,19 @@ class ByKey:
 
 
 def _tag(table: type[BaseModel] | None) -> str | None:
-    """Return the tag of a table; the brackets tell it from a key in the place of a mistake."""
+    """Return the tag of a table; its brackets distinguish it from a key in the place of a mistake."""
     return None if table is None else f"<{table.__name__}>"
 
 
 def entry(table: Any, key: str) -> Any:
-    """Return the value of a key of a table or of the mapping it is made from; None where it has none."""
+    """Return the value of a key of a table, or of the mapping that it is made from; None if it is missing."""
     if isinstance(table, Mapping):
         return table.get(key)
     return getattr(table, key, None) if isinstance(table, BaseModel) else None
 
 
 def exactly(size: int, phrase: str) -> WrapValidator:
-    """Return an annotation that answers an array of another length than `size` by `phrase`."""
+    """Return an annotation whose message for an array of another length than `size` is `phrase`."""
 
     def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
         entries = value.tolist() if hasattr(value, "tolist") else value

@@ -100,7 +100,7 @@ class PathManeuver(Table, called="a maneuver along a path file"):
 
 
 def _step_durations(place: Place, whole: float, steps: int) -> Iterator[tuple[Place, str]]:
-    """Yield the place of a time, s, if so many steps of it are shorter or longer than a step can be."""
+    """Yield the place of a time, s, if `steps` steps of it are shorter or longer than a step can be."""
     if not SHORTEST_STEP <= whole / steps <= LONGEST_STEP:
         yield (
             place,

@@ -68,7 +68,7 @@ def _find(path: str | Path) -> Path:
     """Return the file, or the bundled one of that name."""
     file, name, bundled = Path(path), str(path), bundled_problems()
     beside: list[str] = []
-    # A path that is too long, say, or has a null character is one of no file.
+    # No file can have a path that is too long or has a null character.
     with suppress(OSError, ValueError):
         if file.is_file():
             return file

@@ -76,7 +76,7 @@ CURVE_TERMS = ("curve_rate", "spacing", "smoothness", "obstacle_potential")
 class Weights(Table, called="[method.weights]"):
     """Weights of the terms of one step's QP; the terms are half squares of displacements over the step.
 
-    With u the mean length of members or links, which brings angles to lengths.
+    In units, u is the mean length of members or links; times u, an angle is comparable with a length.
     """
 
     node_rate: Weight = Field(default=1.0, description="node displacements, m^2; unit 1")
@@ -214,7 +214,7 @@ class Method(Table, called="[method]"):
 
     @property
     def goes_by_bays(self) -> bool:
-        """Whether the QP is one over the curve alone, which each bay follows exactly."""
+        """Whether the QP is over the curve alone, and each bay follows the curve exactly."""
         return self.name == "qp" and self.tracking in ("recursive", "parallel")
 
     @property
@@ -225,7 +225,7 @@ class Method(Table, called="[method]"):
 
     @property
     def gives_way(self) -> bool:
-        """Whether stations may leave the curve where it holds the arm back; a solver by bays cannot let them."""
+        """Whether stations may leave the curve if it holds the arm back; not with a solver by bays."""
         return self.holds_curve and self.tracking_mode == "exact" and not self.goes_by_bays
 
     @property
@@ -235,11 +235,11 @@ class Method(Table, called="[method]"):
 
     @property
     def moves_curve_first(self) -> bool:
-        """Whether the truss moves after a curve that has moved by itself."""
+        """Whether the curve moves first, by itself, and the truss after it."""
         return self.name == "curve-pseudoinverse"
 
     def kept_by(self, name: str, tracking: str = "coupled") -> dict[str, Any]:
-        """Return the table of another method: those of its keys here that are not as by default."""
+        """Return the table of another method, with those of its keys that differ from their defaults here."""
         kind = _kind(name, tracking)
         kept: dict[str, Any] = {"name": name, "tracking": tracking}
         for key, value in self._changed():
@@ -249,7 +249,7 @@ class Method(Table, called="[method]"):
         return kept
 
     def _changed(self) -> Iterator[tuple[str, Any]]:
-        """Yield each key that is not as by default, and its value; keys of inner tables as ``weights.tracking``."""
+        """Yield each key that differs from its default, and its value; inner keys as ``weights.tracking``."""
         for key, value in self.model_dump(mode="json", exclude_defaults=True).items():
             if isinstance(value, Mapping):
                 yield from ((f"{key}.{inner}", own) for inner, own in value.items())

@@ -1,4 +1,4 @@
-"""``[[obstacle]]`` and ``[clearance]``: what the arm keeps away from, and how far."""
+"""``[[obstacle]]`` and ``[clearance]``: what the arm keeps away from, and at what distance."""
 
 from __future__ import annotations
 
@@ -91,8 +91,8 @@ class ClearanceTable(Table, called="[clearance]"):
     def between_members(self) -> float:
         """Least distance from surface to surface of members that share no node, m.
 
-        A quarter of `safe` where the problem does not say: the arm's own shape is known far better than where the
-        obstacles are, and battens and longerons of a bent bay come near one another by their nature.
+        A quarter of `safe` by default: the arm's own shape is known far better than the places of obstacles,
+        and battens and longerons of a bent bay inevitably come near one another.
         """
         return 0.25 * self.safe if self.self_safe is None else self.self_safe
 

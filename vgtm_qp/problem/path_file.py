@@ -22,7 +22,8 @@ _TURNS = ("rx", "ry", "rz")
 class PathTable:
     """The rows of a path file: times (K,), s, increasing from 0 or later, and poses in the base frame.
 
-    Those are positions (K, 3), m, and rotation vectors (K, 3), rad, or None where the file has no such columns.
+    A pose is a position (K, 3), m, and a rotation vector (K, 3), rad; None if the file has no columns for the
+    latter.
     """
 
     time: NDArray[np.float64]

@@ -24,7 +24,7 @@ SCHEMA_VERSION = 1
 
 
 class Problem(Table, called="a problem"):
-    """A problem as its file gives it; in Python, keywords and dictionaries of the same names make it too.
+    """A problem as its file gives it, or as keywords and dictionaries of the same names give it in Python.
 
     Paths of files are kept absolute; relative ones start at the problem file's folder, or at the working directory
     without a problem file.
@@ -110,9 +110,10 @@ class Problem(Table, called="a problem"):
     ) -> Self:
         """Make a problem from what :meth:`to_dict` returned; ProblemError with one mistake per mistake.
 
-        Mistakes name `source`, the file of the data, and relative paths start at its folder. With `check_files` the
-        files that the problem names must exist; a result that was moved elsewhere is read without that. With
-        `of_result` values that the method has no use for are allowed, since earlier versions solved such problems.
+        Mistakes name `source`, the file of the data, and relative paths start at its folder. With
+        `check_files` the files that the problem names must exist; a result is read without, since it may have
+        been moved elsewhere. With `of_result` values that the method does not use are allowed, since earlier
+        versions solved such problems.
         """
         context = {"source": source, "check_files": check_files, "of_result": of_result}
         if source is not None:
@@ -149,9 +150,9 @@ class Problem(Table, called="a problem"):
 
     @contextmanager
     def blaming(self, place: Place, expected: str) -> Iterator[None]:
-        """Raise every other error of this package as a mistake at a place, and say what is `expected` there.
+        """Raise any other error of this package as a mistake at a place, with what is `expected` there.
 
-        An error that ends in "; expected ..." says it itself.
+        An error that ends in "; expected ..." has its own expectation.
         """
         try:
             yield
@@ -197,7 +198,7 @@ class Problem(Table, called="a problem"):
 
 
 def check_is_problem(value: object) -> None:
-    """Raise ProblemError where a function is given something else in the place of a problem, such as its name."""
+    """Raise ProblemError if a function is given something else than a problem, such as its name."""
     if isinstance(value, Problem):
         return
     if isinstance(value, str | Path):
@@ -209,7 +210,7 @@ def check_is_problem(value: object) -> None:
 
 
 def _unmet(end_effector: EndEffector, waypoint: Waypoint) -> Iterator[tuple[str, str]]:
-    """Yield key and expectation of each coordinate that a waypoint lacks or gives in vain."""
+    """Yield key and expectation of each coordinate that a waypoint lacks, or has without use."""
     tracked = set(end_effector.track)
     turned = tracked & {"pointing", "orientation"}
     if tracked & {"position", "x", "y", "z"}:

@@ -1,4 +1,4 @@
-"""Snakes: the ``[arm]`` table of a serial arm of universal joints, as many as are wanted."""
+"""Snakes: the ``[arm]`` table of a serial arm of any number of universal joints."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ def snake(
     limit: float = 1.0,
     rate: float = 0.5,
 ) -> dict[str, Any]:
-    """Return the ``[arm]`` table of a snake of so many universal joints, each two joints in one place.
+    """Return the ``[arm]`` table of a snake; each of its `universal` joints is two joints in one place.
 
-    At home it is a gentle arc, since straight snakes are singular.
+    At home the snake is a gentle arc, since a straight snake is singular.
 
     Parameters
     ----------
     length, radius
         Of the whole snake and of its links, m.
     bend
-        How much its end is turned at home, rad.
+        Turn of its end at home, rad.
     limit, rate
-        Of every joint, rad to both sides and rad/s.
+        Of every joint, rad to either side, and rad/s.
     """
     link, home = length / universal, bend / universal
-    # The arc leaves the plane: else its joints could not move the tip in every direction.
+    # The arc leaves its plane: otherwise the joints could not move the tip in every direction.
     kinds = (("pitch", [1.0, 0.0, 0.0], 0.6 * home, link), ("yaw", [0.0, 1.0, 0.0], home, 0.0))
     joints = [
         {

@@ -45,9 +45,9 @@ class Table(BaseModel):
 
     called: ClassVar[str] = "this table"
     later: ClassVar[Mapping[str, str]] = {}
-    """Keys whose names are reserved for what this version does not do, and what it takes instead."""
+    """Reserved keys, which this version does not serve, and what it takes instead of each."""
     decisive: ClassVar[str] = ""
-    """The key on which the meaning of the others rests: where its value is wrong, nothing is said of them."""
+    """The key that decides the meaning of the others: if its value is wrong, they are not checked."""
 
     def __init_subclass__(cls, *, called: str | None = None, **options: Any) -> None:
         """Name the table in messages as `called`, where given."""
@@ -73,7 +73,7 @@ class Table(BaseModel):
         yield from ()
 
     def _unused(self) -> Iterator[tuple[Place, str]]:
-        """Yield place and expectation of each value that the method has no use for; a result may have such values."""
+        """Yield place and expectation of each value that the method does not use; a result may have some."""
         yield from ()
 
     @model_validator(mode="wrap")
@@ -117,7 +117,7 @@ class Table(BaseModel):
 
     @classmethod
     def _misspelt(cls, errors: Sequence[ErrorDetails]) -> set[Place]:
-        """Return the keys of this table itself that an unknown one is probably meant for."""
+        """Return those keys of this table that unknown keys are probably meant for."""
         unknown = [found["loc"] for found in errors if found["type"] == "extra_forbidden"]
         meant = (closest(str(place[0]), cls.model_fields) for place in unknown if len(place) == 1)
         return {(name,) for name in meant if name is not None}
@@ -158,7 +158,7 @@ class Table(BaseModel):
 
 
 def _refusals_first(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
-    """Return the errors, first those of what this version does not have: of keys that go together, the first one."""
+    """Return the errors, reserved keys first; of reserved keys with one message only the first stays."""
     refused = {
         (found["loc"][:-1], found["msg"]): found for found in reversed(errors) if found["type"] == "reserved"
     }
@@ -197,7 +197,7 @@ def _one_of(choices: Sequence[str], value: Any) -> str:
 
 
 def _echo(found: ErrorDetails) -> bool:
-    """Whether an array is called too short only because an entry, which has its own error, was left out."""
+    """Whether an array only seems too short because an entry with an error of its own was left out."""
     return found["type"] == "too_short" and len(found["input"]) >= found["ctx"]["min_length"]
 
 

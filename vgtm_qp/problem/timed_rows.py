@@ -28,7 +28,7 @@ def read_timed_rows(
     file
         With cells of numbers; empty lines are skipped.
     read_header
-        Returns the key of each column, and adds what is wrong with the columns to the mistakes that it is given.
+        Returns the key of each column, and adds the mistakes of the columns to its second argument.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def read_timed_rows(
 
 
 def time_mistakes(place: str, time: float, before: float) -> Mistakes:
-    """Return what is wrong with the time of a row after one `before`, s, which is -inf for the first; NaN passes."""
+    """Return the mistakes of a row's time after the time `before`, s, -inf for the first row; NaN passes."""
     step = time - max(before, 0.0)
     if time < 0:
         return [Mistake(place, f"{time:g}", "a time in seconds, 0 or more")]
@@ -75,7 +75,7 @@ def check_columns(header: list[str], known: tuple[str, ...], expected: str, mist
 
 
 def _rows(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header and the rows that are not empty, with their line numbers; ProblemError where it is no CSV."""
+    """Return the header and the rows that are not empty, with line numbers; ProblemError if it is not CSV."""
     try:
         if not file.is_file():
             raise ProblemError.at(file, "file", "nothing", "a CSV file")
@@ -94,7 +94,7 @@ def _rows(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mistake]) -> dict[str, float]:
-    """Return the numbers of a row by column, without those that are none: `mistakes` has these."""
+    """Return the numbers of a row by column; cells that are not numbers are added to `mistakes`."""
     if len(cells) != len(header):
         mistakes.append(
             Mistake(f"line {line}", f"{len(cells)} cells", f"{len(header)} cells, as the header has")
@@ -103,7 +103,7 @@ def _numbers(header: list[str], line: int, cells: list[str], mistakes: list[Mist
     row: dict[str, float] = {}
     for name, cell in zip(header, cells, strict=True):
         try:
-            # Python reads 1_000 too.
+            # Python would read 1_000 too.
             number = math.nan if "_" in cell else float(cell)
         except ValueError:
             number = math.nan

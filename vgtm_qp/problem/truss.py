@@ -35,7 +35,7 @@ _Positions = Annotated[tuple[Vector, Vector], exactly(2, "two positions [[x, y, 
 
 
 class LockTable(Table):
-    """An actuator that is stuck, from the start or from a time on: its name, or a table of that and the time."""
+    """An actuator that is stuck, from the start or from a time on: its name, or a table of name and time."""
 
     key: ClassVar[str]
     """Key of the name."""
@@ -106,7 +106,10 @@ class _Truss(Table):
     def _misfits(
         self, stroke: Stroke | None, shortest: float, actuated: Mapping[str, float]
     ) -> Iterator[tuple[Place, str]]:
-        """Yield what the shortest distance of joined nodes, or those of actuated members by their key, exclude."""
+        """Yield a joint offset or a stroke that does not fit the home lengths between nodes.
+
+        `shortest` is the least of all; `actuated` has those of actuated members by their key.
+        """
         if 2 * self.joint_offset >= shortest:
             yield ("joint_offset",), f"less than half the shortest member, {shortest / 2:g} m"
         elif stroke:

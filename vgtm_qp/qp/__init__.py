@@ -1,1 +1,1 @@
-"""The QP of one step: its layout and numbers, its forms, and what solves each."""
+"""The QP of one step: its layout and numbers, its forms, and a solver for each."""

@@ -17,8 +17,8 @@ class StepSolution:
     Attributes
     ----------
     nodes : (N, 3)
-        Displacements of all nodes, base nodes included, m; (0, 3) if one compiled call made the whole move, which
-        keeps them, and those of the control vertices, to itself.
+        Displacements of all nodes, base nodes included, m; (0, 3), like `vertices`, if one compiled call made
+        the whole move.
     actuators : (n_a,)
         Changes of the actuated lengths, m.
     vertices : (V, 3)
@@ -89,8 +89,8 @@ class Settled(NamedTuple):
 class Accuracy(NamedTuple):
     """Tolerances to which quantities, the tip, and stations with hard tracking are settled, m or rad.
 
-    These are ten times tighter than the published tolerances of ``verify``, so that rounding cannot decide. A tip
-    error above `start` after a QP calls for another QP.
+    These are ten times tighter than the published tolerances of ``verify``, so that rounding cannot decide
+    there. A tip error above `start` after a QP calls for another QP.
     """
 
     member: float
@@ -103,7 +103,7 @@ class Move(NamedTuple):
     """Where the answer of one QP leads: the configuration `q` by the answer alone, the curve and the progress.
 
     `furthest` is the greatest displacement of a node's coordinate, m. `closed` is the configuration with quantities
-    closed and the tip at its goal; None if it takes another QP.
+    closed and the tip at its goal; None if another QP is needed.
     """
 
     solution: StepSolution

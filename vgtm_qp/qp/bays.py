@@ -46,7 +46,8 @@ class BaySolver(CondensedSolver):
         spare = bays[-1].spare.stop
         self._free = slice(spare, spare + layout.free_curve)
         self._unknown = np.concatenate([np.full(self._free.stop, -1), self._after])
-        # Bays follow the curve in positions, or in positions and turns; the QP has the rows of the last station's turn.
+        # Bays follow the curve in positions, or in positions and turns; the last station's turn is left to
+        # the QP.
         followed = 3 * len(layout.tracked) + layout.turns * len(layout.tracked) * layout.hard_turns
         left = builder.hard_gaps[builder.hard_gaps >= builder.gaps[0] + followed]
         self._actuators, self._equal = self._before, len(left)
@@ -164,7 +165,7 @@ class _Group:
         self._kept, self._places = np.array(kept), np.array(places)
 
     def solved(self, values: Array, missing: Array) -> list[_Followed]:
-        """Return each bay's displacements by the curve and the bays before, for right-hand sides `missing`."""
+        """Return each bay's displacements over curve and earlier bays, for right-hand sides `missing`."""
         size = int(np.prod(self._shape))
         flat = np.bincount(self._places, weights=values[self._kept], minlength=size)
         own, before = np.split(flat.reshape(self._shape), [self._own], axis=2)

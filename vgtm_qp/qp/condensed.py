@@ -78,9 +78,9 @@ class CondensedSolver:
         return builder.solution(Z @ answer.x + start, y, w, answer.iterations)
 
     def gain_of(self, numbers: StepNumbers, at_bound: NDArray[np.bool_]) -> Gain | None:
-        """Return the least changes that make good what the equalities lack, see ``settle.missing_function``.
+        """Return the least changes that correct the equalities' errors, see ``settle.missing_function``.
 
-        Actuators `at_bound` (n_a,) rest, and so does the progress. None if no changes do.
+        Actuators `at_bound` (n_a,) and the progress do not change. None if there are no such changes.
         """
         builder = self.builder
         qp = builder.build(numbers)
@@ -98,7 +98,7 @@ class CondensedSolver:
         return None
 
     def _own(self, bounds: Array) -> Array:
-        """Return the bounds of the unknowns x from those of all columns; free coordinates of the curve have none."""
+        """Return the bounds of the unknowns x from those of all columns; infinite for the curve's."""
         return np.asarray(np.where(self._unknown >= 0, bounds[self._unknown], bounds[0]))
 
     def _reduction(self, numbers: StepNumbers, qp: StepQP) -> tuple[Array, Array]:
@@ -118,7 +118,7 @@ class CondensedSolver:
         return Z, start
 
     def _on_base(self, numbers: StepNumbers) -> tuple[slice, Array, Array]:
-        """Return the curve's columns (D), and their displacements by free coordinates (D, q) and by the base (D,)."""
+        """Return the curve's columns (D) and their displacements by free coordinates (D, q) and base (D,)."""
         column, axes, shift = self.builder.column, numbers.base_axes, numbers.base_displacement
         curve = slice(column["vertices"].start, column["torsion"].stop)
         start = np.zeros(curve.stop - curve.start)

@@ -36,4 +36,4 @@ class Daqp:
 
 
 DAQP = Daqp()
-"""The solver that is taken unless another one is named."""
+"""The default solver."""

@@ -2,7 +2,7 @@
 
     minimise  1/2 x' H x + g' x   subject to   lower <= [x; C x] <= upper
 
-The bounds are those of the first unknowns, then those of the rows C. Often, not always, all unknowns have bounds.
+The bounds are those of the first unknowns, usually of all, then those of the rows C.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class DenseSolver(Protocol):
     Attributes
     ----------
     accuracy : float
-        Violation of a row, m or rad, that its answers may have.
+        Greatest violation of a row by its answers, m or rad.
     """
 
     accuracy: float
@@ -77,7 +77,8 @@ class DenseSolver(Protocol):
         InfeasibleStepError
             The rows contradict one another.
         AnswerError
-            The solver failed. Without this error the answer of :class:`vgtm_qp.qp.daqp.Daqp` is not checked yet.
+            The solver failed. An answer of :class:`vgtm_qp.qp.daqp.Daqp` without this error is not checked
+            yet.
         """
         ...
 
@@ -87,7 +88,7 @@ def residuals(
 ) -> tuple[float, float]:
     """Return the primal residual of an answer, m or rad, and the dual one, relative to the objective's forces.
 
-    The dual residual is the greater one of |H x + g + multipliers| and of what is :func:`loose`.
+    The dual residual is the greater of two norms: of H x + g + multipliers, and of what is :func:`loose`.
     """
     x, y = answer.x, answer.multipliers
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
@@ -116,7 +117,7 @@ def check(
 
 
 def check_question(solver: str, *arrays: Array) -> None:
-    """Refuse a QP that must not be given to a solver by iterations, where NaN would stay; the bounds come last.
+    """Refuse a QP that an iterative solver must not get, since NaN would stay in it; the bounds come last.
 
     Raises
     ------

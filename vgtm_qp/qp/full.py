@@ -82,7 +82,7 @@ class StepQP:
 
 
 class FullBuilder:
-    """Fills the full QP from :class:`StepNumbers`; its sparsity stays while the near pairs stay."""
+    """Fills the full QP from :class:`StepNumbers`; its sparsity changes only with the near pairs."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -200,7 +200,7 @@ class FullBuilder:
         )
 
     def _columns(self) -> dict[str, tuple[list[Label], Any]]:
-        """Return each kind of column: its labels, and its block of the Hessian or the one value on its diagonal."""
+        """Return each kind of column: its labels, and its block of the Hessian or that block's diagonal."""
         layout, arm, weights = self.layout, self.layout.arm, self.layout.weights
         word, tracked = arm.stations.word, layout.tracked
         nodes = [arm.node_names[n] for n in arm.free]
@@ -350,7 +350,7 @@ class FullBuilder:
         ]
 
     def _leg_rows(self, vertices: Index) -> _Rows:
-        """Return the rows of the legs whose directions are given; `vertices` (3 V,) are the columns of the curve's."""
+        """Return the rows of the legs with given directions; `vertices` (3 V,) are the vertices' columns."""
         layout, count = self.layout, len(self.layout.legs)
         labels = [Label(f"curve {name} leg", "curve leg", "m") for name in ("first", "last")[:count]]
         grid = _grid(np.arange(count), vertices)

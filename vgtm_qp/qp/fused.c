@@ -17,18 +17,18 @@ typedef struct {
     /* Root of the node rate's weight, inverted; weights (n_a) of the actuators' changes. */
     double scale;
     const double *actuator_weight;
-    /* Distance from a bound that counts as held; path left that counts as none; worst condition of a gain. */
+    /* Distance from a bound, and remaining path, that count as zero; worst condition of a gain. */
     double at_bound, left, worst_condition;
     int settling_steps, closing_steps;
     double too_far;
-    const double *levers;          /* (m) lengths that compare the equalities */
+    const double *levers;          /* (m) lengths to compare the equalities by */
 
     /* (StepGraph.inputs) -> results of row_function; (q, lower, upper) -> (closer q, quantities, errors);
        (StepGraph.inputs, gone) -> results of missing_function. */
     Kernel condense, close, missing;
     void (*quadprog)(DAQPResult *, DAQPProblem *, DAQPSettings *);
     void (*defaults)(DAQPSettings *);
-    /* In their place another solver, or null: it sets x, multipliers and iterations, and returns a code as above. */
+    /* Another solver instead, or null: it sets x, multipliers and iterations, and returns a code as above. */
     int (*other)(void);
     double feasibility;
 
@@ -37,7 +37,7 @@ typedef struct {
     const double *curve_hessian;   /* (D, D) */
     const double *goal_pull, *goal_weight;     /* (V, 3), (V) of the control vertices' goals */
     int places;
-    const int *place, *of;         /* (E): which coordinates of q change by the shares of which of the motion's */
+    const int *place, *of;         /* (E): coordinates of q, and those of a motion whose shares change them */
     const double *share;
 
     const Index *near_nodes;       /* (R, slots) */
@@ -117,7 +117,7 @@ static void objective(Fused *f)
     }
 }
 
-/* Rows after those of the tip, which the function wrote in place: stations, legs, clearances. */
+/* Rows after those of the tip, which `condense` wrote in place: stations, legs, clearances. */
 static void constrain(Fused *f)
 {
     int n = f->unknowns, count = f->actuators, last = n - 1;
@@ -150,8 +150,8 @@ static void constrain(Fused *f)
     }
 }
 
-/* Norm of what the answer is beyond its bounds; relative to the forces, the greater one of the norm of the
-   stationarity and of that of the multipliers times their distances from their bounds. */
+/* Norm of the answer's violations of its bounds. Relative to the forces, the greater of two norms: of the
+   stationarity, and of the multipliers times their distances from their bounds. */
 static void residuals(Fused *f, int rows)
 {
     int n = f->unknowns;
@@ -205,7 +205,7 @@ EXPORT int solve(Fused *f)
     return DONE;
 }
 
-/* Move q and the curve by the changes x of the unknowns; `whole` adds what residuals alone move. */
+/* Move q and the curve by the changes x of the unknowns; `whole` adds the motions by residuals. */
 static void advance(Fused *f, const double *x, int whole)
 {
     int count = f->actuators, last = f->unknowns - 1;
@@ -283,7 +283,7 @@ static int gain_of(Fused *f, Gain *g, double *work)
     return greatest * greatest < f->worst_condition * least * least;
 }
 
-/* The least changes (n) of the unknowns that make good what is missing (m). */
+/* The least changes (n) of the unknowns that correct the errors `missing` (m). */
 static void change_by(const Fused *f, const Gain *g, const double *missing, double *change, double *work)
 {
     int n = f->unknowns, m = f->tips + f->hard, free = g->free;
@@ -314,7 +314,7 @@ EXPORT int settle(Fused *f)
     Gain gain;
     for (;;) {
         if (call(&f->close)) return UNSETTLED;
-        /* The norm is NaN where one of the errors is. */
+        /* The norm is NaN if one of the errors is. */
         double error = f->errors[0];
         if (!(error < f->too_far && f->errors[1] < INFINITY)) return UNSETTLED;
         if (error > f->enough_length && counted++ < f->closing_steps) {
@@ -354,7 +354,7 @@ EXPORT int move(Fused *f, double tolerance)
     if (!(f->primal <= tolerance && f->dual <= tolerance)) return INACCURATE;
     double before = *f->progress, reached = fmin(fmax(before + f->x[f->unknowns - 1], 0.0), 1.0), fastest = 0.0;
     for (int k = 0; k < 3; k++) fastest = fmax(fastest, fmax(fabs(f->velocity[k]), fabs(f->spin[k])));
-    /* The arm would need one more step for what interior-point solvers leave. */
+    /* Interior-point solvers stop just short of the end; the arm would need one more step. */
     if ((1.0 - reached) * fastest <= f->left) reached = 1.0;
     f->reached = reached;
     *f->gone = reached - before;

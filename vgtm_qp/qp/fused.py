@@ -50,11 +50,11 @@ _NOWHERE: Array = np.zeros((0, 3))
 _LIBRARIES = (".so", ".dylib", ".dll")
 
 _ROOM, _SLOTS = 24, 4
-"""Rows of clearance for which there is room at first, and nodes of each."""
+"""Capacity at first: rows of clearance, and nodes of each."""
 
 
 class _Code(IntEnum):
-    """What a function of ``fused.c`` returns."""
+    """Return codes of the functions of ``fused.c``."""
 
     DONE = 0
     NO_VALUE = 1
@@ -77,8 +77,8 @@ def _daqp() -> dict[str, int]:
 class FusedSolver:
     """Linearises, condenses, solves and settles; for arms whose symbols ``can_eliminate``.
 
-    ``settle`` and ``move`` are for curves of constant tables; others have rows that only Python can compute. Solvers
-    that differ in their goals of control vertices share one workspace.
+    ``settle`` and ``move`` are for curves of constant tables; other curves have rows that only Python can
+    compute. Solvers that differ only in their goals of control vertices share one workspace.
 
     The dense QPs are for `solver`, which C calls back unless it is DAQP.
     """
@@ -103,12 +103,12 @@ class FusedSolver:
         }
 
     def drawn(self, layout: Layout) -> FusedSolver:
-        """Return the solver of a layout in which only other control vertices have goals."""
+        """Return the solver of a layout that differs only in its goals of control vertices."""
         return FusedSolver(layout, workspace=self._workspace)
 
     @property
     def is_ready(self) -> bool:
-        """Whether the C is there to be called; false for ever where it cannot be compiled."""
+        """Whether the C is compiled; always false if it cannot be."""
         return self._workspace.is_ready
 
     def load(self, asked: StepInput) -> None:
@@ -140,7 +140,8 @@ class FusedSolver:
     def move(self, clearance: ClearanceRows, torsion: Array) -> Move:
         """Solve the QP at the state loaded last, and return where its answer leads.
 
-        The solution's ``nodes`` and ``vertices`` are left empty. `torsion` (T,) is the curve's before the step, rad.
+        The solution's ``nodes`` and ``vertices`` are empty. `torsion` (T,) is the curve's before the step,
+        rad.
 
         Raises
         ------
@@ -185,7 +186,7 @@ class FusedSolver:
         return None if gain is None else Gain(gain, lambda x: self._whole(x, 0, moves=False))
 
     def _whole(self, x: Array, near: int, *, moves: bool = True) -> StepSolution:
-        """Return the solution of the unknowns `x`, without what residuals alone move unless it `moves`."""
+        """Return the solution of the unknowns `x`; without the motions by residuals unless it `moves`."""
         work, layout, constant = self._workspace, self.layout, float(moves)
         count, nodes = work.actuators, np.zeros((len(layout.arm.node_names), 3))
         moved = x[:count] @ work.response[:count] + constant * work.response[-1]
@@ -274,7 +275,7 @@ class _Workspace:
         return code
 
     def _ask(self) -> int:
-        """Let the solver answer the QP, for C; an error is raised when C has returned."""
+        """Ask the solver for the QP's answer, on behalf of C; its error is raised once C has returned."""
         rows = self.first_near + self.data.near
         count = self.size + rows
         bounds = self.lower[:count], self.upper[:count]
@@ -290,7 +291,7 @@ class _Workspace:
         return _Code.DONE
 
     def use(self, goals: dict[str, Array]) -> None:
-        """Let the next QPs have these goals of control vertices."""
+        """Set the goals of control vertices for the next QPs."""
         if goals is not self._goals:
             self._program.set(**goals)
             self._goals = goals
@@ -328,9 +329,9 @@ class _Workspace:
         return Closed(q, quantities.copy(), float(errors[0]), position.copy(), turned)
 
     def _start(self) -> None:
-        """Allocate the arrays, and tell the C where they are."""
+        """Allocate the arrays, and give their addresses to C."""
         layout, condense, missing, close = self._layout, self.condense, self.missing, self.close
-        # The two have the same arguments up to the constants, but for q, the control vertices and `motion`.
+        # Both kernels share their arguments up to the constants, except q, the control vertices and `motion`.
         own, common = (0, 3, 6), 12 + len(CurveRows._fields) * (layout.general is not None)
         for argument in set(range(common)) - set(own):
             missing.bind_input(argument, condense.inputs[argument])
@@ -419,7 +420,7 @@ class _Workspace:
         self.lower, self.upper = np.full(size + rows, -UNBOUNDED), np.full(size + rows, UNBOUNDED)
         self._sense = np.zeros(size + rows, dtype=np.int32)
         self._sense[size : size + self.equal] = EQUALITY
-        # The rows of the tip, and the bounds up to theirs, are written in place.
+        # The kernel writes the tip's rows, and the bounds up to these, in place.
         of_tip = (self.constraint[:tips].reshape(-1), self.lower[: size + tips], self.upper[: size + tips])
         for result, array in enumerate(of_tip, start=1):
             self.condense.bind_output(result, array)
@@ -437,9 +438,9 @@ class _Workspace:
 
 
 def _places(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32], Array, bool]:
-    """Return which coordinates (E,) of q change by which (E,) of a motion, by what shares (E,).
+    """Return how the coordinates of q change with those of a motion: places in both (E,), and factors (E,).
 
-    The last is whether the coordinates of a motion are displacements of nodes.
+    The last result is True if the coordinates of a motion are displacements of nodes, not of actuators.
     """
     arm = layout.arm
     symbols, strokes = arm.symbols(Constants()), ca.MX.sym("strokes", len(arm.actuators))

@@ -74,7 +74,7 @@ def _leg_rows(graph: StepGraph) -> ca.MX:
     rows = ca.MX.zeros(layout.free_curve, len(layout.legs))
     for k, (start, _) in enumerate(layout.legs.tolist()):
         if start == 0:
-            # The first leg is the first of these coordinates.
+            # The first leg is along the first of the free coordinates.
             rows[0, k] = 1.0
             continue
         first = 3 * start - 5
@@ -96,7 +96,7 @@ def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX])
     for k, face in enumerate(layout.tracked.tolist()):
         moving = displacement(arm.stations.nodes[face].tolist())
         hard = [ca.DM(mask[k].astype(float)) for mask in (layout.hard_gaps, layout.hard_tilts)]
-        # Corrections close hard rows too, and these have no weight.
+        # Corrections close hard rows as well, without a weight.
         closed = [mask + (1.0 - mask) * motion for mask in hard]
         rows = station(*graph.station(k), moving, every, graph.normal, *closed, *hard)
         weighed = [mask + (1.0 - mask) * scale for mask, scale in zip(hard, scales, strict=True)]

@@ -197,9 +197,9 @@ class StationSymbols:
         self._reaches = layout.reach, layout.reach / layout.arm.unit
 
     def drawn(self, hard_gap: Any, hard_turn: Any) -> tuple[Any, Any]:
-        """Return gap (3,) and turn (R,), those that are not equalities within the reach of a step.
+        """Return gap (3,) and turn (R,); components that are not equalities are cut to the reach of a step.
 
-        The masks `hard_gap` (3,) and `hard_turn` (R,) say which are.
+        The masks `hard_gap` (3,) and `hard_turn` (R,) mark the equalities.
         """
         both = (self.gap, hard_gap), (self.turn, hard_turn)
         if not np.isfinite(self._reaches[0]):
@@ -213,7 +213,8 @@ class StationSymbols:
     def over_curve(self, offset: ca.SX, normal: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         """Return the rows (3, q) and (R, q) of gap and turn over the curve's free coordinates.
 
-        Then their constants (3,) and (R,) for an `offset` of all coordinates: (3, V), or flat if the curve has torsion.
+        And their constants (3,) and (R,) for an `offset` of all coordinates: (3, V), or flat if the curve has
+        torsion.
         """
         if not self._is_tabled:
             rows = -self._position, self._turned

@@ -29,16 +29,16 @@ _GOAL_REACH = 0.01
 
 
 def with_angles(weights: Weights, arm: Arm) -> Weights:
-    """Return weights in which those of stations' squared angles are m^2/rad^2: times the square of the arm's unit."""
+    """Return the weights with those of stations' squared angles times the arm's unit squared, m^2/rad^2."""
     area = arm.unit**2
     return weights.model_copy(update={"tangent": area * weights.tangent, "roll": area * weights.roll})
 
 
 _REACH = 0.03
-"""Share of the arm's unit by which a step draws such a gap back."""
+"""Greatest part of a gap that a step closes in a layout that gives way, over the arm's unit."""
 
 _FIRM = 1e3
-"""Least weight of gaps that give way: far above the terms of the null space, so that only other rows open them."""
+"""Least weight of gaps that give way: far above the null-space terms, so that only other rows open gaps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,8 @@ class Layout:
     hard_turns : bool
         The stations' turns as equalities too, beside their positions.
     reach : float
-        Greatest part of a gap that is not an equality, m, or of a turn times the arm's unit, that a step draws back.
+        Greatest part of a gap, m, or of a turn times the arm's unit, that a step closes if it is not an
+        equality.
     shape : CurveShape or None
         How the curve's nodes are placed; None for a curve that constant tables describe.
     vertex_goals : tuple of int
@@ -84,11 +85,12 @@ class Layout:
     vertex_goals: tuple[int, ...] = ()
 
     def giving_way(self) -> Layout:
-        """Return the layout in which what hard tracking holds at stations gives way where other rows leave no choice.
+        """Return the layout in which hard tracking becomes a penalty with a great weight.
 
-        Its weights draw stations back within a few steps; the weights of elastic tracking would leave them where they
-        are. A step draws them by no more than a share of the arm's unit: so great a weight on the whole of a gap would
-        pay for motions beyond what is linear.
+        Gaps then open only where other rows leave no choice. The weights draw stations back within a few
+        steps; the weights of elastic tracking would leave them off the curve. A step closes a gap by no more
+        than a share of the arm's unit: so great a weight on the whole gap would lead to motions that are no
+        longer linear.
         """
         weights, firm = self.weights, {"tracking": _FIRM}
         if self.hard_turns:
@@ -206,17 +208,17 @@ class Layout:
 
     @cached_property
     def tip_levers(self) -> Array:
-        """(n_e,) lengths, m, that compare the tip's coordinates."""
+        """(n_e,) lengths, m, to compare tip coordinates by: 1 for positions, the arm's unit for angles."""
         return np.array(levers(self.tip_rows, self.arm.unit))
 
     @property
     def slack_levers(self) -> Array:
-        """The same for the slacks of an elastic tip, above its goal and then below; empty where there are none."""
+        """Such lengths for the slacks of an elastic tip, above its goal and then below; otherwise empty."""
         return np.tile(self.tip_levers, 2 if self.elastic_tip else 0)
 
     @cached_property
     def levers(self) -> Array:
-        """(n_e + H,) the same for all equalities of a step: those of the tip, then of stations."""
+        """(n_e + H,) such lengths for all equalities of a step: those of the tip, then of stations."""
         gaps, tilts = np.ones(self.hard_gaps.size), np.full(self.hard_tilts.size, self.arm.unit)
         return np.concatenate([self.tip_levers, np.concatenate([gaps, tilts])[self.hard]])
 
@@ -227,23 +229,23 @@ class Layout:
 
     @cached_property
     def tilt_weights(self) -> Array:
-        """(K, R) weights of the stations' turns, likewise."""
+        """(K, R) weights of the stations' turns; zero where they are equalities."""
         weights = [self.weights.tangent, self.weights.tangent, self.weights.roll][: self.turns]
         return np.where(self.hard_tilts, 0.0, weights)
 
     @cached_property
     def _end_gain(self) -> Array:
-        """(V, 1 or 2) least changes of the control vertices beyond the base that move the curve's end, or turn it."""
+        """(V, 1 or 2) least changes of the control vertices that move the curve's end, and that turn it."""
         rows = [self.curve_weights[-1], self.curve_slopes[-1]][: 1 + self.ends_along_tip]
         gain = np.zeros((self.vertices, len(rows)))
         gain[2:] = np.linalg.pinv(np.array(rows)[:, 2:])
         return gain
 
     def ended(self, vertices: Array, position: Array, rotation: Array) -> Array:
-        """Return (V, 3) control vertices, changed least, whose curve ends at the tip's `position` (3,), m.
+        """Return (V, 3) the least changed control vertices whose curve ends at the tip's `position` (3,), m.
 
-        The curve ends along the z-axis of the tip's `rotation` (3, 3) if the direction is tracked, with its slope as
-        steep as it was: a projection would shrink it from step to step.
+        The curve ends along the z-axis of the tip's `rotation` (3, 3) if the direction is tracked. The length
+        of its slope is kept: a projection would shrink it from step to step.
         """
         if not self.ends_at_tip:
             return vertices
@@ -263,8 +265,8 @@ class Layout:
     def is_reversed(self, vertices: Array, normal: Array, rotation: Array) -> bool:
         """Return whether a curve of vertices (V, 3) begins or ends against its direction.
 
-        That is the base's `normal` (3,) at its begin, and at its end the z-axis of the tip's `rotation` (3, 3) where it
-        ends along that.
+        Its direction at the base is the base's `normal` (3,). At the end it is the z-axis of the tip's
+        `rotation` (3, 3), if the curve ends along that.
         """
         if (vertices[1] - vertices[0]) @ normal < 0.0:
             return True
@@ -272,17 +274,17 @@ class Layout:
 
     @property
     def least_leg(self) -> float:
-        """Least length of such a leg, m: a share of a leg of the straight polygon at home."""
+        """Least length of a leg with a given direction, m; see ``_LEAST_LEG``."""
         return _LEAST_LEG * self.arm.height / max(self.vertices - 1, 1)
 
     def record(self) -> dict[str, Any] | None:
         """Return the curve and its stations as JSON data for verification; None without a curve.
 
-        Keys: ``breaks``, ``extraction``, ``nodes`` and ``by_arc_length`` of the curve, see ``CurveFamily`` and
-        ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``, whether they are
-        kept on the curve, and ``frames``, those of the stations at home whose normals are kept along it, or none;
-        ``start``, ``start_weights``, ``normal``, the same of the base and its normal at home; ``ends_at_tip``,
-        ``ends_along_tip``.
+        Keys: ``breaks``, ``extraction``, ``nodes`` and ``by_arc_length`` of the curve, see ``CurveFamily``
+        and ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``,
+        whether stations are kept on the curve; ``frames``, the home frames of stations whose normals are kept
+        along the curve, else empty; ``start`` and ``start_weights``, nodes and weights of the base, and
+        ``normal``, its normal at home; ``ends_at_tip``, ``ends_along_tip``.
         """
         if self.shape is None:
             return None
@@ -313,7 +315,7 @@ class Layout:
 
     @cached_property
     def curve_hessian(self) -> Array:
-        """(D, D) the same over all coordinates of the curve: control vertices, then torsion."""
+        """(D, D) Hessian of the same over all coordinates of the curve: control vertices, then torsion."""
         vertices = np.kron(self.vertex_hessian, np.eye(3))
         return np.asarray(block_diag(vertices, self.torsion_weight * np.eye(self.torsion)))
 
@@ -333,7 +335,7 @@ class Layout:
         return pull
 
     def vertex_gradient(self, vertices: Array, goals: Array | None) -> Array:
-        """Return (V, 3) the gradient of these objectives at control vertices and goals (V, 3), m."""
+        """Return (V, 3) the gradient of the curve's objectives at control vertices and goals (V, 3), m."""
         return self.weights.smoothness * (self.polygon_bending @ vertices) + self.goal_pull(vertices, goals)
 
     @cached_property

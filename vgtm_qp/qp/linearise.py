@@ -1,4 +1,4 @@
-"""From a configuration to the numbers of its QP: every row of a step, linearised there by one compiled function."""
+"""From a configuration to the numbers of its QP: one compiled function linearises every row of a step."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class StepInput(NamedTuple):
     Attributes
     ----------
     q, at : configurations
-        Configurations of the residuals and of the Jacobians.
+        Configurations at which residuals and Jacobians are evaluated.
     base : (N, 3)
         Nodes at `q` after only the base has moved, m.
     vertices : (V, 3)
@@ -34,7 +34,7 @@ class StepInput(NamedTuple):
         Whether the QP moves the arm. A correction instead returns to the constraints by the least displacement,
         without the gradients of the null-space objectives.
     progress : float
-        Progress alpha so far; the step may change it to anything from 0 to 1.
+        Progress alpha so far; the QP may change it to any value from 0 to 1.
     goal : TipGoal
     curve : CurveRows or None
         Rows of a curve that constant tables do not describe.

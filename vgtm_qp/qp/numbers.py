@@ -19,10 +19,11 @@ from vgtm_qp.qp.shape import CurveRows
 class ClearanceRows:
     """Linearised clearances: sum over slots of coefficients . d rho[nodes] >= lower, in m.
 
-    ``nodes`` (R, 4) are node indices: the two ends of the member, then those of the other member in a self pair
-    (repeated with zero coefficients otherwise); with offset joints (R, 12), the triangles of those four ends.
-    ``coefficients`` is (R, 4, 3) or (R, 12, 3). Base nodes may occur; their displacement is already part of ``lower``.
-    ``by_fcl`` and ``by_formula`` count the rows that FCL and closed forms supplied; the other rows are of angles.
+    ``nodes`` (R, 4) are node indices: the two ends of the member, then those of the other member in a self
+    pair (otherwise the same again with zero coefficients); with offset joints (R, 12), the triangles of those
+    four ends. ``coefficients`` is (R, 4, 3) or (R, 12, 3). Base nodes may occur; their displacement is
+    already part of ``lower``. ``by_fcl`` and ``by_formula`` count the rows that FCL and closed forms
+    supplied; the other rows are of angles.
     """
 
     nodes: Index = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))
@@ -178,8 +179,9 @@ _SLACK_CURVATURE, _LEAST_PENALTY = 1e-5, 0.1
 def slack_curvature(penalty: float) -> float:
     """Return the curvature of the slacks of an elastic tip, for solvers of strictly convex QPs.
 
-    The penalty itself is linear. A dual method starts at the unconstrained minimum, where a slack is the ratio of
-    penalty and curvature: its rounding limits the accuracy of the rows, so that the curvature is scaled by the penalty.
+    The penalty itself is linear. A dual method starts at the unconstrained minimum, where a slack is the
+    ratio of penalty to curvature. The slack's rounding limits the accuracy of the rows; so the curvature is
+    scaled by the penalty.
     """
     return _SLACK_CURVATURE * max(penalty, _LEAST_PENALTY)
 

@@ -39,21 +39,21 @@ _SELDOM = {
     "adaptive_rho_interval": 2_000,
 }
 _AGAIN = ({**_SELDOM, "scaling": 0, "rho": 0.03}, {**_SELDOM, "scaling": 10, "rho": 1.0})
-"""Settings of further tries, where polishing failed, or where the step size `rho` went to and fro.
+"""Settings of further tries, for QPs on which polishing failed or the step size `rho` went to and fro.
 
-Of those that were tried on 43 such QPs, the first ones alone decide all, infeasible ones among them; the second ones
-solve QPs whose rows nearly contradict one another.
+On 43 such QPs, infeasible ones among them, the first settings decided all, alone of all that were tried. The
+second settings solve QPs whose rows nearly contradict one another.
 """
 
 _NEAR = 1e-4
-"""Residual below which a further try starts from the answer so far; others delay it."""
+"""Residual below which a further try starts from the answer so far; a worse start would delay it."""
 
 
 class Osqp:
     """See :class:`vgtm_qp.qp.dense.DenseSolver`; answers are checked.
 
-    All rows of the workspace are dense. Those that a QP does not use are zero and have infinite bounds, so that the
-    sparsity stays while near pairs come and go.
+    All rows of the workspace are dense. Unused rows are zero and have infinite bounds, so that the sparsity
+    does not change when near pairs come and go.
     """
 
     accuracy = 1e-8
@@ -75,7 +75,8 @@ class Osqp:
         check_question("osqp", hessian, gradient, constraint, lower, upper)
         qp = hessian, gradient, constraint, lower, upper
         workspace = self._workspace_for(len(gradient), len(lower) - len(constraint), len(constraint))
-        # A workspace is used again only after an accurate answer, or none: others may start the next QP far off.
+        # A workspace is used again only after an accurate answer, or a proof that there is none: a poor
+        # answer would start the next QP far off.
         self._workspace = None
         try:
             answer = workspace.solved(*qp)
@@ -90,7 +91,7 @@ class Osqp:
         return answer
 
     def _workspace_for(self, size: int, bounded: int, rows: int) -> _Workspace:
-        """Return the workspace in use, or one with more room that starts from its answer, or an unused one."""
+        """Return the workspace in use, a larger one that starts from its answer, or an unused one."""
         old = self._workspace
         if old is None or old.sizes[:2] != (size, bounded):
             return _Workspace(size, bounded, rows + _SPARE)
@@ -101,7 +102,7 @@ class Osqp:
     def _again(
         self, workspace: _Workspace, answer: DenseAnswer | None, off: float, *qp: Array
     ) -> DenseAnswer:
-        """Return an accurate answer by further tries after one with the residual `off`; the next QP starts from it.
+        """Return an accurate answer by further tries after one of residual `off`; the next QP starts there.
 
         Raises
         ------
@@ -153,7 +154,8 @@ class _Workspace:
         self._upper_triangle = np.flatnonzero(np.tri(size).reshape(-1))
         self._constraint = sparse.vstack([sparse.eye(bounded, size), np.ones((capacity, size))], format="csc")
         self._constraint.sort_indices()
-        # Columns one after another, those of unknowns with bounds first: these begin with an entry of the identity.
+        # Columns in order, those of bounded unknowns first: each of these begins with an entry of the
+        # identity.
         first, rest = np.split(self._constraint.data, [bounded * (capacity + 1)])
         self._first = first.reshape(bounded, capacity + 1)[:, 1:]
         self._rest = rest.reshape(size - bounded, capacity)
@@ -161,14 +163,14 @@ class _Workspace:
         self._solver: Any = None
 
     def start(self, answer: DenseAnswer | None) -> None:
-        """Let the iterations for the next QP start from `answer`, or from zero."""
+        """Start the iterations of the next QP from `answer`, or from zero."""
         unknowns, multipliers = np.zeros(self.sizes[0]), np.zeros(len(self._lower))
         if answer is not None:
             unknowns, multipliers[: len(answer.multipliers)] = answer.x, answer.multipliers
         self._solver.warm_start(x=unknowns, y=multipliers)
 
     def restart(self, answer: DenseAnswer | None) -> None:
-        """Let them start from `answer`, or from zero, with the step size of a new workspace."""
+        """Start the next iterations from `answer`, or from zero, with the step size of a new workspace."""
         self.last = answer
         if self._solver is not None:
             self._solver.update_settings(rho=self._settings["rho"])
@@ -177,7 +179,7 @@ class _Workspace:
     def solved(
         self, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
     ) -> DenseAnswer | None:
-        """Return the answer by iterations from the last one, and by polishing; None if OSQP has none.
+        """Return the answer by iterations from the last one and by polishing; None if OSQP finds none.
 
         Raises
         ------

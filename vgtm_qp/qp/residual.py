@@ -1,4 +1,4 @@
-"""One check of every answer: its residuals, by one norm and one tolerance, whatever status the solver returned."""
+"""One check of every answer: its residuals by one norm and one tolerance, whatever the solver's status."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """The small correction after a step's QP: its equalities hold exactly without another QP.
 
-The QP was linearised at the predicted middle of the step, so that what tip and stations lack then is of third order.
-Newton iterations with a constant Jacobian remove it: the least change, in the QP's metric, that makes good what is
-missing while actuators at a bound stay there. Clearance rows can be left out: their margin exceeds the motion.
+The QP was linearised at the predicted middle of the step, so that the errors of tip and stations are of third
+order. Newton iterations with a constant Jacobian remove them: each is the least change in the QP's metric
+that corrects the errors while actuators at a bound stay there. Clearance rows can be left out: their margin
+exceeds the motion.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ AT_BOUND = 1e-6
 
 
 _SETTLED = 1e-3
-"""Ratio of what is missing to the tolerance below which settling stops."""
+"""Error, over its tolerance, below which settling stops."""
 
 _ROUNDING = float(np.finfo(float).eps)
 
@@ -45,8 +46,8 @@ _ROUNDING = float(np.finfo(float).eps)
 def enough_length(q: Array, tolerance: float) -> float:
     """Return the error of a quantity at which the iteration stops.
 
-    It is far below `tolerance`, because division by a short step's duration makes errors of rates and accelerations of
-    it. For very long arms the rounding of node positions is the limit.
+    It is far below `tolerance`, because division by a short step's duration turns it into errors of rates and
+    accelerations. For very long arms the rounding of node positions is the limit.
     """
     return max(1e-3 * tolerance, 8.0 * _ROUNDING * float(np.abs(q).max()))
 
@@ -70,11 +71,11 @@ def settling_gain(hessian: Array, rows: Array, levers: Array, free: NDArray[np.b
     Parameters
     ----------
     hessian : (n, n)
-        Of the QP, whose metric says what is least.
+        Of the QP: the metric in which the changes are least.
     rows : (m, n)
         Equalities: those of the tip, and of stations that are kept on the curve.
     levers : (m,)
-        Lengths that compare them, see ``Layout.levers``.
+        Lengths to compare the rows by, see ``Layout.levers``.
     free : (n,)
         Unknowns that may change.
     """
@@ -96,13 +97,13 @@ def settling_gain(hessian: Array, rows: Array, levers: Array, free: NDArray[np.b
 
 
 class Gain(NamedTuple):
-    """The result (n, m) of :func:`settling_gain`, and the `solution` that changes (n,) of the unknowns are."""
+    """The result (n, m) of :func:`settling_gain`, and the function from changes (n,) to their solution."""
 
     per_missing: Array
     solution: Callable[[Array], StepSolution]
 
     def updated(self, change: Array, less: Array) -> Gain:
-        """Return Broyden's update after a `change` (n,) that made good `less` (m,) of what was missing."""
+        """Return Broyden's update after a `change` (n,) that reduced the errors by `less` (m,)."""
         gain = self.per_missing
         along = change @ gain
         scale = along @ less
@@ -112,11 +113,11 @@ class Gain(NamedTuple):
 
 
 def missing_function(layout: Layout) -> Bound:
-    """Return the function of what the equalities of a step lack at a configuration and a curve.
+    """Return the function for the errors of a step's equalities at a configuration and a curve.
 
-    Arguments: those of ``StepGraph.inputs`` before the constants, with ``motion`` zero, and the progress that the goal
-    has made since, straight. Results: the changes (n_e + H) that the values of the tip's rows and of the hard rows of
-    stations need, m and rad; position (3) and rotation (3, 3) of the tip.
+    Arguments: those of ``StepGraph.inputs`` before the constants, with ``motion`` zero; and the progress by
+    which the goal has moved on since, along a straight line. Results: the changes (n_e + H) that correct the
+    tip's rows and the stations' hard rows, m and rad; position (3) and rotation (3, 3) of the tip.
     """
     constants = Constants()
     graph = StepGraph(layout, layout.arm.symbols(constants), constants)
@@ -137,8 +138,8 @@ def missing_function(layout: Layout) -> Bound:
 def closing_function(layout: Layout) -> Bound:
     """Return the function (q, lower, upper) -> q after one Newton step; quantities (M) and their errors at q.
 
-    Fixed quantities go to their values, actuators into their boxes (n_a); see ``ArmSymbols.closed``. The errors are the
-    greatest one, which skips NaN, and their norm, which keeps it.
+    Fixed quantities go to their values, actuators into their boxes (n_a); see ``ArmSymbols.closed``. The
+    errors are given by their greatest magnitude, which skips NaN, and by their norm, which keeps it.
     """
     constants, arm = Constants(), layout.arm
     symbols = arm.symbols(constants)

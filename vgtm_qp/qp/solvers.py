@@ -1,6 +1,7 @@
 """QP solvers by name.
 
-Each solves the QP condensed onto the actuators; for long arms, the small QPs of the eliminations along the bays.
+Each solves the QP condensed onto the actuators; for long arms it solves the small QPs of the eliminations
+along the bays.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def available_solvers() -> list[str]:
 
 
 def dense_solver(name: str) -> DenseSolver:
-    """Return a solver of dense QPs by its name; it is for QPs of one arm, whose sizes stay.
+    """Return a solver of dense QPs by its name, for the QPs of one arm, whose sizes do not change.
 
     Raises
     ------
@@ -70,7 +71,7 @@ def dense_solver(name: str) -> DenseSolver:
             f'no solver "{name}" is installed{nearest(name, choices)}; choices: {", ".join(choices)}'
         )
     if name == "osqp":
-        # Imported only where it is asked for: that takes a tenth of a second.
+        # Imported only if it is asked for: the import takes a tenth of a second.
         from vgtm_qp.qp.osqp import Osqp
 
         return Osqp()
@@ -78,7 +79,7 @@ def dense_solver(name: str) -> DenseSolver:
 
 
 def make_solver(name: str, layout: Layout) -> StepSolver:
-    """Return what solves QPs of `layout` with the solver called `name`; SolverError as of `dense_solver`."""
+    """Return the solver called `name` for QPs of `layout`; raises SolverError as `dense_solver` does."""
     solver = dense_solver(name)
     along = chain_solver(layout, solver) if prefers_staged(layout) else None
     return along or CondensedSolver(layout, solver)
@@ -86,7 +87,7 @@ def make_solver(name: str, layout: Layout) -> StepSolver:
 
 _TIGHT: Mapping[str, Mapping[str, float]] = {
     "clarabel": {"tol_feas": 1e-10, "tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12},
-    # The complementarity gap must be small enough to tell an active row from a nearly active one.
+    # The complementarity gap must be small enough to distinguish active from nearly active rows.
     "piqp": {
         "eps_abs": 1e-10,
         "eps_rel": 1e-12,
@@ -96,11 +97,11 @@ _TIGHT: Mapping[str, Mapping[str, float]] = {
     "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9},
     "scs": {"eps_abs": 1e-9, "eps_rel": 1e-9},
 }
-"""Options with which solvers' answers pass the residual check; by their defaults they would not."""
+"""Options with which the answers pass the residual check; with these solvers' defaults they would not."""
 
 
 class _QpSolvers:
-    """Any other solver, by its name in qpsolvers; see :class:`vgtm_qp.qp.dense.DenseSolver`. Answers are checked."""
+    """Any solver of qpsolvers, by name; see :class:`vgtm_qp.qp.dense.DenseSolver`. Answers are checked."""
 
     accuracy = 1e-8
 
@@ -148,7 +149,7 @@ class _QpSolvers:
             count = np.count_nonzero(below)
             y[below] += answer.z[:count]
             y[above] -= answer.z[count:]
-        # Those of the bounds are what stationarity implies.
+        # The multipliers of the bounds follow from stationarity.
         of_bounds = -(hessian @ answer.x + gradient + y @ constraint)[:bounded]
         found = DenseAnswer(np.array(answer.x), np.concatenate([of_bounds, y]), 0, self._name)
         check(found, hessian, gradient, constraint, lower, upper)
@@ -170,7 +171,7 @@ class _QpSolvers:
             raise AnswerError(f"{self._name}: {error}") from error
         if answer.found and answer.x is not None:
             return answer
-        # The status is that of the library, or of its record of information.
+        # The status stands in `extras` itself, or in a record of information there.
         status = answer.extras.get("status", getattr(answer.extras.get("info"), "status", ""))
         if "primalinfeasible" in str(status).lower().replace("_", ""):
             raise InfeasibleStepError(f"{self._name}: primal infeasible")

@@ -46,7 +46,7 @@ class Measure:
 
     @property
     def ok(self) -> bool:
-        """True where the value is within its bound, or there is no value or no bound."""
+        """True if the value is within its bound, or value or bound is missing."""
         if self.value is None or self.bound is None:
             return True
         return self.value <= self.bound if self.side == "most" else self.value >= self.bound
@@ -65,17 +65,18 @@ class Measure:
 class Certificate:
     """Result of ``verify``: worst values over all states of a maneuver, and between them.
 
-    A clearance is the distance of a member's axis from a solid obstacle less the radius, or of two axes less both: from
-    surface to surface, and minus the radius where the axis is inside, however deep. Clearances between states are
-    proven lower bounds, at most 1e-6 of the mean member or link below the least one.
+    A clearance is the distance of a member's axis from a solid obstacle less the radius, or of two axes less
+    both radii: from surface to surface, and minus the radius if the axis is inside, at any depth. Clearances
+    between states are proven lower bounds, at most 1e-6 of the mean member or link below the least clearance
+    found.
 
     Attributes
     ----------
     member_error, base_error : Measure
-        Greatest deviation of a fixed or locked member from its length, and of a base node from where the problem
-        holds it, m.
+        Greatest deviation of a fixed or locked member from its length, and of a base node from its place in
+        the problem, m.
     stroke_violation, rate_violation, acceleration_violation : Measure
-        How far actuated members pass their limits, m, m/s and m/s^2; zero where they keep them.
+        Greatest excess of actuated members over their limits, m, m/s and m/s^2; zero if they keep them.
     clearance, clearance_between : Measure
         Least distance from members to obstacles at the states, and a lower bound of it between them, m.
     self_clearance, self_clearance_between : Measure
@@ -93,21 +94,24 @@ class Certificate:
         Least singular value of the square length Jacobian, and of the tip's translation with respect to the
         actuated lengths, m/m.
     tip_error_per_millimetre : Measure
-        Greatest singular value of the same: mm at the tip for actuator errors whose squares sum to 1 mm^2.
+        Greatest singular value of the latter: mm at the tip for actuator errors whose squares sum to 1 mm^2.
     tracking_gap, states_off_curve : Measure
-        Greatest distance of a station from its node on the reference curve, m, and the share of the states in which it
-        is more than 1e-6 of the mean member or link; but for the home pose, to which the curve is fitted.
+        Greatest distance of a station from its node on the reference curve, m, and the share of the states in
+        which that exceeds 1e-6 of the mean member or link; without the home pose, to which the curve is
+        fitted.
     tracking_angle : Measure
-        Greatest angle between a station's normal and the curve, rad, where the method keeps these, too.
+        Greatest angle between a station's normal and the curve, rad, if the method keeps normals along the
+        curve.
     curve_start_gap, curve_start_angle : Measure
         Greatest distance of the curve's start from the base, m, and angle from the base's normal, rad.
     curve_end_gap, curve_end_angle : Measure
-        Greatest distance of the curve's end from the end effector, m, and angle between their directions, rad, where
-        the method ties them.
+        Greatest distance of the curve's end from the end effector, m, and angle between their directions,
+        rad, if the method ties the two.
     fcl_rows, exact_rows : Measure
-        Numbers of the solver's clearance rows by FCL and by closed forms: its own count, which states cannot confirm.
+        Numbers of the solver's clearance rows by FCL and by closed forms: the solver's own count, which the
+        states cannot confirm.
     contradictions, notes : tuple of str
-        What in the file disagrees with itself or with its problem, and what could not be checked, one line each.
+        Contradictions within the file or with its problem, and what could not be checked, one line each.
     """
 
     member_error: Measure
@@ -146,7 +150,7 @@ class Certificate:
 
     @property
     def ok(self) -> bool:
-        """True where every measure is within its tolerance and nothing contradicts."""
+        """True if every measure is within its tolerance and there are no contradictions."""
         return not self.failures()
 
     def failures(self) -> tuple[str, ...]:
@@ -167,7 +171,7 @@ class Certificate:
             values: dict[str, Any] = {
                 f.name: _lines(data[f.name]) if f.name in texts else _measure(data[f.name])
                 for f in fields(cls)
-                # Files of earlier versions lack what has a default.
+                # Files of earlier versions lack measures that have a default.
                 if f.name in data or f.default is MISSING or f.name in texts
             }
             return cls(**values)

@@ -25,15 +25,15 @@ class RecordedChain:
     quantity_names, member_names : tuple of str
         Joints, and links.
     actuated, home_quantities, stroke, rate, acceleration : (J,), (J,), (J, 2), (J,), (J,)
-        Of the joints; infinite where there is no limit. What a joint that follows another is off from a multiple of
-        that other's value is its quantity, and does not change.
+        Of the joints; limits are infinite if there are none. The quantity of a follower is fixed: its value
+        less a multiple of the value of the joint that it follows.
     followers, multipliers : (K, 2) int, (K,)
-        Joints that follow others, and those; and what they multiply the values by.
+        Followers, and the joints that they follow; and the multipliers.
     base : (1,) int
         The point that the problem places.
     links, members : (B, 2) int
-        The points of each link, counted from the base over the joints to the tip, then those of bodies; and its ends,
-        of which neighbours have one in common.
+        The two points of each link, counted from the base over the joints to the tip, then those of bodies;
+        and the link's ends, one of which it shares with each neighbour.
     points, carriers : (P, 3), (P,) int
         Points of bodies, m, in the frames of the joints that they move with, and the numbers of those joints.
     touching : (K, 2) int
@@ -41,7 +41,7 @@ class RecordedChain:
     radius, length : (B,)
         Of the links, m.
     stretches : (B,) bool
-        Links that are drawn as changing their lengths: none.
+        All False: no link is drawn as changing its length.
     """
 
     kind, unit, body, rigid_body = "serial", "rad or m", "link", "link"
@@ -82,7 +82,7 @@ class RecordedChain:
         self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
         self.stretches = np.zeros(links, dtype=np.bool_)
         self._way: tuple[bytes, bytes, Array, Array] | None = None
-        """The way asked about last by :meth:`ends_between`: its ends, and the shares and links placed so far."""
+        """The last motion of :meth:`ends_between`: its two states, and the shares and links placed so far."""
         at_home = np.concatenate([home, np.zeros(6)])[None]
         self._home_values, self.home_quantities = home, self.quantities(at_home)[0]
         points, _, frames = self.placed(at_home)
@@ -189,11 +189,11 @@ class RecordedChain:
         return np.stack(points, axis=1), np.stack(axes, axis=1), frame
 
     def ends(self, points: Array) -> Array:
-        """Return (..., B, 2, 3) the ends of the links where the points (..., J + 2, 3) are."""
+        """Return (..., B, 2, 3) the ends of the links for points (..., J + 2, 3)."""
         return np.asarray(points[..., self.links, :])
 
     def lengths(self, points: Array) -> Array:
-        """Return (..., B) the lengths of the links, m, where the points (..., J + 2, 3) are."""
+        """Return (..., B) the lengths of the links, m, for points (..., J + 2, 3)."""
         return np.asarray(np.linalg.norm(np.diff(self.ends(points), axis=-2)[..., 0, :], axis=-1))
 
     def quantities(self, q: Array) -> Array:
@@ -213,11 +213,11 @@ class RecordedChain:
         return np.asarray(self.placed(q)[0][:, len(self.quantity_names) + 1])
 
     def tip_rotations(self, q: Array) -> Array:
-        """Return (T, 3, 3) the end effector's attitude at configurations (T, J + 6): that at home, turned."""
+        """Return (T, 3, 3) the end effector's attitude at configurations (T, J + 6)."""
         return np.asarray(self.placed(q)[2] @ self._home_tip.T @ self.tip_frame)
 
     def singular_values(self, q: Array) -> tuple[float, float, float] | None:
-        """Return 1, for joints are the configuration, and least and greatest singular value of the tip's Jacobian."""
+        """Return 1, in place of the length Jacobian's, and least and greatest value of the tip's Jacobian."""
         points, axes, _ = self.placed(q[None])
         joints = points[0, 1 : len(axes[0]) + 1]
         arms = np.cross(axes[0], points[0, len(joints) + 1] - joints)
@@ -233,8 +233,8 @@ class RecordedChain:
         return self.ends(self.placed(q)[0])
 
     def ends_between(self, before: Array, after: Array, share: Array, link: Index) -> Array:
-        """Return (P, 2, 3) the ends, m, of links (P,) at shares (P,) of the straight way between configurations."""
-        # Many pairs, one kind after another, are asked about at few instants, and at the same ones.
+        """Return (P, 2, 3) the ends, m, of links (P,) at shares (P,) of a straight motion between states."""
+        # Many pairs of one kind after another are evaluated at the same few instants.
         if self._way is None or self._way[:2] != (before.tobytes(), after.tobytes()):
             self._way = before.tobytes(), after.tobytes(), np.zeros(0), np.zeros((0, *self.links.shape, 3))
         known, ends = self._way[2:]
@@ -250,9 +250,9 @@ class RecordedChain:
     def bend(self, before: Array, after: Array, link: Index) -> Array:
         """Return (..., P) bounds, m, of |d2 r / d share2| of points of links (P,) as the configuration moves straight.
 
-        Configurations are (..., J + 6). A point is the sum of vectors p that are turned by the joints before them at
-        speeds w, one after the other. The product of these turns has a second derivative of at most the square of the
-        sum of w. A slide changes its vector at a constant speed v along itself. So |p''| <= (sum w)^2 |p| + 2 v sum w.
+        Configurations are (..., J + 6). A point is the sum of vectors p, each turned by the joints before it
+        at speeds w. The product of these turns has a second derivative of at most the square of the sum of w.
+        A slide changes its vector at a constant speed v along itself. So |p''| <= (sum w)^2 |p| + 2 v sum w.
         The base's rotation vector counts twice, as its axis turns too.
         """
         count, revolute = len(self.quantity_names), self.revolute
@@ -275,7 +275,7 @@ class RecordedChain:
 
 
 class _Driven(NamedTuple):
-    """What the joints of a problem's table are, where some follow others: see :class:`RecordedChain`."""
+    """Home, limits and followers of the joints in a problem's table; see :class:`RecordedChain`."""
 
     home: Array
     stroke: Array
@@ -286,7 +286,7 @@ class _Driven(NamedTuple):
 
 
 def _driven(joints: Mapping[str, Mapping[str, Any]]) -> _Driven:
-    """Return what joints have at home, their limits, and who follows whom, from the tables of a problem."""
+    """Return home values, limits and followers of joints, from the tables of a problem."""
     number, tables = {name: k for k, name in enumerate(joints)}, list(joints.values())
     home = np.array([joint.get("home") or 0.0 for joint in tables], dtype=float)
     stroke = np.array([joint.get("limits") or (-np.inf, np.inf) for joint in tables], dtype=float)
@@ -308,7 +308,7 @@ def _driven(joints: Mapping[str, Mapping[str, Any]]) -> _Driven:
 def _are_ends(recorded: Array, ends: Array, radius: float) -> bool:
     """Whether both points (2, 3) of a recorded capsule are the `ends` (1 or 2, 3) of its axis, m.
 
-    A ball, or what is nearly one, is recorded as a capsule with a short axis through its centre.
+    A ball, or a capsule that is nearly one, is recorded as a capsule with a short axis through its centre.
     """
     if float(np.linalg.norm(ends[-1] - ends[0])) >= 1e-3 * radius:
         return same(recorded, ends)

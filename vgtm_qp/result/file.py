@@ -1,4 +1,4 @@
-"""The result file: one ``.npz`` of named arrays, without pickle, written atomically and read with all of it checked."""
+"""The result file: an ``.npz`` of named arrays without pickle, written atomically, checked when read."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from vgtm_qp.result.record import GREATEST
 
 _STALE_SECONDS = 60.0
 _WIDEST = 8
-"""Bytes of a number, at most."""
+"""Greatest size of a number, bytes."""
 _GREATEST_MANIFEST = 1 << 28
-"""Bytes of a manifest, at four a letter."""
+"""Greatest size of a manifest, bytes, at four a letter."""
 _FREE_BYTES, _GREATEST_RATIO, _GREATEST_BYTES = 1 << 26, 100, 1 << 32
-"""Bytes that any result file may inflate to, and those more for each of its own, and bytes of the greatest of all."""
+"""Inflated bytes allowed to any file; further ones per byte of the file; and the limit for all files."""
 _UNREADABLE = (
     OSError,
     EOFError,
@@ -38,7 +38,7 @@ _UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What zipfile and numpy raise over a file that is cut, damaged, encrypted or of another kind."""
+"""Errors that zipfile and numpy raise for a file that is cut, damaged, encrypted or of another kind."""
 
 
 class ArrayLayout(NamedTuple):
@@ -79,7 +79,7 @@ OF_SERIAL_ARMS = ("joints", "joint_names", "body_names")
 
 
 def names_of(arrays: Collection[str]) -> list[str]:
-    """Return the names of the arrays that a result file of the kind of these may have."""
+    """Return the names that arrays of a result file may have: a truss's, or a serial arm's, like `arrays`."""
     others = OF_TRUSSES if "joints" in arrays else OF_SERIAL_ARMS
     return [name for name in LAYOUTS if name not in others]
 
@@ -98,7 +98,7 @@ def write_result(path: Path, arrays: Mapping[str, NDArray[Any]], manifest: Mappi
 
 @contextmanager
 def replacing(path: Path, error: type[ResultError | ExportError] = ResultError) -> Iterator[Path]:
-    """Yield a scratch file beside `path` that takes its place once it is whole; raise `error` where that fails."""
+    """Yield a scratch file beside `path`, and move it there when it is complete, or raise `error`."""
     scratch = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -113,7 +113,7 @@ def replacing(path: Path, error: type[ResultError | ExportError] = ResultError) 
 
 
 class _Header(NamedTuple):
-    """What the first bytes of an array in a result file say of it."""
+    """Shape and kind of an array in a result file, from its first bytes."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -157,12 +157,12 @@ def plain(array: Any) -> NDArray[Any]:
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a copy on immutable bytes, which cannot be made writable again either."""
+    """Return a copy on immutable bytes, which cannot be made writable again."""
     return np.ndarray(array.shape, array.dtype, buffer=array.tobytes())
 
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise ResultError for the first array that is missing, unknown, malformed or holds no number."""
+    """Raise ResultError for the first array that is missing, unknown, malformed or has a wrong value."""
     sizes = _check_layout({name: _Header(array.shape, array.dtype) for name, array in arrays.items()})
     for name, array in arrays.items():
         unbounded = not LAYOUTS[name].finite
@@ -181,7 +181,7 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _check_layout(headers: Mapping[str, _Header]) -> dict[str, int]:
-    """Return the sizes of the axes by name; ResultError for the first array that is missing, unknown or malformed."""
+    """Return the sizes of the axes by name; ResultError for a missing, unknown or malformed array."""
     possible = names_of(headers)
     for name in headers:
         if name not in possible:
@@ -210,10 +210,10 @@ def _check_layout(headers: Mapping[str, _Header]) -> dict[str, int]:
 
 
 def _check_headers(path: Path, archive: zipfile.ZipFile) -> None:
-    """Raise ResultError where an archive is not that of a result file; only the headers of its arrays are inflated.
+    """Raise ResultError if an archive is not a result file; only the headers of its arrays are decompressed.
 
-    Names, kinds and shapes are those of a result file. Every array has just the bytes that its header says, and all of
-    them together are no more than what a file of that size can hold of a maneuver.
+    A result file has arrays of known names, kinds and shapes. Each has the number of bytes that its header
+    claims. All together are not larger than a maneuver in a file of that size can be.
     """
     if "manifest.npy" not in archive.namelist():
         raise ResultError(f"{path}: has no manifest, so it is not a result file")
@@ -245,7 +245,7 @@ def _check_headers(path: Path, archive: zipfile.ZipFile) -> None:
 
 
 def _header(about: str, stream: IO[bytes], size: int) -> _Header:
-    """Return the header at the start of an entry of `size` bytes; ResultError where it claims others than these."""
+    """Return the header at the start of an entry of `size` bytes; ResultError if it claims another size."""
     try:
         version = np.lib.format.read_magic(stream)
         read = (
@@ -256,7 +256,7 @@ def _header(about: str, stream: IO[bytes], size: int) -> _Header:
     except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         raise ResultError(f"{about} cannot be read: {str(error)[:200]}") from None
     bytes_claimed = math.prod(shape) * dtype.itemsize
-    # Of items without bytes there may be any number.
+    # Items without bytes could be any number.
     if min(shape, default=0) < 0 or dtype.hasobject or not dtype.itemsize or begin + bytes_claimed != size:
         raise ResultError(
             f"{about} is of {dtype} and shape {shape}, {bytes_claimed} bytes; the file holds {size - begin} of it"
@@ -287,7 +287,8 @@ def _read_array(path: Path, file: Any, name: str) -> NDArray[Any]:
 def _remove_stale_scratch(path: Path) -> None:
     """Remove scratch files that killed saves of `path` left behind; a young one may belong to a save under way."""
     scratch = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{16}}\.tmp")
-    # The file is saved already: a scratch file that cannot be removed, or that another save removes, is no failure.
+    # The file is saved already: it is no failure if a scratch file cannot be removed, or another save removes
+    # it.
     with suppress(OSError):
         for entry in path.parent.iterdir():
             if scratch.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > _STALE_SECONDS:
@@ -295,7 +296,7 @@ def _remove_stale_scratch(path: Path) -> None:
 
 
 def _sync_directory(directory: Path) -> None:
-    """Make the new name itself survive a power cut, where the system lets a directory be opened."""
+    """Make the new name survive a power cut, if the system lets a directory be opened."""
     try:
         handle = os.open(directory, os.O_RDONLY)
     except OSError:

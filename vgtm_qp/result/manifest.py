@@ -1,13 +1,17 @@
 """The manifest of a result file: problem, arm, outcome and versions as strict JSON data.
 
-It has `schema_version`; the `problem` in the form of its file, and `problem_digests`, what the function of that name
-returns; the `arm` as its `record` gives it; the `curve` as ``Layout.record`` gives it, null without one; `status`,
-one of ``STATUSES``, `reached`, the share of the path covered, 0 to 1, and `blocked_by`, the names of what stopped the
-arm; the `stop` as its `to_dict` gives it; `way_out`, the change of the problem with which a retry came further;
-`recovered`, pairs below their clearance in the home pose and their distances there, m; `method` and `solver`;
-`setup_time`, s; `directory`, where relative paths of the problem start; `meshes`, what `mesh_record` returns for each;
-`versions`; the `certificate`, null before verification; `jacobian_rank`, that of the last step where the method reveals
-it; and `clearance_rows`, how many rows of the QPs that moved the arm were supplied by `fcl`, and how many were `exact`.
+Its keys are:
+
+- `schema_version`; `problem`, in the form of its file; `problem_digests`, see the function of that name;
+- `arm`, from ``Arm.record``; `curve`, from ``Layout.record``, null without a curve;
+- `status`, one of ``STATUSES``; `reached`, the share of the path covered, 0 to 1;
+- `blocked_by`, the names of what stopped the arm; `stop`, from ``Stop.to_dict``; `way_out`, the name of the
+  retry that came further;
+- `recovered`, pairs below their clearance in the home pose, and their distances there, m;
+- `method`; `solver`; `setup_time`, s; `versions`; `jacobian_rank`, of the last step if the method reveals it;
+- `directory`, in which relative paths of the problem start; `meshes`, from ``mesh_record`` for each mesh;
+- `certificate`, null before verification;
+- `clearance_rows`, numbers of rows by `fcl` and of `exact` ones in the QPs that moved the arm.
 """
 
 from __future__ import annotations
@@ -32,12 +36,12 @@ SCHEMA_VERSION = 1
 """Version of the result file that this package writes and reads."""
 
 STATUSES = ("solved", "blocked", "infeasible")
-"""Solved: the whole path is covered, and verification, if there was one, found nothing. Blocked: the arm stopped on the
-way. Infeasible: the whole path is covered, but something that was asked for is broken.
+"""Solved: the whole path is covered, and verification, if done, found no fault. Blocked: the arm stopped
+before its end. Infeasible: the whole path is covered, but verification found a fault.
 """
 
 WHOLE_PATH = 1.0 - 1e-9
-"""Share of the path from which the arm has arrived."""
+"""Share of the path from which on the arm counts as arrived."""
 
 _PACKAGES = ("vgtm-qp", "numpy", "casadi", "daqp", "osqp", "piqp", "python-fcl", "qpsolvers", "trimesh")
 _MANIFEST_KEYS = ("schema_version", "problem", "arm", "status", "reached", "blocked_by", "versions")
@@ -99,26 +103,26 @@ _VALUES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "clearance_rows": (lambda value: _is_table(value, _is_count), "numbers of rows by name"),
     "digest": (_is_text, "a string"),
 }
-"""What the values of a manifest have to be, where they are not null; of what is not here `check_manifest` says it."""
+"""Checks of values that are not null, each with its expectation; `check_manifest` checks the other keys."""
 
 
 def mesh_record(path: str | Path, triangles: int) -> dict[str, Any]:
-    """Return what ties a result to a mesh file: its SHA-256 and the number of its triangles."""
+    """Return SHA-256 and number of triangles of a mesh file, by which a result is tied to it."""
     return {"sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest(), "triangles": int(triangles)}
 
 
 def problem_digests(problem: Mapping[str, Any], **files: str | Path | None) -> dict[str, str | None]:
-    """Return the SHA-256 that tie a result to its problem; None where there is no such file, or none any more.
+    """Return the SHA-256 that tie a result to its problem; None for a file that does not exist.
 
     They are of the canonical text of `problem` as the manifest holds it, and of `files` by name: ``file``, that of the
-    problem, ``path`` and ``urdf``. Those of meshes are in their records. No file is read that is not given here.
+    problem, ``path`` and ``urdf``. Those of meshes are in their records. Only the files given here are read.
     """
     text = hashlib.sha256(dump_manifest(problem).encode()).hexdigest()
     return {"problem": text, **{name: file_digest(path) for name, path in files.items()}}
 
 
 def file_digest(path: str | Path | None) -> str | None:
-    """Return the SHA-256 of a file, or None where there is none that can be read."""
+    """Return the SHA-256 of a file, or None if it cannot be read."""
     try:
         return None if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except (OSError, ValueError):
@@ -126,7 +130,7 @@ def file_digest(path: str | Path | None) -> str | None:
 
 
 def recorded_versions() -> dict[str, str]:
-    """Return the versions of what a result depends on."""
+    """Return the versions of Python, machine and packages that a result depends on."""
     return {
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
@@ -169,7 +173,7 @@ def check_manifest(manifest: Any) -> dict[str, Any]:
 
 
 def stored_problem(data: Any) -> Problem:
-    """Return the problem of a manifest, held against the schema of problem files; ResultError with the keys."""
+    """Return the problem of a manifest, checked like a problem file; ResultError names the wrong keys."""
     from vgtm_qp.problem import Problem
 
     try:
@@ -180,7 +184,7 @@ def stored_problem(data: Any) -> Problem:
 
 
 def _with_present_keys(data: Any) -> Any:
-    """Return the problem of a manifest with ``tracking_mode`` in the place of ``hard_tracking``, its former key."""
+    """Return a manifest's problem with ``tracking_mode`` instead of ``hard_tracking``, its former key."""
     method = data.get("method") if isinstance(data, Mapping) else None
     if not isinstance(method, Mapping) or not isinstance(method.get("hard_tracking"), bool):
         return data

@@ -28,10 +28,10 @@ def rotation_matrix(vector: Array) -> Array:
 
 
 def base_poses(problem: Mapping[str, Any], times: Array) -> Array:
-    """Return (T, 6) position, m, and rotation vector, rad, of the base against home at `times` (T,), s.
+    """Return (T, 6) position, m, and rotation vector, rad, of the base relative to home at `times` (T,), s.
 
-    A base that moves goes from pose to pose on straight lines and single-axis rotations, from its home pose at time 0
-    on, and stays in the last one.
+    From its home pose at time 0 on, a moving base goes from pose to pose on straight lines and single-axis
+    rotations. It stays in the last pose.
     """
     poses = (problem.get("truss") or problem.get("arm") or {}).get("base_motion") or ()
     found = np.zeros((len(times), 6))
@@ -54,7 +54,7 @@ def base_poses(problem: Mapping[str, Any], times: Array) -> Array:
 
 
 def _continued(vector: Array, before: Array) -> Array:
-    """Return of all rotation vectors (3,) of a rotation, rad, the one that continues the one `before` (3,)."""
+    """Return the rotation vector (3,), rad, of the same rotation that continues the one `before` (3,)."""
     axis = vector if np.any(vector) else before
     if not np.any(axis):
         return vector

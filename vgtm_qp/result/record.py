@@ -1,4 +1,4 @@
-"""Tables of a manifest, whose values are checked as they are read: a wrong one is named by its key."""
+"""Tables of a manifest. Values are checked as they are read, and errors name the key."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import ResultError
 
 Shape = tuple[int | None, ...]
-"""Sizes of the axes; None where any will do."""
+"""Sizes of the axes; None for any size."""
 
 GREATEST = 1e12
 """Greatest number of a record or an array: squares and products of such numbers are finite."""
 
 
 class Record:
-    """The table `data` of a manifest, which messages call `name`; ResultError for a value of another kind or shape."""
+    """The table `data` of a manifest, `name` in messages; ResultError for a wrong kind or shape of value."""
 
     def __init__(self, data: Any, name: str) -> None:
         if not isinstance(data, Mapping):
@@ -30,7 +30,7 @@ class Record:
         return Record(self._value(key), f"{self._name}.{key}")
 
     def numbers(self, key: str, shape: Shape, *, limits: bool = False) -> NDArray[np.float64]:
-        """Return the numbers of a key; of `limits` null is none, inf."""
+        """Return the numbers of a key. In `limits`, null means infinite."""
         array = self._array(key, shape, "numbers")
         if array.dtype.kind == "O" and limits:
             flat = array.reshape(-1)
@@ -59,7 +59,7 @@ class Record:
         return np.asarray(array, dtype=np.bool_)
 
     def names(self, key: str, count: int | None = None) -> tuple[str, ...]:
-        """Return the strings of a key, each of them another one."""
+        """Return the strings of a key; no two are equal."""
         value = self._value(key)
         if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
             raise self._error(key, "a list of strings")
@@ -68,7 +68,7 @@ class Record:
         return tuple(value)
 
     def has(self, key: str) -> bool:
-        """Return whether a key, which must be there, has another value than null."""
+        """Return whether the value of a key is not null; ResultError if the key is missing."""
         return self._value(key) is not None
 
     def flag(self, key: str) -> bool:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 _LEFT_OUT: Any = None
-"""Of a serial arm these follow from its joints."""
+"""Default of the arrays that follow from the joints of a serial arm."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,7 +39,7 @@ class Result:
         Pose of the end effector, and the target for which each state was accepted, m.
     clearance, self_clearance : (T,)
         Least clearance at each state from obstacles, and between members that share no node, m, as the certificate
-        defines it; infinite if nothing is near.
+        defines it; infinite without any pair.
     progress : (T,)
         Share of the path covered, 0 to 1.
     step_time, phase_names, phase_time : (T,), (P,), (T, P)
@@ -47,11 +47,11 @@ class Result:
     manifest : dict
         Plain data, see `vgtm_qp.result.manifest`.
     tip_target_rotation, tip_target_pointing : (T, 3, 3) or None, (T, 3) or None
-        Targets of orientation or direction where they were tracked.
+        Targets of orientation or direction, if these were tracked.
     nodes : (T, N, 3)
-        Node positions, m; of a serial arm, which has none in its file: base, joints and tip.
+        Node positions, m. For a serial arm, whose file has none: base, joints and tip.
     members, member_names, member_actuated : (M, 2), (M,), (M,)
-        The nodes, name and kind of each member; of a serial arm: its links.
+        The nodes, name and kind of each member; for a serial arm of each link.
     member_lengths : (T, M)
         m.
     joints, joint_names, body_names : (T, J), (J,), (B,), or None
@@ -60,7 +60,7 @@ class Result:
     Raises
     ------
     ResultError
-        An array has another shape or kind than this, holds a NaN, or the manifest is not strict JSON.
+        An array has another shape or kind, or a wrong value; or the manifest is not strict JSON.
     """
 
     time: Array
@@ -98,7 +98,7 @@ class Result:
             object.__setattr__(self, name, frozen(array))
 
     def __str__(self) -> str:
-        """Return one paragraph: name, status, steps, what stopped it, what verification found."""
+        """Return one paragraph: name, status, steps, cause of a stop, result of the verification."""
         text = f"{self._name}: {self.status}, {100.0 * self.reached:.4g} % of the path in {self.steps} steps."
         if way := self.manifest.get("way_out"):
             text += f" The problem as given was a dead end; this is the retry with {way}."
@@ -122,7 +122,7 @@ class Result:
     def to_dataframe(self) -> DataFrame:
         """Return a table of pandas with a row a state, by time, s.
 
-        Its columns are the actuators' values, the tip's position and its target's, m, and both least clearances, m.
+        Columns: the actuators' values, the positions of tip and target, m, and both least clearances, m.
 
         Raises
         ------
@@ -151,7 +151,7 @@ class Result:
 
     @property
     def configurations(self) -> Array:
-        """(T, N, 3) the nodes, m; of a serial arm (T, J + 6) joints, then position and rotation vector of its base."""
+        """(T, N, 3) nodes, m; of a serial arm (T, J + 6) joints, position and rotation vector of the base."""
         if self.joints is None:
             return self.nodes
         return np.concatenate([self.joints, base_poses(self.manifest["problem"], self.time)], axis=1)
@@ -181,12 +181,12 @@ class Result:
 
     @property
     def status(self) -> str:
-        """``"solved"``, ``"blocked"``, or ``"infeasible"``: it arrived, but breaks what was asked for."""
+        """``"solved"``, ``"blocked"``, or ``"infeasible"``: at the end of the path, but with a fault."""
         return str(self.manifest["status"])
 
     @property
     def arrived(self) -> bool:
-        """Whether the arm covered the whole path, in whatever way."""
+        """Whether the arm covered the whole path, with faults or without."""
         return self.reached >= WHOLE_PATH
 
     @property
@@ -196,32 +196,32 @@ class Result:
 
     @property
     def blocked_by(self) -> tuple[str, ...]:
-        """Names of all obstacles, members and limits that together stopped it."""
+        """Names of all obstacles, members and limits that together stopped the arm."""
         return tuple(self.manifest["blocked_by"])
 
     @property
     def stopped_by(self) -> str:
-        """What stopped it and what would let it go on, for people; empty if it was not stopped."""
+        """What stopped the arm and what would let it go on, for people; empty if it was not stopped."""
         text: str = (self.manifest.get("stop") or {}).get("text", "")
         return text or ", ".join(self.blocked_by[:3])
 
     @property
     def remedies(self) -> list[list[dict[str, Any]]]:
-        """Alternatives with which the arm goes on past its stop: each a list of changes of limits, as plain data."""
+        """Alternatives with which the arm gets past its stop: lists of changes of limits, as plain data."""
         return list((self.manifest.get("stop") or {}).get("remedies", []))
 
     @property
     def why_not(self) -> str:
-        """Why it is not solved: what stopped it, or else the first thing that it breaks; empty if it is solved."""
+        """Why the maneuver is not solved: what stopped the arm, or the first fault; empty if it is solved."""
         certificate = self.certificate
         return self.stopped_by or next(iter(() if certificate is None else certificate.failures()), "")
 
     @property
     def least_clearance(self) -> float | None:
-        """Least clearance from obstacles over all states and between them, m; None if nothing is near.
+        """Least clearance from obstacles over all states and between them, m; None without obstacles.
 
-        Before verification it is that of the states alone. Pairs that began too near, which a certificate excuses,
-        count here.
+        Before verification it is that of the states alone. Pairs that began too near count here, although a
+        certificate excuses them.
         """
         certificate = self.certificate
         between = None if certificate is None else certificate.clearance_between.value
@@ -235,7 +235,7 @@ class Result:
 
     @property
     def certificate(self) -> Certificate | None:
-        """What verification found; None before it."""
+        """The result of the verification; None before it."""
         data = self.manifest.get("certificate")
         return None if data is None else Certificate.from_dict(data)
 
@@ -284,7 +284,7 @@ class Result:
         }
 
     def _step_time(self) -> dict[str, Any]:
-        """Median and percentiles of the steps, median of each phase, s; the home pose took no step."""
+        """Median and percentiles of the steps, and median of each phase, s; without row 0, the home pose."""
         times = self.step_time[1:]
         if not len(times):
             return {"median": None, "p95": None, "p99": None, "phases": {}}
@@ -315,7 +315,7 @@ class Result:
 
 
 def _links(chain: RecordedChain, q: Array) -> dict[str, NDArray[Any]]:
-    """Return points and links of a serial arm at configurations (T, J + 6), in the terms of nodes and members."""
+    """Return points and links of a serial arm at configurations (T, J + 6), as nodes and members."""
     if q.shape[1] != len(chain.quantity_names) + 6:
         raise ResultError(
             f"array joints holds {q.shape[1] - 6} joints; manifest.arm describes {len(chain.quantity_names)}"

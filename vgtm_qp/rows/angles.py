@@ -30,7 +30,7 @@ def angle_gradients(angle: Array, first: Array, second: Array) -> Array:
 
 
 def corners(joints: Index) -> Index:
-    """Return (K, 2, 2) the pairs of bodies that meet at a joint: of each body its number, and which end meets.
+    """Return (K, 2, 2) the pairs of bodies that meet at a joint: number and meeting end of each body.
 
     `joints` (B, 2) are the joints at the two ends of each body.
     """

@@ -30,14 +30,15 @@ def clearance_rows(
     normal : (R, 3)
         Unit, from the obstacle or other body to the body.
     weights : (R, 4)
-        Of the velocities of the four points in that of the body's witness point relative to the other's.
+        Of the velocities of the four points in the velocity of the body's witness point relative to the
+        other's.
     is_self : (R,) bool
         Whether `self_safe` is to be kept instead of `safe`.
     safe, self_safe, margin : float
         Distance to keep from obstacles and between bodies, and a margin added to both, m.
     fraction : float
-        Where on the straight path to the end of the step the contacts were found: a displacement of the end state
-        moves that point by this share of it.
+        Place of the contacts on the straight path to the end of the step: a displacement of the end state
+        moves the arm there by this share of it.
     """
     pull = normal if fraction == 1.0 else fraction * normal
     coefficients = weights[:, :, None] * pull[:, None, :]

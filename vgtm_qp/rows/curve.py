@@ -11,7 +11,7 @@ from vgtm_qp.arrays import Array
 
 _TINY = 1e-300
 _STRAIGHTENS = 1e-6
-"""Weight that makes a fitted curve as straight as its points let it be."""
+"""Weight of the straightness of a fitted curve, small beside its points."""
 _KEEPS = 1e3
 """Weight of the direction in which a fitted curve ends, beside its points."""
 _LEAST_FIRST = 0.1
@@ -33,9 +33,10 @@ def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
 def legs(vertices: Any, normal: Any, least: Any, *, both: bool) -> tuple[Any, Any]:
     """Return axes (3, G) of the first leg of the control polygon (3, V), and of the last, and bounds (G,).
 
-    A leg must not shrink to zero length: it would reverse, and the curve with it. So the displacement of its end less
-    that of its start, along its axis, is at least the bound, m: the leg then keeps the `least` length, or what it has.
-    The axis of the first leg is the base's `normal` (3,), that of the last its own direction.
+    A leg must not shrink to zero length: it would reverse, and the curve with it. So the displacement of its
+    end less that of its start, along its axis, is at least the bound, m: the leg then keeps the `least`
+    length, or its own if that is less. The axis of the first leg is the base's `normal` (3,), that of the
+    last its own direction.
     """
     axes, lengths = [normal], [ca.dot(vertices[:, 1] - vertices[:, 0], normal)]
     if both:
@@ -50,8 +51,8 @@ def fitted(
 ) -> Array:
     """Return (V, 3) the vertices of the straightest curve from `start` (3,), along `normal` (3,), through `points`.
 
-    These are (K, 3), m, and met at the curve nodes with `weights` (K, V) as well as they can be. The `end`, weights
-    (V,) of the slope there and an axis (3,), is a direction that the curve ends in.
+    The points are (K, 3), m. The curve nodes with `weights` (K, V) meet them as well as possible. The `end`
+    gives the direction in which the curve ends: weights (V,) of the slope there, and an axis (3,).
     """
     vertices = weights.shape[1]
     basis = free_basis(normal, 3 * vertices)
@@ -65,7 +66,7 @@ def fitted(
     free = np.linalg.lstsq(rows, away, rcond=None)[0]
     least = _LEAST_FIRST * float(np.linalg.norm(points[-1] - start)) / max(vertices - 1, 1)
     if free[0] < least:
-        # It must not begin backwards.
+        # The curve must not begin backwards.
         rest = np.linalg.lstsq(rows[:, 1:], away - least * rows[:, 0], rcond=None)[0]
         free = np.concatenate([[least], rest])
     return np.asarray(start + (basis @ free).reshape(-1, 3))

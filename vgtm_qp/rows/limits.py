@@ -11,11 +11,11 @@ from vgtm_qp.arrays import Array
 def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
     """Return the greatest speed of a step of `dt` after which further ones stop within `distance`, m/s.
 
-    The mean speed v of a step is that in its middle if the speed falls by `acceleration` a all along. So does it from
-    there on: at the end of the step it is v - a dt / 2, and the way to rest from there is half its square over a. Steps
-    into which this motion is divided, of whatever durations, change their mean speeds by a times the time between their
-    middles, or by less in the last. So a speed that was allowed once can be braked within the limits, also where steps
-    become longer or shorter.
+    Let the speed fall at the `acceleration` a throughout. Then the mean speed v of the step is the speed in
+    its middle, the speed at its end is v - a dt / 2, and the distance to rest from there is half the square
+    of that over a. If this motion is divided into steps of any durations, their mean speeds change by a times
+    the time between their middles, or by less in the last. So a speed that was allowed once can be braked
+    within the limits, even if steps become longer or shorter.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         gap, lost = np.maximum(distance, 0.0), 0.5 * acceleration * dt
@@ -35,9 +35,10 @@ def actuator_box(
 ) -> tuple[Array, Array]:
     """Return the least and greatest values (n_a,) after a step of `dt` from `value`: lengths, m, or joint values.
 
-    Rate, acceleration and the speed from which the actuator still brakes before the end of its stroke are
-    intersected. Where they contradict one another (a start outside a limit) the acceleration gives way, then the
-    rate; an actuator outside its stroke may only come back.
+    The box is the intersection of three ranges: by the rate, by the acceleration, and by the speed from which
+    the actuator still brakes before the end of its stroke. If they contradict one another, at a start outside
+    a limit, the acceleration gives way first, then the rate. An actuator outside its stroke may only come
+    back.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ def actuator_box(
         least, greatest = speed - acceleration * interval, speed + acceleration * interval
     lower = np.maximum(low, value + np.clip(least, slowest, fastest) * dt)
     upper = np.minimum(high, value + np.clip(greatest, slowest, fastest) * dt)
-    # Where both bounds are the same value, rounding must not swap them.
+    # If both bounds are the same value, rounding must not swap them.
     return lower, np.maximum(lower, upper)
 
 
@@ -77,13 +78,13 @@ def binding(
     bound, end, fastest : (n_a,)
         The side of the box, the end of the stroke there, and the value that the greatest rate reaches.
     acceleration : (n_a,)
-        Limits; inf where there is none.
+        Limits; inf without one.
     locked : (n_a,) bool
         Actuators that are locked.
     """
     # Without a limited acceleration, only slowing before the end of the stroke gives a smaller bound.
     other = np.where(np.isinf(acceleration), STROKE, ACCELERATION)
-    # Bounds that are infinite are nobody's.
+    # Infinite bounds belong to no limit.
     with np.errstate(invalid="ignore"):
         kind = np.where(np.abs(bound - fastest) < _SAME, RATE, other)
         kind = np.where(np.abs(bound - end) < _SAME, STROKE, kind)

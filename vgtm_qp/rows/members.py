@@ -1,7 +1,7 @@
 """Rows of members: ends, lengths and their gradients, and the length Jacobian, eqs. (12)-(15) and (19)-(24).
 
-Functions that are mapped over members are in symbols. The ends of all members exist in arrays too, so that an accepted
-state can be measured by other code than the code that made it.
+Functions that are mapped over members are in symbols. The ends of all members exist in arrays as well, so
+that an accepted state can be measured by code that did not make it.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class LengthScatter:
         return out
 
     def sparse(self, gradient: Array) -> sparse.csc_matrix:
-        """Return the same as a sparse matrix."""
+        """Return the length Jacobian of :meth:`dense` as a sparse matrix."""
         return sparse.csc_matrix(
             (gradient.reshape(-1)[self.flat], (self.member, self.column)), shape=self.shape
         )

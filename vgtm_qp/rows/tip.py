@@ -26,13 +26,14 @@ _TINY = 1e-30
 _SHORT_WAY = 0.01
 """Displacement of the tip in a step, over the arm's unit, below which its progress has a larger weight.
 
-The weight is the square of the displacement. The other objectives have forces that do not shrink with it, so that with
-the square alone the last micrometres would never be covered: below this value the weight is the product of both. On a
-path of zero length progress costs nothing, and any positive weight will do.
+Above this value the weight is the square of the displacement. The other objectives have forces that do not
+shrink with the displacement, so that with its square alone the last micrometres would never be covered. Below
+this value the weight is therefore the product of displacement and value. On a path of zero length any
+positive weight will do.
 """
 
 _NO_WAY = 1e-6
-"""Displacement, over the arm's unit, that counts as none."""
+"""Displacement, over the arm's unit, that counts as zero."""
 
 _CLOSED = 2e-8
 """Tip error that a motion need not close, m: twice the tolerance of a settled state."""
@@ -53,7 +54,7 @@ class TipGoal(NamedTuple):
         m, and m per unit of the path variable or of progress.
     rotation : (3, 3)
     spin : (3,)
-        Angular velocity in the base frame, rad per unit of the same.
+        Angular velocity in the base frame, rad per unit of the path variable or of progress.
     """
 
     position: Array
@@ -62,7 +63,7 @@ class TipGoal(NamedTuple):
     spin: Array
 
     def over(self, span: float) -> TipGoal:
-        """Return the same with rates per unit of progress along a piece of path of that `span`."""
+        """Return the goal with rates per unit of progress along a piece of path of that `span`."""
         return TipGoal(self.position, self.rotation, self.velocity * span, self.spin * span)
 
 
@@ -94,7 +95,7 @@ def unit(row: str) -> str:
 
 
 def turned_axes(rows: Sequence[str], rotation: Any) -> Any:
-    """Return (r, 3) the directions about which the tip's turns are tracked: two across its z-axis, three, or none."""
+    """Return (r, 3) the axes of the tracked turns of the tip: r = 0, 2 (across its z-axis) or 3."""
     if "tip direction 1" in rows:
         return rotation[:, :2].T
     if "tip rotation x" in rows:
@@ -105,8 +106,8 @@ def turned_axes(rows: Sequence[str], rotation: Any) -> Any:
 def combined(rows: Sequence[str], position: Any, spin: Any, rotation: Any) -> Any:
     """Return the rows (n_e, n) of the end effector's rate, eqs. (3), (4) and (16)-(18): J, that is [J_u J_c].
 
-    Given are the derivatives (3, n) of the tip's velocity and angular velocity by the rates of n coordinates. The rates
-    of a moving goal, x_e-dot, are combined in the same way.
+    `position` and `spin` are the derivatives (3, n) of the tip's velocity and angular velocity by the rates
+    of n coordinates. The rates of a moving goal, x_e-dot, are combined in the same way.
     """
     return ca.vertcat(position[axes(rows), :], turned_axes(rows, rotation) @ spin)
 
@@ -132,7 +133,7 @@ def error(rows: Sequence[str], position: Any, rotation: Any, goal: Any, turned: 
 def _turn(twist: Any, cosine: Any, least: float, axis: Any) -> Any:
     """Return the turn (3,) of a `twist` (3,), its axis times its sine; about `axis` (3,) if near half a turn.
 
-    There the sine is below `least`, and the twist too small to show its axis.
+    Near half a turn the sine is below `least`, and the twist is too small to show its axis.
     """
     sine = ca.sqrt(ca.dot(twist, twist) + _TINY)
     angle = ca.atan2(sine, cosine)
@@ -153,7 +154,7 @@ def _axis(rotation: Any, twist: Any, cosine: Any) -> Any:
 def worth_closing(error: Any, motion: Any, levers: Any, fineness: Any) -> Any:
     """Return an error (n_e, 1), or zeros in a motion (1) if it is within the tolerance of an accepted state.
 
-    The `levers` (n_e, 1) turn it into lengths, m; `fineness` is that of the arm.
+    The `levers` (n_e, 1) turn the error into lengths, m; `fineness` is that of the arm.
 
     An arm held on all sides cannot close even such an error, and its QP would be infeasible. With zeros, resting is
     feasible, and the multipliers show the rows that hold the arm.
@@ -165,8 +166,8 @@ def worth_closing(error: Any, motion: Any, levers: Any, fineness: Any) -> Any:
 def progress_weight(rate: Any, levers: Any, unit: Any) -> Any:
     """Return the weight of the progress along the path, m^2, from the tip's displacement (n_e, 1) over it.
 
-    It is the square of the displacement, except for short ones, see :data:`_SHORT_WAY`. The `levers` (n_e, 1) turn it
-    into lengths, m; `unit` is that of the arm, m.
+    The weight is the square of the displacement, except for short ones, see :data:`_SHORT_WAY`. The `levers`
+    (n_e, 1) turn the displacement into lengths, m; `unit` is that of the arm, m.
     """
     way = ca.norm_2(levers * rate)
     return ca.if_else(way > _NO_WAY * unit, way * ca.fmax(way, _SHORT_WAY * unit), unit**2)
@@ -181,15 +182,16 @@ def progress_gradient(curvature: Any, progress: Any) -> Any:
 
 
 def levers(rows: Sequence[str], unit_length: float) -> list[float]:
-    """Return the lengths, m, that compare the rows' changes: 1 for positions, the arm's unit for angles."""
+    """Return the lengths, m, to compare rows' changes by: 1 for positions, the arm's unit for angles."""
     return [1.0 if unit(row) == "m" else unit_length for row in rows]
 
 
 def tip_function(rows: Sequence[str], unit_length: float) -> ca.Function:
     """Return the rows of a tip as a function of numbers, for an arm of that unit, m.
 
-    Arguments: position (3), rotation (3, 3); goal (3), turned (3, 3), velocity and spin (3) of that; motion, 1 or 0,
-    see :func:`worth_closing`. Results: error (n_e), rate (n_e), axes of the turns (r, 3), weight of the progress.
+    Arguments: position (3), rotation (3, 3); goal (3), turned (3, 3), velocity and spin (3) of the goal;
+    motion, 1 or 0, see :func:`worth_closing`. Results: error (n_e), rate (n_e), axes of the turns (r, 3),
+    weight of the progress.
     """
     position, rotation = ca.SX.sym("position", 3), ca.SX.sym("rotation", 3, 3)
     goal, turned = ca.SX.sym("goal", 3), ca.SX.sym("turned", 3, 3)

@@ -30,7 +30,7 @@ def turns(rotation: Any, frame: Any, count: int) -> tuple[Any, Any]:
 
 
 def within(error: Any, reach: float) -> Any:
-    """Return an error, shortened to the length `reach`: what one step is to make good of it."""
+    """Return an error, shortened to the length `reach`: the part that one step is to correct."""
     square = ca.dot(error, error)
     return error * ca.fmin(1.0, reach / ca.sqrt(ca.fmax(square, (1e-3 * reach) ** 2)))
 

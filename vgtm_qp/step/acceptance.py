@@ -1,7 +1,7 @@
-"""Acceptance of a new state: its constraints are checked again, by other code than the code that made it.
+"""Acceptance of a new state: its constraints are checked again, by code that did not make it.
 
-The engine that settles a configuration also measures it, and an error in that measure would go unnoticed. Here only
-the configuration is used: quantities and tip are computed from it again.
+The engine that settles a configuration also measures it, so that an error in its measure would go unnoticed.
+Here quantities and tip are computed again from the configuration alone.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.target import Target
 
 _LOOSER = 10.0
-"""A state is refused from this many times the tolerance of settling on.
+"""Error of a state that is refused, over the tolerance of settling.
 
-Rounding then never decides, and the published tolerances still hold.
+With this factor rounding never decides, and the published tolerances still hold.
 """
 
 _ROUNDING = 64.0 * float(np.finfo(float).eps)
@@ -51,8 +51,8 @@ class Acceptance:
     ) -> str:
         """Return what is wrong with a configuration and its curve (V, 3), m, and (T,), rad, or an empty string.
 
-        `before` is the configuration of the state before; the limits and the base are those of the `target`. `goal` is
-        that of the tip, None for a free tip. A tip with a direction overwrites the kinematics.
+        `before` is the configuration of the state before; limits and base are those of the `target`. `goal`
+        is the tip's goal, None for a free tip. If the tip has a direction, the kinematics is overwritten.
         """
         arm, q, base = self._arm, closed.q, target.base
         # NaN fails every comparison with `<=`, and makes every norm NaN.
@@ -62,7 +62,7 @@ class Acceptance:
             return "the new state is not finite"
         rounding = _ROUNDING * size
         X, at = arm.nodes(q), arm.nodes(before if base is None else arm.based(q, base))
-        # Nothing moves a base at rest, so that its nodes must be equal, without a tolerance.
+        # Nothing moves a base at rest: its nodes must be equal, without a tolerance.
         spare = 0.0 if base is None else self._member + rounding
         off = norm((X[self._base] - at[self._base]).reshape(-1))
         if not off <= spare:

@@ -21,10 +21,10 @@ _APPROACH = 0.3
 """Largest share of the distance to the end of its stroke that an actuator may use in one step."""
 
 _LEAST_APPROACH = 2e-3
-"""What it may always use: rad, or a share of the arm's unit."""
+"""Approach to the end of a stroke that is always allowed in one step: rad, or a share of the arm's unit."""
 
 _SPARE_RATE = 1e-6
-"""Greatest share of a rate that is kept for what settling leaves."""
+"""Greatest share of a rate that is kept in reserve for the errors of settling."""
 
 _ROUNDING = float(np.finfo(float).eps)
 
@@ -35,8 +35,22 @@ _INSTANT = 1e-9
 class Limits(NamedTuple):
     """The box of the actuators after a step, and the limits that set its sides.
 
-    These are the value (n_a,) before the step, the greatest `travel` by the rate, the stroke (n_a, 2), the greatest
-    acceleration, and whether the actuator is locked.
+    Attributes
+    ----------
+    lower, upper : (n_a,)
+        The box.
+    names : tuple of str
+        Of the actuators.
+    value : (n_a,)
+        Values before the step.
+    travel : (n_a,)
+        Greatest changes by the rate.
+    stroke : (n_a, 2)
+        Least and greatest values.
+    acceleration : (n_a,)
+        Greatest accelerations.
+    held : (n_a,) bool
+        Whether an actuator is locked.
     """
 
     lower: Array
@@ -80,7 +94,8 @@ class Actuation:
         self._stroke, self._rate = arm.stroke[arm.actuators], arm.rate[arm.actuators]
         self._acceleration = arm.acceleration[arm.actuators]
         self.starts_at_once = bool(np.isinf(self._acceleration).all())
-        # An error of a length, divided twice by the time, is an error of an acceleration: it is kept near rounding.
+        # An error of a length, divided twice by the time, is an error of an acceleration: so it is kept near
+        # rounding.
         exact = max(1e-12 * arm.fineness, 32.0 * _ROUNDING * arm.height)
         self.tolerance = 1e-10 * arm.fineness if self.starts_at_once else exact
         self._settled = enough_length(arm.home_configuration, self.tolerance)
@@ -108,7 +123,7 @@ class Actuation:
             hint = nearest(name, self.names)
             raise GoalError(f'cannot lock "{name}", which {what}; actuators are {names}{hint}')
         k = self.names.index(name)
-        # Limits of earlier steps keep the arrays that they were made with.
+        # New arrays: the limits of earlier steps keep theirs.
         self._stroke, self._held = self._stroke.copy(), self._held.copy()
         self._stroke[k] = self.values(state)[k]
         self._held[k] = True
@@ -132,12 +147,12 @@ class Actuation:
         return limits.lower, limits.upper
 
     def limits(self, state: State, dt: float, *, slowing: bool = False) -> Limits:
-        """Return what limits a step of `dt`, s, from `state`.
+        """Return the box of a step of `dt`, s, from `state`, and the limits that set it.
 
         With `slowing`, actuators slow down before the ends of their strokes, if the problem asks for it.
         """
         value, rates, stroke = self.values(state), state.rates.take(self._actuators), self._stroke
-        # What settling may leave, over the duration, would be a rate of its own. It leaves less in a very short step.
+        # The error that settling may leave, over the duration, is a rate. In a very short step less is left.
         spare = np.minimum(self.tolerance / dt, _SPARE_RATE * self._rate)
         rate = np.maximum(self._rate - np.maximum(spare, self._settled / dt), 0.0)
         ends = stroke, rate, self._acceleration
@@ -155,6 +170,6 @@ class Actuation:
         return (lower, upper) if np.all(lower <= upper) else None
 
     def _approach(self, distance: Array) -> Array:
-        """Return how far slowing actuators may move in one step at a `distance` (n_a,) before the end, m or rad."""
+        """Return the greatest approach of a slowing actuator at `distance` (n_a,) from its end, m or rad."""
         distance = np.maximum(distance, 0.0)
         return np.asarray(np.maximum(_APPROACH * distance, np.minimum(distance, self._least_approach)))

@@ -26,16 +26,16 @@ _LONGER = 2.0
 """Greatest ratio of an actuator's change to the displacement of its nodes."""
 
 _BEYOND = 60.0
-"""An arm at the end of its path may brake on its continuation, by this many times its last piece."""
+"""Length of the continuation on which an arm at the end of its path may brake, over the path's last piece."""
 
 _INSTANT = 1e-9
 
 _LEAST_HELD = 0.5
-"""Least share of a piece of path for which stations stay on the curve, where they may leave it."""
+"""Least share of a piece of path for which stations that may leave the curve stay on it."""
 
 _LEAST_CRAWL = 0.1
-"""Least share of a piece that an arm must cover with stations on the curve to keep them there: next to a dead end the
-last digits decide where it goes on it.
+"""Share of a piece below which progress with stations on the curve does not count: next to a dead end the
+last digits would decide where the arm goes.
 """
 
 _OFF_PATH = "the arm could brake after it only off its path"
@@ -68,10 +68,10 @@ class Advancer:
     def first_accepted(
         self, state: State, target: Target, dt: float, smallest: float, worst: int = ANY_RANK
     ) -> Advance:
-        """Return the first accepted attempt at a target, or at a share of its piece of path; or else the last attempt.
+        """Return the first accepted attempt at a target or at a share of its piece, or else the last attempt.
 
-        Attempts with a lower rank of braking are preferred. Those with a rank above `worst`, the rank of braking at
-        once, are refused. The step takes `dt`, s; shares below `smallest` are not tried.
+        Attempts with a lower rank of braking are preferred. Attempts with a rank above `worst`, the rank of
+        braking at once, are refused. The step takes `dt`, s; shares below `smallest` are not tried.
         """
         best: Advance | None = None
         too_long, before = "", self._attempt.qps
@@ -101,7 +101,7 @@ class Advancer:
                 yield self._try(state, replace(target, lower=slow[0], upper=slow[1]), dt)
 
     def first_share(self, target: Target) -> float:
-        """Return the share of a target's piece that is tried first: less than all where nodes may not move as far."""
+        """Return the share of a target's piece that is tried first; below 1 if the step limit requires it."""
         if self._tip_mode != "scaled" or not self._step_limit < np.inf:
             return 1.0
         return min(1.0, self._step_limit / max(self._asked(target), _INSTANT))
@@ -109,10 +109,10 @@ class Advancer:
     def _held_or_free(
         self, state: State, target: Target, dt: float, first: float, smallest: float
     ) -> Iterator[Advance]:
-        """Yield attempts with stations on the curve and then, if these get less than half as far, with others free.
+        """Yield attempts with stations on the curve; then others, if these get less than half as far.
 
-        Stations leave the curve only if the arm then gets a quarter further than on it, or hardly gets on there. An arm
-        that cannot stop at once must not be led into a corner in that way.
+        Stations leave the curve only if the arm then gets a quarter further than on it, or hardly moves on
+        it. An arm that cannot stop at once must not be led into a corner like that.
         """
         held: Advance | None = None
         for found in self._pieces(state, target, dt, first, max(smallest, _LEAST_HELD), Tracking.HARD):
@@ -126,7 +126,7 @@ class Advancer:
                 on_curve = self._piece(state, target, dt, first, share, Tracking.HARD)
                 if on_curve.step.moved and on_curve.step.progress >= _LEAST_CRAWL * first:
                     held = on_curve if held is None else max(held, on_curve, key=_progress)
-            # An arm may wait: a step without progress is one, too.
+            # A step without progress is allowed: the arm waits.
             least = -np.inf if held is None else FURTHER * held.step.progress
             if share <= least or (found.step.moved and found.step.progress <= least):
                 break
@@ -138,7 +138,7 @@ class Advancer:
     def _pieces(
         self, state: State, target: Target, dt: float, first: float, smallest: float, tracking: Tracking
     ) -> Iterator[Advance]:
-        """Yield the attempts at the `first` share of a piece, and at halves of that down to its `smallest` share."""
+        """Yield the attempts at the `first` share of a piece, and at halves down to `smallest` of it."""
         share = first
         yield self._piece(state, target, dt, first, share, tracking)
         while share > first * smallest:
@@ -148,7 +148,7 @@ class Advancer:
     def _piece(
         self, state: State, target: Target, dt: float, first: float, share: float, tracking: Tracking
     ) -> Advance:
-        """Return a step towards a `share` of a target; below the `first` share, actuators move less than they could."""
+        """Return a step towards a `share` of a target; below the `first` share, within a trust region."""
         if share == 1.0:
             return self._try(state, target, dt, tracking=tracking)
         lower, upper = target.lower, target.upper
@@ -175,13 +175,13 @@ class Advancer:
         *,
         tracking: Tracking = Tracking.EITHER,
     ) -> Advance:
-        """Return a step towards a target that is a `share` of the one that progress refers to."""
+        """Return a step towards a target; this is a `share` of the target that progress is counted on."""
         enough = _LEAST_HELD if self._tip_mode == "scaled" else WHOLE
         step = self._attempt.run(state, target, share, tracking=tracking, enough=enough)
         if not step.moved:
             return Advance(step, None)
         if step.progress < WHOLE and self._tip_mode != "scaled":
-            # The tip must stay on time: a part of the path is not enough.
+            # The tip must stay on time: part of the path is not enough.
             return Advance(_blocked(step, state, "the tip cannot stay on time"), None)
         braking: Braking | None = None
         if not self._actuation.starts_at_once:

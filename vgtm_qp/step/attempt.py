@@ -25,10 +25,10 @@ from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.target import QPInput, Target, base_frame
 
 _FREE_QPS = 3
-"""Greatest number of QPs that may each go as far along the piece of path as they can."""
+"""Greatest number of QPs with free progress along the piece of path."""
 
 _MOST_QPS = 6
-"""Greatest number of QPs: the last ones start anew from the answer of the first, and go no further than it did."""
+"""Greatest number of QPs: the last ones start anew from the first answer, and go no further than it."""
 
 _MOST_FRACTIONS = 8
 """Greatest number of times between two states for which a QP has rows."""
@@ -37,7 +37,7 @@ _MOTION_MARGIN = 2.5
 """Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
 
 _TOO_FAR = 1e3
-"""Displacement of a node, over the arm's length, from which on the answer of a QP shows a singular pose."""
+"""Displacement of a node, over the arm's length, above which a QP's answer shows a singular pose."""
 
 _LEAP = 1.0
 """Greatest displacement of a control vertex's coordinate in one step, over the arm's length."""
@@ -49,14 +49,14 @@ _SETTLING = 5e-3
 """Tip error after a QP, over the arm's length, above which another QP is solved."""
 
 _NOTHING = 1e-9
-"""Progress of a QP below which its corrections may go further than it did."""
+"""Progress of a QP below which its corrections may go further than the QP."""
 
 FURTHER = 1.25
-"""Least ratio of progresses for which stations leave the curve."""
+"""Least progress off the curve, over that on the curve, for which stations leave it."""
 
 
 class Tracking(Enum):
-    """Whether stations stay on the curve in an attempt, may leave it, or leave it only if the arm then gets further."""
+    """Whether stations stay on the curve, are free to leave it, or leave it only if the arm gets further."""
 
     HARD = "hard"
     ELASTIC = "elastic"
@@ -124,9 +124,9 @@ class Attempt:
     ) -> Step:
         """Return the step from `state` along the target's piece of path, with its progress on that piece.
 
-        The motion of the step before, times `share`, predicts the motion of this one. `progress` is the part of the
-        piece that is covered at the start. Stations that may leave the curve do so only if they do not get as far as
-        is `enough` on it.
+        The motion of the step before, times `share`, predicts the motion of this one. `progress` is the part
+        of the piece that is covered at the start. Stations that may leave the curve do so only if the
+        progress on it is less than `enough`.
         """
         self.phases.start()
         elastic, piece = self._setup.elastic, (state, target, share, progress)
@@ -146,14 +146,14 @@ class Attempt:
         progress: float,
         engine: Engine,
     ) -> Step:
-        """Return the step of an engine that drives apart pairs too near each other; if that fails, only keeps them."""
+        """Return an engine's step that drives apart pairs too near, or if that fails keeps their distance."""
         short = self.separation.shortfall_of(state)
         for gain in (self._recovery(short), 0.0) if short else (0.0,):
             asked, reach = self._first(state, target, share, progress, short, gain)
             try:
                 step = self._run(state, asked, reach, short, gain, engine)
             except CurveError as error:
-                # A trial curve may have no frame, where a shorter piece has one.
+                # A trial curve may have no frame; that of a shorter piece may have one.
                 step = Step(StepStatus.BLOCKED, 0.0, state, str(error), 1, True)
             if step.moved:
                 break
@@ -169,7 +169,7 @@ class Attempt:
         return replace(step, gap=gap, gave_way=self._gave_way(gap))
 
     def _gave_way(self, gap: float) -> bool:
-        """Return whether stations with that gap are off the curve that exact tracking keeps them on."""
+        """Return whether stations with that gap are off the curve although tracking is exact."""
         return self.gives_way and not gap <= self.accuracy.tracking
 
     def first_input(self, state: State, target: Target, share: float) -> QPInput:
@@ -191,7 +191,7 @@ class Attempt:
             expected = _MOTION_MARGIN * furthest
         rows = self.separation.rows(q, state.time, target.duration, reach, short, gain, expected=expected)
         if target.base is not None:
-            # The displacement of nodes with the base is known.
+            # The displacement of the nodes by the base is known.
             rows = rows.after(arm.nodes(arm.based(q, target.base)) - arm.nodes(q))
         curve = state.control_vertices, state.torsion
         return QPInput(q, q + 0.5 * guess, *curve, target, goal, progress, rows, True), reach
@@ -205,7 +205,7 @@ class Attempt:
         gain: float,
         engine: Engine,
     ) -> Step:
-        """Run the attempt from its first input; pairs too near at the start, `short`, are driven apart by `gain`, m."""
+        """Run the attempt from its first input; `short` are pairs to drive apart by `gain`, m."""
         phases, separation, target = self.phases, self.separation, asked.target
         q, fractions = state.q, list[float]()
         rows: ClearanceRows | None = None
@@ -221,7 +221,8 @@ class Attempt:
 
         for count in range(1, _MOST_QPS + 1):
             if count > _FREE_QPS and covered == 1.0 and first is not None and self._is_cut_short(first):
-                # Corrections that make for the end of the piece leave what the first QP allowed, and do not converge.
+                # Corrections towards the end of the piece would leave what the first QP allowed, and not
+                # converge.
                 covered = first.progress
                 q, target, move = first.q, target.part(covered), first._replace(progress=1.0)
             if move is not None:
@@ -253,7 +254,8 @@ class Attempt:
             leap = np.abs(move.vertices - state.control_vertices).max(initial=0.0)
             if not leap < _LEAP * self._arm.height:
                 return blocked("the curve moves too far in one step")
-            # A pair that one correction pushed apart must stay listed for the next, or two corrections alternate.
+            # A pair that a correction pushed apart must stay listed for the next one, or the two would
+            # alternate.
             reach = max(reach, move.furthest)
             if move.closed is None:
                 continue
@@ -261,7 +263,7 @@ class Attempt:
             if flaw:
                 return blocked(flaw, solver_failed=True)
             q, closed = move.closed.q, move.closed
-            # Linearised rows leave a small gap between the curve's end and the tip.
+            # Linearised rows leave a small gap between the curve's end and the tip, which is closed here.
             vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
             if len(engine.layout.legs) and engine.layout.is_reversed(
                 vertices, base_frame(self._arm, target.base)[:, 2], closed.tip_rotation
@@ -298,14 +300,14 @@ class Attempt:
         return self._setup.tip_mode == "scaled" and _NOTHING < move.progress < WHOLE
 
     def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
-        """Return what is wrong with the configuration of a `move` from `state`, computed again; empty if nothing is."""
-        # An elastic tip with a slack is not held to its goal.
+        """Return the flaw of the configuration of a `move` from `state`, computed again, or nothing."""
+        # An elastic tip with a slack need not be at its goal.
         on_path = move.solution.tip_slack <= self.accuracy.tip
         goal = target.goal(move.progress) if on_path else None
         return self.acceptance.flaw(closed, state.q, target, goal, move.vertices, move.torsion)
 
     def _expected(self, target: Target, goal: TipGoal, guess: Array) -> float:
-        """Return the expected displacement of a node in the step, m; the influence if the guess is no prediction."""
+        """Return the expected displacement of a node in the step, m; the influence without a prediction."""
         last = self._arm.travel(guess)
         if last == 0.0 or target.base is not None:
             return self._influence

@@ -1,9 +1,10 @@
 """Braking: how an arm with limited accelerations comes to rest, proven before each step is accepted.
 
-A moving arm with limited accelerations cannot stop at once. A step into a state is accepted only if further steps are
-known that bring the arm from there to rest, each within the limits and clear of obstacles. If no other step is found
-later, the arm does the first of those. A tip that is held to its path brakes along it. An elastic tip, or one whose
-base moves on, may leave the path: then every actuator brakes by itself, which strokes always allow.
+A moving arm with limited accelerations cannot stop at once. A step into a state is accepted only if braking
+steps are known that bring the arm from there to rest, each within the limits and clear of obstacles. If no
+other step is found later, the arm takes the first braking step. A tip that has to stay on its path brakes
+along it. An elastic tip, or one whose base moves on, may leave the path: then every actuator brakes by
+itself, which strokes always allow.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ ANY_RANK = 2
 
 _MOST_STEPS = 60
 _SPARE_STEPS = 4
-"""Greatest number of braking steps, in total and beyond those that the fastest actuator needs by itself."""
+"""Greatest number of braking steps in all, and beyond those that the fastest actuator needs by itself."""
 
 _GENTLER = (0.5, 0.75)
 """Shares of the previous step's displacement that a step aims at if braking as hard as possible fails."""
 
 _MOST_RIDING = 500
-"""Greatest number of steps that are computed on a base that moves on."""
+"""Greatest number of braking steps on a moving base."""
 
 _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
@@ -67,7 +68,7 @@ class Braking:
         return replace(self, origin=self.steps[0][0], steps=steps, on_path=on_path)
 
     def first(self, path: Path | None, start: float, end: float, blocked: Step) -> Step:
-        """Return the first step, instead of the `blocked` one, with its progress on a piece of `path`."""
+        """Return the first step, in place of the `blocked` one, with its progress on a piece of `path`."""
         (state, value), on_path = self.steps[0], self.on_path > 0
         progress = (value - start) / (end - start) if on_path and path is self.path else 0.0
         return replace(
@@ -80,7 +81,7 @@ class Braking:
         )
 
     def changed(self, origin: State, change: Callable[[State], State]) -> Braking:
-        """Return these steps from another state `origin`, with `change` applied to every other state."""
+        """Return these steps from the state `origin`, with `change` applied to all further states."""
         return replace(self, origin=origin, steps=[(change(state), value) for state, value in self.steps])
 
 
@@ -151,7 +152,7 @@ class Brakes:
         return self._follow(state, step, until)
 
     def _yielding(self, state: State, value: float) -> Steps | None:
-        """Brake an elastic tip: its goal moves on along a line, ever more slowly, and its slack keeps the limits."""
+        """Brake an elastic tip: its goal moves along a line, ever more slowly; its slack keeps the limits."""
         arm, kinematics = self.shaping.setup.arm, self.shaping.setup.kinematics
         kinematics.evaluate(state.q)
         here, rotation = arm.end_effector.position(state.nodes), kinematics.tip_rotation.copy()
@@ -186,7 +187,7 @@ class Brakes:
     def _follow(
         self, state: State, step: Callable[[State, Box], tuple[State, float] | None], until: float
     ) -> Steps | None:
-        """Add steps until a time, s, and until the arm may stay; None if a step fails or there are too many."""
+        """Return the steps until a time, s, and until the arm can stay; None if one fails or too many."""
         found: Steps = []
         most = _MOST_STEPS
         for count in range(_MOST_STEPS + _MOST_RIDING):
@@ -205,7 +206,7 @@ class Brakes:
         return None
 
     def _count(self, state: State, limits: Box) -> int:
-        """Return how many steps the fastest actuator needs by itself.
+        """Return the number of steps that the fastest actuator needs by itself.
 
         Each step reduces its speed by half the width of its box.
         """
@@ -216,7 +217,7 @@ class Brakes:
         return int(np.ceil(min(float((speed / width).max(initial=0.0)), float(_MOST_STEPS))))
 
     def _released(self, state: State, limits: Box, closing: Closing) -> State | None:
-        """Return the state after every actuator moved as little as it may; None if that is not clear of obstacles."""
+        """Return the state after the least allowed motion of every actuator; None if it is not clear."""
         setup, attempt = self.shaping.setup, self.attempt
         arm, base, separation = setup.arm, setup.base_motion, attempt.separation
         strokes = np.clip(self.actuation.values(state), *limits)

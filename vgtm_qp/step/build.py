@@ -1,4 +1,9 @@
-"""From a problem to an arm that is ready to move, and its curve: the last module that reads a problem."""
+"""From a problem to a ``Setup``, an arm ready to move: steps are computed from that without the problem.
+
+Around the steps the problem is read again: by ``checks.py``, which finds its mistakes; by the resolvers in
+``methods/``, for keys of their own; by ``Resolver.again``, which builds a resolver from another problem; and
+by those who call for steps, for the maneuver.
+"""
 
 from __future__ import annotations
 
@@ -45,13 +50,13 @@ _CONDENSED_ALL_THE_SAME = (
 def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, solves: bool = True) -> Setup:
     """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
 
-    A `plain` arm does not step in one call of C: its answers are the same. If the caller never `solves` a QP, the
-    engine is the one that is built fastest.
+    A `plain` arm does not step in one call of C; its answers are the same. If the caller never `solves` a QP,
+    it gets the engine that is built fastest.
 
     Raises
     ------
     ProblemError
-        There is no such arm, or the problem asks for something that it cannot do at all; each mistake is named.
+        There is no such arm, or it cannot do at all what the problem asks for; each mistake is named.
     """
     check_is_problem(problem)
     check_solver(problem)
@@ -136,7 +141,7 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         return HomeCurve(layout, np.zeros((0, 3)), np.zeros(0), None)
     is_hard, mistakes = method.holds_curve, list(_beyond_the_arm(problem, arm, task))
     if method.gives_way and mistakes and method.hard_coordinates == ("position",):
-        # By default: this arm can hold only the curve's end exactly.
+        # By default tracking becomes a penalty here: this arm can hold only the curve's end exactly.
         is_hard, mistakes = False, []
     if mistakes:
         raise problem.error(mistakes)
@@ -188,7 +193,7 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
     end = arm.end_effector
     ended = layout.ended(vertices, end.position(arm.home), end.frame)
     if layout.ends_along_tip and np.abs(ended - vertices).max() > 1e-9 * arm.height:
-        # The direction of its end is to cost the stations of a bent arm as little as it can.
+        # The direction of the curve's end is to move the stations of a bent arm as little as possible.
         along = layout.curve_slopes[-1], end.frame[:, 2]
         vertices = curve_rows.fitted(layout.curve_weights, centres[tracked], centres[0], normal, along)
         ended = layout.ended(vertices, end.position(arm.home), end.frame)
@@ -198,10 +203,10 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
 def _fitted(
     family: CurveFamily, fractions: Array, start: Array, points: Array, normal: Array
 ) -> tuple[Array, Array]:
-    """Return s_k (K,) and control vertices (V, 3) at home: on the straight axis, or fitted to the faces of a bent arm.
+    """Return s_k (K,) and control vertices (V, 3) at home: on the straight axis, or fitted to a bent arm.
 
-    `fractions` (K,) are those of the length from `start` (3,) through the `points` (K, 3) at each point; the curve of
-    a bent arm begins along the base's `normal` (3,).
+    `fractions` (K,) are the shares, at each of the `points` (K, 3), of the length from `start` (3,) through
+    the points. The curve of a bent arm begins along the base's `normal` (3,).
     """
     end, length = points[-1], float(np.linalg.norm(points[-1] - start))
     straight = straight_curve(family, start, end)
@@ -215,7 +220,7 @@ def _fitted(
 
 
 def _beyond_the_arm(problem: Problem, arm: Arm, task: TipTask) -> Iterator[Mistake]:
-    """Yield the coordinates that stations shall keep on the curve but the arm has too few motions for."""
+    """Yield the coordinates that stations shall keep on the curve if the arm has too few motions."""
     method, curve = problem.method, problem.curve
     if not method.holds_curve:
         return
@@ -250,7 +255,7 @@ def make_engine(
     compiled: bool = True,
     plain: bool = False,
 ) -> Engine:
-    """Return the engine that solves the steps of an arm with the QP solver of that name, or by its bays.
+    """Return the engine for the steps of an arm: with the QP solver of that name, or by its bays.
 
     `compiled` and `plain` are as for :func:`build_arm`.
 
@@ -279,8 +284,8 @@ def make_engine(
 def elastic_engine(
     solver: str, layout: Layout, kinematics: Kinematics, task: TipTask, *, plain: bool = False
 ) -> Callable[[], Engine]:
-    """Return a function that gives the engine of a layout whose hard tracking gives way, built on its first call."""
-    # That of a long arm is built faster if it is not compiled, and seldom needed.
+    """Return a function that gives the engine for ``Layout.giving_way``; the first call builds it."""
+    # The engine of a long arm is seldom needed, and built faster without compiling.
     is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
     return cache(
         lambda: make_engine(solver, layout.giving_way(), kinematics, task, compiled=is_short, plain=plain)
@@ -288,7 +293,7 @@ def elastic_engine(
 
 
 def check_solver(problem: Problem) -> None:
-    """Raise ProblemError where the problem's QP solver is unknown or not installed."""
+    """Raise ProblemError if the problem's QP solver is unknown or not installed."""
     name = problem.method.solver
     if name != DEFAULT_SOLVER and name not in (choices := available_solvers()):
         expected = f"one of the solvers installed here, {quoted(choices)}{nearest(name, choices)}"

@@ -1,7 +1,7 @@
 """The engine of long arms: from the positions of the nodes to the step and back by sweeps along the bays.
 
-Its QP is that of the general engine with the solvers of ``qp.long``. But the numbers of the QP are written directly
-into the sweeps' inputs, and lengths are closed with the factors of the QP.
+Its QP is that of the general engine with the solvers of ``qp.long``. The numbers of the QP are written
+directly into the sweeps' inputs, and lengths are closed with the factors of the QP.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ class ChainEngine(Engine):
     ) -> Settled | None:
         """See ``engine.Engine``: each step corrects the lengths, and the remaining tip error by the actuators.
 
-        The actuated lengths are those of the QP's answer plus a correction that brings the tip to its goal. With faces
-        held on the curve they follow from the curve, as far as bounds allow.
+        The actuated lengths are those of the QP's answer plus a correction that brings the tip to its goal.
+        If faces are held on the curve, the lengths follow from the curve as far as bounds allow.
         """
         closing, solver, bounds = self._closing, self._solver, (target.lower, target.upper)
         enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)

@@ -22,7 +22,7 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import over_all_nodes, tip_response
 
 _POINT = 1e-6
-"""Length of the member that stands for a point, over the arm's unit; distances are printed to no more digits."""
+"""Length of the member that stands for a point, over the arm's unit: distances are printed less precisely."""
 
 
 def checked_arm(problem: Problem) -> Setup:
@@ -45,8 +45,8 @@ def checked_arm(problem: Problem) -> Setup:
 def check_problem(problem: Problem, setup: Setup) -> list[Mistake]:
     """Return the mistakes that make a problem impossible, each proven: no solvable problem is refused.
 
-    These are overlaps at home of members with obstacles or other members; a target farther from the base than the
-    members can be long; a target so deep inside an obstacle that no tip can be there.
+    These are overlaps at home of members with obstacles or other members; a target beyond the greatest reach
+    of the members; and a target so deep inside an obstacle that no tip can be there.
     """
     mistakes = [mistake for distance, mistake in _at_home(problem, setup) if distance <= 0.0]
     return [
@@ -83,7 +83,7 @@ def find_warnings(problem: Problem, setup: Setup) -> list[Mistake]:
     """Return suspicious values of a problem: a home pose nearer than ``safe``, a target at an obstacle.
 
     Neither is impossible: the resolver moves the arm away from obstacles too near at home, and a tip of three nodes may
-    surround an obstacle that contains its centre.
+    surround an obstacle with its centre inside.
     """
     certain = {mistake.key for mistake in check_problem(problem, setup)}
     near = [mistake for distance, mistake in _at_home(problem, setup) if distance > 0.0]
@@ -165,7 +165,7 @@ def _inside_obstacles(problem: Problem, setup: Setup, hollow: float) -> Iterator
     spot = capsules([[0, 1]], 0.0)
     point = Clearance(spot, obstacles, safe=safe, influence=needed, self_collision=False, by_fcl=False)
     for target, key, value in _targets(problem):
-        # A contact says how deep a point is inside, which the clearance does not.
+        # Unlike a clearance, a contact has the depth of a point inside.
         contacts = point.near(np.stack([target, target + point_size / 2]))
         k = int(np.argmin(contacts.distance)) if len(contacts) else -1
         if k >= 0 and (distance := float(contacts.distance[k])) + hollow + point_size < needed:

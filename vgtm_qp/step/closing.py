@@ -55,10 +55,10 @@ class Closing:
     def close(
         self, q: Array, lower: Array, upper: Array, tolerance: float, *, too_far: float | None = None
     ) -> Closed:
-        """Return the configuration near `q` whose actuators keep their values, or go to the nearest one allowed.
+        """Return the closed configuration near `q`; actuators keep their values, or go to their bounds.
 
-        `lower`, `upper` (n_a,) are their bounds. The error is infinite in a singular pose; the iteration ends at errors
-        beyond `too_far`, m or rad.
+        `lower`, `upper` (n_a,) are the bounds. The error is infinite in a singular pose; the iteration ends
+        at errors beyond `too_far`, m or rad.
         """
         kinematics, wanted = self._kinematics, self._arm.home_quantities.copy()
 
@@ -74,7 +74,8 @@ class Closing:
     ) -> Closed | None:
         """Return the configuration near `q` whose tracked stations are at `points` (K, 3), m; actuators follow.
 
-        What an actuator is beyond its bounds (n_a,) then goes back, and the stations with it. None in a singular pose.
+        Actuators beyond their bounds (n_a,) then go back to these, and move the stations. None in a singular
+        pose.
         """
         arm, kinematics, tracked = self._arm, self._kinematics, self._layout.tracked
         home = arm.home_quantities[self._fixed]

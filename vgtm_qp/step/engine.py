@@ -1,7 +1,7 @@
-"""Engines: from a configuration through the QP's answer to the next one, quantities closed and the tip at its goal.
+"""Engines: from a configuration through the QP's answer to the next, quantities closed, the tip at its goal.
 
-The fused engine compiles everything between configuration and QP into one call. The general one linearises by one
-compiled call and serves every arm and solver; the fused engine is tested against it.
+The fused engine compiles everything between configuration and QP into one call. The general engine linearises
+by one compiled call, and serves every arm and solver; the fused engine is tested against it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
 
 _ON_PATH = 1e-6
-"""Slack, m or rad, that counts as zero: solvers leave so much."""
+"""Slack, m or rad, that counts as zero: the accuracy of solvers."""
 
 
 Spent = Callable[[str], None]
@@ -59,7 +59,7 @@ class Engine(ABC):
 
     @cached_property
     def _linearisation(self) -> Linearisation:
-        # Built once to be read: compiling would take longer.
+        # It is evaluated seldom, for people to read: compiling would take longer.
         return Linearisation(self.layout, compiled=False)
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
@@ -120,7 +120,7 @@ class Engine(ABC):
     ) -> Settled | None:
         """Return the configuration near `q`, quantities closed and the tip at `goal`, and the curve near `curve`.
 
-        None if it takes another QP.
+        None if another QP is needed.
         """
 
     def drawn(self, layout: Layout) -> Engine | None:  # noqa: ARG002
@@ -149,7 +149,8 @@ class Equalities:
     ) -> Settled | None:
         """Return the configuration near `q` and the curve that satisfy all equalities, by Newton steps.
 
-        Their Jacobian is at first that of the QP, which was `asked`, and their metric that of its objective.
+        The Newton steps start with the Jacobian of the QP that was `asked`; their metric is that of its
+        objective.
         """
         arm, target = self._layout.arm, asked.target
         gain, x, before = None, np.zeros(0), np.zeros(0)
@@ -170,7 +171,7 @@ class Equalities:
         return Settled(closed, curve) if off <= accuracy.tip else None
 
     def _missing_at(self, q: Array, curve: CurvePoint, asked: QPInput, goal: TipGoal) -> Array:
-        """Return what the equalities lack, see ``missing_function``."""
+        """Return the errors of the equalities, see ``missing_function``."""
         here = asked._replace(
             q=q, at=q, vertices=curve.vertices, torsion=curve.torsion, goal=goal, motion=False
         )
@@ -250,7 +251,7 @@ class GeneralEngine(Engine):
     def _on_its_curve(
         self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
     ) -> Settled | None:
-        """Return the configuration near `q` whose stations are on the curve, if these determine the nodes."""
+        """Return the configuration near `q` with its stations on the curve, if they determine the nodes."""
         bounds = target.lower, target.upper
         closed = None
         if self._on_curve:
@@ -297,7 +298,7 @@ class GeneralEngine(Engine):
 class FusedEngine(Engine):
     """One compiled call, for arms whose coordinates can be eliminated one after another.
 
-    Until it is compiled, and where no compiler works, an interpreted engine gives the same answers.
+    Until the call is compiled, and without a compiler, an interpreted engine gives the same answers.
     """
 
     def __init__(self, layout: Layout, kinematics: Kinematics, task: TipTask, solver: FusedSolver) -> None:
@@ -330,7 +331,7 @@ class FusedEngine(Engine):
         try:
             return self._quick(asked, accuracy, spent)
         except (EvaluationError, AnswerError):
-            # The other way may have an answer: it has another version of DAQP, and rounds otherwise.
+            # The plain engine may have an answer: it uses another version of DAQP, and rounds differently.
             return self._plain.move(asked, accuracy, spent)
 
     def _quick(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
@@ -344,7 +345,7 @@ class FusedEngine(Engine):
             solver.load(asked.linear(self.layout))
             return solver.move(asked.rows, asked.torsion)
         except InfeasibleStepError:
-            # The general way may find an answer without the margin.
+            # The general move may find an answer without the margin.
             return super().move(asked, accuracy, spent)
         finally:
             spent("qp")

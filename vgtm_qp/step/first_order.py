@@ -1,10 +1,10 @@
-"""What an arm can do to first order from a state: a linear program in the actuators' displacements and the progress.
+"""An arm's motions from a state to first order: a linear program in actuator displacements and progress.
 
 To first order the arm can cover the share alpha of a piece of path that is the greatest one with
 
     J d_rho = E d_a,   tip rows d_rho = alpha rate,   clearance and angle rows,   limits <= d_a <= limits.
 
-The rows with multipliers hold it back.
+Rows with multipliers hold the arm back.
 """
 
 from __future__ import annotations
@@ -27,27 +27,28 @@ from vgtm_qp.step.task import over_all_nodes, tip_response
 _TRUST = 0.05
 """Trust region: greatest change of an actuator in the linear program, rad or a share of the arm's unit."""
 _PRESSES = 1e-7
-"""Multiplier from which on a row presses."""
+"""Multiplier from which on a row counts as active."""
 _FURTHER = 4.0
 """Least trust region for a tip that must not be late, over the length of its piece of path."""
 
 FREE = 1.0 - 1e-6
-"""Progress alpha, of 1, from which an arm counts as free."""
+"""Progress alpha, at most 1, from which on an arm counts as free."""
 
 CLEARANCE, MEMBERS, ANGLE = "clearance", "members", "angle"
 
 
 class Limit(NamedTuple):
-    """A limit that a person can change, to which one or more rows belong.
+    """A limit that a person can change; one or more rows belong to it.
 
     Attributes
     ----------
     kind : str
         ``"clearance"`` from an obstacle, between ``"members"``, ``"angle"``, ``"stroke"`` or ``"rate"``.
     name : str
-        The obstacle or actuator. Empty for a stroke of all actuators and for other limits, which are one for all.
+        The obstacle, or the actuator of a stroke; empty for a stroke of all actuators, and for the other
+        kinds, which have one limit for all.
     upper : bool
-        Which end of a stroke.
+        True for the upper end of a stroke.
     """
 
     kind: str
@@ -63,15 +64,15 @@ class Limit(NamedTuple):
 class FirstOrder:
     """The linear program in (d_a, alpha), and its rows by number: clearances, lower limits, upper limits.
 
-    Its numbers are those of an arm of unit size: lengths are over the arm's unit, and angles as they are.
+    Its numbers are those of an arm of unit size: lengths are divided by the arm's unit, angles are not.
 
     Attributes
     ----------
     unit, progress : float
-        Share of the piece of path that alpha = 1 stands for: what the arm covers within the trust region, roughly. And
-        the same without `reach`, a factor of the trust region and the piece of path.
+        Share of the piece of path at alpha = 1, roughly the greatest share within the trust region; and the
+        same share for a `reach` of 1, the factor of trust region and piece of path.
     names, limits : tuple of str, tuple of (Limit or None)
-        Of each row; None where nobody can change what the row keeps: a locked actuator, an acceleration.
+        Of each row; None for a row that nobody can change, of a locked actuator or an acceleration.
 
     Raises
     ------
@@ -92,12 +93,12 @@ class FirstOrder:
         kinematics.evaluate(state.q)
         every = over_all_nodes(arm, kinematics.motion().response()[0])
         tip = setup.task.rows(state.nodes, kinematics, goal)
-        # Changes of the actuators, m or rad, that stand for 1.
+        # Units of length, and of each actuator's changes, m or rad.
         self._size, self._sizes = arm.unit, arm.unit / arm.levers
         length = float(np.linalg.norm(tip.rate)) / self._size
         self._trust, self.unit = reach * _TRUST, reach * (min(1.0, _TRUST / length) if length > 0.0 else 1.0)
         if setup.tip_mode == "hard":
-            # The tip must not be late: less than the whole piece is nothing.
+            # The tip must not be late: less than the whole piece does not count.
             self._trust, self.unit = reach * max(_TRUST, _FURTHER * length), reach
         self.progress = min(self.unit / reach, 1.0)
         response = tip_response(arm, tip.jacobian, every) * self._sizes
@@ -139,7 +140,7 @@ class FirstOrder:
         return float(answer.x[-1]), np.where(multipliers > _PRESSES, multipliers, 0.0) * self.unit / sizes
 
     def without(self, limits: Iterable[Limit]) -> tuple[float, Array]:
-        """Return what :meth:`solve` does without the rows of some limits."""
+        """Return share and multipliers as :meth:`solve` does, without the rows of some limits."""
         kept = np.ones(self.count, dtype=bool)
         for limit in limits:
             kept[self._rows_of(limit)] = False
@@ -150,7 +151,7 @@ class FirstOrder:
         return [k for k, other in enumerate(self.limits) if other and limit in (other, other.for_all)]
 
     def least_changes(self, limits: Sequence[Limit], most: Sequence[float]) -> Array | None:
-        """Return by how much each of some limits must give for alpha = `FREE`, m or rad, with the least sum.
+        """Return the changes of some limits, m or rad, with the least sum for which alpha = `FREE`.
 
         None if changes up to `most` do not suffice.
         """
@@ -161,7 +162,7 @@ class FirstOrder:
         for g, limit in enumerate(limits):
             of_limit = self._rows_of(limit)
             if of_limit[0] >= near:
-                # Where some actuators turn and others do not, each gets at least what it needs.
+                # If only some of the actuators turn, each gets at least the change that it needs.
                 sizes[g] = max(self._sizes[(k - near) % actuators] for k in of_limit)
             for k in of_limit:
                 if k < near:
@@ -200,7 +201,7 @@ def _linear_program(
     high: Sequence[float],
 ) -> Any:
     """Return SciPy's answer of min cost.x with inequality x <= bound, equality x = value, low <= x <= high."""
-    # Its import takes a tenth of what a start takes.
+    # Its import takes a tenth of the time of a start.
     from scipy.optimize import linprog
 
     return linprog(

@@ -16,7 +16,7 @@ from vgtm_qp.step.target import base_frame
 
 
 class Gap:
-    """Measures how far the stations of an arm are from the nodes of its curve: linear rows leave gaps after a step."""
+    """Measures the gaps between an arm's stations and its curve's nodes that linear rows leave."""
 
     def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
         self._layout, self._kinematics = layout, kinematics
@@ -24,7 +24,7 @@ class Gap:
             return
         station, count = StationSymbols(layout), len(layout.tracked)
         _, rotation, _, _, *curve = station.inputs
-        # The slope of a plain curve says its direction, the frame of any other one all.
+        # Turns need the slope of a plain curve, or the frame of any other one.
         curve = curve[:3] if layout.general is None else [curve[2]]
         function = ca.Function("turns", [rotation, *curve], [ca.densify(station.turn)])
         self._turns = Kernel(function.map(count), compiled=False)
@@ -33,7 +33,7 @@ class Gap:
             self._turns.inputs[3][:] = layout.curve_slopes.reshape(-1)
 
     def greatest(self, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
-        """Return the greatest gap of a configuration, m, or turn times the arm's unit where turns are equalities.
+        """Return the greatest gap of a configuration, m, or turn, times the arm's unit, if it is an equality.
 
         Its curve has control vertices (V, 3), m, and torsion (T,), rad.
         """

@@ -39,7 +39,7 @@ class Path:
 
     def __post_init__(self) -> None:
         knots, positions, rotations = self.knots, self.positions, self.rotations
-        # One entry that is not finite makes the sum so.
+        # One entry that is not finite makes the sum not finite.
         if not math.isfinite(knots.sum() + positions.sum() + rotations.sum()):
             raise GoalError("a goal must be made of finite numbers; the state of the arm is unchanged")
         widths = (knots[1:] - knots[:-1])[:, None]
@@ -80,7 +80,7 @@ class Path:
         return TipGoal(position, rotation, self._velocity[k], self._spin[k])
 
     def pose(self, value: float) -> Pose:
-        """Return the pose at `value` alone; of a base: where it is at that time, s."""
+        """Return the pose at `value`; for the path of a base `value` is the time, s."""
         point = self.at(value)
         return Pose(point.position, point.rotation)
 
@@ -90,7 +90,7 @@ class Path:
         return bisect_right(self._knots, low) >= bisect_left(self._knots, high)
 
     def continued(self, pieces: float) -> Path:
-        """Return the path extended by `pieces` times its last piece, with less than half a turn of it."""
+        """Return the path extended by `pieces` times its last piece, but by less than half a turn."""
         width, turn = float(self.knots[-1] - self.knots[-2]), self._spin[-1]
         angle = width * float(np.linalg.norm(turn))
         on = width * min(pieces, 3.0 / angle if angle > 0.0 else np.inf)

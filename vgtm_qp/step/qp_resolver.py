@@ -1,4 +1,4 @@
-"""A resolver for a control loop: one call, one certified step, or a stop that says why."""
+"""The resolver of the QP: each call is one certified step, or a stop with its reason."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from vgtm_qp.step.stops import Stop, explain, struck
 from vgtm_qp.step.task import duration
 
 _SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
-"""Least share of a piece of path that is tried by any arm, and by one that can brake instead."""
+"""Least share of a piece of path that an arm tries: at rest, and moving, when it can brake instead."""
 
 
 class QPResolver(Resolver, serves="qp"):
@@ -57,7 +57,7 @@ class QPResolver(Resolver, serves="qp"):
         self._rehearse()
 
     def _rehearse(self) -> None:
-        """Try a step that stays at home: what steps make when they first need it is there before the first one."""
+        """Try a step that stays at home: everything that steps make on first use is then there."""
         if self.setup.elastic is not None:
             self.setup.elastic()
         state, path = self._state, self.setup.task.path_to(self.tip(), None, None, None)
@@ -157,7 +157,7 @@ class QPResolver(Resolver, serves="qp"):
         return braking if braking is not None and braking.origin is self._state and braking.steps else None
 
     def _brake(self, braking: Braking, path: Path | None, start: float, end: float, blocked: Step) -> Step:
-        """Do the first step of `braking`, instead of the `blocked` one, and return it."""
+        """Take the first step of `braking`, instead of the `blocked` one, and return it."""
         step = braking.first(path, start, end, blocked)
         self.state, self._braking = step.state, braking.rest
         return self._attempt.with_gap(step)

@@ -1,4 +1,4 @@
-"""What would let a stopped arm go on: the fewest limits that must give, and by how much."""
+"""What would let a stopped arm go on: the fewest changes of limits, and their least amounts."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ MOST = 3
 _TRIED = 8
 """Number of the most decisive limits that are tried as the next change."""
 _BEST = 4
-"""Number of the sets of changes, those with which the arm gets furthest, that are tried with one change more."""
+"""Number of sets of changes, those that take the arm furthest, that are tried with one change more."""
 _MARGIN = 1.5
-"""Factor of what is needed to first order: the curvature of the motion takes its part."""
+"""Amount of a change over the one needed to first order, to allow for the curvature of the motion."""
 
 
 class Change(NamedTuple):
-    """By how much one limit gives.
+    """A change of one limit.
 
     Attributes
     ----------
     limit : Limit
     amount : float
-        m, rad, m/s or rad/s, rounded up to two digits; infinite where the obstacle has to go.
+        m, rad, m/s or rad/s, rounded up to two digits; infinite if the obstacle has to go.
     unit : str
     most : float
-        By how much the limit can give: clearances and angles down to zero.
+        Greatest possible amount: clearances and angles can go down to zero.
     """
 
     limit: Limit
@@ -66,7 +66,7 @@ class Change(NamedTuple):
         return f"{name}: {size} more {kind}{where}"
 
     def times(self, factor: float) -> Change:
-        """Return a change by the amount times a factor, rounded up, but no more than the limit can give."""
+        """Return the change with its amount times a factor, rounded up, but at most `most`."""
         if math.isinf(self.amount):
             return self
         return self._replace(amount=min(_rounded_up(factor * self.amount), self.most))
@@ -95,14 +95,15 @@ class Remedy(NamedTuple):
         return " and ".join(str(change) for change in self.changes)
 
     def times(self, factor: float) -> Remedy:
-        """Return the same changes by their amounts times a factor."""
+        """Return the remedy with all amounts times a factor."""
         return self._replace(changes=tuple(change.times(factor) for change in self.changes))
 
 
 def remedies(setup: Setup, program: FirstOrder) -> tuple[Remedy, ...]:
-    """Return up to `MOST` alternatives, the fewest and smallest changes first; none if no few changes free the arm.
+    """Return up to `MOST` alternatives, the smallest changes first; empty if no few changes free the arm.
 
-    A change is half as large again as to first order it must be for the progress within the trust region.
+    The amount of a change is half as large again as needed, to first order, for the progress in the trust
+    region.
     """
     sets = list(_freeing(program)) or list(_freeing(program, for_all=True))
     found = [_remedy(setup, program, limits) for limits in sets]
@@ -112,9 +113,9 @@ def remedies(setup: Setup, program: FirstOrder) -> tuple[Remedy, ...]:
 
 
 def _freeing(program: FirstOrder, *, for_all: bool = False) -> Iterator[tuple[Limit, ...]]:
-    """Yield the smallest sets of limits without which the arm is free to first order; none of more than `MOST`.
+    """Yield the smallest sets of up to `MOST` limits without which the arm is free to first order.
 
-    Limits are those of single actuators, or `for_all` of them.
+    Limits are those of single actuators, or, `for_all`, common to all of them.
     """
 
     def pressing(costs: Array) -> list[Limit]:
@@ -148,7 +149,7 @@ def _remedy(setup: Setup, program: FirstOrder, limits: tuple[Limit, ...]) -> Rem
     most = [_greatest(setup, limit) for limit in limits]
     amounts = program.least_changes(limits, most)
     if amounts is None:
-        # Obstacles in the set have to go; the others give as much as they must then.
+        # Obstacles in the set have to go; the other limits then change as much as needed.
         amounts = program.least_changes(limits, [math.inf] * len(limits))
         assert amounts is not None, "without these limits the arm is free"
         amounts = np.where(amounts > most, math.inf, amounts)
@@ -167,7 +168,7 @@ def _remedy(setup: Setup, program: FirstOrder, limits: tuple[Limit, ...]) -> Rem
 
 
 def _greatest(setup: Setup, limit: Limit) -> float:
-    """Return by how much a limit can give, m or rad: clearances and angles down to zero."""
+    """Return the greatest amount of a limit's change, m or rad; clearances and angles can go down to zero."""
     kept = {CLEARANCE: setup.safe, MEMBERS: setup.self_safe, ANGLE: setup.minimum_angle}
     return kept.get(limit.kind, math.inf)
 
@@ -181,14 +182,14 @@ def _rounded_up(amount: float) -> float:
 
 
 def _actuators(setup: Setup, limit: Limit) -> list[tuple[int, str]]:
-    """Return numbers, among the arm's quantities, and units of the actuators that a limit is of."""
+    """Return numbers among the arm's quantities, and units, of the actuators that have a limit."""
     arm = setup.arm
     each = zip(arm.actuators.tolist(), arm.actuator_units, strict=True)
     return [(k, unit) for k, unit in each if limit.name in ("", arm.quantity_names[k])]
 
 
 def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
-    """Return an arm that shares everything with that of `setup` but the limits that changed."""
+    """Return a setup with changed limits that shares everything else with `setup`."""
     arm = copy.copy(setup.arm)
     arm.stroke, arm.rate = arm.stroke.copy(), arm.rate.copy()
     allowance, self_safe, angle = dict[str, float](), setup.self_safe, setup.minimum_angle

@@ -24,7 +24,7 @@ from vgtm_qp.step.task import duration
 
 
 class Resolver:
-    """Moves one arm step by step by the method of its problem. Not to be shared by threads: use one per thread.
+    """Moves one arm step by step by the method of its problem. Threads must not share one.
 
     ``Resolver(problem)`` is an instance of the subclass that serves ``problem.method``. A call that a method cannot
     serve raises GoalError, which names the methods that can.
@@ -54,7 +54,7 @@ class Resolver:
     _actuation: Actuation
     _clock: Phases
     _follow: Callable[[Path, float, float, float, float], Step]
-    """Moves along a path from one value to another in a duration, s, the last argument's share of the whole step."""
+    """Moves along a path from value to value in a duration, s; the last argument is its share of a step."""
     _method = ""
     _served: ClassVar[dict[str, type[Resolver]]] = {}
 
@@ -64,7 +64,7 @@ class Resolver:
             Resolver._served[serves] = cls
 
     def __new__(cls, problem: Problem | Setup) -> Self:
-        """Return an instance of the subclass that serves the problem's method; for a ``Setup``, of the QP's."""
+        """Return an instance of the subclass for the problem's method; for a ``Setup`` of ``QPResolver``."""
         chosen: type = cls
         if cls is Resolver:
             if isinstance(problem, Setup):
@@ -151,9 +151,10 @@ class Resolver:
         self.control_vertex_goals = goals if position is None else {**goals, index: position}
 
     def set_control_vertices(self, count: int) -> float:  # noqa: ARG002
-        """Give the curve another number of control vertices where it is; return how far it moved, m.
+        """Give the curve another number of control vertices in its present place; return how far it moved, m.
 
-        More of them change a Bezier curve or B-spline by rounding only; fewer are fitted. Control-vertex goals end.
+        More vertices change a Bezier curve or B-spline by rounding only; fewer are fitted. Control-vertex
+        goals end.
 
         Raises
         ------
@@ -172,7 +173,7 @@ class Resolver:
         rotation_vector: ArrayLike | None = None,
         dt: float | None = None,
     ) -> Step:
-        """Move towards a goal of the end effector in one step and return what was done.
+        """Move towards a goal of the end effector in one step and return the step.
 
         Parameters
         ----------
@@ -188,8 +189,8 @@ class Resolver:
         Raises
         ------
         GoalError
-            The goal is not three finite numbers, names a coordinate that is not tracked or the direction twice, or
-            `dt` is not a positive number; the state is unchanged.
+            The goal is not three finite numbers, has a coordinate that is not tracked or the direction twice,
+            or `dt` is not a positive number; the state is unchanged.
         """
         path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
         return self.follow(path, 0.0, 1.0, dt=dt)
@@ -218,7 +219,8 @@ class Resolver:
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's.
 
-        A step in which an actuator of the problem jams ends at that time, with the share of the path until then.
+        A step in which an actuator jams, see ``Setup.jams``, ends at that time, with the share of the path
+        until then.
 
         Raises
         ------
@@ -230,16 +232,17 @@ class Resolver:
         return self._follow(path, start, start + whole * (end - start), whole * dt, whole)
 
     def _until_jam(self, dt: float) -> float:
-        """Lock what has jammed by now, and return the share of a step of `dt`, s, that ends at the next jam."""
+        """Lock actuators that have jammed; return the share of a step of `dt`, s, until the next jam."""
         for name in self._actuation.jammed(self.state.time):
             self.lock(name)
         return self._actuation.until_jam(self.state.time, dt)
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:  # noqa: ARG002
-        """Do the next of the braking steps that bring a moving arm with limited accelerations to rest.
+        """Take the next of the braking steps that bring a moving arm with limited accelerations to rest.
 
-        They were computed before the last step was accepted, each within the limits and clear of obstacles. If the arm
-        is at rest, nothing moves and the result is None. Progress is counted from `start` to `end` of a braking `path`.
+        These steps were computed before the last step was accepted, each within the limits and clear of
+        obstacles. If the arm is at rest, nothing moves and the result is None. Progress is counted from
+        `start` to `end` of a braking `path`.
         """
         return None
 
@@ -253,10 +256,10 @@ class Resolver:
         last: Step | None = None,
         state: State | None = None,  # noqa: ARG002
     ) -> Stop:
-        """Return why the arm stopped at a state on its way along `path` from the value `start` to `end`.
+        """Return why the arm stopped at a state while moving along `path` from the value `start` to `end`.
 
         Meant for a `last` step that was blocked, hardly moved or braked. The state is the present one by default;
-        nothing moves. A method without rows that hold the arm gives the reason of the last step.
+        nothing moves. A method without rows gives the reason of the last step.
         """
         if last is None:
             return Stop(StopKind.NONLINEAR)
@@ -274,9 +277,9 @@ class Resolver:
         return None
 
     def relaxed(self, remedy: Remedy) -> Resolver | None:  # noqa: ARG002
-        """Return a resolver of the same arm in the same state, whose limits give as a remedy of a stop says.
+        """Return a resolver of the same arm in the same state, with the limits changed by a stop's remedy.
 
-        It shares its workspaces with this one. None if the method has no limits.
+        It shares its workspaces with this resolver. None if the method has no limits.
         """
         return None
 

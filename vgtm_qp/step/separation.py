@@ -37,7 +37,7 @@ _NEAR_ANGLE = 0.3
 """Excess over the least angle, rad, above which bodies that meet have no row."""
 
 _BETWEEN = 5e-5
-"""Approach between states that is allowed to bodies whose points leave their chords, over the arm's unit.
+"""Violation of a clearance between states that is allowed if points leave their chords, over the arm's unit.
 
 It is half of the published tolerance.
 """
@@ -46,8 +46,8 @@ It is half of the published tolerance.
 class Separation:
     """Rows, checks and proofs of clearance for the steps of one arm.
 
-    If the `setup` slows down, a pair may use only a share of its remaining clearance in one step. Otherwise bodies
-    arrive at full speed and stop dead: the rates of all actuators jump.
+    If the `setup` slows down, a pair may use only a share of its remaining clearance in one step. Otherwise
+    bodies would arrive at full speed and stop dead, and the rates of all actuators would jump.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -79,8 +79,9 @@ class Separation:
     ) -> tuple[BetweenReport, Shortfall | None]:
         """Return the proof of :meth:`between` for the motion to `q`, and the pairs that are too near there.
 
-        These are None if one of them was not too near `before`, or came nearer. The proof covers the end of the motion,
-        unless points leave their chords: it then allows a little less clearance than a state must have.
+        The pairs are None if one of them was not too near `before`, or came nearer. The proof covers the end
+        of the motion, unless points leave their chords: it then allows a little less clearance than a state
+        must have.
         """
         report = self.between(state.q, q, state.time, time, before)
         if not self._angles_hold(q):
@@ -95,7 +96,7 @@ class Separation:
     def between(
         self, start: Array, end: Array, start_time: float, end_time: float, before: Shortfall
     ) -> BetweenReport:
-        """Return the proof that no pair falls below its clearance on the way, or below the least one at the start."""
+        """Return the proof that no pair falls below its clearance, or the least one at the start if less."""
         floor, self_floor = self._setup.safe, self._setup.self_safe
         for pair, distance in before.items():
             if pair.is_self:
@@ -107,7 +108,8 @@ class Separation:
             floors = floor - self._rounding, max(self_floor - self._rounding, 0.0)
             return along(ways(start, end, 1), start_time, end_time, *floors)
         deviation = self.deviation(start, end)
-        # In k pieces, the deviation from the chords is 1 / k^2 of the whole. Most motions need one piece alone.
+        # In k pieces, the deviation from the chords is 1 / k^2 of the whole. Most motions need only one
+        # piece.
         is_far = deviation >= self._arm.unit
         needed = 1 if is_far else math.ceil(math.sqrt(max(deviation / self._between, 1.0)))
         tries = sorted({1, min(needed, _MOST_PIECES)})
@@ -121,7 +123,7 @@ class Separation:
         return report
 
     def deviation(self, start: Array, end: Array) -> float:
-        """Return a bound of how much nearer two points come to each other than their chords do, m."""
+        """Return a bound of how much nearer two points come to each other than their chords, m."""
         return self._arm.deviation(start, end) if self._arm.leaves_chords else 0.0
 
     def rows(
@@ -135,14 +137,15 @@ class Separation:
         *,
         expected: Array | None = None,
     ) -> ClearanceRows:
-        """Return the rows at a configuration: of every pair that can become active, by FCL as far as it is proven.
+        """Return the rows of every pair that can become active at a configuration, by FCL where proven.
 
         Parameters
         ----------
         duration
-            Time from the configuration to the end of the step, s, in which the obstacles move; zero at the end. If it
-            is not zero, pairs slow down before they touch. A zero step is then allowed while obstacles rest, except for
-            a margin that the step before used and for pairs that are driven apart.
+            Time from the configuration to the end of the step, s, in which the obstacles move; zero at the
+            end. If it is not zero, pairs slow down before they touch. While obstacles are at rest a zero step
+            is then allowed, except for margins used up by the step before and for pairs that are driven
+            apart.
         reach
             Bound of the displacement of a node, m: a pair further from its floor cannot become active. If a body moves
             further, the check of the new state finds the missed pair, and another QP corrects it.
@@ -202,13 +205,13 @@ class Separation:
         if motion:
             if self._monitor.pieces.moving:
                 rows.lower += contacts.normal_speed * duration
-            # The remaining clearance is that after the obstacles have moved.
+            # `lower` now has the remaining clearance after the obstacles' motion.
             rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH * self._arm.unit)
 
     def with_rows_between(
         self, rows: ClearanceRows, state: State, q: Array, time: float, fractions: list[float]
     ) -> ClearanceRows:
-        """Return `rows`, and the rows at `fractions`, 0 to 1, of the way from a state to `q`."""
+        """Return `rows`, and the rows at `fractions`, 0 to 1, of the motion from a state to `q`."""
         for s in fractions:
             at, now = state.q + s * (q - state.q), state.time + s * (time - state.time)
             contacts = self._monitor.near(self._arm.points(at), now, 1.5 * self._setup.safe, by_fcl=True)
@@ -216,7 +219,7 @@ class Separation:
         return rows
 
     def _clearance_rows(self, q: Array, contacts: Contacts, fraction: float = 1.0) -> ClearanceRows:
-        """Return the rows of contacts found at a configuration, a `fraction` of the way to the end."""
+        """Return the rows of contacts found at a configuration, at a `fraction` of the motion to the end."""
         if not len(contacts):
             return ClearanceRows(name=contacts.name)
         kept = self._setup
@@ -243,7 +246,7 @@ class Separation:
     def _angle_rows(self, q: Array, *, motion: bool) -> ClearanceRows:
         """Return the rows of the angles that are near the least one at a configuration.
 
-        Where points are not the nodes, the nodes of the joints stand for them: the rows are then approximate.
+        If points are not the nodes, the nodes of the joints stand for them, and the rows are approximate.
         """
         kept, bodies = self._setup, self._monitor.bodies
         first, second = self._vectors(q)

@@ -19,7 +19,7 @@ from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
 
 TOO_LONG = "a node would move further than method.step_limit"
-"""How the reason of a step begins that is refused for its length."""
+"""Beginning of the reason of a step that is refused for its length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +107,11 @@ class Setup:
         return self._gap.greatest(q, vertices, torsion, base) if len(self.layout.tracked) else np.nan
 
     def gap_of(self, state: State) -> float:
-        """Return the same of a state."""
+        """Return the greatest distance of a station from its curve node in a state, m; see :meth:`gap`."""
         return self.gap(state.q, state.control_vertices, state.torsion, self.base_at(state.time))
 
     def base_at(self, time: float) -> Pose | None:
-        """Return where the base is at `time`, s; None where it rests."""
+        """Return the pose of the base at `time`, s; None if it is at rest."""
         return None if self.base_motion is None else self.base_motion.pose(time)
 
     def home_state(self) -> State:

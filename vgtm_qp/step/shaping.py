@@ -92,7 +92,7 @@ class Shaping:
         return add_control_vertices(curve, more) if more >= 0 else remove_control_vertices(curve, -more)
 
     def _reshape(self, layout: Layout) -> None:
-        """Go on with another curve; the setup of each curve is kept for the next time."""
+        """Use another curve; the setup of each curve is kept for later use."""
         setup = self.setup
         self._built[_key(setup.layout)] = setup
         if _key(layout) not in self._built:

@@ -39,7 +39,7 @@ class State:
     q : configuration
         Of the arm, see ``arm.Arm``; of a truss the positions of its nodes.
     nodes : (N, 3)
-        Where the nodes are, m.
+        Positions of the nodes, m.
     control_vertices : (V, 3)
         Reference curve, m; V = 0 without a curve.
     torsion : (T,)
@@ -49,13 +49,15 @@ class State:
     rates : (M,)
         Rate of each over the step that led here, per second.
     motion : configuration
-        Displacement over that step: it predicts the next step, whose QP is linearised at the predicted middle.
+        Displacement over that step, which predicts the next step: its QP is linearised at the predicted
+        middle.
     duration : float
         Duration of that step, s; 0 at home, where the arm rests.
     shortfall : Shortfall or None
         Pairs below their clearance; None if not computed yet.
     late : float
-        Duration that `time` lacks by rounding, s: a large clock does not show short steps, their sum it does.
+        Duration that `time` lacks by rounding, s. A large clock cannot show a short step, but the sum of
+        many.
     """
 
     time: float

@@ -45,25 +45,25 @@ class Step:
     reason : str
         Why the step was cut short; empty if it was not.
     qps : int
-        QPs solved, those of attempts that were not accepted among them.
+        QPs solved, including those of attempts that were not accepted.
     solver_failed : bool
         True if the step was blocked only because the QP solver gave no accurate answer.
     braked : bool
-        True if the only step found was to brake on the arm's previous path, which limited accelerations do not let it
-        leave at once.
+        True if the only step found was to brake on the previous path: with limited accelerations an arm
+        cannot leave it at once.
     gave_way : bool
-        True if stations are off the curve after the step, with ``method.tracking_mode`` exact, because the arm got
-        further that way, or brakes, or because a blocked arm stood there before.
+        True if stations are off the curve after the step although ``method.tracking_mode`` is exact: because
+        the arm got further that way, or brakes, or is blocked in a state with stations off the curve.
     gap : float
-        Greatest distance of a station from its curve node after the step, m; where turns are kept as well, at least the
-        greatest turn times the arm's unit. NaN if no station tracks a curve in the QP of the step, and so with every
+        Greatest distance of a station from its curve node after the step, m; if turns are kept as well, at
+        least the greatest turn times the arm's unit. NaN if no station tracks a curve in a QP, as with every
         pseudoinverse.
     left_path : bool
         True if the tip left the path while braking, because it is elastic or its base moves on.
     solution, rows, limits
         The answer of the QP that moved the arm, its clearance rows, and the limits of its actuators; or None.
     failure : FailedStepError or None
-        What blocked it if that was a QP without an answer.
+        The error that blocked the step, if that was a QP without an answer.
     """
 
     status: StepStatus
@@ -125,7 +125,7 @@ class Step:
             name = self.rows.name(int(k))
             found[name] = max(found.get(name, 0.0), float(pressing[k]))
         pull = self.solution.actuator_multipliers
-        # A share of a step has narrower bounds than the limits: a bound may be active without a limit.
+        # A share of a step has narrower bounds than the limits, so that an active bound need not be a limit.
         limited = np.isfinite(np.where(pull > 0.0, self.limits.upper, self.limits.lower))
         for k in np.flatnonzero((np.abs(pull) > 1e-9) & limited):
             found[self.limits.name(int(k), upper=bool(pull[k] > 0.0))] = float(abs(pull[k]))
@@ -133,22 +133,22 @@ class Step:
 
     @property
     def fcl_rows(self) -> int:
-        """Number of clearance rows of that QP that FCL supplied, each proven."""
+        """Number of clearance rows in the QP that moved the arm by FCL, each proven."""
         return 0 if self.rows is None else self.rows.by_fcl
 
     @property
     def exact_rows(self) -> int:
-        """Number of its clearance rows by closed forms: FCL was not used, its answer refused, or an axis touched."""
+        """Number of clearance rows by closed forms: FCL unused, its answer refused, or axes touching."""
         return 0 if self.rows is None else self.rows.by_formula
 
     @property
     def failed_qp(self) -> StepQP | None:
-        """The last QP if the step was blocked because that had no answer: every row and column with a name."""
+        """The last QP, with names of all rows and columns, if it had no answer and so blocked the step."""
         return None if self.failure is None else self.failure.qp
 
     @property
     def active(self) -> tuple[str, ...]:
-        """Names of the rows that were active in that QP, most decisive first."""
+        """Names of the rows that were active in the QP that moved the arm, most decisive first."""
         return tuple(self.multipliers)
 
     @property

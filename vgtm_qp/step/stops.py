@@ -1,8 +1,9 @@
 """Why an arm stops, and what would let it go on, found at the state itself.
 
-The rows with multipliers in the linear program of ``step/first_order.py`` hold the arm back. Those that can be left out
-without letting it further are dropped one after another, until each remaining row is needed. An arm may stop although
-the linear program allows a little progress: near a fold of its motion the curvature uses that up.
+The rows with multipliers in the linear program of ``step/first_order.py`` hold the arm back. Rows without
+which the arm gets no further are dropped one after another, until each remaining row is needed. An arm may
+stop although the linear program allows a little progress: near a fold of its motion the curvature uses up
+that progress.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from vgtm_qp.step.step import Step
 _BLOCKED = 0.02
 """Share of the path, within the trust region, below which the arm counts as blocked."""
 _FREER = 2.0
-"""Growth of the share without a row from which on that row counts as one that holds the arm."""
+"""A row holds the arm if the share grows by at least this factor without the row."""
 _SINGULAR = 0.1
 """Share below which the tip moves far less than the actuators do."""
 _FURTHER = (2.0, 4.0, 8.0, 16.0)
-"""Factors of the piece of path on which the arm is held, if it is free on that itself."""
+"""Factors of the piece of path that are tried one after another if the arm is free on the piece itself."""
 _NAMED = 3
 """Number of rows that a text names."""
 
@@ -77,7 +78,7 @@ class Stop:
         Rows of the set, the most decisive first, and the share of the path that each costs per metre (radian); 0 for
         an obstacle that strikes an arm at rest.
     obstacles : tuple of str
-        Names of the obstacles in the set.
+        Names of the obstacles among the rows of the set.
     reason : str
         Reason of the last attempt.
     away : tuple of float
@@ -101,7 +102,7 @@ class Stop:
     def __str__(self) -> str:
         """Return what lets the arm go on; or else the rows that hold it, or the reason."""
         if self.reason and self.reason in self.multipliers:
-            # Of a method without rows, which says in its own words why it broke down.
+            # A method without rows gives the reason of its breakdown in its own words.
             return self.reason
         if self.remedies:
             return f"{self.kind}; to go on: {', or '.join(map(str, self.remedies))}"
@@ -180,7 +181,7 @@ def explain(
 
 
 def _remedies(setup: Setup, program: FirstOrder, make: Callable[..., FirstOrder]) -> tuple[Remedy, ...]:
-    """Return the remedies of a stop; if the arm is free to first order there, of what holds it further on.
+    """Return the remedies of a stop; if the arm is free to first order, those on a longer piece of path.
 
     `make` gives the linear program for a ``reach``.
     """
@@ -193,9 +194,9 @@ def _remedies(setup: Setup, program: FirstOrder, make: Callable[..., FirstOrder]
 
 
 def struck(stop: Stop, setup: Setup, separation: Separation, state: State, dt: float) -> Stop:
-    """Return a stop with the obstacles first that come too near in `dt`, s, to an arm that stays in `state`.
+    """Return a stop led by the obstacles that come too near to an arm at rest in `state` within `dt`, s.
 
-    The rows of a step are those of its end, where a fast obstacle may be on the other side of the arm already.
+    The rows of a step are those of its end: then a fast obstacle may be on the other side of the arm already.
     """
     if not setup.monitor.pieces.moving:
         return stop
@@ -225,7 +226,7 @@ def _obstacles(setup: Setup, names: Iterable[str]) -> tuple[str, ...]:
 
 
 def _kind(setup: Setup, name: str) -> StopKind:
-    """Return the kind of stop by the row of that name."""
+    """Return the kind of stop that the row of that name causes."""
     first = name.split(":")[0]
     if first == "clearance":
         return StopKind.OBSTACLE if _obstacles(setup, [name]) else StopKind.MEMBERS

@@ -27,9 +27,9 @@ class Target:
     lower, upper : (n_a,)
         Values of the actuators allowed at the end of the step.
     time, duration : float
-        Time at the end of the step, and how long the step takes, s: a difference of times would lack digits.
+        Time at the end of the step, and its duration, s: a difference of times would lack digits.
     base : Pose or None
-        Pose of the base then; None if it rests.
+        Pose of the base at the end of the step; None if the base is at rest.
     vertex_goals : (V, 3) or None
         Goals of control vertices, m; only the rows of ``Layout.vertex_goals`` are used.
     """
@@ -58,11 +58,11 @@ class Target:
 
 
 class QPInput(NamedTuple):
-    """Where the QP of a step is linearised, and its target.
+    """The point at which the QP of a step is linearised, and its target.
 
-    Residuals are those at `q`, Jacobians those at `at`, which is `q` in a correction. The curve is (V, 3), m, and (T,),
-    rad. The `goal` is that of the target at the tip's `progress`, 0 to 1. A QP of `motion` moves the arm; a correction
-    returns to the constraints by the least displacement.
+    Residuals are evaluated at `q`, Jacobians at `at`, which is `q` in a correction. The curve is (V, 3), m,
+    and (T,), rad. The `goal` is that of the target at the tip's `progress`, 0 to 1. A QP of `motion` moves
+    the arm; a correction returns to the constraints by the least displacement.
     """
 
     q: Array
@@ -76,7 +76,7 @@ class QPInput(NamedTuple):
     motion: bool
 
     def linear(self, layout: Layout, *, rows: bool = True) -> StepInput:
-        """Return this input in the terms of a QP of `layout`; without `rows`, those of a general curve are zeros."""
+        """Return this input for a QP of `layout`; without `rows`, the rows of a general curve are zeros."""
         arm, target, shape, curve = layout.arm, self.target, layout.general, None
         if shape is not None:
             at = self.vertices, self.torsion, base_frame(arm, target.base)
@@ -98,6 +98,6 @@ class QPInput(NamedTuple):
 
 
 def base_frame(arm: Arm, pose: Pose | None) -> Array:
-    """Return (3, 3) the frame of the first station where the base is at `pose`, or at home."""
+    """Return (3, 3) the frame of the first station with the base at `pose`, or at home."""
     home = arm.stations.frames[0]
     return home if pose is None else np.asarray(pose.rotation @ home)

@@ -21,7 +21,7 @@ from vgtm_qp.step.path import Path
 _UNCHANGED = "the state of the arm is unchanged"
 
 _SHORTEST, _LONGEST = 1e-8, 1e8
-"""Least and greatest duration of a step, s: rates of a shorter one would be rounding errors."""
+"""Least and greatest duration of a step, s: rates over a shorter one would be rounding errors."""
 
 
 class TipRows(NamedTuple):
@@ -77,7 +77,7 @@ class TipTask:
         return norm(self._levers * self.error(position, rotation, goal))
 
     def error(self, position: Array, rotation: Array, goal: TipGoal) -> Array:
-        """Return the error (n_e,) alone, m or rad, as every step of settling needs it."""
+        """Return the error (n_e,) alone, m or rad, which every step of settling needs."""
         return self.residual(position, rotation, goal)[0]
 
     def rows(self, X: Array, kinematics: Kinematics, goal: TipGoal) -> TipRows:
@@ -86,7 +86,7 @@ class TipTask:
         return TipRows(self.jacobian(across, kinematics.tip_spin), rate, error)
 
     def jacobian(self, across: Array, spin: Array | None) -> Array:
-        """Return (n_e, 3 K_tip) the rows' Jacobian, from `residual`'s combination of the tip's `spin` (3, 3 K_tip)."""
+        """Return (n_e, 3 K_tip) the rows' Jacobian, from turned axes `across` and `spin` (3, 3 K_tip)."""
         if spin is None or not len(across):
             return np.asarray(self._position_jacobian)
         return np.concatenate([self._position_jacobian, across @ spin])
@@ -103,7 +103,8 @@ class TipTask:
         Raises
         ------
         GoalError
-            The goal is not three finite numbers, is for coordinates without a row in the QP, or there are two for one.
+            The goal is not three finite numbers, has coordinates without a row in the QP, or has a coordinate
+            twice.
         """
         steered = {
             "position": (position, bool(len(self.axes))),

@@ -33,8 +33,8 @@ def bending_problem(
 ) -> Problem:
     """Return a maneuver that takes the tip from straight up by `goal` times the arm's height.
 
-    `cubes` are two beside the arm, at the same parts of its height as in the five-bay example; `truss` has more keys
-    of the ``[truss]`` table.
+    `cubes` asks for two beside the arm, at the same parts of its height as in the five-bay example. `truss`
+    has further keys of the ``[truss]`` table.
     """
     data: dict[str, Any] = {
         "name": f"{bays} bays, {module}",
@@ -61,7 +61,7 @@ def built_truss(problem: Problem) -> Truss:
 
 
 def moving_curve(problem: Problem) -> Iterator[CurveFirstResolver]:
-    """Yield a resolver that moves its curve first, at home and after each step, its kinematics evaluated.
+    """Yield a resolver that moves its curve first, at home and after each step, with kinematics evaluated.
 
     Raises
     ------
@@ -92,8 +92,8 @@ def bring_lengths(
 ) -> bool:
     """Move the nodes `X` (N, 3) in place until all members have `lengths` (M,), m, by Newton's method.
 
-    Return False if they do not after `tries` iterations, each of which changes lengths by `longest` at most, or if a
-    pose on the way has a least singular value below `singular`.
+    An iteration changes lengths by at most `longest`. Return False if the lengths are not reached after
+    `tries` iterations, or if a pose in between has a least singular value below `singular`.
     """
     for _ in range(tries):
         setup.kinematics.evaluate(X)
@@ -109,7 +109,7 @@ def bring_lengths(
 
 
 def least_singular_value(setup: Setup) -> float:
-    """Return that of the length Jacobian where the kinematics was evaluated last, 0 where it is not finite."""
+    """Return the least singular value of the length Jacobian evaluated last; 0 if that is not finite."""
     jacobian = truss_of(setup.arm).scatter.dense(setup.kinematics.gradient)
     if not np.all(np.isfinite(jacobian)):
         return 0.0

@@ -48,7 +48,7 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
     """Return scene `number` with that many cubes: the same for the same arguments, on any machine.
 
     The goal lies aside of the home tip and somewhat below; the cubes, 0.25 to 0.7 m, stand about the arm, clear of
-    its home pose and of the goal. Nothing says that a scene has a solution.
+    its home pose and of the goal. A scene need not have a solution.
     """
     random = np.random.default_rng([seed, cubes, number])
     azimuth, aside = random.uniform(0.0, 2.0 * np.pi), random.uniform(0.15, 0.45)
@@ -73,12 +73,12 @@ def scene(seed: int, cubes: int, number: int, steps: int) -> Problem:
 
 
 def run(seed: int, cubes: int, number: int, steps: int, methods: list[str]) -> Row:
-    """Return for each method whether it kept everything but 1 mm of drift, how far it came, and why not further."""
+    """Return success of each method, 1 mm of drift allowed, share of the path, and what stopped it."""
     return successes(scene(seed, cubes, number, steps), methods)
 
 
 def successes(problem: Problem, methods: Sequence[str]) -> Row:
-    """Return what :func:`run` does, of a problem."""
+    """Return the result of :func:`run` for a problem."""
     row: Row = {"placed": len(problem.obstacle)}
     for method in methods:
         found, _ = run_method(problem, method)
@@ -116,7 +116,7 @@ def text(rows: Sequence[Row]) -> str:
 
 
 def crossed(arm: str, rows: Sequence[Row]) -> str:
-    """Give the successes of rows of scenes about an `arm` in words, with their intervals."""
+    """Give the successes with their intervals; `arm` names the arm of the scenes in words."""
     if not rows:
         return "No scene was run."
     methods = rows[0]["methods"]

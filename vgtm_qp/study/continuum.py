@@ -32,7 +32,7 @@ def tasks(short: bool) -> list[Task]:
 
 
 def run(module: str, bays: int, steps: int) -> Row:
-    """Bend an arm of 4 m, its bays the smaller the more there are; return its distances from its curve, m."""
+    """Bend an arm of 4 m with that many bays; return its distances from its curve, m."""
     unit = _HEIGHT / bays / (1.0 if module == "longeron" else float(np.sqrt(2.0 / 3.0)))
     sizes: dict[str, Any] = {
         "longeron": unit,

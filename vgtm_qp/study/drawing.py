@@ -1,4 +1,4 @@
-"""What figures and texts of the studies share: rows by their values, panels, lines with marks, labelled axes."""
+"""Common parts of the studies' figures: rows by their values, panels, lines with marks, labelled axes."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ def draw_line(
     style: str = "--",
     factor: float = 1.0,
 ) -> None:
-    """Draw the k-th line of a panel, with a mark and colour of its own: `y` of rows, times `factor`, over their `x`."""
+    """Draw the k-th line of a panel, in a mark and colour of its own: `y` times `factor` over `x` of rows."""
     if rows:
         xs, ys = [row[x] for row in rows], [factor * row[y] for row in rows]
         axes.plot(xs, ys, style, color=f"C{k}", marker=MARKS[k], markersize=4, label=name)
 
 
 def label(axes: Axes, x: str, y: str, title: str = "", *, legend: bool = True, log: str = "") -> None:
-    """Name the axes; those in `log`, of ``"xy"``, are logarithmic."""
+    """Name the axes; those in `log`, a part of ``"xy"``, are logarithmic."""
     axes.set_xlabel(x, fontsize=8)
     axes.set_ylabel(y, fontsize=8)
     axes.set_title(title, fontsize=8)

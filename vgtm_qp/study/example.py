@@ -62,7 +62,7 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 def text(rows: Sequence[Row]) -> str:
-    """Say which method comes through, and with what clearance."""
+    """Say which method arrives, and with what clearance."""
     table = markdown_table(
         ("method", "solved", "path", "least clearance [m]", "stroke beyond [m]", "why not"),
         [

@@ -1,4 +1,4 @@
-"""What it costs to ignore the offset of the joints: the tip error of an arm that is modelled with pin joints."""
+"""The cost of ignoring the offset of joints: the tip error of an arm that is modelled with pin joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Control loops with random goals among obstacles, some of which move: what the independent check finds."""
+"""Control loops with random goals among obstacles at rest and in motion, checked independently."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _PERIODS = (0.02, 0.05, 0.1, 0.3)
 _FURTHEST = 0.4
 """Distance of goals from the tip's home, as a share of the arm's height."""
 _PATIENCE = 25
-"""Steps after which another goal is set at the latest."""
+"""Greatest number of steps before another goal is set."""
 _GLIDES = 0.5
-"""Share of goals that move there, and are not set at once; all of those of a tip that may not be late do."""
+"""Share of goals that glide to their place instead of being set there; all do if a tip may not be late."""
 _STRIDE = (1e-4, 1e-2)
-"""How far goals move in a step, as a share of the arm's height."""
+"""Least and greatest motion of a gliding goal in a step, as shares of the arm's height."""
 
 
 def tasks(
@@ -49,9 +49,9 @@ def tasks(
 def run(seed: int, number: int, steps: int, arms: Arms = "trusses") -> Row:
     """Run one loop and return its row.
 
-    Keys: ``module``, ``features`` of the scene; how many steps were ``reached``, ``slowed`` and ``blocked``; the
-    ``goals`` that were met; ``failures`` of the independent check of all states and of what is between them; and CPU
-    ``seconds`` of the steps alone.
+    Keys: ``module``, ``features`` of the scene; numbers of steps ``reached``, ``slowed`` and ``blocked``;
+    number of ``goals`` that were met; ``failures`` of the independent check of all states and motions; and
+    CPU ``seconds`` of the steps alone.
     """
     problem = varied_scene(seed, number, arms=arms)
     found: Row = {"module": kind_of(problem), "features": features(problem)}
@@ -75,7 +75,7 @@ def run(seed: int, number: int, steps: int, arms: Arms = "trusses") -> Row:
         counts[step.status] += 1
         counts["goals"] += goals.note(step)
         if step.moved:
-            # An arm that brakes is still on its way to the goal before.
+            # An arm that brakes is still moving to the goal before.
             targets.append(_pose(resolver) if step.braked else path.pose(step.progress))
             log.add(step, targets[-1], (k + 1) / (steps + 1))
     seconds = process_time() - started
@@ -86,7 +86,7 @@ def run(seed: int, number: int, steps: int, arms: Arms = "trusses") -> Row:
 
 
 class _Goals:
-    """Random goals of a loop, some set at once, some that move there in even steps."""
+    """Random goals of a loop: some are set at once, some move to their place in even steps."""
 
     def __init__(self, resolver: Resolver, random: np.random.Generator) -> None:
         self._resolver, self._random = resolver, random
@@ -129,7 +129,7 @@ class _Goals:
         self._turn = vector_from_rotation(rotation_from_vector(tilt) @ self._rotation)
 
     def note(self, step: Step) -> bool:
-        """Take note of the step towards what `next` gave, and return whether a goal is met with it."""
+        """Take note of the step towards the goal of `next`, and return whether it met a goal."""
         met = step.status is StepStatus.REACHED and bool(self._shares[-self._left] == 1.0)
         self._left = 0 if met else self._left - 1
         return met
@@ -140,7 +140,7 @@ def _pose(resolver: Resolver) -> Pose:
 
 
 def _along(problem: Problem, targets: Sequence[Pose]) -> Problem:
-    """Return the problem with the path that a loop took: it was not known before."""
+    """Return the problem with the path of a loop, which is known only after it."""
     track = problem.to_dict()["end_effector"]["track"]
     waypoints = [
         {
@@ -168,7 +168,7 @@ def draw(rows: Sequence[Row]) -> Figure:
         axes[0].fill_between(range(len(ordered)), below, below + counts, step="mid", label=str(status))
         below += counts
     label(axes[0], "loops, by steps that reached their goal", "steps", legend=False)
-    # The bars fill the panel.
+    # Outside, because the bars fill the panel.
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 

@@ -43,7 +43,7 @@ def run(problem: str, method: str, vertices: int) -> Row:
 
 
 def draw(rows: Sequence[Row]) -> Figure:
-    """Draw reach, travel of the solved ones, and step time."""
+    """Draw reach, travel of the solved maneuvers, and step time."""
     figure, axes = panels(1, 3, width=3.4, height=3.1)
     for k, (problem, method) in enumerate(_CASES):
         name, mine = f"{problem}: {method}", select(rows, problem=problem, method=method)

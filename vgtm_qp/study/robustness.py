@@ -1,4 +1,4 @@
-"""Random scenes of everything that a problem may say: what is solved, what breaks, and what stops the rest."""
+"""Random scenes of all that a problem may contain: what is solved, what breaks, what stops the rest."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vgtm_qp.study.workers import Row, Task
 
 SEED = 1991
 _APART = 10
-"""Of so many scenes one is solved without a compiler, too: its steps take ten times as long."""
+"""Of this many scenes one is also solved without a compiler, where steps take ten times as long."""
 
 
 def tasks(
@@ -32,7 +32,7 @@ def tasks(
     arms: Arms = "trusses",
     without_compiler: int = _APART,
 ) -> list[Task]:
-    """Return one task a scene, and for one scene in so many `without_compiler` another one."""
+    """Return one task a scene, and for every `without_compiler`-th scene a second one, without a compiler."""
     count = scenes if scenes is not None else 10 if short else 1000
     scene = {"seed": seed, "steps": steps, "arms": arms}
     return [
@@ -74,7 +74,7 @@ def run(seed: int, number: int, steps: int, compiler: bool, arms: Arms = "trusse
 
 
 def kind_of(problem: Problem) -> str:
-    """Return the module of a truss, or what joints a serial arm has."""
+    """Return the module of a truss, or the kind of a serial arm's joints."""
     if problem.truss is not None:
         return str(problem.to_dict()["truss"]["module"])
     assert problem.arm is not None
@@ -150,7 +150,7 @@ def text(rows: Sequence[Row]) -> str:
 
 
 def share_of(rows: Sequence[Row]) -> str:
-    """Return how many rows were solved, of how many, with the interval of 95 % for the share."""
+    """Return the number of solved rows, that of all, and the interval of 95 % for the share."""
     if not rows:
         return "none of 0"
     done = len(select(rows, status="solved"))

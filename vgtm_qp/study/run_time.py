@@ -49,14 +49,14 @@ def tasks(short: bool) -> list[Task]:
 
 
 def run(bays: int, method: str, cubes: bool) -> Row:
-    """Return the processor time of 50 steps, s: their median fifty times over, and their sum."""
+    """Return the processor time of 50 steps, s: fifty times their median, and their sum."""
     height = bays * np.sqrt(2.0 / 3.0)
     part = min(_REACH / height, 0.3)
     goal = (part, 0.3 * part, -0.4 * part)
-    # A curve with many more motions than the arm cannot be tracked: at most two vertices more than bays.
+    # At most two vertices more than bays: a curve with many more motions than the arm cannot be tracked.
     problem = bending_problem(bays, steps=_STEPS, goal=goal, vertices=min(6, bays + 2), cubes=cubes)
     changed = with_method(problem, method)
-    # Kernels are compiled, and memory is touched, in a step of another arm that does not count.
+    # Kernels are compiled, and memory is touched, in a step of another arm, which does not count.
     compile_steps(changed)
     resolver = Resolver(changed)
     plan = make_plan(problem, *resolver.tip())

@@ -26,9 +26,9 @@ _LEAST_SINGULAR_VALUE = 0.1
 
 
 class RandomScene(NamedTuple):
-    """A random problem, and whether its goal is the tip pose of a `shape` (N, 3), m, that keeps limits and clearances.
+    """A random problem; if `reachable`, its goal is the tip pose of a `shape` (N, 3), m.
 
-    That there is such a shape does not mean that it can be reached along the straight path.
+    The shape keeps limits and clearances. It need not be reachable along the straight path.
     """
 
     reachable: bool
@@ -37,7 +37,7 @@ class RandomScene(NamedTuple):
 
 
 def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
-    """Return scene `number` of a `seed`: always the same, whichever scenes were made before it."""
+    """Return scene `number` of a `seed`: always the same, whatever scenes were made before it."""
     random = np.random.default_rng([seed, number])
     truss = _truss(random)
     directed = bool(random.random() < 0.4)
@@ -172,7 +172,7 @@ def _cubes(
 
 
 def is_clear(truss: Truss, obstacle: shapes.Obstacle, X: Array) -> bool:
-    """Whether members between nodes at `X` (N, 3) keep the safe distance from an obstacle, with some room."""
+    """Whether members between nodes at `X` (N, 3) keep the safe distance from an obstacle, and some more."""
     members = capsules(truss.members, truss.radius)
     monitor = Clearance(members, [obstacle], safe=SAFE, influence=0.5, self_collision=False, by_fcl=False)
     return monitor.least(X)[0] >= SAFE + _ROOM

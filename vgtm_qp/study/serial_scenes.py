@@ -23,17 +23,17 @@ _TRACKED = (["position"], ["position", "pointing"], ["position", "orientation"])
 
 
 def random_serial_scene(seed: int, number: int, *, steps: int = 30) -> Problem:
-    """Return scene `number` of a `seed`: always the same, whichever scenes were made before it.
+    """Return scene `number` of a `seed`: always the same, whatever scenes were made before it.
 
-    Three goals of four are the tip's pose in a configuration that keeps limits and clearances; that there is such a
-    configuration does not mean that it can be reached along the straight path.
+    Three goals of four are the tip's pose in a configuration that keeps limits and clearances. It need not be
+    reachable along the straight path.
     """
     random = np.random.default_rng([seed, number, 3])
     while True:
         try:
             return _scene(random, f"serial scene {seed}-{number}", steps)
         except ProblemError:
-            # Such as a home pose that the tip cannot leave in every direction.
+            # For example, the tip cannot leave its home pose in every direction.
             continue
 
 
@@ -129,12 +129,12 @@ def _joint(random: np.random.Generator, number: int) -> dict[str, Any]:
 
 
 def placed(arm: SerialArm, q: Array) -> Array:
-    """Return the nodes, always to the same digits: those of compiled functions have other last ones."""
+    """Return the nodes, always to the same digits: compiled functions differ in the last ones."""
     return np.asarray(arm.chain.at(q)[0])
 
 
 def _shape(arm: SerialArm, random: np.random.Generator) -> Array:
-    """Return the furthest configuration on a random way from home whose bodies keep apart."""
+    """Return the furthest configuration in a random direction from home whose bodies keep apart."""
     home, actuators = arm.home_configuration, arm.actuators
     low, high = np.maximum(arm.stroke[actuators], -3.0), np.minimum(arm.stroke[actuators], 3.0)
     now = arm.home_quantities[actuators]

@@ -21,7 +21,7 @@ _METHODS = ("qp", "qp-none", "pseudoinverse-corrected", "pseudoinverse-obstacles
 _JOINTS = 15
 _SAFE, _ROOM = 0.08, 0.02
 _REACH, _TRIES = 0.9, 400
-"""Greatest distance of a goal from the base, as a share of the length, and how often a place for a cube is sought."""
+"""Greatest distance of a goal from the base, as a share of the length; tries of a place for a cube."""
 
 
 def tasks(short: bool) -> list[Task]:
@@ -39,7 +39,7 @@ def scene(seed: int, cubes: int, number: int, steps: int, *, joints: int = _JOIN
     """Return scene `number` of a snake of universal `joints` with that many cubes: always the same.
 
     The goal is 0.15 to 0.4 of the snake's length from the tip; the cubes, 0.2 to 0.5 m, stand about the snake, clear of
-    its home pose and of the goal. Nothing says that a scene has a solution.
+    its home pose and of the goal. A scene need not have a solution.
     """
     random = np.random.default_rng([seed, cubes, number, joints])
     data: dict[str, Any] = {
@@ -77,7 +77,7 @@ def scene(seed: int, cubes: int, number: int, steps: int, *, joints: int = _JOIN
 
 
 def run(seed: int, cubes: int, number: int, steps: int, methods: list[str]) -> Row:
-    """Return the row of a scene, as that of ``clutter``."""
+    """Return the row of a scene, as in ``clutter``."""
     return successes(scene(seed, cubes, number, steps), methods)
 
 

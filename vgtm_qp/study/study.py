@@ -1,4 +1,4 @@
-"""The list of all studies, and how each is run: its tasks, where their rows are kept, what is written of them."""
+"""The list of all studies, and how each is run: its tasks, the storage of their rows, the written results."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from vgtm_qp.study.workers import Row, Task, run_dask, run_here, run_processes
 
 
 class Study(NamedTuple):
-    """A study: what is in its module, its title, and whether its rows hold times that tasks beside it would falsify.
+    """A study: its module, its title, and whether it is `timed`.
 
-    The module's functions are ``tasks(short, **options)``, the keyword arguments of each run, fewer and smaller ones
-    for a `short` look; ``run(**task)``, the row of a task; ``draw(rows)``, the figure; ``text(rows)``, what the rows
-    say, in a paragraph and tables. Tasks and rows are JSON data.
+    Other processes beside a timed study would falsify its times, so that it runs alone. The module's
+    functions are ``tasks(short, **options)``, the keyword arguments of each run, fewer and smaller ones for a
+    `short` look; ``run(**task)``, the row of a task; ``draw(rows)``, the figure; and ``text(rows)``, the
+    results in a paragraph and tables. Tasks and rows are JSON data.
     """
 
     module: str
@@ -90,7 +91,7 @@ def run_study(
     progress: Callable[[int, int], None] | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Run a study, or what is left of it, and write its rows, figure and text.
+    """Run a study, or the rest of it, and write its rows, figure and text.
 
     In `folder` a folder ``NAME/`` is made: ``rows.jsonl`` grows by a line a task; ``NAME.csv``, ``.json``, ``.pdf`` and
     ``.md`` are written at the end. Tasks whose rows are there already are not run again; failed ones are.
@@ -100,9 +101,10 @@ def run_study(
     workers, dask
         Number of processes, each with one BLAS thread, 1 being this process; or address of a Dask scheduler.
     progress
-        Called with the numbers of tasks done and in all.
+        Called with the number of tasks done, and of all tasks.
     options
-        Of the study: ``scenes`` and ``seed`` of tracking, robustness and loops, ``arms`` of the last two.
+        Of the study: ``scenes`` and ``seed`` of tracking, robustness and loops, ``arms`` of the last two, and
+        ``without_compiler`` of robustness.
 
     Raises
     ------

@@ -26,7 +26,7 @@ TRACKINGS = {
     "recursive": {"method.tracking": "recursive"},
     "parallel": {"method.tracking": "parallel"},
 }
-"""What each form changes in a problem."""
+"""The changes of each form in a problem."""
 
 
 def tasks(
@@ -52,10 +52,10 @@ def _scene(seed: int, number: int, steps: int) -> Problem:
 def run(seed: int, number: int, steps: int, tracking: str) -> Row:
     """Solve one scene with one form of tracking and return its row.
 
-    Keys: ``module``, ``status``, the part of the path that was ``reached``, ``failures`` of the independent check,
-    ``way_out``, ``states``; the share of them that is ``exact``, its stations within 1e-6 m of the curve, and their
-    greatest ``gap``, m, None without a curve; the ``travel`` of all actuators, m; the median ``step``, s, and CPU
-    ``seconds``.
+    Keys: ``module``, ``status``, the part of the path that was ``reached``, ``failures`` of the independent
+    check, ``way_out``, ``states``; the share of ``exact`` states, with stations within 1e-6 m of the curve,
+    and the greatest ``gap`` of all states, m, None without a curve; the ``travel`` of all actuators, m; the
+    median ``step``, s, and CPU ``seconds``.
     """
     problem = _scene(seed, number, steps)
     module, started = problem.to_dict()["truss"]["module"], process_time()
@@ -82,7 +82,7 @@ def run(seed: int, number: int, steps: int, tracking: str) -> Row:
 
 
 def draw(rows: Sequence[Row]) -> Figure:
-    """Draw how many scenes are solved, and how many steps of these are exact."""
+    """Draw the number of solved scenes, and the share of their steps that are exact."""
     figure, axes = panels(1, 2, width=3.4, height=2.8)
     forms = [form for form in TRACKINGS if select(rows, tracking=form)]
     solved = [select(rows, tracking=form, status="solved") for form in forms]
@@ -95,7 +95,7 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 def text(rows: Sequence[Row]) -> str:
-    """Give what each form solved, what it lost of what another solves, and how near the stations kept to the curve."""
+    """Give what each form solved, what only others solved, and the stations' distance from the curve."""
     if not rows:
         return "No scene was run."
     solved = {form: select(rows, tracking=form, status="solved") for form in TRACKINGS}
@@ -136,7 +136,7 @@ def text(rows: Sequence[Row]) -> str:
 
 
 def _exact(rows: Sequence[Row]) -> float | None:
-    """Return the share of exact steps of some rows; None where none has a curve."""
+    """Return the share of exact steps of some rows; None if no row has a curve."""
     known = [row for row in rows if row["exact"] is not None]
     steps = sum(row["states"] - 1 for row in known)
     return sum(row["exact"] * (row["states"] - 1) for row in known) / steps if steps else None

@@ -1,4 +1,4 @@
-"""Random scenes of everything that a problem file may say: shapes, motions, limits, jams, curves, modes."""
+"""Random scenes of all that a problem file may contain: shapes, motions, limits, jams, curves, modes."""
 
 from __future__ import annotations
 
@@ -22,11 +22,10 @@ _FASTEST = 0.05
 
 
 def varied_scene(seed: int, number: int, *, steps: int = 30, arms: Arms = "trusses") -> Problem:
-    """Return scene `number` of a `seed`: always the same, whichever scenes were made before it.
+    """Return scene `number` of a `seed`: always the same, whatever scenes were made before it.
 
     The arm, its goal and the places of the obstacles are those of ``random_scene``, or for serial `arms` of
-    ``random_serial_scene``. Obstacles that rest are clear of the arm at home; nothing says that the goal can be
-    reached.
+    ``random_serial_scene``. Obstacles at rest are clear of the arm at home. The goal need not be reachable.
     """
     random = np.random.default_rng([seed, number, 1])
     if arms == "serial":

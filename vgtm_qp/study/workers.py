@@ -1,4 +1,4 @@
-"""Independent tasks on one process, several processes or a Dask cluster; a task that crashes loses itself alone."""
+"""Independent tasks on one process, several processes or a Dask cluster; a crash loses only its own task."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Row = dict[str, Any]
 HANG = 900.0
 """Seconds after which a task counts as hung."""
 _BEGUN = {"begun": True}
-"""What a process says when it takes up a task: the time that it needed to start is not the task's."""
+"""Message of a process that begins a task: the time of its own start does not count as the task's."""
 
 
 def run_task(function: str, task: Task) -> Row:
-    """Return the row of a task: `function` is ``"module:name"``; an exception becomes a row that says so."""
+    """Return the row of a task; `function` is ``"module:name"``. An exception becomes a row with its text."""
     module, name = function.split(":")
     try:
         return dict(getattr(import_module(module), name)(**task))
@@ -43,7 +43,7 @@ def run_here(function: str, tasks: Sequence[Task]) -> Iterator[tuple[int, Row]]:
         for k, task in enumerate(tasks):
             row = run_task(function, task)
             if interrupted.is_set():
-                # A maneuver ends with the steps that it made, as if it were blocked.
+                # An interrupted maneuver ends with the steps that it made, as if it were blocked.
                 raise KeyboardInterrupt
             yield k, row
 
@@ -53,8 +53,8 @@ def run_processes(
 ) -> Iterator[tuple[int, Row]]:
     """Yield number and row of each task as `workers` processes finish them.
 
-    A process that dies, or takes longer than `hang` seconds for a task, loses that task alone: another takes its
-    place, and the task is tried once more when all others are done, with no other beside it. If that fails too, its
+    A process that dies, or takes longer than `hang` seconds for a task, loses only that task: another process
+    takes its place, and the task is tried once more, alone, when all others are done. If that fails too, its
     row says so.
     """
     again: list[int] = []
@@ -83,7 +83,7 @@ def run_dask(function: str, tasks: Sequence[Task], address: str) -> Iterator[tup
     with Client(address) as client:
         futures = {client.submit(run_task, function, task, pure=False): k for k, task in enumerate(tasks)}
         for future in as_completed(futures):
-            # Where a worker dies, Dask itself gives its task to another one, three times by default.
+            # If a worker dies, Dask itself gives its task to another one, three times by default.
             failed = future.exception()
             yield futures[future], {"failed": f"its worker died: {failed}"} if failed else future.result()
 
@@ -103,7 +103,7 @@ class _Worker:
         self.pipe.send((function, task))
 
     def answer(self) -> Row | None:
-        """Return what it says, None if it died."""
+        """Return the process's answer; None if it died."""
         try:
             return dict(self.pipe.recv())
         except (EOFError, OSError):
@@ -119,7 +119,7 @@ def _pool(
     function: str, tasks: Iterable[tuple[int, Task]], workers: int, hang: float
 ) -> Iterator[tuple[int, Row | None]]:
     """Yield number and row of each numbered task, None where its process died or hung."""
-    # Inherited by the processes before they import NumPy.
+    # The processes inherit this before they import NumPy.
     pin_threads()
     waiting = deque(tasks)
     busy: list[_Worker] = []
@@ -148,11 +148,11 @@ def _pool(
 
 
 def _serve(pipe: Connection, is_alone: bool) -> None:
-    """Answer tasks until the other end closes; an interrupt is the other process's business."""
+    """Answer tasks until the other end closes; interrupts are left to the other process."""
     from vgtm_qp.compiled import OFTEN, SELDOM, compile_after
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Beside other processes, to compile the kernels of an arm costs more than a few maneuvers with it gain.
+    # Beside other processes, compiling the kernels of an arm costs more than it gains in a few maneuvers.
     compile_after(OFTEN if is_alone else SELDOM)
     while True:
         try:

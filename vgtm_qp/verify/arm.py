@@ -32,16 +32,16 @@ class RecordedArm:
     home : (N, 3)
         Home positions of the nodes, m.
     base, free : (N_c,) int, (N - N_c,) int
-        Given nodes, and the others.
+        Given nodes, and all others.
     actuated, stretches : (M,) bool
         True where a member changes its length.
     quantity_names, home_quantities : (M,)
         Names and home lengths of the members, actuated and fixed.
     length, stroke, rate, acceleration, radius : (M,), (M, 2), (M,), (M,), (M,)
-        Home lengths and limits; inf where there is no limit.
+        Home lengths and limits; inf without a limit.
     corners, offset : (M, 2, 3) int or (M, 2, 1) int, (M, 2, 3)
-        Nodes that place the two ends of each member and orient its joint there, and the ends in the joint
-        frames, eqs. (12)-(13); the end's node alone and zeros for pin joints.
+        Nodes that place the two ends of each member and orient its joints, and the ends in the joint frames,
+        eqs. (12)-(13). For pin joints: the end's node alone, and zeros.
     """
 
     unit, body, rigid_body = "m", "member", "fixed member"
@@ -78,7 +78,7 @@ class RecordedArm:
         self.size = float(np.linalg.norm(last - first, axis=1).mean()) if len(members) else 1.0
         self.quantity_names, self.home_quantities = self.member_names, self.length
         self.free = np.setdiff1d(np.arange(nodes), self.base)
-        # Fewer than three nodes have no attitude.
+        # A tip of fewer than three nodes has no attitude.
         self._tip_fit = polygon_frame(self.home[self.tip], None) if len(self.tip) >= 3 else None
 
     def contradictions(self, problem: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[str]:
@@ -99,7 +99,7 @@ class RecordedArm:
 
     @property
     def has_pin_joints(self) -> bool:
-        """True where members end in their nodes, and so move along straight lines when the nodes do."""
+        """True if members end in their nodes, and so move along straight lines when the nodes do."""
         return bool(self.corners.shape[2] == 1)
 
     def ends(self, nodes: Array) -> Array:
@@ -109,7 +109,7 @@ class RecordedArm:
     states_ends = ends
 
     def ends_between(self, before: Array, after: Array, share: Array, member: Index) -> Array:
-        """Return (P, 2, 3) the ends, m, of members (P,) at shares (P,) of the straight way between nodes (N, 3)."""
+        """Return (P, 2, 3) the ends, m, of members (P,) at shares (P,) of a straight motion of the nodes."""
         start, stop = before[self.corners[member]], after[self.corners[member]]
         return self._ends_at(start + share[:, None, None, None] * (stop - start), self.offset[member])
 
@@ -128,7 +128,8 @@ class RecordedArm:
         """Return (..., P) an upper bound, m, of |d2 r / d share2| of members' ends between node positions (..., N, 3).
 
         Zero for pin joints. The joint frame's axes are unit vectors of polynomials w of the share, and
-        |(w/|w|)''| <= |w''|/|w| + 3 (|w'|/|w|)^2, with |w| bounded below from its ends; inf where that fails.
+        |(w/|w|)''| <= |w''|/|w| + 3 (|w'|/|w|)^2, with a lower bound of |w| from its ends; inf if that is not
+        positive.
         """
         if self.has_pin_joints:
             return np.zeros((*before.shape[:-2], len(member)))
@@ -155,7 +156,7 @@ class RecordedArm:
         return np.asarray(np.einsum("k,...kc->...c", self.tip_weights, nodes[..., self.tip, :]))
 
     def tip_rotations(self, nodes: Array) -> Array:
-        """Return (T, 3, 3) the end effector's attitude at nodes (T, N, 3): that at home, turned by the best fit."""
+        """Return (T, 3, 3) the end effector's attitude at nodes (T, N, 3), by the best fit to its nodes."""
         if self._tip_fit is None:
             return np.tile(self.tip_frame, (len(nodes), 1, 1))
         home_frame, angles = self._tip_fit
@@ -165,7 +166,7 @@ class RecordedArm:
     def length_gradient(self, nodes: Array) -> tuple[Array, Index]:
         """Return (..., M, Q, 3) the gradients of the lengths with respect to (M, Q) nodes, m/m, at nodes (..., N, 3).
 
-        For offset joints by central differences of the joints' own corners: exact to about 1e-9.
+        For offset joints they are central differences over the joints' own corners, exact to about 1e-9.
         """
         place = nodes[..., self.corners, :]
         if self.has_pin_joints:
@@ -185,7 +186,7 @@ class RecordedArm:
         """Return the least singular value of the length Jacobian, and the least and greatest of the tip's.
 
         The length Jacobian is d lengths / d (free node positions), square in a determinate truss; the tip's
-        is d tip position / d actuated lengths. None where the truss is not determinate or has no actuator.
+        is d tip position / d actuated lengths. None if the truss is not determinate or has no actuator.
         """
         from scipy.sparse import csc_array
 
@@ -215,7 +216,7 @@ class RecordedArm:
             return 0.0, 0.0, np.inf
 
     def _sparse_values(self, J: Any, tip: Array) -> tuple[float, float, float]:
-        """Inverse power iteration on J^T J: it comes down to the least singular value from above."""
+        """Inverse power iteration on J^T J, which approaches the least singular value from above."""
         from scipy.sparse.linalg import splu
 
         try:
@@ -242,7 +243,7 @@ def recorded_arm(record: Mapping[str, Any], members: Index) -> Arm:
 
 
 def arm_of(maneuver: Result) -> Arm:
-    """Return the arm of a result; ResultError where its record is malformed, or describes another number of nodes."""
+    """Return the arm of a result; ResultError if its record is malformed, or has another number of nodes."""
     arm, count = recorded_arm(maneuver.manifest["arm"], maneuver.members), maneuver.nodes.shape[1]
     if count != len(arm.home):
         raise ResultError(f"array nodes holds {count} nodes; manifest.arm describes {len(arm.home)}")
@@ -253,7 +254,7 @@ def polygon_frame(points: Array, angles: Array | None) -> tuple[Array, Array]:
     """Return the (3, 3) frame fitted to a polygon (K, 3), and its nodes' polar angles (K,) in that frame.
 
     z is the direction of the area vector. x is the direction in the plane from which the nodes' polar angles
-    differ least from `angles` (the planar Procrustes problem); any direction where `angles` is None.
+    differ least from `angles` (the planar Procrustes problem); any direction if `angles` is None.
     """
     spokes = points - points.mean(axis=0)
     z = _unit(np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0))
@@ -293,7 +294,7 @@ def _bisector_bounds(first: list[Array], second: list[Array]) -> tuple[Array, Ar
 
 
 def _normal_bounds(first: list[Array], second: list[Array]) -> tuple[Array, Array]:
-    """Bounds of the derivatives of the direction of first x second, which is quadratic in the share."""
+    """Bounds of the derivatives of the direction of the product first x second, quadratic in the share."""
     change = [after - before for before, after in (first, second)]
     bend = 2.0 * _norm(np.cross(change[0], change[1]))
     slopes = [np.cross(change[0], second[k]) + np.cross(first[k], change[1]) for k in range(2)]

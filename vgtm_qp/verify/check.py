@@ -58,15 +58,15 @@ _FEW_STATES = 21
 
 
 def verify_file(path: str | Path, *, problem: Problem | None = None) -> Certificate:
-    """Load a result file and verify it; ResultError where it cannot be loaded, or its arm record is malformed."""
+    """Load a result file and verify it; ResultError if it cannot be loaded or its arm record is malformed."""
     return verify(Result.load(path), problem=problem)
 
 
 def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
     """Return the certificate of `maneuver`, recomputed from its nodes and a problem.
 
-    That is the problem in its manifest, or `problem` in its place: then the certificate names every value in which the
-    two differ, but notes alone say so of those that only say how the maneuver was solved.
+    The problem is that of its manifest, or `problem` instead. Then the certificate names every value in which
+    the two differ; values that only say how the maneuver was solved are in its notes.
 
     Raises
     ------
@@ -131,9 +131,9 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
 def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
     """Return errors of fixed lengths or joint values (T, M) and of the base, and violations of limits.
 
-    A rate is the mean over a step. An acceleration is the change of the rate from step to step over the time between
-    their middles; that of a member which stops because it locks does not count. Neither is beyond its limit by what
-    rounding of positions and times, over a short step, makes of it.
+    A rate is the mean over a step. An acceleration is the change of the rate from step to step over the time
+    between their middles; that of a member that stops because it locks does not count. The rounding of
+    positions and times over a short step is allowed beyond both limits.
     """
     time, unit, names = maneuver.time, arm.unit, arm.quantity_names
     per = f"({unit})" if " " in unit else unit
@@ -166,9 +166,10 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
 
 
 def changes(time: Array, values: Array, size: float) -> tuple[Array, Array, Array, Array]:
-    """Return rates (T - 1, M) and accelerations (T - 2, M) of values (T, M) at times (T,), s, and what rounding makes.
+    """Return rates (T - 1, M), accelerations (T - 2, M) of values (T, M) at times (T,), and their rounding.
 
-    That is what the rounding of values as large as `size` and of times makes of a rate and of an acceleration.
+    Times are in s. The last two results are bounds of the errors of a rate and of an acceleration by the
+    rounding of times, and of values as large as `size`.
     """
     durations = np.diff(time)[:, None]
     between = 0.5 * (durations[1:] + durations[:-1])
@@ -225,14 +226,14 @@ def _least_clearances(motion: RecordedMotion, encounters: Sequence[Encounters]) 
     for step in range(count - 1):
         for pairs in encounters:
             limit, bound = pairs.between(step, limit, bound)
-    # The bound names an interval; if the clearance found there is as low, its instant is more precise.
+    # The bound names an interval. If the clearance found is as low, its instant is more precise.
     where = limit.where if bound.value >= limit.value - motion.resolution else bound.where
     between = Least(min(bound.value, limit.value), where)
     return at, between, np.array([least.value for least in each])
 
 
 def _difference(stored: Array, found: Array) -> Array:
-    """Return (T,) differences of clearances, which are infinite where nothing is near."""
+    """Return (T,) differences of clearances, which may be infinite."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(stored == found, 0.0, np.abs(stored - found)))
 
@@ -245,7 +246,7 @@ def locks_of(problem: Mapping[str, Any]) -> list[tuple[str, float]]:
 
 
 def _jams_between_rows(maneuver: Result) -> list[str]:
-    """Return the members that lock between two rows, so that the length at which they locked is unknown."""
+    """Return the members that lock between two rows: the lengths at which they lock are unknown."""
     return [
         f"{name} locks at {since:g} s, where there is no state"
         for name, since in locks_of(maneuver.manifest["problem"])
@@ -268,7 +269,7 @@ def _member_angle(motion: RecordedMotion) -> Least:
 
 
 def joined_ends(members: Index) -> Index:
-    """Return (P, 2) each two ends of members (M, 2) that are in one node: end e of member m is 2 m + e."""
+    """Return (P, 2) the pairs of ends of members (M, 2) in one node; end e of member m has number 2 m + e."""
     node = members.reshape(-1)
     order = np.argsort(node, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(node[order])) + 1)

@@ -1,8 +1,8 @@
 """Least clearances of a maneuver: exact at its states, and a proven lower bound between them.
 
-Between two states every node moves along a straight line, so a plane that separates a member from a convex
-body at both ends of an interval separates them all through it. Intervals whose best plane proves too little
-are halved.
+Between two states every node moves along a straight line. So a plane that separates a member from a convex
+body at both ends of an interval separates them throughout. Intervals whose best plane proves too little are
+halved.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from vgtm_qp.verify.obstacles import Body
 Pairs = tuple[Index, Index]
 
 CLEARANCE_TOLERANCE = 1e-9
-"""Clearances at states, m."""
+"""Tolerance of clearances at states, m."""
 BETWEEN_TOLERANCE = 1e-4
-"""Clearances between states, over the mean length of members or links."""
+"""Tolerance of clearances between states, over the mean length of members or links."""
 RESOLUTION = 1e-6
-"""Greatest gap of the bound between states below the least clearance found there, over the same."""
+"""Greatest gap between bound and least clearance found between states, over the same mean length."""
 
 _GREATEST_DEPTH = 48
 _GREATEST_COUNT = 400_000
-"""Numbers of halvings, and of open intervals, from which on a bound stays as it is."""
+"""Greatest numbers of halvings, and of open intervals; beyond, a bound stays as it is."""
 _CHUNK = 200_000
 
 
 class RecordedMotion:
-    """The moving arm: times (T,), s, and states: nodes (T, N, 3), m, or joints and base (T, J + 6).
+    """The moving arm: times (T,), s, and states, which are nodes (T, N, 3), m, or joints and base (T, J + 6).
 
     The ends (T, M, 2, 3), m, are those of its bodies at the states.
     """
@@ -59,24 +59,24 @@ class RecordedMotion:
 
 @dataclass(frozen=True)
 class Least:
-    """The least clearance met so far, m, and between what and where."""
+    """The least clearance so far, m, with its pair and place."""
 
     value: float = np.inf
     where: str = ""
 
     def or_lower(self, values: Array, where: Callable[[int], str]) -> Least:
-        """Return the least of `values` and `where` its index is, if that is lower than this."""
+        """Return the least of `values` with the place that `where` gives for its index, if it is lower."""
         k = int(np.argmin(values)) if len(values) else -1
         return Least(float(values[k]), where(k)) if k >= 0 and values[k] < self.value else self
 
 
 class Encounters(ABC):
-    """All pairs of a member and an obstacle or another member that must keep apart."""
+    """All pairs, of a member and an obstacle or of two members, that must keep apart."""
 
     def __init__(self, motion: RecordedMotion) -> None:
         self.motion = motion
         self.held_from: dict[tuple[int, int], int] = {}
-        """First state at which each pair counts; pairs not in it count from the first state on."""
+        """First state at which each pair counts; other pairs count from the first state on."""
 
     @abstractmethod
     def pairs_named(self, name: str) -> list[tuple[int, int]]:
@@ -104,12 +104,12 @@ class Encounters(ABC):
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """Return (P,) the gap between the surfaces' supporting planes across `normal`, m.
 
-        With a zero normal it is the value for axes that touch.
+        With a zero normal it is minus the radius, or the radii: the value for axes that touch.
         """
 
     @abstractmethod
     def _bend(self, step: int, pair: Pairs) -> Array:
-        """Return (P,) bounds, m, of the pairs' second derivative that comes from turning joints."""
+        """Return (P,) bounds, m, of the pairs' second derivative, which comes from turning joints."""
 
     @abstractmethod
     def name(self, pair: tuple[int, int]) -> str:
@@ -135,13 +135,14 @@ class Encounters(ABC):
         for _ in range(40):
             pair = next(self._counting(low, high, state, state, reach), None)
             if pair is not None:
-                # Boxes along the axes may be exactly as far apart as the pair: rounding must not drop it.
+                # Boxes along the axes may be exactly as far apart as the pair: rounding must not drop the
+                # pair.
                 return float(self.distances(state, pair).min()) + self.motion.resolution
             reach *= 2.0
         return np.inf
 
     def _counting(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Iterator[Pairs]:
-        """Yield what `near` finds and counts from state `start` on, some pairs at a time."""
+        """Yield the pairs of `near` that count from state `start` on, some pairs at a time."""
         first, second = self.near(low, high, start, stop, limit)
         if self.held_from:
             each = zip(first.tolist(), second.tolist(), strict=True)
@@ -156,8 +157,8 @@ class Encounters(ABC):
     def between(self, step: int, limit: Least, bound: Least) -> tuple[Least, Least]:
         """Return `limit` and `bound` lowered by the motion from state `step` to the next.
 
-        `limit` is the least clearance at any instant looked at; `bound` is proven to be below every clearance
-        on the steps seen so far, and comes within `RESOLUTION` of `limit`.
+        `limit` is the least clearance at any instant evaluated; `bound` is proven to be below every clearance
+        in the steps so far, and comes within `RESOLUTION` of `limit`.
         """
         ends = self.motion.ends[step : step + 2]
         low, high = ends.min(axis=(0, 2)), ends.max(axis=(0, 2))
@@ -213,7 +214,7 @@ class AgainstBody(Encounters):
         self._centers = body.at(motion.time)
 
     def pairs_named(self, name: str) -> list[tuple[int, int]]:
-        """Return all pieces of the body with the member of ``member / obstacle``."""
+        """Return the pairs of all pieces of the body with the member in ``member / obstacle``."""
         named = [k for k in range(len(self.motion.arm.member_names)) if self.name((k, 0)) == name]
         return [(member, piece) for member in named for piece in range(len(self._low))]
 
@@ -234,7 +235,7 @@ class AgainstBody(Encounters):
         return np.repeat(member, [len(found) for found in near]), np.concatenate(near)
 
     def at_state(self, state: int) -> Least:
-        """Return the exact least clearance at a state; a member inside a closed mesh touches it."""
+        """Return the exact least clearance at a state; a member inside a closed mesh counts as touching."""
         ends = self.motion.ends[state] - self._centers[state]
         inside = self.body.encloses(ends.reshape(-1, 3)).reshape(-1, 2).any(axis=1)
         depth = np.where(inside, -self.motion.arm.radius, np.inf)
@@ -263,10 +264,10 @@ class AgainstBody(Encounters):
 
 
 class AgainstMembers(Encounters):
-    """Members against members that they share no node with."""
+    """Members against members without a common node."""
 
     def pairs_named(self, name: str) -> list[tuple[int, int]]:
-        """Return the two members of ``member / member`` in either order."""
+        """Return the two members in ``member / member``, in either order."""
         names, nodes = self.motion.arm.member_names, self.motion.arm.members
         apart = [k for k, first in enumerate(names) if name.startswith(f"{first} / ")]
         found = [(a, b) for a in apart for b in range(len(names)) if self.name((a, b)) == name]
@@ -276,7 +277,7 @@ class AgainstMembers(Encounters):
         return [pair for a, b in kept for pair in ((a, b), (b, a))]
 
     def contradictions(self) -> list[str]:
-        """Return the pairs that the record allows to touch because they do so at home, but which do not."""
+        """Return the pairs that are recorded as touching at home but do not touch there."""
         pairs = np.array(sorted(self._touching), dtype=np.int64).reshape(-1, 2)
         ends = self.motion.arm.ends(self.motion.arm.home)
         points = np.concatenate([ends[pairs[:, 0]], ends[pairs[:, 1]]], axis=1)

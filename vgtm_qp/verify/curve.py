@@ -21,12 +21,12 @@ TRACKING_TOLERANCE = 1e-6
 """Tolerance of stations with exact tracking and of the curve's end, over the mean length of members or links."""
 
 _PIECES, _FEWEST = 1600, 100
-"""Chords whose lengths make the arc length of a curve, and fewest of each of its Bezier segments."""
+"""Number of chords that measure the arc length of a curve, and least number in each Bezier segment."""
 _REFINEMENTS = 3
 
 _ROUNDING = 1e-9
 _ENDS_AT_TIP = 3
-"""Number of control vertices from which on a curve can end in the tip; along its direction with one more."""
+"""Least number of control vertices of a curve that ends in the tip; one more to end along its direction."""
 
 
 class RecordedCurve(NamedTuple):
@@ -41,7 +41,7 @@ class RecordedCurve(NamedTuple):
     nodes : (K,)
         Parameters of the curve nodes, or their shares of the arc length where `by_arc_length`.
     stations, weights : (K, Q) int, (K, Q)
-        The nodes that each station is the weighted mean of.
+        The nodes whose weighted mean each station is.
     frames : (K or 0, 3, 3)
         Frames at home of stations whose normals are kept along the curve.
     """
@@ -56,7 +56,7 @@ class RecordedCurve(NamedTuple):
 
     @classmethod
     def of(cls, record: Mapping[str, Any], nodes: int, vertices: int) -> RecordedCurve:
-        """Read ``Layout.record``; ResultError where it does not fit so many nodes and control vertices."""
+        """Read ``Layout.record``; ResultError if it does not fit the number of nodes or control vertices."""
         table = Record(record, "manifest.curve")
         breaks = table.numbers("breaks", (None,))
         if len(breaks) < 2 or (np.diff(breaks) <= 0.0).any():
@@ -70,7 +70,7 @@ class RecordedCurve(NamedTuple):
         stations = table.integers("stations", (len(at), None), nodes)
         weights = table.numbers("weights", stations.shape)
         frames = np.zeros((0, 3, 3))
-        # Earlier versions did not record them.
+        # Earlier versions did not record frames.
         if table.has("frames") and record["frames"]:
             frames = table.numbers("frames", (len(at), 3, 3))
         return cls(breaks, extraction, at, table.flag("by_arc_length"), stations, weights, frames)
@@ -80,7 +80,7 @@ class RecordedCurve(NamedTuple):
         return self._mean(self.extraction, s, vertices)
 
     def _mean(self, tables: Array, s: Array, vertices: Array) -> Array:
-        """Return (T, K, 3) what the Bezier points (S, d + 1, V) of `tables` give at `s` (T, K)."""
+        """Return (T, K, 3) the points at `s` (T, K) of Bezier segments with points `tables` (S, d + 1, V)."""
         segment = np.searchsorted(self.breaks[1:-1], s, side="right")
         u = (s - self.breaks[segment]) / np.diff(self.breaks)[segment]
         degree = tables.shape[1] - 1
@@ -174,7 +174,7 @@ def curve_measures(maneuver: Result, rotation: Array, size: float) -> dict[str, 
         return {}
     table, tolerance = Record(maneuver.manifest["curve"], "manifest.curve"), TRACKING_TOLERANCE * size
     off = gaps(maneuver, curve)
-    # At home the curve is fitted to the arm, however that is bent.
+    # At home the curve is only fitted to the arm, which may be bent.
     moved = off[min(1, len(off) - 1) :]
     row, k = divmod(int(np.argmax(moved)), moved.shape[1])
     row += len(off) - len(moved)
@@ -219,7 +219,7 @@ def curve_measures(maneuver: Result, rotation: Array, size: float) -> dict[str, 
 
 
 def _start(maneuver: Result, table: Record, tolerance: float) -> dict[str, Measure]:
-    """Return how far the curve is from beginning at the base, m, and along its normal, rad."""
+    """Return the distance of the curve's start from the base, m, and its angle to the base's normal, rad."""
     nodes, vertices = maneuver.nodes, maneuver.control_vertices
     start = table.integers("start", (None,), nodes.shape[1])
     weights, normal = table.numbers("start_weights", start.shape), table.numbers("normal", (3,))
@@ -236,9 +236,9 @@ def _start(maneuver: Result, table: Record, tolerance: float) -> dict[str, Measu
 
 
 def keeps_stations(problem: Mapping[str, Any]) -> bool:
-    """Return whether the method of a problem keeps stations on the curve in every step, or stops the arm."""
+    """Return whether the method of a problem keeps stations on the curve, or else stops the arm."""
     method = problem.get("method") or {}
-    # Results of earlier versions, which do not have this key, do not record their curve.
+    # Results of earlier versions lack this key, and do not record their curve.
     if "tracking_mode" not in method or method.get("name") != "qp":
         return False
     tracking = method.get("tracking")
@@ -248,7 +248,7 @@ def keeps_stations(problem: Mapping[str, Any]) -> bool:
 
 
 def curve_contradictions(maneuver: Result) -> Iterator[str]:
-    """Yield where the recorded curve cannot be that of the problem, so that its measures say nothing."""
+    """Yield contradictions of the recorded curve with its problem, which make its measures meaningless."""
     problem, record = maneuver.manifest["problem"], maneuver.manifest.get("curve")
     truss, vertices = problem.get("truss") or {}, maneuver.control_vertices.shape[1]
     if record is None or not vertices:

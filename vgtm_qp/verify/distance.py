@@ -1,7 +1,7 @@
 """Exact distances of segments in plain NumPy, each with the direction in which the two bodies are apart.
 
 Every function takes P pairs and returns ``distance (P,)``, m, and ``normal (P, 3)``: the unit vector from the
-closest point of the second body to that of the segment, or zero where they touch.
+closest point of the second body to that of the segment, or zero if they touch.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ Separation = tuple[Array, Array]
 def segment_box(start: Array, end: Array, half: Array) -> Separation:
     """Segments against the solid boxes |x_i| <= half_i; `half` is (3,) or (P, 3), m.
 
-    The squared distance is convex and piecewise quadratic along the segment, with a break where it crosses a
-    face plane: between two breaks its derivative is linear, so its minimum is found in closed form.
+    The squared distance is convex and piecewise quadratic along the segment, with a break wherever the
+    segment crosses a face plane. Between two breaks its derivative is linear, so that its minimum has a
+    closed form.
     """
     along, half = end - start, np.broadcast_to(half, start.shape)
     moving = np.where(along == 0.0, 1.0, along)
@@ -58,8 +59,8 @@ def segment_cylinder(
 ) -> Separation:
     """Segments against the solid cylinders round the z axis, |z| <= half_height; both sizes one number or (P,), m.
 
-    The squared distance to a convex body is convex along the segment and differentiable, so its minimum is
-    where the derivative changes sign: bisection down to the rounding of the parameter.
+    The squared distance to a convex body is convex along the segment and differentiable. Its minimum is where
+    the derivative changes sign: bisection down to the rounding of the parameter.
     """
     along, low, high = end - start, np.zeros(len(start)), np.ones(len(start))
     sizes = np.stack(np.broadcast_arrays(radius, half_height, low)[:2], axis=1)
@@ -141,7 +142,7 @@ def segment_triangle(start: Array, end: Array, triangle: Array) -> Separation:
 
 
 def _over(point: Array, u: Array, v: Array, normal: Array, area: Array) -> NDArray[np.bool_]:
-    """Return True where the projection of `point` falls into the triangle (0, u, v)."""
+    """Return True for a `point` whose projection falls into the triangle (0, u, v)."""
     square = np.where(area > 0.0, area * area, 1.0)
     beta = np.sum(np.cross(point, v) * normal, axis=1) / square
     gamma = np.sum(np.cross(u, point) * normal, axis=1) / square

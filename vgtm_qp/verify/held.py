@@ -1,4 +1,4 @@
-"""Whose problem a maneuver is held against: the one in its manifest, or one that is given."""
+"""The problem against which a maneuver is checked: the one in its manifest, or a given one."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _HOW_SOLVED: tuple[Place, ...] = (
     ("clearance", "margin"),
     ("clearance", "distance"),
 )
-"""Keys that say how a maneuver is solved, not what it has to keep."""
+"""Keys that say how a maneuver is solved, not what it has to satisfy."""
 _FILES = ("file", "path", "urdf")
-"""Keys of files: their content is compared, by what reads it, not their place."""
+"""Keys of files: the content of these is compared where it is read, not their paths."""
 _MISSING = object()
 
 
 def held_against(maneuver: Result, problem: Problem | None) -> tuple[Result, list[str], list[str]]:
-    """Return the maneuver with the problem that it is held against, contradictions, and notes.
+    """Return the maneuver with the problem that it is checked against, contradictions, and notes.
 
-    ResultError where the problem in the manifest is not one.
+    ResultError if the problem in the manifest is malformed.
     """
     manifest = maneuver.manifest
     recorded = manifest.get("problem_digests") or {}
@@ -56,10 +56,11 @@ def held_against(maneuver: Result, problem: Problem | None) -> tuple[Result, lis
 
 
 def describe_problem(maneuver: Result, problem: Problem | None) -> dict[str, Any]:
-    """Return what `verify` holds a maneuver against, as JSON data.
+    """Return the problem against which `verify` checks a maneuver, as JSON data.
 
-    Keys: ``problem`` is the file, None for the problem in the result; ``sha256`` that of the file, or of the problem in
-    the result; ``solved_from`` that of the file that the result was solved from, None where it is not known.
+    Keys: ``problem`` is the file, None for the problem in the result; ``sha256`` is that of the file, or of
+    the problem in the result; ``solved_from`` is the SHA-256 of the file that the result was solved from,
+    None if it is unknown.
     """
     solved_from = (maneuver.manifest.get("problem_digests") or {}).get("file")
     if problem is None:

@@ -27,13 +27,13 @@ class Shape:
     corners: Array
     """(K, C, 3) points whose convex hulls hold the pieces, m."""
     sizes: Array
-    """(K, ...) what the functions of the kind know of a piece, m."""
+    """(K, ...) the sizes of each piece, m, for the functions below."""
     distance: Callable[[Array, Array, Array], Separation]
     """Distances and normals of P segments, from start to end (P, 3), against pieces of sizes (P, ...)."""
     reach: Callable[[Array, Array], Array]
     """Greatest ``normal . x`` (P,) over the points x of pieces of sizes (P, ...) for normals (P, 3), m."""
     closed: bool | None = None
-    """Whether the pieces are a closed surface, with an inside; None where they are solid themselves."""
+    """Whether the pieces are a closed surface, with an inside; None if they are solid themselves."""
 
 
 _BOX_CORNERS: Array = np.array([list(itertools.product((-1.0, 1.0), repeat=3))])
@@ -56,7 +56,7 @@ def cylinder(radius: float, half_height: float) -> Shape:
 
 
 def mesh(triangles: Array, closed: bool) -> Shape:
-    """Return a surface of `triangles` (F, 3, 3), m; that of a solid where `closed`."""
+    """Return a surface of `triangles` (F, 3, 3), m; that of a solid if `closed`."""
     return Shape(triangles, triangles, segment_triangle, _triangle_reach, closed)
 
 
@@ -85,7 +85,7 @@ def _triangle_reach(normal: Array, triangles: Array) -> Array:
 class Body:
     """An obstacle of a `shape`, with `center` (3,), m, at time 0, `velocity` (3,), m/s, and attitude `rotation` (3, 3).
 
-    Positions it takes and gives are relative to its centre, in directions of the base frame.
+    Its methods take and return positions relative to its centre, in directions of the base frame.
     """
 
     name: str
@@ -115,8 +115,8 @@ class Body:
     def encloses(self, points: Array) -> NDArray[np.bool_]:
         """Return (Q,) True for points (Q, 3) inside a closed mesh: its winding number round them is not zero.
 
-        Of other solids the distance says it. The solid angle of each triangle is that of Van Oosterom and
-        Strackee (1983).
+        For other solids the distance shows whether a point is inside. The solid angle of each triangle is
+        that of Van Oosterom and Strackee (1983).
         """
         inside = np.zeros(len(points), dtype=np.bool_)
         if not self.shape.closed:
@@ -137,10 +137,10 @@ class Body:
 def read_obstacles(
     problem: Mapping[str, Any], meshes: Mapping[str, Any] | None, directory: Path
 ) -> tuple[list[Body], list[str], list[str]]:
-    """Return the obstacles of `problem`, as JSON data, what contradicts the problem, and what could not be checked.
+    """Return the obstacles of `problem`, which is JSON data; contradictions; and what could not be checked.
 
-    The result recorded SHA-256 and triangle count of mesh files in `meshes`, by obstacle; None without a result. Paths
-    of those files start in `directory`.
+    `meshes` are the SHA-256 and triangle counts of mesh files that the result recorded, by obstacle; None
+    without a result. Paths of the files start in `directory`.
     """
     bodies: list[Body] = []
     contradictions: list[str] = []
@@ -172,7 +172,7 @@ def read_obstacles(
 def _read_mesh(
     name: str, entry: Mapping[str, Any], meshes: Mapping[str, Any] | None, directory: Path
 ) -> tuple[Shape | None, str]:
-    """Return the mesh, and what is wrong with its file."""
+    """Return the mesh, and the flaw of its file."""
     import trimesh
 
     path = directory / str(entry.get("file", ""))

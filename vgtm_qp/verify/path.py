@@ -45,8 +45,8 @@ def direction_error(maneuver: Result, rotation: Array) -> Array | None:
 def check_path(maneuver: Result, tip: Array, tolerance: float) -> tuple[Array | None, list[str], list[str]]:
     """Check the targets of a maneuver whose tip was at `tip` (T, 3), m, to a tolerance, m.
 
-    Return the distance (T,) of each position target from the path, m, or None if there is no path of positions; then
-    contradictions and notes, as in the certificate.
+    Return the distance (T,) of each position target from the path, m, or None without a path of positions;
+    and contradictions and notes, as in the certificate.
     """
     wanted = maneuver.manifest["problem"].get("maneuver") or {}
     axes = _tracked_axes(maneuver)
@@ -88,7 +88,7 @@ def _tracked_axes(maneuver: Result) -> list[int]:
 
 
 def _direction_targets(maneuver: Result) -> dict[str, Array | None]:
-    """Return the targets of each kind of direction that is tracked, None where the result has none."""
+    """Return the targets of each kind of direction that is tracked; None if the result lacks them."""
     kinds = (kind for kind in _DIRECTIONS if kind in _tracked(maneuver))
     return {kind: getattr(maneuver, _DIRECTIONS[kind][0]) for kind in kinds}
 
@@ -119,7 +119,7 @@ def _to_polyline(points: Array, corners: Array) -> Array:
 
 
 def _last_direction(maneuver: Result, waypoints: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield whether a maneuver that arrives ends in another direction than the last waypoint that names one."""
+    """Yield a contradiction if a maneuver arrives in another direction than its last waypoint has."""
     for kind, targets in _direction_targets(maneuver).items():
         key = _DIRECTIONS[kind][1]
         goals = [np.asarray(entry[key], dtype=np.float64) for entry in waypoints if entry.get(key)]

@@ -1,4 +1,4 @@
-"""Pairs below their clearance at home: they must come no nearer, and keep their clearance once they have reached it."""
+"""Pairs below their clearance at home: they must not come nearer, and must keep clear once they are clear."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def excuse_recovering(
 ) -> tuple[list[str], list[str]]:
     """Return the faults of recovering pairs, one line each, and a note that sums them up.
 
-    The `record` of the manifest has entries of ``pair``, as encounters name it, and ``distance`` at home, m; the
-    `encounters` come with the distances that their pairs keep, m. They ignore a recovering pair until it has reached
-    its clearance. Until then its distance may not decrease from one state to the next. ResultError where the record is
-    malformed.
+    The `record` of the manifest has entries of ``pair``, as encounters name it, and ``distance`` at home, m.
+    The `encounters` come with the clearances that their pairs have to keep, m; afterwards they ignore a
+    recovering pair until it has reached its clearance. Until then its distance may not decrease from one
+    state to the next. ResultError if the record is malformed.
     """
     try:
         wanted = {str(entry["pair"]): float(entry["distance"]) for entry in record}
@@ -61,7 +61,7 @@ def _note(distance: Mapping[str, float], until: int, states: int) -> str:
 
 
 def _nearer(group: Encounters, pairs: Pairs, name: str, distance: Array, floor: float) -> list[str]:
-    """Return where a pair comes nearer than at the state before, up to the last of `distance` (K,)."""
+    """Return a line for each state up to the last of `distance` (K,) before which a pair comes nearer."""
     wrong = []
     for state in range(len(distance) - 1):
         least = min(float(distance[state]), floor)

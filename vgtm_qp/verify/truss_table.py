@@ -1,4 +1,4 @@
-"""What a problem's ``[truss]`` says of the arm, for its record to be held against: strokes left to a default too."""
+"""The arm that a problem's ``[truss]`` describes, default strokes included, to check the arm's record."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _STROKES = {
     "longeron": (0.6, 1.4),
     "tetrahedral": (0.75, 1.3),
 }
-"""Least and greatest length of the actuated members of each module over their home length, by default."""
+"""Default strokes of each module: least and greatest length of actuated members over their home length."""
 
 
 class ExpectedMember(NamedTuple):
-    """A member as the problem has it, lengths in m; None for a length that its nodes give, inf for no limit."""
+    """A member as in the problem, lengths in m; None for a length given by its nodes, inf without a limit."""
 
     actuated: bool
     length: float | None
@@ -35,18 +35,18 @@ class ExpectedMember(NamedTuple):
 
 
 class ExpectedTruss(NamedTuple):
-    """A truss as the problem has it: members by name, home positions (N, 3), m, base and tip nodes by index."""
+    """A truss as in the problem: members by name, home positions (N, 3), m, base and tip nodes by index."""
 
     members: dict[str, ExpectedMember]
     home: Array
     base: tuple[int, ...]
     tip: tuple[int, ...]
     corrected: bool = False
-    """Whether given lengths move the home nodes, but for those of the base."""
+    """Whether given lengths move the home nodes, except those of the base."""
 
 
 def expected_truss(truss: Mapping[str, Any]) -> ExpectedTruss:
-    """Return what the table `truss`, as JSON data that the problem's schema accepts, describes."""
+    """Return the truss that the table `truss` describes, JSON data that the problem's schema accepts."""
     return _of_graph(truss) if truss["module"] == "graph" else _of_module(truss)
 
 
@@ -99,7 +99,7 @@ def _of_module(truss: Mapping[str, Any]) -> ExpectedTruss:
 
 
 def _counts(module: str) -> dict[str, int]:
-    """Return how many members of each letter join a layer to the one below it, and its own nodes."""
+    """Return, by letter, the numbers of members that join a layer to the one below, and its own nodes."""
     if module == "tetrahedral" or module == "longeron":
         return {"B": 3, "D": 3, "L": 3}
     return {"L": 6, "B": 3}
@@ -116,7 +116,7 @@ def _actuated(truss: Mapping[str, Any], layer: int) -> str:
 
 
 def _layers(module: str, layers: int, longeron: float, batten: float) -> Array:
-    """Return (N, 3) equilateral triangles above one another, every second one turned by 60 degrees but in a prism."""
+    """Return (N, 3) stacked equilateral triangles, every second turned by 60 degrees, except in a prism."""
     height, turn = longeron, 0.0
     if module != "longeron":
         height, turn = math.sqrt(longeron**2 - batten**2 / 3.0), math.pi / 3.0
@@ -140,7 +140,7 @@ def _helix(count: int, longeron: float, batten: float) -> Array:
 
 
 def _limits(table: Mapping[str, Any]) -> dict[str, float]:
-    """Return rate, acceleration and radius that a table gives; those of a whole truss are for all its members."""
+    """Return rate, acceleration and radius in a table; those of a whole truss are for all its members."""
     keys = {"rate": "rate", "acceleration": "acceleration", "radius": "radius", "member_radius": "radius"}
     return {name: float(table[key]) for key, name in keys.items() if table.get(key) is not None}
 
@@ -159,7 +159,7 @@ def _member(
 
 
 def table_contradictions(arm: Any, truss: Mapping[str, Any]) -> Iterator[str]:
-    """Yield where the record of a truss (``verify.arm.RecordedArm``) is not what the table `truss` describes."""
+    """Yield where the record of a truss (``verify.arm.RecordedArm``) differs from the table `truss`."""
     if not truss:
         yield "the arm record is that of a truss; the problem has none"
         return
@@ -181,7 +181,7 @@ def table_contradictions(arm: Any, truss: Mapping[str, Any]) -> Iterator[str]:
         if isinstance(entry, str) or not entry.get("time")
     }
     wanted = [expected.members[name] for name in arm.member_names]
-    # The record of a member that is stuck from the start has its home length in the place of limits.
+    # In the record, a member that is stuck from the start has its home length instead of limits.
     free = [name not in stuck for name in arm.member_names]
     compared: dict[str, tuple[Any, list[Any]]] = {
         "actuated": (arm.actuated, [m.actuated if k else None for m, k in zip(wanted, free, strict=True)]),

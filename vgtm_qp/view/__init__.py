@@ -1,1 +1,1 @@
-"""What a person sees: the scene, the live page and the plots."""
+"""Pictures for people: the scene, figures and plots."""

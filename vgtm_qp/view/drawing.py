@@ -1,4 +1,4 @@
-"""What there is to draw of an arm, for any renderer: member ends, colours, curve, obstacles and a camera."""
+"""An arm as data to draw, for any renderer: member ends, colours, curve, obstacles and a camera."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ CURVE_COLOUR = (0.0, 0.45, 0.34)
 POLYGON_COLOUR = (0.35, 0.62, 0.53)
 PATH_COLOUR = (0.10, 0.10, 0.12)
 _STROKE_COLOURS = np.array([(0.05, 0.30, 0.80), (0.66, 0.48, 0.72), (0.84, 0.10, 0.12)])
-"""Shortest, middle and longest; distinct for the colour-blind, and from the grey of fixed members."""
+"""Colours of shortest, middle and longest; distinct for the colour-blind, and from the grey of fixed ones."""
 
 _CURVE_POINTS = 49
 _SURROUNDINGS = 0.25
 _FIELD_OF_VIEW, _ELEVATION = float(np.radians(32.0)), float(np.radians(14.0))
 _SIDES = np.radians([-62.0, -118.0, 62.0, 118.0])
 _STRAIGHT = 1e-6
-"""A tip that goes no farther aside than this, m, has no heading."""
+"""Distance aside, m, up to which a tip has no heading."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObstacleMesh:
     """The surface of an obstacle.
 
-    Its triangles, `vertices` (K, 3), m, and `faces` (F, 3), are about its own origin and turned into the base frame.
-    That origin is at `center` (3,), m, at time 0 and has the `velocity` (3,), m/s.
+    Its triangles, `vertices` (K, 3), m, and `faces` (F, 3), are relative to its own origin, in directions of
+    the base frame. The origin is at `center` (3,), m, at time 0 and has the `velocity` (3,), m/s.
     """
 
     name: str
@@ -55,7 +55,7 @@ class ObstacleMesh:
 class Drawing:
     """An arm and its surroundings, ready to be drawn at any configuration.
 
-    `curve_weights` (K, V) are those of points along the curve; K = 0 where there is no curve.
+    `curve_weights` (K, V) are those of points along the curve; K = 0 without a curve.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Drawing:
     def stroke_share(self, lengths: Array) -> Array:
         """Return (M,) lengths or joint values (M,) as shares of the stroke, 0 to 1.
 
-        NaN for those that are fixed or have no limits.
+        NaN for quantities that are fixed or have no limits.
         """
         low, high = self.arm.stroke.T
         share = np.full(len(low), np.nan)
@@ -99,7 +99,7 @@ def stroke_colours(share: Array) -> Array:
 
 
 def drawing_of_maneuver(maneuver: Result) -> Drawing:
-    """Return the drawing of a result, from its manifest; raise ResultError where its record of the arm is wrong."""
+    """Return the drawing of a result, from its manifest; ResultError if its record of the arm is wrong."""
     manifest = maneuver.manifest
     arm = arm_of(maneuver)
     vertices = maneuver.control_vertices.shape[1]
@@ -107,7 +107,7 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
 
 
 def make_drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory: str | Path) -> Drawing:
-    """Return the drawing of an arm with so many control vertices among the obstacles of a problem, as plain data."""
+    """Return the drawing of an arm, with `vertices` control vertices, among the obstacles of a problem."""
     weights = np.zeros((0, vertices))
     spec = problem.get("curve")
     if vertices and spec:
@@ -167,9 +167,9 @@ class Camera(NamedTuple):
 
 
 def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
-    """Return a camera on the arm in all states (T, N, 3) and what is near it, across the path of the tip (T, 3).
+    """Return a camera on the arm in all states (T, N, 3) and its surroundings, across the tip's path (T, 3).
 
-    Of four sides it is the one from which obstacles hide least of the arm.
+    Of four sides the camera is on the one from which obstacles hide least of the arm.
     """
     points = nodes.reshape(-1, 3)
     reach = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -182,7 +182,7 @@ def camera_for(drawing: Drawing, nodes: Array, tip: Array) -> Camera:
 
 
 def with_surroundings(points: Array, surroundings: Iterable[Array], room: float) -> Array:
-    """Return least and greatest coordinates (2, D) of points (K, D) and of what is within `room` of their box, m."""
+    """Return least and greatest coordinates (2, D) of points (K, D) and of surroundings within `room`, m."""
     box = np.stack([points.min(axis=0), points.max(axis=0)])
     near = [np.clip(others, box[0] - room, box[1] + room) for others in surroundings]
     seen = np.concatenate([box, *near])
@@ -190,7 +190,7 @@ def with_surroundings(points: Array, surroundings: Iterable[Array], room: float)
 
 
 def heading(tip: Array) -> float:
-    """Return the azimuth, rad, of the way to where a tip (T, 3) is farthest aside from its first place; 0 if never."""
+    """Return the azimuth, rad, in which a tip (T, 3) gets farthest aside from its first place, or 0."""
     aside = (tip - tip[0])[:, :2]
     x, y = aside[int(np.argmax(np.linalg.norm(aside, axis=1)))]
     return float(np.arctan2(y, x)) if np.hypot(x, y) > _STRAIGHT else 0.0
@@ -203,7 +203,7 @@ def direction(azimuth: float, elevation: float) -> Array:
 
 
 def _hidden(obstacles: Sequence[ObstacleMesh], eye: Array, points: Array) -> int:
-    """Return how many of points (K, 3) are behind the box round an obstacle, seen from `eye` (3,)."""
+    """Return the number of points (K, 3) behind the box round an obstacle, seen from `eye` (3,)."""
     rays = points - eye
     rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     behind = np.zeros(len(points), dtype=bool)
@@ -216,7 +216,7 @@ def _hidden(obstacles: Sequence[ObstacleMesh], eye: Array, points: Array) -> int
 
 
 def off_curve(maneuver: Result) -> list[str]:
-    """Return how far stations are off the reference curve in each state, as text; empty where they are on it."""
+    """Return the distance of stations from the reference curve in each state, as text; empty on the curve."""
     gaps = greatest_gaps(maneuver)
     if gaps is None:
         return [""] * len(maneuver.time)

@@ -50,12 +50,12 @@ _LABELS = {
     "y": ((4.0, -1.0), (13.0, -5.0), "left", "center"),
     "z": ((-3.0, 0.0), (-13.0, 0.0), "right", "center"),
 }
-"""Where numbers and name of an axis stand, points from their places, and how they are aligned."""
+"""Offsets of the numbers and the name of an axis, points, and their alignment."""
 _ABOVE = 100.0
 
 
 def _style(label: str, colour: Any, order: int, **more: Any) -> dict[str, Any]:
-    """Return how a line is drawn that nothing hides, and what it is called in the legend."""
+    """Return the options of a line that nothing hides, and its name in the legend."""
     return {"label": label, "color": colour, "zorder": _ABOVE + order, **more}
 
 
@@ -77,16 +77,16 @@ def plot_frames(
 ) -> Figure:
     """Return a figure of states of a maneuver side by side, all in the same view and scale.
 
-    Members are drawn as thick as they are, grey where fixed and coloured by length where actuated; with them
-    the reference curve, its control polygon, the obstacles, the tip's path so far and the rest of it. Where stations
-    are off the curve the title says how far.
+    Members are drawn in their true thickness: fixed ones grey, actuated ones coloured by length. The
+    reference curve, its control polygon, the obstacles, the tip's path so far and its rest are drawn as well.
+    If stations are off the curve, the title says how far.
 
     Parameters
     ----------
     maneuver
         What `solve` or `load_result` returns.
     frames
-        How many states, evenly spread, or which ones.
+        Number of states, evenly spread, or the states themselves.
     azimuth, elevation
         Azimuth of the view, rad; by default across the path of the tip.
 
@@ -114,7 +114,7 @@ def each_frame(maneuver: Result, rows: Sequence[int]) -> Iterator[Figure]:
 def save_figure(figure: Figure, path: str | Path) -> Path:
     """Write a figure in the format of the suffix of `path`, one of `SUFFIXES`, and return the path.
 
-    VgtmError where the suffix is another one, or the file cannot be written.
+    VgtmError for another suffix, or if the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -125,7 +125,7 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
 
 
 def _off_somewhere(maneuver: Result, off: Sequence[str]) -> str:
-    """Return in which states stations are off the curve, and by how much at most; empty where they are in none."""
+    """Return in words the states with stations off the curve, and the greatest distance; or nothing."""
     certificate, count = maneuver.certificate, sum(map(bool, off[1:]))
     if certificate is None or not count:
         return ""
@@ -135,10 +135,10 @@ def _off_somewhere(maneuver: Result, off: Sequence[str]) -> str:
 
 
 class _View:
-    """What panels show, m: the arm in the states `seen` and, of the obstacles, what is near it.
+    """The part of space in all panels, m: the arm in the states `seen`, and near parts of obstacles.
 
     The paper goes from `low` to `high` (2,). The `floor` (2, 2), least and greatest x and y, is at the height `ground`
-    and has lines every `step`, as there are ticks up to `top`.
+    and has lines every `step`; ticks with the same spacing go up to `top`.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class _View:
     ) -> tuple[Figure, list[Axes], float]:
         """Return the figure, one axes a frame at equal scale, and points a metre.
 
-        There is room for a `title` above each and for the `foot` of all, inches.
+        There is room for a `title` above each frame and for the `foot` of all, inches.
         """
         lines = -(-count // columns)
         extent = self.high - self.low
@@ -260,7 +260,7 @@ class _View:
             borders = np.array([depth[part[-1]] for part in slices[:-1]])
             slot = np.searchsorted(borders, node_depth[balls])
             for j, part in enumerate(slices):
-                # A dark line below each member, a little wider, parts it from what is behind it.
+                # A dark line below each member, a little wider, separates it from things behind it.
                 lines = np.repeat(projection.flat(cut[part]), 2, axis=0)
                 widths = np.repeat(width[part], 2)
                 widths[::2] += _CASING
@@ -278,7 +278,7 @@ class _View:
             axes.plot(*projection.flat(drawing.curve(vertices)).T, path_effects=effects, **_CURVE)
 
     def _draw_tip(self, axes: Axes, row: int) -> None:
-        """Draw the tip's path and what is wanted of it."""
+        """Draw the tip's path and its targets."""
         maneuver, flat = self.maneuver, self.projection.flat
         axes.plot(*flat(maneuver.tip_target_position[row:]).T, **_AHEAD)
         axes.plot(*flat(maneuver.tip_position[: row + 1]).T, markevery=[-1], **_BEHIND)
@@ -287,7 +287,7 @@ class _View:
         axes.plot(*flat(goals).T, **_GOAL)
 
     def _draw_legend(self, figure: Figure, room: float) -> None:
-        """Draw what the colours and marks mean, above some `room` at the foot, inches."""
+        """Draw the meaning of colours and marks, above some `room` at the foot, inches."""
         width, height = figure.get_size_inches()
         arm = self.drawing.arm
         strokes = np.unique(arm.stroke[arm.actuated].round(9), axis=0)
@@ -336,12 +336,12 @@ def _round_step(size: float) -> float:
 
 
 def _label(axes: Axes, name: str, values: Array, places: Array, scale: float) -> None:
-    """Write numbers at ticks (K, 2) of an axis, as many as there is room for, and its name with the unit."""
+    """Write numbers at ticks (K, 2) of an axis, as many as fit, and its name with the unit."""
     apart = scale * float(np.linalg.norm(places[-1] - places[0])) / max(len(values) - 1, 1)
     every = int(np.ceil((9.0 if name == "z" else 13.0) / max(apart, 1e-3)))
     shift, name_shift, ha, va = _LABELS[name]
     text: dict[str, Any] = {"textcoords": "offset points", "ha": ha, "va": va, "color": _DARK}
-    # The corner where x and y meet is named once, on x.
+    # The common corner of x and y has its number once, on x.
     first = 1 if name == "y" else 0
     for value, place in list(zip(values, places, strict=True))[first::every]:
         axes.annotate(f"{value:g}", place, shift, fontsize=6.5, **text)

@@ -49,8 +49,8 @@ def _draw_clearance(axes: Axes, maneuver: Result) -> None:
 def _draw_strokes(axes: Axes, maneuver: Result) -> None:
     """Draw the lengths of the actuated members over time, between their limits.
 
-    In m where all have the same stroke, as parts of it, %, where not. The members that come nearest to a limit
-    are named; the others are grey.
+    The unit is m if all have the same stroke, otherwise % of the stroke. The members that come nearest to a
+    limit are named; the others are grey.
     """
     arm = arm_of(maneuver)
     limited = np.isfinite(arm.stroke[arm.actuated]).all(axis=1)

@@ -1,4 +1,4 @@
-"""Parallel projection of a scene onto paper, and what is drawn before what."""
+"""Parallel projection of a scene onto paper, and the order of drawing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Projection:
 
 
 class ProjectedMesh:
-    """An obstacle's surface as it is drawn: outline, edges seen and hidden, and what is in front of it."""
+    """An obstacle's surface on paper: outline, seen and hidden edges, and which points are in front of it."""
 
     def __init__(self, mesh: ObstacleMesh, projection: Projection) -> None:
         import trimesh
@@ -59,7 +59,7 @@ class ProjectedMesh:
         return float(self.projection.depth(middle + self.mesh.position(time)))
 
     def polygons(self, time: float) -> list[Array]:
-        """Return the polygons (K, 2) that its shape on paper is filled by."""
+        """Return the polygons (K, 2) that fill its shape on paper."""
         flat = self.projection.flat(self.vertices + self.mesh.position(time))
         if self.is_convex:
             from scipy.spatial import ConvexHull
@@ -68,15 +68,15 @@ class ProjectedMesh:
         return list(flat[self.faces[self.facing]])
 
     def edges(self, time: float, *, seen: bool) -> Array:
-        """Return (K, 2, 2) its sharp edges on paper that are seen, or that it hides itself."""
+        """Return (K, 2, 2) its sharp edges on paper: the visible ones, or those that it hides itself."""
         flat = self.projection.flat(self.vertices + self.mesh.position(time))
         return np.asarray(flat[self._sharp_edges[self.facing[self._beside].any(axis=1) == seen]])
 
     def is_before(self, points: Array, time: float) -> NDArray[np.bool_]:
         """Return (K,) whether points (K, 3) are drawn over it: not inside or behind it for the viewer.
 
-        A point whose line of sight meets a convex body is before it just if it is outside one of the planes
-        of the faces that the viewer sees.
+        A point with a convex body in its line of sight is before the body if and only if it is outside one of
+        the planes of the faces that the viewer sees.
         """
         if not self.is_convex:
             return self.projection.depth(points) > self.depth(time)
@@ -86,7 +86,7 @@ class ProjectedMesh:
 
 
 def layers(points: Array, surfaces: list[ProjectedMesh], time: float) -> Index:
-    """Return (K,) how many of the surfaces, farthest first, have been drawn before each point (K, 3) is."""
+    """Return (K,) the number of surfaces, farthest first, that are drawn before each point (K, 3)."""
     order = np.zeros(len(points), dtype=np.int64)
     for k, surface in enumerate(surfaces, start=1):
         order[surface.is_before(points, time)] = k
@@ -94,7 +94,7 @@ def layers(points: Array, surfaces: list[ProjectedMesh], time: float) -> Index:
 
 
 def pieces(ends: Array, count: int) -> Array:
-    """Return (M * count, 2, 3) members (M, 2, 3) in `count` pieces that overlap a little, without seams."""
+    """Return (M * count, 2, 3) members (M, 2, 3) in `count` pieces that overlap a little, to hide seams."""
     share = np.linspace(0.0, 1.0, count + 1)
     shares = np.clip(np.stack([share[:-1] - 0.1 / count, share[1:] + 0.1 / count], axis=1), 0.0, 1.0)
     along = ends[:, 1] - ends[:, 0]

@@ -25,7 +25,7 @@ _FIXED_POINT = 2.0**-12
 
 
 def import_viser() -> Any:
-    """Return the module ``viser``; raise MissingExtraError where it is not installed."""
+    """Return the module ``viser``; raise MissingExtraError if it is not installed."""
     try:
         import viser
     except ImportError:
@@ -34,7 +34,7 @@ def import_viser() -> Any:
 
 
 class ArmScene:
-    """Draws one arm into a viser scene once, and moves it as often as asked."""
+    """Draws one arm into a viser scene once, and moves it afterwards."""
 
     def __init__(self, server: Any, drawing: Drawing, nodes: Array, control_vertices: Array) -> None:
         import trimesh
@@ -182,6 +182,6 @@ def _rgb(colours: Any) -> NDArray[np.uint8]:
 
 
 def _instance_rgb(colours: Any) -> NDArray[np.uint8]:
-    """Return colours for batched meshes: the renderer takes those as linear light, all others as sRGB."""
+    """Return colours for batched meshes, which the renderer takes as linear light; all others are sRGB."""
     colours = np.asarray(colours)
     return _rgb(np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4))

@@ -1,4 +1,4 @@
-"""The viser server behind the live page and the offline page, and whom it answers."""
+"""The viser server behind the live page and the offline page, and the choice of requests that it answers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vgtm_qp.view.scene import import_viser
 
 LOOPBACK = "127.0.0.1"
 MOST_PORTS = 1000
-"""Ports that are tried from the wanted one on."""
+"""Number of ports that are tried from the wanted one on."""
 
 _starting = Lock()
 
@@ -27,15 +27,15 @@ _starting = Lock()
 def viser_server(port: int = 0, host: str = LOOPBACK) -> Iterator[Any]:
     """Run a viser server at `host`; its own messages do not reach stdout.
 
-    It answers requests to a loopback name or to `host` alone, and web sockets of its own pages alone. The `port` is the
-    next free one from there on, 0 for any.
+    It answers only requests to a loopback name or to `host`, and only web sockets of its own pages. It uses
+    the first free port from `port` on, any port for 0.
 
     Raises
     ------
     GoalError
-        `port` is not one of 0 to 65535, none is free, or `host` is no address of this machine.
+        `port` is not from 0 to 65535, no port is free, or `host` is not an address of this machine.
     MissingExtraError
-        viser is not installed, or not one whose requests can be refused.
+        viser is not installed, or is a version whose requests cannot be refused.
     """
     viser = import_viser()
     from websockets.asyncio import server as websockets
@@ -47,7 +47,7 @@ def viser_server(port: int = 0, host: str = LOOPBACK) -> Iterator[Any]:
         guarded = partial(_answer, host, process_request)
         return given(handler, sock=listening, process_request=guarded, **options)
 
-    # viser has no option for whom to answer, and waits for ever where no port is free.
+    # viser has no option to refuse requests, and waits for ever if no port is free.
     with _starting, redirect_stdout(StringIO()), patch.object(websockets, "serve", serve):
         server = viser.ViserServer(host=host, port=listening.getsockname()[1], verbose=False)
     try:
@@ -61,7 +61,7 @@ def viser_server(port: int = 0, host: str = LOOPBACK) -> Iterator[Any]:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Return a socket that listens at `port` of `host` or the next free one, any where `port` is 0."""
+    """Return a socket that listens at `port` of `host` or the next free port; at any for 0."""
     if not 0 <= port <= 65535:
         raise GoalError(f"port {port}: expected one of 0 to 65535, 0 for any that is free")
     reason: OSError | None = None
@@ -80,7 +80,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _answer(host: str, process_request: Any, connection: Any, request: Any) -> Any:
-    """Refuse a request that another site can have sent; let viser answer all others."""
+    """Refuse a request that another site may have sent; let viser answer all others."""
     headers = request.headers
     upgrades = "websocket" in ",".join(headers.get_all("Upgrade")).lower()
     why = refusal(headers.get_all("Host"), headers.get_all("Origin"), upgrades=upgrades, served=host)
@@ -90,20 +90,20 @@ def _answer(host: str, process_request: Any, connection: Any, request: Any) -> A
 
 
 def refusal(hosts: list[str], origins: list[str], *, upgrades: bool, served: str = LOOPBACK) -> str:
-    """Return why a request is not answered, empty where it is.
+    """Return why a request is not answered; empty if it is.
 
     Parameters
     ----------
     hosts, origins
         Its ``Host`` and ``Origin`` headers.
     upgrades
-        It asks for a web socket: a browser says whose page asks.
+        Whether it asks for a web socket; then a browser names the page's origin.
     served
         Address that the server listens at.
     """
     name = _name(hosts[0]) if len(hosts) == 1 else ""
     if not _is_answered(name, served):
-        # A name of another site can be made to mean this address while its page is open.
+        # While its page is open, another site can make its own name resolve to this address.
         return f"this page answers to {LOOPBACK}, localhost and the address that it was started with alone"
     if (upgrades or origins) and [origin.lower() for origin in origins] != [f"http://{hosts[0].lower()}"]:
         return "this page answers to itself alone, not to pages of another origin"
@@ -124,17 +124,17 @@ def _is_answered(name: str, served: str) -> bool:
         address = ipaddress.ip_address(name)
     except ValueError:
         return False
-    # An address cannot be made to mean another machine: where all are served, each of them will do.
+    # An address cannot be made to mean another machine: if all are served, any of them will do.
     return address.is_loopback or is_unspecified(served)
 
 
 def is_unspecified(host: str) -> bool:
-    """Return whether a server at `host` is reached by every address of this machine."""
+    """Return whether a server at `host` can be reached by every address of this machine."""
     return host in ("", "0.0.0.0", "::")
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a server at `host` is reached from this machine alone."""
+    """Return whether a server at `host` can be reached from this machine alone."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -19,11 +19,11 @@ from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem.arm import ArmTable, Joint
 
 _BENDS = (0.1, 0.3, -0.3)
-"""Turns by which a home is bent where the tip cannot start in every direction, rad."""
+"""Turns, rad, that are tried to bend a home from which the tip cannot start in every direction."""
 
 
 class SerialArm(JointSpaceArm):
-    """See ``arm.Arm``; joints of an ``[arm]`` table, of which those locked from the start stay at home.
+    """See ``arm.Arm``; the joints of an ``[arm]`` table. Joints locked from the start stay at home.
 
     Its nodes are those of ``SerialChain.functions``.
 
@@ -31,7 +31,7 @@ class SerialArm(JointSpaceArm):
     ----------
     chain : SerialChain
     values : (J, 2)
-        Least and greatest values of the joints, rad or m, those that follow others among them.
+        Least and greatest values of all joints, rad or m, followers included.
     """
 
     kind = "serial"
@@ -52,7 +52,7 @@ class SerialArm(JointSpaceArm):
         self.bodies = self._links(spec.link_radius) if spec.body is None else self._apart(self._carried(spec))
 
     def _limit(self, joints: Sequence[Joint]) -> None:
-        """Find followers and limits: those of a follower are limits of what it follows, which keeps all at home."""
+        """Find followers and limits; the limits of a follower become limits of the joint that it follows."""
         number = {joint.name: k for k, joint in enumerate(joints)}
         self.stroke = np.array([joint.limits or (-np.inf, np.inf) for joint in joints], dtype=float)
         self.rate = _or_infinite([joint.rate for joint in joints])
@@ -76,9 +76,10 @@ class SerialArm(JointSpaceArm):
         return nodes, self.by_quantities(jacobian.reshape(-1, len(chain))).reshape(jacobian.shape)
 
     def _every(self, chain: SerialChain) -> int:
-        """Return the least spacing of stations, in joints, with which all can stay on the curve at once at home.
+        """Return the least spacing of stations, in joints, at which all can keep to the curve at home.
 
-        If there is none, as at the straight home of a snake, there is a station for every three actuators.
+        If no spacing allows that, as at the straight home of a snake, there is a station for every three
+        actuators.
         """
         joints, (_, jacobian) = len(chain), self._placed(chain, self.home_configuration)
         for every in range(1, joints + 1):
@@ -93,8 +94,8 @@ class SerialArm(JointSpaceArm):
     def _place_stations(self, tip_turn: Sequence[float] | None) -> None:
         """Find nodes and stations at home; the stations' z-axes lie along the arm.
 
-        So does that of the end effector, unless its attitude in the last frame, the rotation vector `tip_turn`, rad, is
-        given.
+        The end effector's z-axis does too, unless the rotation vector `tip_turn`, rad, gives its attitude in
+        the last frame.
         """
         count, tracked = len(self.chain), self.chain.tracked
         words = ["base", *(self.quantity_names[j] for j in tracked), "tip"]
@@ -134,12 +135,13 @@ class SerialArm(JointSpaceArm):
     def approach(self, motion: Array) -> Approach:
         """See ``arm.Arm``.
 
-        A joint between two bodies moves the further one, by no more than its turn times the length of the way there.
+        A joint between two bodies moves the further one by at most its turn times the length of the links up
+        to there.
         """
         turn, slide = (moved[1:] for moved in self._motions(motion))
-        # Sums over the joints before each: of turns, of turns times ways, of slides.
+        # For each joint, sums over the joints before it: turns, turns times lengths along the links, slides.
         sums = np.zeros((3, len(turn) + 1))
-        # Without limits they are no numbers.
+        # Infinite limits give NaN.
         with np.errstate(invalid="ignore"):
             np.cumsum([turn, turn * self._ways[0][:-1], slide], axis=1, out=sums[:, 1:])
         way, (first, last) = self._extents, self._movers
@@ -157,7 +159,7 @@ class SerialArm(JointSpaceArm):
 
     @cached_property
     def _extents(self) -> Array:
-        """(B,) lengths of the ways from the base to the furthest points of bodies, m."""
+        """(B,) lengths along the links from the base to the furthest points of bodies, m."""
         chain, (to_places, to_frames) = self.chain, self._ways
         to_points = to_frames[chain.carriers] + np.linalg.norm(chain.points, axis=1)
         extents: Array = np.concatenate([[0.0], to_places, to_points])[self.bodies.points].max(axis=1)
@@ -165,18 +167,19 @@ class SerialArm(JointSpaceArm):
 
     @cached_property
     def _movers(self) -> tuple[Index, Index]:
-        """(B,) numbers of joints that move a body as a whole, and that move a part of it."""
+        """(B,) numbers of joints that move a body as a whole, and (B,) of joints that move any part of it."""
         places = np.concatenate([[0], np.arange(len(self.chain) + 1), self.chain.carriers])
         last = places[self.bodies.points].max(axis=1)
-        # Where a slide begins, the body stretches; a joint that turns a body is at its end.
+        # A slide within a body stretches it; a joint that turns a body is at its end.
         stretches = (last > 0) & ~self.revolute[last - 1] & (places[self.bodies.points].min(axis=1) < last)
         return last - stretches, last
 
     @cached_property
     def _ways(self) -> tuple[Array, Array]:
-        """Lengths (J + 1,) of the ways along the links, slides fully extended, m.
+        """Lengths along the links from the base, slides fully extended, m.
 
-        They lead to the joints and the tip, and to the origins of the frames: the base's, and those of the joints.
+        The first (J + 1,) lead to the joints and the tip; the second (J + 1,) to the origins of the frames of
+        the base and the joints.
         """
         to_places = np.cumsum(self.chain.lengths + np.concatenate([[0.0], self._slides()]))
         return to_places, np.concatenate([[0.0], to_places[:-1] + self._slides()])
@@ -186,7 +189,7 @@ class SerialArm(JointSpaceArm):
         return np.where(self.chain.revolute, 0.0, np.abs(self.values).max(axis=1, initial=0.0))
 
     def _links(self, radius: float) -> Bodies:
-        """Return links between successive origins; those of joints in one place are joined as if they were one."""
+        """Return links between successive origins; joints in one place count as one where links join."""
         place = self._places()
         kept = np.flatnonzero(self._have_length())
         points = np.stack([kept + 1, kept + 2], axis=1)
@@ -194,7 +197,7 @@ class SerialArm(JointSpaceArm):
         return capsules(points, radius, names, joints=place[points], kind="link")
 
     def _have_length(self) -> Mask:
-        """Return (J,) where a joint and the origin after it may be apart."""
+        """Return (J,) True for joints whose origin may be apart from the next one."""
         return (self.chain.lengths[1:] > 0.0) | ~self.chain.revolute
 
     def _places(self) -> Index:
@@ -245,12 +248,12 @@ class SerialArm(JointSpaceArm):
     def record(self) -> dict[str, Any]:
         """See ``arm.Arm``.
 
-        Keys: ``kind``, ``joint_names``, ``revolute``, ``axis``, ``position``, ``rotation`` (in the frame of the one
-        before), ``home``, ``followers`` (joint, and that which it follows) and their ``multipliers``, ``tip`` in the
-        last frame and ``tip_frame`` at home; of the bodies ``body_names``, ``links`` (their points: base, joints, tip,
-        then those of bodies) and ``joined`` (their ends; bodies with one in common are neighbours), ``points`` of
-        bodies in the frames of their ``carriers``, numbers of joints that move them, and ``touching`` pairs, which are
-        not kept apart.
+        Keys: ``kind``, ``joint_names``, ``revolute``, ``axis``, ``position``, ``rotation`` (in the frame of
+        the joint before), ``home``, ``followers`` (joint, and the joint it follows) and their
+        ``multipliers``, ``tip`` in the last frame and ``tip_frame`` at home; of the bodies ``body_names``,
+        ``links`` (their points: base, joints, tip, then those of bodies) and ``joined`` (their ends; bodies
+        with one in common are neighbours), ``points`` of bodies in the frames of their ``carriers``, numbers
+        of joints that move them, and ``touching`` pairs, which are not kept apart.
         """
         chain, bodies = self.chain, self.bodies
         keys = ("revolute", "axis", "position", "rotation", "tip", "points", "carriers")

@@ -1,4 +1,4 @@
-"""A serial arm's geometry, and where it places nodes as a CasADi function of the configuration."""
+"""A serial arm's geometry, and its nodes as a CasADi function of the configuration."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _UNROLLED = 20
 """Number of joints up to which their functions are written out one after another: faster, but long in C."""
 
 _LEAST_AXIS = 1e-3
-"""A ball is a capsule whose axis is that share of its radius: axes without a length have no direction."""
+"""Length of a ball's axis over its radius: an axis of length zero would have no direction."""
 
 
 @dataclass(frozen=True, eq=False)
 class SerialChain:
-    """J joints, base first, each placed in the frame of the one before; every so many of them are stations.
+    """J joints, base first, each placed in the frame of the one before.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class SerialChain:
     tip : (3,)
         The end effector in the last frame, m.
     every : int
-        Which joints are stations between the base and the tip.
+        Every `every`-th joint is a station between the base and the tip, see :attr:`tracked`.
     points : (P, 3)
         Points of bodies, in the frames that they move with, m.
     carriers : (P,) int
@@ -54,7 +54,7 @@ class SerialChain:
 
     @classmethod
     def of(cls, spec: ArmTable) -> SerialChain:
-        """Return the chain of an ``[arm]`` table; where that leaves it open, base and tip are its only stations."""
+        """Return the chain of an ``[arm]`` table; without its key `every` only base and tip are stations."""
         joints, number = spec.joint, {joint.name: k + 1 for k, joint in enumerate(spec.joint)}
         carried = [
             (point, number[body.joint] if body.joint else 0)
@@ -137,7 +137,8 @@ class SerialChain:
             places.append(place)
             nodes.append((place, j))
             if j in self.tracked:
-                # Its station turns with a joint, but stays where a slide begins.
+                # A station turns with its revolute joint; that of a prismatic joint does not move with the
+                # slide.
                 stations.append((place, frame, j + 1 if turns else j))
             frames.append((origin, frame))
         end = origin + frame @ tip
@@ -163,7 +164,7 @@ class SerialChain:
         return (alone, both) if count > _UNROLLED else (alone.expand(), both.expand())
 
     def attitude(self, joints: Array, turn: Sequence[float]) -> Array:
-        """Return (3, 3) the attitude in the base's frame of what is turned by the vector `turn` in the last frame."""
+        """Return (3, 3) the rotation, in the base's frame, of the last frame turned by the vector `turn`."""
         frame = np.eye(3)
         for value, axis, rotation, turns in zip(joints, self.axis, self.rotation, self.revolute, strict=True):
             frame = frame @ rotation @ rotation_from_vector(value * axis if turns else np.zeros(3))

@@ -93,11 +93,11 @@ class TrussArm(Arm):
         return step
 
     def points(self, q: Array) -> Array:
-        """Return the nodes; in offset joints the ends of all members, two of each."""
+        """Return the nodes; with offset joints the two ends of each member."""
         return q if self.truss.joints is None else self.truss.member_ends(q).reshape(-1, 3)
 
     def over_nodes(self, q: Array, points: Index, coefficients: Array) -> tuple[Index, Array]:
-        """See ``arm.Arm``: the three nodes that orient an offset joint move the end in it."""
+        """See ``arm.Arm``: the three nodes that orient an offset joint move the member end in it."""
         ends, (count, slots) = self._ends, points.shape
         if ends is None:
             return points, coefficients
@@ -125,7 +125,7 @@ class TrussArm(Arm):
         return describe(self.truss).unreachable
 
     def deviation(self, start: Array, end: Array) -> float:
-        """See ``arm.Arm``: offset joints turn on the way."""
+        """See ``arm.Arm``: offset joints turn during the motion."""
         return 2.0 * chord_deviation(self.truss, start, end)
 
     def symbols(self, constants: Constants) -> TrussSymbols:

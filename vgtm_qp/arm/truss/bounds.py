@@ -1,4 +1,4 @@
-"""Bounds for a truss in any pose: how far it reaches, and how far ends of members leave their chords on the way."""
+"""Bounds for a truss in any pose: its reach, and how far members' ends leave their chords in a motion."""
 
 from __future__ import annotations
 

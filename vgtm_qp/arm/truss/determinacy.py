@@ -146,7 +146,7 @@ def _localised(basis: Array) -> Array:
 
 
 def _largest(size: Array, what: str, name: Callable[[int], str]) -> str:
-    """Return the names of what is greatest in `size` (K,); what differs by rounding alone stays in order."""
+    """Return the names of the greatest entries of `size` (K,); entries equal to rounding keep their order."""
     greatest = float(size.max())
     order = np.argsort(-np.round(size / greatest, 9), kind="stable")
     order = order[size[order] > 1e-6 * greatest]

@@ -20,7 +20,7 @@ from vgtm_qp.errors import TrussError
 from vgtm_qp.problem.truss import GraphTruss, Member
 
 _LENGTH_SLACK = 1e-3
-"""Positions this near, as a fraction, to the given lengths are corrected to them: rounded, not mistaken."""
+"""Relative error up to which positions count as rounded, and are corrected to the given lengths."""
 
 
 def truss_from_graph(spec: GraphTruss) -> Truss:
@@ -173,7 +173,7 @@ def _polygon_frame(truss: Truss, nodes: Index, away: Array) -> Array:
         names = ", ".join(truss.node_names[i] for i in nodes)
         raise TrussError(f"nodes {names} lie on one line and have no normal; expected a triangle")
     z = axes[2] if axes[2] @ away >= 0.0 else -axes[2]
-    # Where the first node is the centre itself the longest extent of the polygon has to do.
+    # If the first node is the centre itself, x lies along the longest extent of the polygon.
     x = centred[0] - z * (z @ centred[0])
     x = x if np.linalg.norm(x) > 1e-6 * spread[0] else axes[0]
     x = x / np.linalg.norm(x)

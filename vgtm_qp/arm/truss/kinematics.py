@@ -36,7 +36,7 @@ class EndKinematics:
     nodes : (M, 2, 3) int
         The triangle that places each end, its own node first.
     ends : (M, 2, 3)
-        m; overwritten by `evaluate`, as is the next.
+        m; overwritten by `evaluate`, like `jacobian`.
     jacobian : (M, 2, 3, 9)
         d end / d (positions of ``nodes``).
     """

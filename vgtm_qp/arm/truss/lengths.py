@@ -1,4 +1,4 @@
-"""Newton's step on the lengths of members, and on the places of stations: displacements for given changes."""
+"""Newton's step on lengths of members and places of stations: displacements for given changes."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class LengthSolver:
         Raises
         ------
         SolverError
-            The pose is singular: these do not determine the nodes.
+            The pose is singular: lengths and stations do not determine the nodes.
         """
         values = np.concatenate([gradient.reshape(-1)[self._flat], self._weights])
         size, known = self._size, error[self._order]

@@ -1,4 +1,4 @@
-"""Mobility of a truss: its counts, free motions, and the coordinates of tip and faces that they reach."""
+"""Mobility of a truss: its counts, free motions, and which coordinates of tip and faces these reach."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class TrussDescription:
     bays, nodes, base_nodes, fixed_members, actuated_members : int
         Counts.
     free_motions : int
-        Unknown coordinates less fixed members: what the actuators and nothing else decide.
+        Unknown coordinates less fixed members: the motions that the actuators alone decide.
     trackable, face_stride
         As in :class:`vgtm_qp.arm.truss.truss.Truss`.
     determinacy : DeterminacyReport
@@ -74,9 +74,10 @@ class TrussDescription:
 def pose_response(truss: Truss, nodes: Index, weights: Array, rotations: Array, X: Array) -> Array:
     """Return (F, 6, n_a) twists of F poses for unit rates of each actuator, fixed members kept.
 
-    Three rows for the velocity of each centroid, m/m, and three for its angular velocity, rad/m, both in the base
-    frame; the first three alone where a pose has no frame. Each pose is made of `nodes` with `weights` (F, K), of three
-    or more with a frame, `rotations` (F, 3, 3) at home; nodes are at `X` (N, 3), m, of a determinate truss.
+    Three rows for the velocity of each centroid, m/m, and three for its angular velocity, rad/m, both in the
+    base frame. Each pose is made of `nodes` (F, K) with `weights` (F, K). If K is 3 or more it has a frame,
+    `rotations` (F, 3, 3) at home; otherwise only the first three rows are returned. The nodes of the
+    determinate truss are at `X` (N, 3), m.
     """
     count, corners = nodes.shape
     rows = np.zeros((count, 6 if corners >= 3 else 3, truss.node_count, 3))

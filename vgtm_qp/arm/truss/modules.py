@@ -30,14 +30,14 @@ class MemberRow(NamedTuple):
 
 
 class _Module(NamedTuple):
-    """What tells the modules of triangular layers apart; ``trackable`` and ``face_stride`` are those of ``Truss``."""
+    """What differs between modules of triangular layers; for the last two fields see ``Truss``."""
 
     longerons: bool
     """Whether the members between two layers are actuated (but for diagonals)."""
     battens: tuple[bool, ...]
-    """Whether the battens of each layer of a bay are."""
+    """Whether the battens of each layer of a bay are actuated."""
     stroke: tuple[float, float]
-    """Least and greatest length of an actuated member over its home length, where a table has none."""
+    """Least and greatest length of an actuated member over its home length, where a table gives no stroke."""
     trackable: tuple[str, ...]
     face_stride: int = 1
 
@@ -93,8 +93,8 @@ def tetrahedral(spec: TetrahedralTruss) -> Truss:
     A bay is three nodes, and every node is a stage of its own. Members (i, i-1) and (i, i-2) are the battens
     ``B`` and ``D``, members (i, i-3) the longerons ``L``. The home pose is a helix about z, theta its turn a
     node, cos theta = -1/2 - L^2 / (6 b^2). Three successive nodes with the weights w, 1 - 2 w, w, where
-    w = 1 / (2 (1 - cos theta)), have their mean on its axis (w = 0.3 where L = b). No face is normal to the
-    axis, the base neither: its axis point is the origin.
+    w = 1 / (2 (1 - cos theta)), have their mean on its axis (w = 0.3 where L = b). No face, not even the
+    base, is normal to the axis; the base's point on the axis is the origin.
 
     Raises
     ------

@@ -15,10 +15,10 @@ from vgtm_qp.errors import TrussError
 def placement_stages(base: Mask, members: Index) -> Index:
     """Return (N,) the stage of each node, -1 for base nodes; the stages are the smallest possible ones.
 
-    Every node is given three members that place it. A node depends on the other nodes of its members, and
-    the nodes that depend on one another, the strong components of that relation, are a stage: one node
-    where it hangs on three nodes placed before, all three of a face that must be placed at once. Dulmage &
-    Mendelsohn, Can. J. Math. 10 (1958): the components are the same for every such choice of members.
+    Every node is given three members that place it, and so depends on the other nodes of these members. The
+    strong components of that relation are the stages: one node that hangs on three nodes placed before, or
+    all three nodes of a face that must be placed at once. The components are the same for every such choice
+    of members (Dulmage & Mendelsohn, Can. J. Math. 10, 1958).
 
     `base` (N,) says which nodes are given; `members` (M, Q) are the nodes that each member's length depends on, its own
     two first, M = 3 (number of other nodes).

@@ -35,7 +35,7 @@ class PlacedNodes:
 
 
 def elimination_stages(truss: Truss) -> list[PlacedNodes]:
-    """Return the stages of the truss in order; none where a stage does not have three members for each node."""
+    """Return the stages of the truss in order; empty if one lacks three members for each of its nodes."""
     node_stage = np.where(truss.base, -1, truss.stage)
     member_stage = node_stage[truss.member_nodes].max(axis=1)
     stages = []

@@ -39,10 +39,11 @@ class UrdfJoint:
         Its origin, m, and attitude at joint value 0, in the frame of the moving joint before it; of the base for the
         first.
     limits : (float, float) or None
-        rad or m; None for one that turns on and on.
+        rad or m; None for a continuous joint.
     rate, effort : float or None
     mimic : (str, float, float) or None
-        Name of the joint that it follows, multiplier and offset: that joint moves by itself, and is one of the arm.
+        Name of the joint that it follows, multiplier and offset. That joint is one of the arm, and follows
+        none.
     """
 
     name: str
@@ -117,16 +118,16 @@ def read_urdf(
     Parameters
     ----------
     file
-        Links that are fixed to those of the arm belong to it; what moves beside it, or carries it, is cut off.
+        Links fixed to those of the arm belong to it; links that move beside it, or carry it, are left out.
     base_link, tip_link
         By default the root, and the end with the most moving joints.
     package_path
-        Folders in which files of ``package://`` are looked up, before those beside the file and above it.
+        Folders in which ``package://`` files are looked up, before those beside the file and above it.
 
     Raises
     ------
     ProblemError
-        With one :class:`~vgtm_qp.errors.Mistake` per mistake, each with its line.
+        With one :class:`~vgtm_qp.errors.Mistake` for each fault, with its line.
     """
     path = Path(file)
     mistakes = Mistakes(path)
@@ -154,7 +155,7 @@ class _Joint:
 
 
 class _Tree:
-    """Links and joints of a file; ProblemError where they are no tree."""
+    """Links and joints of a file; ProblemError if they do not form a tree."""
 
     def __init__(self, root: Element, mistakes: Mistakes) -> None:
         self._root, self._mistakes = root, mistakes
@@ -193,7 +194,7 @@ class _Tree:
         mistakes.stop()
 
     def ends(self, base: str | None, tip: str | None) -> tuple[str, str]:
-        """Return the first and the last link of the arm, where they are given or not."""
+        """Return the first and the last link of the arm: as given, or else the default ones."""
         roots = [name for name in self._links if name not in self._above]
         for key, name in (("base_link", base), ("tip_link", tip)):
             if name is not None and name not in self._links:
@@ -211,7 +212,7 @@ class _Tree:
         return base, tip
 
     def _longest(self, base: str) -> str:
-        """Return the link without children that is behind the most moving joints."""
+        """Return the link without children that has the most moving joints before it."""
         parents = {joint.parent for joint in self._joints}
         found: dict[str, int] = {}
         for name in self._links:
@@ -229,7 +230,7 @@ class _Tree:
         return ends[0]
 
     def _upwards(self, tip: str, base: str) -> list[_Joint] | None:
-        """Return the joints from the tip down to the base, None if they do not lead there."""
+        """Return the joints from the tip down to the base; None if they do not lead there."""
         joints, link, seen = [], tip, {tip}
         while link != base:
             joint = self._above.get(link)
@@ -241,7 +242,7 @@ class _Tree:
         return joints
 
     def chain(self, base: str, tip: str) -> list[_Joint]:
-        """Return the joints from the base to the tip; ProblemError where there are none or they cannot be served."""
+        """Return the joints from the base to the tip; ProblemError without any, or for a kind not served."""
         joints = self._upwards(tip, base)
         if joints is None:
             self._wrong("tip_link", tip, f'a link that joints connect with the base, "{base}"')
@@ -264,7 +265,7 @@ class _Tree:
         return joints[::-1]
 
     def _mimic(self, joint: _Joint) -> tuple[str, float, float] | None:
-        """Return name, multiplier and offset of the joint that moves by itself and that a joint follows, if it does.
+        """Return the joint that a joint follows in the end, with multiplier and offset; None without one.
 
         A joint may follow one that follows another.
         """
@@ -304,7 +305,7 @@ class _Tree:
     def bodies(
         self, chain: Sequence[_Joint], base: str, shapes: Shapes
     ) -> tuple[tuple[UrdfBody, ...], tuple[str, ...]]:
-        """Return the bodies of the links of the chain and of those that are fixed to them, and what is left out."""
+        """Return bodies of the chain's links and those fixed to them, and notes of what is left out."""
         places, number, frame, link = {base: (0, _AT_REST)}, 0, _AT_REST, base
         for joint in chain:
             frame = _after(frame, self._origin(joint.element, f'joint "{joint.name}"'))
@@ -337,7 +338,7 @@ class _Tree:
         return tuple(bodies), tuple(notes)
 
     def _beside(self, link: str) -> list[_Joint]:
-        """Return the joints of a link: those to its children, and that to its parent."""
+        """Return the joints of a link: to its children and to its parent."""
         above = self._above.get(link)
         return self._below[link] + ([] if above is None else [above])
 
@@ -370,7 +371,7 @@ class _Tree:
     def _limits(
         self, joint: _Joint, what: str
     ) -> tuple[tuple[float, float] | None, float | None, float | None]:
-        """Return limits, rate and effort of a joint; a rate or an effort of 0 is none."""
+        """Return limits, rate and effort of a joint. Zero rate or effort means no limit: None."""
         mistakes, limit = self._mistakes, joint.element.first("limit")
         if limit is None:
             if joint.kind != "continuous":
@@ -441,7 +442,7 @@ class _Tree:
         return _Joint(name, kind or "fixed", links[0], links[1], element)
 
     def _refuse_xacro(self) -> None:
-        """Stop at the first trace of the language that URDF files are often generated from."""
+        """Stop at the first trace of xacro, the language that URDF files are often generated from."""
         for element in self._root.walk():
             if element.tag.startswith("xacro:") or any("${" in text for text in element.attributes.values()):
                 expected = "plain URDF: xacro has to be expanded first (xacro FILE > robot.urdf)"
@@ -449,7 +450,7 @@ class _Tree:
                 self._mistakes.stop()
 
     def _refuse_loops(self) -> None:
-        """Add the first joint of a closed loop: no link without a parent leads to it. No link has two parents here."""
+        """Add the first joint of a closed loop, to which no root leads; here no link has two parents."""
         reached = [name for name in self._links if name not in self._above]
         for link in reached:
             reached += [joint.child for joint in self._below[link]]
@@ -465,10 +466,10 @@ class _Tree:
 
 
 def _after(frame: Frame, inner: Frame) -> Frame:
-    """Return a frame that is given in another one."""
+    """Return a frame, given as `inner` in another `frame`, in the frame of the latter."""
     return frame[0] + frame[1] @ inner[0], frame[1] @ inner[1]
 
 
 def _inverse(frame: Frame) -> Frame:
-    """Return the frame that another one is given in, in that other one."""
+    """Return the inverse: the frame in which `frame` is given, as seen from `frame`."""
     return -frame[1].T @ frame[0], frame[1].T

@@ -20,18 +20,18 @@ Capsule = tuple[Array, float]
 
 _ROUNDING = 1e-12
 _RADII = np.linspace(1.0, 1.6, 61)
-"""Radii that are tried, over the least one: a thicker capsule may be shorter."""
+"""Radii that are tried, over the least possible one: a thicker capsule may be shorter."""
 _STEPS = 100
 _GREATEST_POINTS = 2_000_000
 _HEAD = 1_000_000
-"""Bytes at the beginning of a COLLADA file, among which its unit is."""
+"""Bytes at the beginning of a COLLADA file in which its unit is searched."""
 _KINDS = "box, cylinder, sphere, capsule, mesh"
 
 
 class Shapes:
     """Encloses collision shapes; finds the files of their meshes.
 
-    `files` are those that were read.
+    `files` are the files that were read.
     """
 
     def __init__(self, urdf: Path, packages: Sequence[Path], mistakes: Mistakes) -> None:
@@ -101,7 +101,7 @@ class Shapes:
         return np.asarray(self._meshes[file] * np.array(scale))
 
     def _places(self, name: str) -> list[Path]:
-        """Return the paths at which the file of a mesh may be, the first ones first."""
+        """Return the paths at which the file of a mesh may be, in the order of search."""
         beside = self._urdf.parent
         if not name.startswith("package://"):
             return [beside / unquote(name.removeprefix("file://"))]
@@ -141,11 +141,11 @@ def enclosing_capsule(points: Array) -> Capsule:
 def _capsule(centre: Array, direction: Array, along: Array, aside: Array) -> Capsule:
     """Return the smallest capsule on a line that holds points at distances `along` and `aside` of it (K,), m."""
     least = float(aside.max())
-    # A radius of the whole extent makes it a ball.
+    # With the radius of the whole extent the capsule is a ball.
     extent = float(np.hypot(least, 0.5 * np.ptp(along)))
     found = []
     for radius in np.minimum(least * _RADII, extent) if least > 0.0 else [extent]:
-        # The caps reach beyond the ends by this.
+        # How far the caps reach beyond the axis's ends at each point.
         cap = np.sqrt(np.maximum(radius**2 - aside**2, 0.0))
         low, high = float((along + cap).min()), float((along - cap).max())
         if low > high:
@@ -156,7 +156,7 @@ def _capsule(centre: Array, direction: Array, along: Array, aside: Array) -> Cap
     points = centre + along[:, None] * direction
     length = float(np.linalg.norm(ends[1] - ends[0]))
     share = np.clip((points - ends[0]) @ direction, 0.0, length)
-    # What rounding leaves outside is taken in.
+    # The radius grows by what rounding left outside.
     needed = np.hypot((points - ends[0]) @ direction - share, aside).max()
     size = float(np.abs(ends).max()) + float(needed)
     return ends, float(needed) + _ROUNDING * size
@@ -189,7 +189,7 @@ def _read_mesh(file: Path) -> Array:
         expected = f"an STL or OBJ file; for COLLADA {MissingExtraError('dae', 'pycollada')}"
         raise ProblemError.at(file, "file", "", expected)
     try:
-        # Of COLLADA a part would be left out in silence that refers to what is not there.
+        # By default trimesh silently skips COLLADA parts with broken references.
         how = {".dae": {"ignore_broken": False}, ".obj": {"skip_materials": True}}
         mesh = trimesh.load(file, force="mesh", **how.get(file.suffix.lower(), {}))
         mesh.apply_scale(_unit(file))
@@ -205,7 +205,7 @@ def _read_mesh(file: Path) -> Array:
 
 
 def _unit(file: Path) -> float:
-    """Return the length that a mesh file is given in, m: COLLADA says it, and trimesh does not apply it."""
+    """Return the unit of length of a mesh file, m: COLLADA files have one, which trimesh does not apply."""
     if file.suffix.lower() != ".dae":
         return 1.0
     with file.open("rb") as stream:

@@ -49,11 +49,11 @@ _KNOWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "capsule": ((), ("radius", "length")),
     "mesh": ((), ("filename", "scale")),
 }
-"""By element, the elements inside it and its attributes. Others are left to those who read them."""
+"""Of each element the known elements inside it, and its known attributes; other elements are not checked."""
 _ALIKE = 0.65
-"""How much a misspelt name is like the right one at least: "xzy" is, but not "kinematic", which is used, "inertial"."""
+"""Least similarity of a misspelt name: "xzy" counts, but "kinematic", which is in use, not as "inertial"."""
 _ONCE = ("origin", "parent", "child", "axis", "limit", "mimic", "geometry")
-"""Elements of which there is one inside another at most."""
+"""Elements that may stand at most once inside another."""
 
 
 @dataclass(eq=False)
@@ -114,14 +114,14 @@ def read_xml(file: Path) -> Element:
 
 
 class Mistakes:
-    """The mistakes of one file, gathered so that they are told together; ProblemError at once where they are many."""
+    """The mistakes of one file, gathered for one report; ProblemError as soon as there are very many."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
         self._found: list[Mistake] = []
 
     def add(self, place: Element, what: str, value: str | None, expected: str) -> None:
-        """Add a mistake at an element; `what` says of which link or joint, and which part of it, the value is."""
+        """Add a mistake at an element; `what` names the link or joint, and its part, that has the value."""
         where = f"line {place.line}" + (f", {what}" if what else "")
         self._found.append(Mistake(where, shown(value), expected))
         if len(self._found) == _GREATEST_MISTAKES:
@@ -133,9 +133,9 @@ class Mistakes:
             raise ProblemError(str(self.file), self._found)
 
     def spelling(self, element: Element, what: str) -> None:
-        """Add elements and attributes that are probably meant for known ones, and what stands twice, at any depth.
+        """Add misspelt elements and attributes, and elements that stand twice, at any depth.
 
-        What is misspelt would be left out in silence: a body, or a limit.
+        Otherwise a misspelt body or limit would be ignored silently.
         """
         for inner in element.walk():
             elements, attributes = _KNOWN.get(inner.tag, ((), ()))
@@ -153,7 +153,7 @@ class Mistakes:
     def numbers(
         self, element: Element, what: str, key: str, count: int, default: tuple[float, ...] | None = None
     ) -> tuple[float, ...] | None:
-        """Return `count` finite numbers of an attribute; `default` without it, and None where they are wrong."""
+        """Return `count` finite numbers of an attribute; `default` if missing, None if they are wrong."""
         text = element.attributes.get(key)
         expected = "a finite number" if count == 1 else f"{count} finite numbers with blanks between them"
         what = f"{what}, <{element.tag}> {key}"
@@ -189,6 +189,6 @@ class Mistakes:
 
 
 def _misspelt(name: str, known: tuple[str, ...]) -> str | None:
-    """Return the known name that an unknown one is probably meant for: as long, or by one letter longer or shorter."""
+    """Return the known name that a name is probably meant for, at most one letter longer or shorter."""
     meant = None if name in known else closest(name, known, alike=_ALIKE)
     return meant if meant is not None and abs(len(meant) - len(name)) <= 1 else None

@@ -20,25 +20,26 @@ _MOST_BASE_NODES = 4
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Periods of p stages; its members and tracked stations use nodes of it and of the period before.
+    """Periods of p stages; members and stations of one use its own nodes and those of the period before.
 
-    Places within a period: first the w nodes of the period before that it uses, then its own m nodes by stage. If the
-    arm allows it, nodes and members of every period are ordered so that all periods are alike.
+    Places within a period: first the w nodes that it uses of the period before, then its own m nodes by
+    stage. If the arm allows it, nodes and members of every period are ordered so that all periods are alike.
 
     Attributes
     ----------
     bays : Bays
         Of the arm of `layout`.
     nodes, members : (n, m) int, (n, 3m) int
-        Of each period by the stage they belong to.
+        Of each period, in the order of its stages.
     stage_sizes : tuple of int
         Nodes of each of the p stages.
     node_period, node_place : (N,) int
-        The period of each node, negative for base nodes, and its place in there, 0 to m - 1.
+        The period of each node, negative for base nodes, and its place in that period, 0 to m - 1.
     carried : (w,) int
         Which of a period's nodes the next period uses.
     window : (n, w + m) int
-        The node at each place; places before the first period hold base nodes if all periods are alike, else any node.
+        The node at each place. Places before the first period hold base nodes if all periods are alike, else
+        any node.
     pattern : (3m, 3w + 3m) bool
         Coordinates that a member's length depends on in at least one period.
     member_places : (3m, 2) int or None
@@ -85,7 +86,7 @@ class Chain:
 
     @property
     def before(self) -> int:
-        """Number of displacement coordinates of the nodes of the period before that a period uses, 3w."""
+        """Number of displacement coordinates that a period uses of the period before, 3w."""
         return 3 * len(self.carried)
 
     @cached_property
@@ -153,10 +154,10 @@ def _chain(layout: Layout, bays: Bays, stages: int, length: int) -> Chain | None
 def _alike(
     bays: Bays, nodes: Index, members: Index, sizes: tuple[int, ...]
 ) -> tuple[Index, Index, Index] | None:
-    """Return base nodes, nodes (n, m) and members (n, 3m) in the order in which all periods are alike, if any.
+    """Return base nodes, nodes (n, m) and members (n, 3m) ordered so that all periods are alike, or None.
 
-    Base nodes are those of a period before the first one. Nodes of a stage are distinguished by the nodes they stand
-    on, so that a bay that mirrors the one before has its nodes in another order.
+    Base nodes are those of a period before the first one. Nodes of a stage are distinguished by the nodes
+    that they stand on: a bay that mirrors the one before has its nodes in another order.
     """
     base = np.flatnonzero(bays.base).tolist()
     if bays.joints is not None or len(nodes) < 2 or len(base) > _MOST_BASE_NODES:
@@ -182,9 +183,10 @@ def _alike(
 def _ordered_period(
     before: list[int], names: list[int], members: list[int], ends: list[list[int]], sizes: tuple[int, ...]
 ) -> tuple[list[int], list[int], list[tuple[int, int]]]:
-    """Return a period's nodes and members in order, and the places they join; nothing if these reach further back.
+    """Return a period's nodes and members in order, and the places that members join.
 
-    Places of nodes `before` are negative, and a period's own count from zero.
+    All are empty if members reach further back than `before`. Places of nodes `before` are negative; places
+    of a period's own nodes count from zero.
     """
     place = dict(zip(before, range(-len(before), 0), strict=True))
     hangs: dict[int, list[int]] = {node: [] for node in (*before, *names)}

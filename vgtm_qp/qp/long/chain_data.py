@@ -1,6 +1,7 @@
 """The numbers of a step, period by period, as the eliminations along a chain read them.
 
-They are copied from a QP's numbers, or computed from the nodes' positions by one compiled function mapped over periods.
+They are copied from a QP's numbers, or computed from node positions by one compiled function mapped over
+periods.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ class ChainData:
     Attributes
     ----------
     head, tail, table : (n, ...)
-        In the order of ``elimination.Inputs``; periods from the base to the tip, or the other way where `is_reversed`.
+        In the order of ``elimination.Inputs``; periods from the base to the tip, or reversed if
+        `is_reversed`.
     part : dict
         Their parts by name.
     turn_squares : (n, 9f)
@@ -42,7 +44,7 @@ class ChainData:
     weights, slopes : (K, V)
         Of the control vertices at those stations.
     offset : (V, 3)
-        Displacements of the control vertices where the free coordinates are zero, m.
+        Displacements of the control vertices for free coordinates of zero, m.
     normal : (3,)
         The direction in which the second control vertex moves.
     """
@@ -162,7 +164,7 @@ class ChainData:
         return self._free.T @ self._polygon_hessian @ self._free, self.polygon_gradient(self.offset)
 
     def polygon_gradient(self, vertices: Array) -> Array:
-        """Return (3V - 5,) the gradient of those terms at displacements `vertices` (V, 3)."""
+        """Return (3V - 5,) the gradient of the same terms at displacements `vertices` (V, 3)."""
         gradient = self._polygon @ vertices + self.vertex_gradient
         return np.asarray(gradient.reshape(-1) @ self._free)
 
@@ -233,13 +235,13 @@ class PeriodValues:
         inputs = [array.reshape(chain.periods, -1) for array in self._kernel.inputs]
         self._X, self._Y = (array.reshape(-1, 3) for array in inputs[:2])
         self._curve, self._motion = inputs[6].reshape(-1, 2, 6), inputs[7]
-        # Two switches for each station, for gap and angles: corrections close hard rows too.
+        # Two switches for each station, for gap and angles: corrections close hard rows as well.
         self._closes, tracked = inputs[8].reshape(-1, 2), data.stations
         self._is_hard = np.stack([layout.hard_gaps[tracked, 0], layout.hard_tilts[tracked, 0]], axis=1)
         inputs[2][:], inputs[3][:] = layout.arm.home_quantities[data.members], ~bays.actuated[data.members]
         for array, constants in zip(inputs[4:6], _frame_constants(chain, data), strict=True):
             array[:] = constants.reshape(array.shape)
-        # Base nodes, on which the first period's members stand, are no unknowns.
+        # The first period's members stand on base nodes, which are not unknowns.
         self._first = -1 if data.is_reversed else 0
         self._base_row, self._base_column = np.nonzero(chain.pattern[:, : chain.before])
         self._of_base = chain.entry[self._base_row, self._base_column]
@@ -249,7 +251,7 @@ class PeriodValues:
         """Overwrite the QP's numbers with those at `X` (N, 3), with Jacobians at `Y` (N, 3), m.
 
         The curve's base is already set, see :meth:`ChainData.hold_base`. `moved` (N, 3) are displacements of the base
-        nodes, m; None if they rest.
+        nodes, m; None if the base is at rest.
         """
         chain, data = self._chain, self._data
         window = data.window.reshape(-1)
@@ -318,7 +320,7 @@ def period_values(chain: Chain) -> ca.Function:
 def _frame_constants(chain: Chain, data: ChainData) -> tuple[Array, Array]:
     """Return angles (K, 6) and alignments (K, 3, 3), columns first, of the stations in the order of `data`.
 
-    A station whose nodes are named clockwise has y- and z-axis of its fitted frame reversed.
+    A station with its nodes in clockwise order has y- and z-axis of its fitted frame reversed.
     """
     arm, angles, alignments = chain.layout.arm, [], []
     for station, order in zip(

@@ -1,9 +1,9 @@
 """Elimination of one period of a chain, as CasADi graphs: one bay of a Riccati recursion from tip to base.
 
-Each graph takes the period's numbers and what the period after (or before) hands over, and hands over the
-same to the next; :class:`Sweep` runs it along the chain. A stage's displacements are u = G (rhs + T u_before)
-+ N t: G from the QR factors of its fixed members' rows, N a basis of their null space, t the stage's free
-motions, which are eliminated.
+Each graph takes the period's numbers and the *carry*, the result that the period after (or before) hands
+over, and returns the carry for the next period; :class:`Sweep` runs it along the chain. A stage's
+displacements are u = G (rhs + T u_before) + N t: G from the QR factors of its fixed members' rows, N a basis
+of their null space, t the stage's free motions, which are eliminated.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.rows import members
 
 NewtonStep = Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ca.SX]]
-"""From displacements before (3w,), positions (3w + 3m,) and lengths (3m,) to displacements (3w + 3m,) and errors."""
+"""From displacements before (3w,), positions (3w + 3m,), lengths (3m,) to displacements (3w + 3m,), error."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a period: its own coordinates, those before, the rows of its fixed and its actuated members.
+    """One stage of a period: own coordinates, coordinates before, and rows of fixed and actuated members.
 
     T couples the fixed members to the nodes before, rhs are their errors; G and N are as in the module docstring.
     """
@@ -62,7 +62,8 @@ class Inputs:
     Attributes
     ----------
     head, tail, table : vector
-        What all sweeps read, what the factorisation alone reads, and what depends on the curve's base alone.
+        Numbers that all sweeps read; those for the factorisation alone; those that depend on the curve's base
+        alone.
     jacobian : (3m, 3w + 3m), rhs : (3m,), actuator_gradient : (actuated,)
     weights, slopes : lists of (V,)
         Of the control vertices, by station.
@@ -172,7 +173,7 @@ class Elimination:
         return row
 
     def curve_columns(self, k: int) -> tuple[ca.SX, ca.SX]:
-        """Return the (3, 3V - 5) and (2, 3V - 5) derivatives of station `k`'s point on the curve, and of its angles."""
+        """Return the derivatives (3, 3V - 5) of station `k`'s curve point and (2, 3V - 5) of its angles."""
         inputs = self.inputs
         point = curve_rows.weighted_columns(inputs.weights[k], inputs.normal, ca.SX.eye(3))
         turned = curve_rows.weighted_columns(inputs.slopes[k], inputs.normal, inputs.tangent_curve[k])
@@ -252,7 +253,7 @@ class Elimination:
     def balance(self) -> ca.Function:
         """Return (carry, head, gains, nodal (3m,), actuator (actuated,), stations (5f,)) -> (carry, residual).
 
-        The costates of given gradients; the residual (freedom,) is what is left of stationarity.
+        The costates of given gradients; the residual (freedom,) is the violation of stationarity.
         """
         vector, gains = self._gains()
         carry, nodal = ca.SX.sym("carry", len(self.live)), ca.SX.sym("nodal", self.chain.own)
@@ -290,7 +291,7 @@ class Elimination:
     def strokes(self, count: int) -> ca.Function:
         """Return (carry, head, gains, z (freedom, count)) -> (carry, J u of the actuated members), all without rhs.
 
-        Each column of `z` is a motion of its own; z and J u are stored row by row.
+        Each column of `z` is one motion; z and J u are stored row by row.
         """
         vector, gains = self._gains()
         carry, rows = ca.SX.sym("carry", len(self.live), count), ca.SX.sym("z", count, self.freedom)
@@ -301,7 +302,7 @@ class Elimination:
         )
 
     def _moved(self, u: ca.SX, z: ca.SX, gains: list[list[ca.SX]], rhs: list[ca.SX]) -> ca.SX:
-        """Return displacements (3w + 3m, c) for free motions `z` (freedom, c) and displacements `u` (3w, c) before."""
+        """Return displacements (3w + 3m, c) for free motions `z` (freedom, c) after those `u` (3w, c)."""
         motions = ca.vertsplit(z, offsets(stage.freedom for stage in self.stages))
         for stage, (free, G, W, Wb, _), motion, wanted in zip(self.stages, gains, motions, rhs, strict=True):
             followed = stage.T @ u
@@ -330,8 +331,8 @@ class Elimination:
     def newton(self, name: str, gains: ca.SX, aims: list[ca.SX], step: NewtonStep) -> ca.Function:
         """Return (carry, head, gains, X, *aims) -> (carry, X, lengths, error): one Newton step of a period.
 
-        The carry holds the live nodes' positions and their displacements; X (3m,) are the positions of a period's own
-        nodes, and the lengths (3m,) and the error those before the step.
+        The carry holds the live nodes' positions and displacements; X (3m,) are the positions of a period's
+        own nodes. The lengths (3m,) and the error are those before the step.
         """
         carry, own = ca.SX.sym("carry", 2 * self.chain.before), ca.SX.sym("X", self.chain.own)
         before, moved = ca.vertsplit(carry, offsets([self.chain.before] * 2))

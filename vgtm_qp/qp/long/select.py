@@ -14,7 +14,7 @@ STAGED_ACTUATORS = 46
 
 
 def chain_solver(layout: Layout, solver: DenseSolver = DAQP) -> StagedSolver | TrackedSolver | None:
-    """Return what solves along the chain of `layout`; None if it is no chain, or has rows that chains do not serve.
+    """Return the solver along the chain of `layout`; None without a chain, or if chains cannot have its rows.
 
     The dense QPs of the elimination are for `solver`.
     """

@@ -1,4 +1,4 @@
-"""The step's QP of a long arm, solved exactly at a cost linear in its bays, by one of two eliminations along them."""
+"""The step's QP of a long arm, solved exactly at a cost linear in its bays by one of two eliminations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vgtm_qp.qp.residual import loose, refuse_large, relative
 SINGULAR = "the QP is singular: the arm is in a singular pose, or a term that it needs has weight zero"
 
 _PRESSES = 1e-9
-"""Least multiplier of a row that the next QP starts with. Interior-point solvers leave some of each row."""
+"""Least multiplier of a row that the next QP starts with: interior-point solvers give each row some."""
 
 
 class ChainSolver(ABC):
@@ -88,7 +88,7 @@ class ChainSolver(ABC):
         def values(combined: Array) -> Array:
             nonlocal progress
             progress = -scale * (scale * numbers.progress_gradient + float(combined[-1]))
-            # The minimiser must be computed before the curve's coordinates there are read.
+            # The minimiser must be computed before its curve coordinates are read.
             least = self._least(combined[:-1])
             return table.values(*least, self._free, progress)
 
@@ -135,7 +135,7 @@ class ChainSolver(ABC):
 
     @abstractmethod
     def _eliminate(self) -> None:
-        """Factorise the Hessian that `data` make; raise SolverError where it is singular."""
+        """Factorise the Hessian of `data`; raise SolverError if it is singular."""
 
     @abstractmethod
     def _columns(self, nodes: Index, coefficients: Array, curve: Array) -> Array:

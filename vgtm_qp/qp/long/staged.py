@@ -44,13 +44,13 @@ class StagedSolver(ChainSolver):
         self._forward = Sweep(elimination.forward(), periods, *ahead)
         self._strokes = Sweep(elimination.strokes(len(self.layout.tip_rows)), periods, *ahead)
         self._motions = self._forward.inputs[3].reshape(periods, -1)
-        # Rows of base nodes, which are no unknowns, go to places behind the last one that is read.
+        # Rows of base nodes, which are not unknowns, go behind the last place that is read.
         self._rows = np.zeros(((periods + 1) * BLOCK * own, 3))
         self._through.bind_input(3, self._rows[: periods * BLOCK * own])
         is_free = chain.node_period >= 0
         first = np.where(is_free, periods - 1 - chain.node_period, periods) * BLOCK * own
         self._row_place = first + chain.node_place * is_free
-        # A row of zeros after those of the free nodes, for base nodes, which do not move.
+        # After the free nodes comes a row of zeros for base nodes, which do not move.
         self._moved = np.zeros((chain.nodes.size + 1, 3))
         self._forward.bind_output(1, self._moved[:-1])
         self._moved_at = np.where(is_free, chain.node_period * own + chain.node_place, -1)
@@ -60,8 +60,8 @@ class StagedSolver(ChainSolver):
     def gain(self, held: NDArray[np.bool_]) -> Array | None:
         """Return the changes (n_a, n_e) of the actuated lengths that move the tip by one unit of each of its rows.
 
-        They are those of the least motion in the metric of the QP solved last; its progress and the `held` actuators
-        (n_a,) do not change. None if there is no such motion.
+        The motion is the least one in the metric of the QP solved last; progress and `held` actuators (n_a,)
+        do not change. None if there is no such motion.
         """
         if self._last is None:
             return None

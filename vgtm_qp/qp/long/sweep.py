@@ -13,8 +13,8 @@ from vgtm_qp.qp.long.chain import Chain
 class Sweep(Kernel):
     """A period's function run along the chain: its first argument is its first result for the period before.
 
-    CasADi maps a function in order, and first argument and first result share memory, shifted by one period: the map is
-    a recursion. The arguments after the first one are read from the given arrays.
+    CasADi maps a function in order. First argument and first result share memory, shifted by one period, so
+    that the map is a recursion. The other arguments are read from the given arrays.
 
     Attributes
     ----------
@@ -53,12 +53,12 @@ class ChainClosing(Sweep):
         self.lengths = self.outputs[2].reshape(chain.periods, -1)
 
     def start(self, base: Array) -> None:
-        """Let base nodes stand at their rows of `base` (N, 3), m."""
+        """Put base nodes at their rows of `base` (N, 3), m."""
         self.carry[0] = 0.0
         self.carry[0, : 3 * len(self._base)] = base[self._base].reshape(-1)
 
     def step(self, X: Array) -> tuple[Array, float]:
-        """Return the positions after one step from `X` (n m, 3), and the greatest error there was before it, m."""
+        """Return the positions after one step from `X` (n m, 3), and the greatest error before it, m."""
         self.inputs[3][:] = X.reshape(-1)
         self()
         return self.outputs[1].reshape(-1, 3), float(np.abs(self.outputs[3]).max())

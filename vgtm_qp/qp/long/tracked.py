@@ -1,7 +1,7 @@
 """The step's QP of a long arm whose stations stay on the curve exactly: only the curve's coordinates are free.
 
-Where a period's fixed members and its stations' positions are as many as its coordinates, one pass from the base
-to the tip gives all nodes as a linear function of the control vertices.
+If a period has as many coordinates as fixed members and station coordinates, one pass from the base to the
+tip gives all nodes as a linear function of the control vertices.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class Following:
     def response(self) -> ca.Function:
         """Return (carry, head, tail, table) -> (carry, gains, D, R, U): the responses to the curve.
 
-        D (actuated, 3V - 5 + 1), strokes, R (2f, ...), angles, and U (3m, ...), displacements, are stored by rows, as
-        is the carry, the displacements of the live nodes; their last columns are constants. U is left out where the
-        next period uses all nodes of this one in order. The gains are those of :meth:`hold`.
+        Stored by rows are the strokes D (actuated, 3V - 5 + 1), the angles R (2f, ...), the displacements U
+        (3m, ...), and the carry, the displacements of the live nodes; their last columns are constants. U is
+        left out if the next period uses all nodes of this one in order. The gains are those of :meth:`hold`.
         """
         elimination, inputs = self._elimination, self._elimination.inputs
         columns = elimination.curve + 1
@@ -78,7 +78,7 @@ class Following:
     def hold(self) -> ca.Function:
         """Return ``Elimination.newton`` towards lengths `aim` (3m,) and points `curve` (3f,) of the stations' centres.
 
-        Only fixed members are aimed at their lengths; actuated members take the lengths that follow.
+        Only fixed members have target lengths; the lengths of actuated members follow.
         """
         elimination = self._elimination
         vector, gains = symbols_like([part.sparsity() for part in self._gains], "gains")
@@ -103,7 +103,7 @@ class TrackedSolver(ChainSolver):
         self._changes = Sweep(elimination.changes(), chain.periods, data.head)
         columns, own = self._curve + 1, chain.nodes.shape[1]
         self._strokes, self._angles = (output.reshape(-1, columns) for output in self._following.outputs[2:4])
-        # The first rows are those of the base, whose nodes do not move; then come the nodes in order.
+        # First the rows of base nodes, which do not move; then those of the nodes in order.
         self._moving = np.zeros(((chain.periods + 1) * own, 3, columns))
         if len(self._following.outputs) > 4:
             self._following.bind_output(4, self._moving[own:])

@@ -31,7 +31,7 @@ MemberRows = Callable[[Index], tuple[Index, Array]]
 """Nodes (R, Q) and coefficients (R, Q, 3) of the lengths of members (R,); base nodes may have any coefficients."""
 
 Key = int | bytes
-"""Of a row; the nodes of a clearance row."""
+"""Key of a row from QP to QP: its number, or the nodes of a clearance row."""
 
 Moved = Callable[[Index], Array]
 """Displacements (..., 3), m, of nodes (...,)."""
@@ -149,12 +149,12 @@ class RowTable:
         return forces
 
     def key(self, row: int) -> Key:
-        """Return a key of the row that holds in the next QP, whose clearance rows may be others."""
+        """Return a key of the row that is valid in the next QP, which may have other clearance rows."""
         near = row - self.clearance.start
         return row if near < 0 else self.numbers.clearance.nodes[near].tobytes()
 
     def remembered(self, keys: set[Key]) -> list[int]:
-        """Return the rows that `keys` name."""
+        """Return the rows with these `keys`."""
         rows = [key for key in keys if isinstance(key, int)]
         if len(rows) < len(keys):
             rows += [k for k in range(self.clearance.start, len(self.lower)) if self.key(k) in keys]
@@ -164,7 +164,7 @@ class RowTable:
 def _all_active(
     gram: Array, values: Array, lower: Array, upper: Array, equal: NDArray[np.bool_]
 ) -> Array | None:
-    """Return the multipliers with all rows active at the bounds they violate; None if that may not be the answer."""
+    """Return the multipliers with all rows active at the bounds they violate; None if that may be wrong."""
     above = equal | (values > upper)
     if not np.all(above | (values < lower)):
         return None
