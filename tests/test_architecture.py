@@ -3,22 +3,157 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 import vgtm_qp
 
 PACKAGE = Path(vgtm_qp.__file__).parent
+TESTS = Path(__file__).parent
 
-# Names that two files still share: whoever renames one takes it off this list, and nobody adds to it.
-SHARED: set[str] = set()
+LONGEST_CLASS, LONGEST_FUNCTION = 300, 80
+"""Lines, docstrings included and decorators not, above which a docstring has a sentence that begins as follows."""
+REASON = "Long because "
+
+OPEN = {"_replace", "_asdict", "_fields", "_make", "_exit"}
+"""Names that others made public: NamedTuple's, and that of the module os."""
+BY_NAME = {"setattr", "delattr", "getattr", "hasattr", "attrgetter", "patch", "object"}
+"""Functions that take the names of attributes, or the places of things, as texts."""
+
+Definition = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def definitions(tree: ast.Module, name: str = "") -> Iterator[tuple[str, Definition]]:
+    """Yield all classes and functions, also those in others, with where they are."""
+    for node in ast.walk(tree):
+        if isinstance(node, Definition):
+            yield f"{name}:{node.lineno} {node.name}", node
+
+
+def of_the_package() -> Iterator[tuple[str, Definition]]:
+    for file in sorted(PACKAGE.rglob("*.py")):
+        yield from definitions(
+            ast.parse(file.read_text(encoding="utf-8")), file.relative_to(PACKAGE).as_posix()
+        )
 
 
 def test_a_class_name_stands_for_one_class() -> None:
     homes = defaultdict(list)
-    for file in sorted(PACKAGE.rglob("*.py")):
-        for node in ast.parse(file.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                homes[node.name].append(file.relative_to(PACKAGE).as_posix())
-    shared = {name: files for name, files in homes.items() if len(files) > 1}
-    assert set(shared) <= SHARED, {name: shared[name] for name in set(shared) - SHARED}
+    for place, node in of_the_package():
+        if isinstance(node, ast.ClassDef):
+            homes[node.name].append(place)
+    assert not {name: places for name, places in homes.items() if len(places) > 1}
+
+
+def too_long(node: Definition) -> bool:
+    most = LONGEST_CLASS if isinstance(node, ast.ClassDef) else LONGEST_FUNCTION
+    assert node.end_lineno is not None
+    return node.end_lineno - node.lineno + 1 > most and REASON not in (ast.get_docstring(node) or "")
+
+
+def test_what_is_long_says_why() -> None:
+    assert not [place for place, node in of_the_package() if too_long(node)], f'cut it, or say "{REASON}..."'
+
+
+@pytest.mark.parametrize(("kind", "most"), [("class", LONGEST_CLASS), ("def", LONGEST_FUNCTION)])
+def test_long_classes_and_functions_are_found(kind: str, most: int) -> None:
+    def found(lines: int, said: str = "Something.") -> bool:
+        head = f"{kind} long:" if kind == "class" else f"{kind} long():"
+        text = "\n".join(["@decorated", head, f'    """{said}"""', *["    a = 1"] * (lines - 2)])
+        ((_, node),) = definitions(ast.parse(text))
+        return too_long(node)
+
+    assert not found(most)
+    assert found(most + 1)
+    assert not found(most + 1, f"Something. {REASON}its options are.")
+
+
+def is_private(name: str) -> bool:
+    """Return whether a name is for its own module or class alone; ``_repr_html_`` and its like belong to protocols."""
+    return name.startswith("_") and not name.endswith("_") and name not in OPEN
+
+
+def private_names(text: str) -> Iterator[tuple[int, str]]:
+    """Yield line and name where a test's text reads a private name that is not its own."""
+    tree = ast.parse(text)
+    nodes = list(ast.walk(tree))
+    # Of a function that takes the place of a method of the package, `self` is the package's.
+    classes = [node for node in nodes if isinstance(node, ast.ClassDef)]
+    own = {id(inner) for one in classes for inner in ast.walk(one) if _is_own(inner)}
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and is_private(node.attr) and id(node) not in own:
+            yield node.lineno, node.attr
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            above = getattr(node, "module", None) or ""
+            names = [part for alias in node.names for part in f"{above}.{alias.name}".split(".")]
+            yield from ((node.lineno, name) for name in names if is_private(name))
+        elif isinstance(node, ast.Call):
+            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            texts = [one.value for one in node.args if isinstance(one, ast.Constant)]
+            names = [one.split(".")[-1] for one in texts if isinstance(one, str)]
+            yield from ((node.lineno, name) for name in names if called in BY_NAME and is_private(name))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield from ((node.lineno, name) for name in _in_text(node.value))
+
+
+def _is_own(node: ast.AST) -> bool:
+    return isinstance(node, ast.Attribute) and getattr(node.value, "id", "") in ("self", "cls")
+
+
+def _in_text(text: str) -> Iterator[str]:
+    """Yield the private names in a dotted place within the package, or in a program that another process runs."""
+    if re.fullmatch(r"vgtm_qp(\.\w+)+", text):
+        yield from filter(is_private, text.split("."))
+    elif re.search(r"^\s*(from|import) ", text, re.MULTILINE):
+        try:
+            yield from (name for _, name in private_names(text))
+        except (SyntaxError, ValueError):
+            return
+
+
+def test_tests_read_no_private_names() -> None:
+    # The examples below are no programs.
+    files = sorted(set(TESTS.rglob("*.py")) - {Path(__file__)})
+    found = {file.name: list(private_names(file.read_text(encoding="utf-8"))) for file in files}
+    assert not {name: names for name, names in found.items() if names}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "arm._table",
+        "arm.solver._kept(1)",
+        "def wrong(self): return self._state",
+        "from vgtm_qp.qp.osqp import _FIRST",
+        "from vgtm_qp._qp import osqp",
+        "import vgtm_qp._qp.osqp",
+        "monkeypatch.setattr(module, '_FIRST', 1)",
+        "monkeypatch.setattr('vgtm_qp.compiled._PATIENCE', 1)",
+        "getattr(arm, '_table')",
+        "place = 'vgtm_qp.compiled._PATIENCE'",
+        "program = 'import vgtm_qp\\nprint(vgtm_qp._state)'",
+    ],
+)
+def test_private_names_are_found(line: str) -> None:
+    assert list(private_names(line))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "move._replace(closed=1)._asdict()",
+        "os._exit(0)",
+        "maneuver._repr_html_()",
+        "type(arm).__init__",
+        "class Own:\n    def __init__(self): self._state = 1",
+        "from vgtm_qp.errors import CurveError as _Error",
+        "key.endswith('_rows')",
+        "said = 'imports from _elsewhere are not served'",
+    ],
+)
+def test_names_that_tests_may_read_are_let_be(line: str) -> None:
+    assert not list(private_names(line))

@@ -50,21 +50,21 @@ def post(x: float, y: float, radius: float = 0.1, **more: Any) -> dict[str, Any]
 
 
 def test_what_bends_without_a_bound_is_not_certified() -> None:
-    certifier = Certifier(planar(obstacle=[post(1.0, 0.6)]))
-    motion = JointMotion(certifier.arm, np.array([0.0, 1.0]), np.zeros((2, 2)), certifier._table)
-    assert not decide(motion, certifier._kept(motion))["clearance"].undecided
+    problem = planar(obstacle=[post(1.0, 0.6)])
+    certifier = Certifier(problem)
+    motion = JointMotion(certifier.arm, np.array([0.0, 1.0]), np.zeros((2, 2)), problem.to_dict())
+    assert not decide(motion, certifier.kept(motion))["clearance"].undecided
     motion.bends[:] = np.inf
-    assert decide(motion, certifier._kept(motion))["clearance"].undecided
+    assert decide(motion, certifier.kept(motion))["clearance"].undecided
 
 
 def test_an_obstacle_is_known_no_better_than_its_clock() -> None:
-    away = post(-1e6 + 1.0, 0.17, velocity=[1.0, 0.0, 0.0])
-    near = Certifier(planar(obstacle=[post(1.0, 0.17, velocity=[1.0, 0.0, 0.0])]))
-    far = Certifier(planar(obstacle=[away]))
     kept = []
-    for certifier, start in ((near, 0.0), (far, 1e6)):
-        motion = JointMotion(certifier.arm, start + np.array([0.0, 0.5]), np.zeros((2, 2)), certifier._table)
-        kept += certifier._kept(motion)[:1]
+    for x, start in ((1.0, 0.0), (-1e6 + 1.0, 1e6)):
+        problem = planar(obstacle=[post(x, 0.17, velocity=[1.0, 0.0, 0.0])])
+        certifier = Certifier(problem)
+        motion = JointMotion(certifier.arm, start + np.array([0.0, 0.5]), np.zeros((2, 2)), problem.to_dict())
+        kept += certifier.kept(motion)[:1]
     assert kept[0].rounding < 1e-12
     # Its centre and its way cancel.
     assert kept[1].rounding >= 64.0 * 2e6 * np.finfo(float).eps
@@ -337,7 +337,7 @@ def test_one_row_is_a_pose() -> None:
 def test_a_proof_that_may_not_go_on_is_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
     module = importlib.import_module("vgtm_qp.certify.decide")
     problem = planar(obstacle=[post(1.6, 1.6, 0.2)])
-    monkeypatch.setattr(module, "_GREATEST_DEPTH", 1)
+    monkeypatch.setattr(module, "GREATEST_DEPTH", 1)
     verdict = vq.certify(problem, [0.0, 2.0], [[0.0, 0.0], [np.pi / 2, 0.0]])
     assert verdict.answer == "undecided"
     assert not verdict.certified

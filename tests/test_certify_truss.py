@@ -109,7 +109,9 @@ def test_numbers_that_overflow_prove_nothing(size: float) -> None:
     assert not tube(solver, arm.home[None], arm.length[None], np.full((1, 3), 1e-3)).closed.any()
 
 
-def test_nodes_of_the_same_lengths_elsewhere_are_not_taken_for_the_motion() -> None:
+def test_nodes_of_the_same_lengths_elsewhere_are_not_taken_for_the_motion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     arm = recorded(tripod())
     lengths = arm.length + np.array([[0.0], [0.05]])
     motion, doubts = truss_motion(arm, np.array([0.0, 1.0]), lengths, {})
@@ -118,9 +120,13 @@ def test_nodes_of_the_same_lengths_elsewhere_are_not_taken_for_the_motion() -> N
     half, middle = np.full(len(motion.time) - 1, 0.5), np.arange(len(motion.time) - 1)
     above = motion.ends_at(middle, half)
     assert not list(motion.doubts())
-    solve = motion._solver.solve
-    under = np.array([1.0, 1.0, -1.0])
-    motion._solver.solve = lambda nodes, lengths: (solve(nodes, lengths)[0] * under, solve(nodes, lengths)[1])  # type: ignore[method-assign]
+    solve = TrussSolver.solve
+
+    def under(self: TrussSolver, nodes: Array, lengths: Array) -> tuple[Array, NDArray[np.bool_]]:
+        right, found = solve(self, nodes, lengths)
+        return right * np.array([1.0, 1.0, -1.0]), found
+
+    monkeypatch.setattr(TrussSolver, "solve", under)
     below = motion.ends_at(middle, half)
     np.testing.assert_allclose(np.linalg.norm(np.diff(below, axis=2)), np.linalg.norm(np.diff(above, axis=2)))
     assert [doubt.reason for doubt in motion.doubts()] == [
@@ -287,7 +293,7 @@ def test_offset_joints_leave_it_undecided_but_limits_are_still_checked() -> None
 
 def test_a_motion_that_cannot_be_followed_to_its_end_is_certified_to_where_it_can(monkeypatch: Any) -> None:
     module = importlib.import_module("vgtm_qp.certify.truss_motion")
-    monkeypatch.setattr(module, "_GREATEST_DEPTH", 1)
+    monkeypatch.setattr(module, "GREATEST_DEPTH", 1)
     problem = two_bays()
     arm = recorded(problem)
     lengths = np.tile(arm.length, (3, 1))

@@ -771,9 +771,9 @@ def test_bodies_of_another_problem_are_found(change, said):
 def test_long_chains_loop_over_their_joints_and_give_the_same(monkeypatch, prismatic, rng):
     spec = serial_problem(chain(12, prismatic=prismatic)).arm
     looped, written_out = SerialChain.of(spec), SerialChain.of(spec)
-    monkeypatch.setattr(serial_chain, "_UNROLLED", 0)
+    monkeypatch.setattr(serial_chain, "UNROLLED", 0)
     assert looped.functions[1].is_a("MXFunction")
-    monkeypatch.setattr(serial_chain, "_UNROLLED", 100)
+    monkeypatch.setattr(serial_chain, "UNROLLED", 100)
     assert written_out.functions[1].is_a("SXFunction")
     q = rng.normal(scale=0.3, size=len(looped) + 6)
     for one, other in zip(looped.at(q), written_out.at(q), strict=True):

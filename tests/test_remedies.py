@@ -13,8 +13,8 @@ from arms import three_bays
 import vgtm_qp as vq
 from vgtm_qp.cli import main
 from vgtm_qp.errors import ResultError
-from vgtm_qp.export.html import _read_out
-from vgtm_qp.maneuver import solve as maneuvers
+from vgtm_qp.export.html import read_out
+from vgtm_qp.maneuver.solve import ManeuverAttempt, helpful_remedies
 from vgtm_qp.methods import Resolver, with_method
 from vgtm_qp.step.first_order import ANGLE, CLEARANCE, MEMBERS, Limit
 from vgtm_qp.step.remedies import Change, Remedy, relaxed
@@ -25,7 +25,7 @@ WALL = {"name": "wall", "shape": "box", "center": [1.2, 0.0, 2.0], "size": [0.3,
 
 def stopped(problem):
     """Return the attempt at a problem and its stop, or None."""
-    attempt = maneuvers._Attempt(problem, Resolver(problem))
+    attempt = ManeuverAttempt(problem, Resolver(problem))
     return attempt, attempt.run(None)
 
 
@@ -56,13 +56,13 @@ def test_what_is_named_lets_the_arm_go_on_and_nothing_else_does(rng):
             continue
         stops += 1
         kept = attempt.resolver.state
-        tried = maneuvers._tried(attempt, stop)
+        tried = helpful_remedies(attempt, stop)
         helped += bool(tried)
         assert not attempt.goes_on(Remedy((), 1.0)), str(stop)
         assert len(tried) <= 3
         for remedy in tried:
             assert 1 <= len(remedy.changes) <= 3
-            again = maneuvers._Attempt(problem, attempt.resolver.relaxed(remedy))
+            again = ManeuverAttempt(problem, attempt.resolver.relaxed(remedy))
             again.plan, again.value = attempt.plan, attempt.value
             again.run(None)
             assert again.progress > attempt.progress, str(remedy)
@@ -88,11 +88,11 @@ def test_more_stroke_frees_a_stretched_arm_and_less_than_is_named_does_not_get_a
     problem = three_bays(**{"truss.stroke": [0.8, 1.2], "maneuver.waypoint": waypoint})
     attempt, stop = stopped(problem)
     assert stop is not None
-    (remedy, *_) = maneuvers._tried(attempt, stop)
+    (remedy, *_) = helpful_remedies(attempt, stop)
     assert {change.limit.kind for change in remedy.changes} == {"stroke"}
 
     def reached(factor):
-        again = maneuvers._Attempt(problem, attempt.resolver.relaxed(remedy.times(factor)))
+        again = ManeuverAttempt(problem, attempt.resolver.relaxed(remedy.times(factor)))
         again.plan, again.value = attempt.plan, attempt.value
         again.run(None)
         return again.progress
@@ -113,7 +113,7 @@ def test_command_certificate_page_and_maneuver_tell_the_same_sentence(tmp_path, 
     assert f"stopped by {sentence}" in maneuver.certificate.notes
     assert f"Stopped by {sentence}." in str(maneuver)
     assert maneuver.why_not == sentence
-    assert _read_out(maneuver, float(maneuver.time[-1]), 0.1).endswith(f"blocked: {sentence}")
+    assert read_out(maneuver, float(maneuver.time[-1]), 0.1).endswith(f"blocked: {sentence}")
     summary = maneuver.summary()
     assert summary["stopped_by"] == sentence
     assert summary["blocked_by"] == list(maneuver.blocked_by)

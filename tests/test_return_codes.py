@@ -64,7 +64,7 @@ def test_a_tip_that_cannot_be_moved_is_not_settled(compiled, tmp_path, monkeypat
     layout, _ = make_layout(modules.octahedral(2), vertices=0)
     assert building(SOURCE).finish() is not None
     solver = FusedSolver(layout, compiled=compiled)
-    for kernel in (solver._workspace.condense, solver._workspace.missing, solver._workspace.close):
+    for kernel in solver.kernels:
         assert kernel.compile() == compiled
     assert solver.is_ready
     arm, curve = layout.arm, CurvePoint(np.zeros((0, 3)), np.zeros(0))

@@ -7,11 +7,10 @@ import osqp
 import pytest
 
 import vgtm_qp as vq
-from vgtm_qp.qp import osqp as by_osqp
 from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.dense import EQUALITY, check, residuals
 from vgtm_qp.qp.numbers import UNBOUNDED
-from vgtm_qp.qp.osqp import Osqp
+from vgtm_qp.qp.osqp import AGAIN, FIRST, Osqp
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError
 from vgtm_qp.qp.solvers import available_solvers, dense_solver
 from vgtm_qp.step.build import build_arm
@@ -101,15 +100,13 @@ def test_osqp_starts_from_its_last_answer_also_with_more_rows():
     np.testing.assert_allclose(more.x, cold.x, atol=1e-9)
 
 
-def test_osqp_tries_again_where_the_first_answer_is_not_accurate(set_ups, monkeypatch):
-    monkeypatch.setattr(by_osqp, "_FIRST", {**by_osqp._FIRST, "max_iter": 10})
-    monkeypatch.setattr(by_osqp._Workspace.__init__, "__defaults__", (by_osqp._FIRST,))
-    rng, solver = np.random.default_rng(5), Osqp()
+def test_osqp_tries_again_where_the_first_answer_is_not_accurate(set_ups):
+    rng, solver = np.random.default_rng(5), Osqp({**FIRST, "max_iter": 10})
     for _ in range(3):
         *qp, sense = random_qp(rng, 4)
         answer = solver.ask(*qp, sense)
         assert max(residuals(answer, *qp)) <= solver.accuracy
-    assert 1 < len(set_ups) <= 1 + len(by_osqp._AGAIN)
+    assert 1 < len(set_ups) <= 1 + len(AGAIN)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])

@@ -15,10 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from steps import MOVED_BASE
 
-from vgtm_qp.arm.truss import lengths as lengths_module
 from vgtm_qp.arm.truss.build import lock_members
 from vgtm_qp.arm.truss.kinematics import LengthRows
-from vgtm_qp.arm.truss.lengths import LengthSolver
+from vgtm_qp.arm.truss.lengths import WIDEST, LengthSolver
 from vgtm_qp.errors import SolverError
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.condensed import CondensedSolver
@@ -409,15 +408,13 @@ def test_memory_is_linear_in_the_bays():
 @pytest.mark.parametrize("joint_offset", [0.0, 0.02])
 @pytest.mark.parametrize("is_wide", [False, True])
 @pytest.mark.parametrize("name", [*MODULES, "graph"])
-def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, monkeypatch, rng):
-    if is_wide:
-        monkeypatch.setattr(lengths_module, "_WIDEST", 0)
+def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, rng):
     truss = mast() if name == "graph" else MODULES[name](joint_offset=joint_offset)
     case = Case(truss, vertices=0)
     kinematics = case.kinematics
     kinematics.evaluate(random_pose(truss, rng, 0.02))
     error = rng.normal(size=truss.member_count)
-    solver = LengthSolver(case.layout.arm.bays)
+    solver = LengthSolver(case.layout.arm.bays, widest=0 if is_wide else WIDEST)
     step = solver.solve(kinematics.gradient, error)
     np.testing.assert_allclose(kinematics.motion().jacobian() @ step.ravel(), error, atol=1e-10)
     for wrong in (0.0, np.nan, np.inf):

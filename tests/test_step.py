@@ -804,19 +804,21 @@ def test_what_holds_an_actuator_is_named_by_the_limit_that_does():
 
 def test_a_trial_curve_without_a_frame_blocks_its_piece_alone(crate_problem, monkeypatch):
     resolver, target = vq.Resolver(crate_problem), vq.Resolver(crate_problem).tip()[0] + [0.02, 0.0, 0.0]
-    right, calls = resolver._attempt._run, []
 
-    def spoilt(state, asked, *rest):
-        calls.append(asked.target.end - asked.target.start)
-        if calls[-1] > 0.5:
-            raise vq.CurveError("no frame")
-        return right(state, asked, *rest)
+    def spoil(longest):
+        """Let no curve have a frame in pieces of path that are longer."""
+        for engine in (resolver.setup.engine, resolver.setup.elastic()):
 
-    monkeypatch.setattr(resolver._attempt, "_run", spoilt)
+            def spoilt(asked, *rest, right=engine.move):
+                if asked.target.end - asked.target.start > longest:
+                    raise vq.CurveError("no frame")
+                return right(asked, *rest)
+
+            monkeypatch.setattr(engine, "move", spoilt)
+
+    spoil(0.5)
     step = resolver.step(position=target)
     assert step.status is vq.StepStatus.SLOWED
     assert 0.0 < step.progress <= 0.5
-    monkeypatch.setattr(
-        resolver._attempt, "_run", lambda *a: (_ for _ in ()).throw(vq.CurveError("no frame"))
-    )
+    spoil(0.0)
     assert resolver.step(position=target).reason == "no frame"

@@ -165,10 +165,10 @@ def test_a_loop_counts_its_steps_and_what_breaks_is_found(monkeypatch: pytest.Mo
     assert row["reached"] + row["slowed"] + row["blocked"] == 20
     assert row["reached"]
     assert not row["failures"]
-    along = loops._along
+    along = loops.problem_along
 
     def stricter(problem: Any, targets: Any) -> Any:
         return along(problem, targets).replace({"clearance.safe": 2.5, "clearance.influence": 3.0})
 
-    monkeypatch.setattr(loops, "_along", stricter)
+    monkeypatch.setattr(loops, "problem_along", stricter)
     assert "clearance" in " ".join(loops.run(7, 5, 20)["failures"])

@@ -13,6 +13,7 @@ import vgtm_qp as vq
 from vgtm_qp.certify.certify import Certifier
 from vgtm_qp.certify.trajectory import read_trajectory
 from vgtm_qp.cli import main
+from vgtm_qp.export.trajectory import JOINT_STATE
 
 PROBLEM = {
     "arm": {
@@ -207,10 +208,8 @@ def states(path: Path, topics: list[str], names: list[list[str]]) -> Path:
     """A bag of JointState messages of 10 ms after one another, from a large clock on."""
     from mcap_ros2.writer import Writer
 
-    from vgtm_qp.export import trajectory as export
-
     with path.open("wb") as stream, Writer(stream) as writer:
-        schema = writer.register_msgdef("sensor_msgs/msg/JointState", export._JOINT_STATE)
+        schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
         for k, (topic, name) in enumerate(zip(topics, names, strict=True)):
             stamp = {"sec": 1_700_000_000, "nanosec": 10_000_000 * k}
             values = {"position": [0.1 * (j + k) for j in range(len(name))], "velocity": [], "effort": []}

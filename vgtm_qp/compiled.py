@@ -75,7 +75,7 @@ A compiler takes about as much time as that many interpreted calls.
 
 _often = OFTEN
 
-_PATIENCE = 60.0
+PATIENCE = 60.0
 """Seconds after which a compiler counts as hung."""
 
 _LINGER = 1.0
@@ -342,7 +342,7 @@ class Building:
                 return
             with contextlib.suppress(OSError):
                 self._target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            self._builder = _hand_over({**self._job, "patience": _PATIENCE})
+            self._builder = _hand_over({**self._job, "patience": PATIENCE})
 
     def finish(self) -> Path | None:
         """Make it now, wait for the end of it, and return `library`."""
@@ -374,7 +374,7 @@ class Building:
                 if builder.hung:
                     _hanging.add(self._job["cc"])
                     _warn(
-                        f"the C compiler {self._job['cc']} did not end within {_PATIENCE:g} s: kernels run uncompiled, "
+                        f"the C compiler {self._job['cc']} did not end within {PATIENCE:g} s: kernels run uncompiled, "
                         "4 to 10 times slower; VGTM_CC names another compiler"
                     )
 

@@ -18,7 +18,9 @@ from vgtm_qp.result.chain import RecordedChain
 
 if TYPE_CHECKING:
     from vgtm_qp.certify.motion import GivenMotion
+    from vgtm_qp.certify.pairs import Kept
     from vgtm_qp.problem import Problem
+    from vgtm_qp.verify.obstacles import Body
 
 
 def certify(problem: Problem, times: ArrayLike, joints: ArrayLike | Mapping[str, ArrayLike]) -> Verdict:
@@ -84,7 +86,7 @@ class Certifier:
         values = self._quantities(trajectory)
         wrong = list(beyond_limits(self.arm, self._table, trajectory.time, values))
         motion, doubt = self._motion(trajectory.time, values)
-        decided = {} if motion is None else decide(motion, self._kept(motion))
+        decided = {} if motion is None else decide(motion, self.kept(motion))
         if motion is not None and self._rules.minimum_angle > 0.0:
             decided["angle"] = keep_angles(motion, self._rules.minimum_angle)
         for decision in decided.values():
@@ -129,13 +131,14 @@ class Certifier:
 
         return truss_motion(self.arm, knots, at_knots, self._table)
 
-    def _kept(self, motion: GivenMotion) -> list[Any]:
+    def kept(self, motion: GivenMotion) -> list[Kept]:
+        """Return the pairs that have to keep their clearances along a motion of the arm."""
         from vgtm_qp.certify.pairs import KeptBodies, KeptMembers
 
-        kinds: dict[Any, list[Any]] = {}
+        kinds: dict[Any, list[Body]] = {}
         for body in self._bodies:
             kinds.setdefault(body.shape.distance, []).append(body)
-        kept: list[Any] = [KeptBodies(motion, self._rules.safe, bodies) for bodies in kinds.values()]
+        kept: list[Kept] = [KeptBodies(motion, self._rules.safe, bodies) for bodies in kinds.values()]
         if self._rules.self_collision:
             kept.append(KeptMembers(motion, self._rules.between_members))
         return kept

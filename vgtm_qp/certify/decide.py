@@ -19,9 +19,10 @@ from vgtm_qp.certify.pairs import Kept, Near
 from vgtm_qp.certify.verdict import Finding
 from vgtm_qp.verify.clearance import CLEARANCE_TOLERANCE, Pairs
 
-_GREATEST_DEPTH = 30
+GREATEST_DEPTH = 30
+"""Number of halvings from which on nothing more is decided."""
 _GREATEST_COUNT = 200_000
-"""Greatest numbers of halvings, and of intervals at a time; what is open then stays undecided."""
+"""Number of intervals at a time from which on nothing more is decided."""
 _NEAR_ENOUGH = 1e-3
 _REPORT_DEPTH = 10
 """Greatest gap between proven bound and least clearance, over the mean link, and halvings to reach it."""
@@ -132,7 +133,7 @@ class Bisection:
         start, width = np.zeros(len(pair)), 1.0
         first, last = edges
         proven = self._across(pair, first, last)
-        for depth in range(_GREATEST_DEPTH + 1):
+        for depth in range(GREATEST_DEPTH + 1):
             proven = np.maximum(proven - self.bend[pair] * width**2 / 8.0, -self.depth[pair])
             open_ = self._open(pair, proven, depth)
             np.minimum.at(self.proven, pair[~open_], proven[~open_])
@@ -159,7 +160,7 @@ class Bisection:
         open_ = np.where(broken, coarse, doubtful | coarse) & np.isfinite(self.bend[pair])
         if open_.sum() > _GREATEST_COUNT:
             open_ &= doubtful & ~broken
-        if depth == _GREATEST_DEPTH or open_.sum() > _GREATEST_COUNT:
+        if depth == GREATEST_DEPTH or open_.sum() > _GREATEST_COUNT:
             open_[:] = False
         return np.asarray(open_)
 

@@ -21,9 +21,10 @@ from vgtm_qp.certify.verdict import Finding
 from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.verify.arm import RecordedArm
 
-_GREATEST_DEPTH = 12
+GREATEST_DEPTH = 12
+"""Number of halvings of a segment from which on its motion counts as unknown."""
 _GREATEST_COUNT = 100_000
-"""Greatest numbers of halvings of a segment, and of intervals at a time; beyond, the motion is unknown."""
+"""Number of intervals at a time from which on the motion counts as unknown."""
 _ROUNDS = 8
 _SLACK = 1e-3
 """Number of iterations towards bounds that reproduce themselves, and the relative slack asked of these."""
@@ -226,7 +227,7 @@ def truss_motion(
     if not arm.has_pin_joints:
         return None, [_doubt(start, end, "where offset joints are between rows is not bounded")]
     solver, lengths = TrussSolver(arm), np.concatenate([arm.length[None], lengths])
-    followed = _Followed(solver, _rows(solver, lengths), lengths, time)
+    followed = _FollowedTruss(solver, _rows(solver, lengths), lengths, time)
     known = followed.follow()
     if known == 0:
         reason = "its first row was not reached from home in a straight line of lengths"
@@ -253,7 +254,7 @@ def _rows(solver: TrussSolver, lengths: Array) -> Array:
     return np.array(found)
 
 
-class _Followed:
+class _FollowedTruss:
     """A truss that is followed from row to row, with intervals of segments as short as the proof needs them."""
 
     def __init__(self, solver: TrussSolver, rows: Array, lengths: Array, time: Array) -> None:
@@ -267,7 +268,7 @@ class _Followed:
         start, width = np.zeros(len(segment)), 1.0
         first, last = self.rows[:-1], self.rows[1:]
         known = len(segment)
-        for _ in range(_GREATEST_DEPTH):
+        for _ in range(GREATEST_DEPTH):
             closed = np.zeros(len(segment), dtype=np.bool_)
             size = max(1, _CHUNK // (3 * len(self.solver.arm.members) ** 2))
             for k in range(0, len(segment), size):

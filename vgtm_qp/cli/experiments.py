@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -25,6 +25,9 @@ from vgtm_qp.cli.output import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vgtm_qp.bench.scenes import BenchScene
     from vgtm_qp.step.step import Step
 
 _several = partial(Switch, consume_multiple=True)
@@ -217,8 +220,8 @@ def bench(
     pinned = pin_threads()
     from vgtm_qp.bench.contestants import BASELINES
     from vgtm_qp.bench.report import compare as compared
-    from vgtm_qp.bench.report import load_document, measure
-    from vgtm_qp.bench.scenes import BAYS, KINDS, BenchScene, make_scenes
+    from vgtm_qp.bench.report import load_document
+    from vgtm_qp.bench.scenes import BAYS, KINDS, make_scenes
     from vgtm_qp.bench.tables import render
 
     if figure is not None:
@@ -226,27 +229,40 @@ def bench(
     older = None if compare is None else load_document(compare)
     kinds = scene or (("cubes",) if bays else KINDS)
     scenes = make_scenes(kinds, bays or BAYS, tracking, distance)
+    rivals = BASELINES if baselines is None else dict.fromkeys(baselines)
+    found = _measured(scenes, tuple(rivals), seconds=seconds, steps=steps, cold=cold, pinned=pinned)
+    if older is not None:
+        found["compared"] = compared(found, older)
+    if figure is not None:
+        _draw_phases(found, figure)
+    answer(found, render(found), as_json=json)
+
+
+def _measured(
+    scenes: Sequence[BenchScene],
+    baselines: tuple[BaselineName, ...],
+    *,
+    seconds: float,
+    steps: int,
+    cold: bool,
+    pinned: bool,
+) -> dict[str, Any]:
+    """Return what is measured in the scenes, and tell which one is under way."""
+    from vgtm_qp.bench.report import measure
+
     if not pinned:
         note("vgtm bench: BLAS was loaded before its threads could be held to one")
 
     def follow(under_way: BenchScene) -> None:
         note(f"{scenes.index(under_way) + 1}/{len(scenes)} {under_way.name}")
 
-    found = measure(
-        scenes,
-        tuple(BASELINES) if baselines is None else tuple(dict.fromkeys(baselines)),
-        seconds=seconds,
-        steps=steps,
-        cold=cold,
-        pinned=pinned,
-        progress=follow,
-    )
-    if older is not None:
-        found["compared"] = compared(found, older)
-    if figure is not None:
-        from vgtm_qp.bench.chart import plot_phases
-        from vgtm_qp.view.figure import save_figure
+    return measure(scenes, baselines, seconds=seconds, steps=steps, cold=cold, pinned=pinned, progress=follow)
 
-        save_figure(plot_phases(found), figure)
-        note(f"written: {figure}")
-    answer(found, render(found), as_json=json)
+
+def _draw_phases(found: dict[str, Any], file: Path) -> None:
+    """Draw the time of a step by phase into a file."""
+    from vgtm_qp.bench.chart import plot_phases
+    from vgtm_qp.view.figure import save_figure
+
+    save_figure(plot_phases(found), file)
+    note(f"written: {file}")

@@ -35,21 +35,22 @@ def html_text(maneuver: Result) -> str:
             scene.add_path("/tip path", tip)
         scene.look(camera_for(drawing, nodes, tip))
         top = nodes[..., 2].max() + 0.12 * np.ptp(nodes[..., 2])
-        read_out = server.scene.add_label(
+        label = server.scene.add_label(
             "/read-out", "", position=(*nodes[0].mean(axis=0)[:2], top), anchor="bottom-center"
         )
         recording = server.get_scene_serializer()
         pause = min(float(time[-1] - time[0]), _LONGEST) / max(len(at) - 1, 1)
         for k, (moment, row) in enumerate(zip(at, rows, strict=True)):
             scene.move(moving[k], curves[k], float(moment), coarse=True)
-            read_out.text = _read_out(maneuver, float(moment), float(maneuver.clearance[row]), off[row])
+            label.text = read_out(maneuver, float(moment), float(maneuver.clearance[row]), off[row])
             recording.insert_sleep(pause)
         page: str = recording.as_html()
     title = escape(f"{drawing.name or 'maneuver'} ({maneuver.status})")
     return page.replace("<title>Viser</title>", f"<title>{title}</title>", 1)
 
 
-def _read_out(maneuver: Result, time: float, clearance: float, off: str = "") -> str:
+def read_out(maneuver: Result, time: float, clearance: float, off: str = "") -> str:
+    """Return the line over the arm: time, clearance, what else is told of the state, and why the maneuver ends."""
     text = f"{time:.1f} s"
     if np.isfinite(clearance):
         text += f"   clearance {1000.0 * clearance:.0f} mm"

@@ -23,9 +23,10 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec"""
 
-_JOINT_STATE = _HEADER.format(own="string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort")
+JOINT_STATE = _HEADER.format(own="string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort")
+"""Definition of sensor_msgs/msg/JointState, as bags have it."""
 
-_JOINT_TRAJECTORY = (
+JOINT_TRAJECTORY = (
     _HEADER.format(own="string[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points")
     + """
 ================================================================================
@@ -40,6 +41,7 @@ MSG: builtin_interfaces/Duration
 int32 sec
 uint32 nanosec"""
 )
+"""Definition of trajectory_msgs/msg/JointTrajectory."""
 
 
 def step_rates(maneuver: Result) -> Array:
@@ -115,8 +117,8 @@ def mcap_bytes(maneuver: Result) -> bytes:
         raise MissingExtraError("export", "mcap-ros2-support") from None
     trajectory, file = joint_trajectory(maneuver), BytesIO()
     with Writer(file) as writer:
-        state_schema = writer.register_msgdef("sensor_msgs/msg/JointState", _JOINT_STATE)
-        trajectory_schema = writer.register_msgdef("trajectory_msgs/msg/JointTrajectory", _JOINT_TRAJECTORY)
+        state_schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+        trajectory_schema = writer.register_msgdef("trajectory_msgs/msg/JointTrajectory", JOINT_TRAJECTORY)
         first = _nanoseconds(float(maneuver.time[0]))
         writer.write_message("/joint_trajectory", trajectory_schema, trajectory, first, first)
         for k, (time, point) in enumerate(zip(maneuver.time, trajectory["points"], strict=True)):

@@ -40,7 +40,7 @@ _NEXT = 2.0
 """If no pair is near: distance below which pairs are still evaluated, in one call, over the limit."""
 
 
-class _Code(IntEnum):
+class _FollowCode(IntEnum):
     """What ``follow`` of ``watch.c`` returns."""
 
     DONE, NO_VALUE, TOO_FAR, NOT_PROVEN = range(4)
@@ -189,17 +189,17 @@ class Watch:
             self._pairs[k] = pairs.address()
             self._floors[k], self._limits[k] = floors[pairs.group.is_self], reach[pairs.group.is_self]
         way.set(pieces=len(places) - 1, places=places)
-        code = _Code(way.call("follow"))
-        if code is _Code.TOO_FAR:
+        code = _FollowCode(way.call("follow"))
+        if code is _FollowCode.TOO_FAR:
             raise GeometryError("node positions must be finite numbers")
-        if code is _Code.NO_VALUE:
+        if code is _FollowCode.NO_VALUE:
             self._way, self._at = None, b""
             raise EvaluationError("the distance of a pair has no value")
         done = way.data.done
         self._place = places[done]
         self._at = self._place.tobytes()
         self._reach = reach if done == len(places) - 1 else floors
-        return code is _Code.DONE
+        return code is _FollowCode.DONE
 
     def _start(self, X: Array) -> Program:
         """List all pairs, with their distances at `X`."""

@@ -14,6 +14,7 @@ from vgtm_qp.arm.arm import Pose
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
+from vgtm_qp.qp.layout import curve_record
 from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, recorded_versions
 from vgtm_qp.step.step import Step
 from vgtm_qp.step.stops import Stop
@@ -89,7 +90,7 @@ class Log:
             "schema_version": SCHEMA_VERSION,
             "problem": problem.to_dict(),
             "arm": setup.arm.record(),
-            "curve": setup.layout.record(),
+            "curve": curve_record(setup.layout),
             "status": "solved" if stop is None else "blocked",
             # From the last whole row: an interrupt may have come before the next one.
             "reached": float(self._rows["progress"][-1]),

@@ -73,7 +73,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     mistakes = check_problem(problem, resolver.setup)
     if mistakes:
         raise problem.error(mistakes)
-    attempt = _Attempt(problem, resolver)
+    attempt = ManeuverAttempt(problem, resolver)
     setup_time = perf_counter() - started
 
     way = ""
@@ -82,7 +82,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
             stop = attempt.run(progress)
             if stop is not None:
                 way, attempt, stop = _retry(problem, attempt, stop, progress)
-                stop = None if stop is None else replace(stop, remedies=_tried(attempt, stop))
+                stop = None if stop is None else replace(stop, remedies=helpful_remedies(attempt, stop))
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
     maneuver = attempt.log.maneuver(
@@ -143,7 +143,7 @@ def compile_steps(problem: Problem) -> None:
     finish_compiling()
 
 
-class _Attempt:
+class ManeuverAttempt:
     """A resolver on its way along the path of a problem, and the log of its states."""
 
     def __init__(self, problem: Problem, resolver: Resolver) -> None:
@@ -232,17 +232,17 @@ class _Attempt:
 
 
 def _retry(
-    problem: Problem, first: _Attempt, stop: Stop, progress: Progress | None
-) -> tuple[str, _Attempt, Stop | None]:
+    problem: Problem, first: ManeuverAttempt, stop: Stop, progress: Progress | None
+) -> tuple[str, ManeuverAttempt, Stop | None]:
     """Return name, attempt and stop of the retry that gets furthest; the name is empty for the first attempt."""
     arm, state = first.resolver.setup.arm, first.resolver.state
     heading = first.plan.path.at(first.value).velocity
-    best: tuple[str, _Attempt, Stop | None] = ("", first, stop)
+    best: tuple[str, ManeuverAttempt, Stop | None] = ("", first, stop)
     for name, other in retries(problem, DeadEnd(stop, state.control_vertices, arm.height, heading)):
         resolver = first.resolver.again(other)
         if resolver is None:
             break
-        attempt = _Attempt(other, resolver)
+        attempt = ManeuverAttempt(other, resolver)
         found = attempt.run(progress)
         if problem.method.gives_way and not other.method.gives_way and found is not None:
             way, attempt, found = _retry(other, attempt, found, progress)
@@ -254,7 +254,7 @@ def _retry(
     return best
 
 
-def _tried(attempt: _Attempt, stop: Stop) -> tuple[Remedy, ...]:
+def helpful_remedies(attempt: ManeuverAttempt, stop: Stop) -> tuple[Remedy, ...]:
     """Return the remedies of a stop with which the arm goes on, enlarged as far as needed."""
     enough = (next(filter(attempt.goes_on, map(remedy.times, _MORE)), None) for remedy in stop.remedies)
     return tuple(remedy for remedy in enough if remedy is not None)

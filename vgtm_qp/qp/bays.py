@@ -96,7 +96,7 @@ class Bay(NamedTuple):
     spare: slice
 
 
-class _Followed(NamedTuple):
+class _BayMotion(NamedTuple):
     """The displacements of a bay's own columns: ``known`` (c, size + 1) - ``gain`` (c, b) times those before.
 
     ``free`` (c, c - r) are the displacements by its spare motions.
@@ -164,7 +164,7 @@ class _Group:
                 places.append((b * self._shape[1] + i) * width + column_place[b][column])
         self._kept, self._places = np.array(kept), np.array(places)
 
-    def solved(self, values: Array, missing: Array) -> list[_Followed]:
+    def solved(self, values: Array, missing: Array) -> list[_BayMotion]:
         """Return each bay's displacements over curve and earlier bays, for right-hand sides `missing`."""
         size = int(np.prod(self._shape))
         flat = np.bincount(self._places, weights=values[self._kept], minlength=size)
@@ -179,7 +179,7 @@ class _Group:
             answer, free = Q[:, :, :equations] @ np.linalg.solve(lower, right), Q[:, :, equations:]
         columns = missing.shape[1]
         return [
-            _Followed(bay, answer[b, :, :columns], answer[b, :, columns:], free[b])
+            _BayMotion(bay, answer[b, :, :columns], answer[b, :, columns:], free[b])
             for b, bay in enumerate(self._bays)
         ]
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.native import Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
@@ -53,7 +54,7 @@ _ROOM, _SLOTS = 24, 4
 """Capacity at first: rows of clearance, and nodes of each."""
 
 
-class _Code(IntEnum):
+class _FusedCode(IntEnum):
     """Return codes of the functions of ``fused.c``."""
 
     DONE = 0
@@ -89,10 +90,10 @@ class FusedSolver:
         solver: DenseSolver = DAQP,
         *,
         compiled: bool = True,
-        workspace: _Workspace | None = None,
+        workspace: _FusedWorkspace | None = None,
     ) -> None:
         self.layout = layout
-        self._workspace = _Workspace(layout, solver, compiled) if workspace is None else workspace
+        self._workspace = _FusedWorkspace(layout, solver, compiled) if workspace is None else workspace
         self.solver = self._workspace.solver
         self._pull = np.zeros((layout.vertices, 3))
         weight = np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
@@ -110,6 +111,11 @@ class FusedSolver:
     def is_ready(self) -> bool:
         """Whether the C is compiled; always false if it cannot be."""
         return self._workspace.is_ready
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """What the C calls: the functions of the rows, of what settling misses, and of the closing."""
+        return self._workspace.kernels
 
     def load(self, asked: StepInput) -> None:
         """Set the state, the goal and the boxes of the next QP."""
@@ -150,9 +156,9 @@ class FusedSolver:
         """
         near, work = self._workspace.take(clearance), self._workspace
         code, data = work.check(work.call("move", TOLERANCE)), work.data
-        if code == _Code.INACCURATE:
+        if code == _FusedCode.INACCURATE:
             refuse_large(data.primal, data.dual, work.status)
-        solution, is_settled = self._solution(work.x, near, _NOWHERE, _NOWHERE), code == _Code.DONE
+        solution, is_settled = self._solution(work.x, near, _NOWHERE, _NOWHERE), code == _FusedCode.DONE
         points = work.points if is_settled else work.started_points
         q, vertices = work.started.reshape(work.shape).copy(), points.reshape(-1, 3).copy()
         torsion = torsion + solution.torsion if len(torsion) else torsion
@@ -172,7 +178,7 @@ class FusedSolver:
         inputs[4][:], inputs[5][:] = lower, upper
         inputs[8][:], inputs[9][:] = goal.position, goal.rotation.T.reshape(-1)
         work.gone[0] = 0.0
-        if work.call("settle") != _Code.DONE:
+        if work.call("settle") != _FusedCode.DONE:
             return None
         return Settled(work.closed(), CurvePoint(work.points.reshape(-1, 3).copy(), curve.torsion))
 
@@ -212,7 +218,7 @@ class FusedSolver:
         )
 
 
-class _Workspace:
+class _FusedWorkspace:
     """The arrays of the C, and the kernels that it calls."""
 
     hessian: Array
@@ -241,13 +247,18 @@ class _Workspace:
         """See :class:`FusedSolver`."""
         if self._is_ready is None:
             if not self._source.ask():
-                for kernel in (self.condense, self.missing, self.close):
+                for kernel in self.kernels:
                     kernel.prepare()
                 return False
             self._is_ready = self._source.library is not None
             if self._is_ready:
                 self._start()
         return self._is_ready
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """See :class:`FusedSolver`."""
+        return self.condense, self.missing, self.close
 
     @property
     def data(self) -> Any:
@@ -268,9 +279,9 @@ class _Workspace:
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
-        if code == _Code.INFEASIBLE:
+        if code == _FusedCode.INFEASIBLE:
             raise InfeasibleStepError("the hard rows of the step contradict one another")
-        if code == _Code.NO_VALUE:
+        if code == _FusedCode.NO_VALUE:
             raise EvaluationError("the rows of the step have no value at its configuration")
         return code
 
@@ -285,10 +296,10 @@ class _Workspace:
             )
         except SolverError as error:
             self._failure = error
-            return _Code.FAILED
+            return _FusedCode.FAILED
         self.x[:], self.multipliers[:count] = answer.x, answer.multipliers
         self._other_status, self.data.iterations = answer.status, answer.iterations
-        return _Code.DONE
+        return _FusedCode.DONE
 
     def use(self, goals: dict[str, Array]) -> None:
         """Set the goals of control vertices for the next QPs."""
@@ -347,32 +358,10 @@ class _Workspace:
             out[6].reshape(-1, 3),
             out[7],
         )
-        place, of, share, by_nodes = _places(layout)
         work = nodes + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
-        self._program, arm = Program(SOURCE, "Fused"), layout.arm
+        self._program = Program(SOURCE, "Fused")
+        self._program.set(**_numbers(layout), **_daqp(), unknowns=size)
         self._program.set(
-            unknowns=size,
-            actuators=self.actuators,
-            nodes=nodes,
-            squares=rows,
-            tips=len(layout.tip_rows),
-            hard=len(layout.hard),
-            legs=len(layout.legs),
-            vertices=layout.vertices,
-            torsion=layout.torsion,
-            coordinates=self.q.size,
-            by_nodes=int(by_nodes),
-            scale=1.0 / float(np.sqrt(layout.weights.node_rate)),
-            actuator_weight=layout.actuator_weights,
-            at_bound=AT_BOUND * arm.fineness,
-            left=LEFT * arm.fineness,
-            levers=layout.levers,
-            worst_condition=WORST_CONDITION,
-            settling_steps=SETTLING_STEPS,
-            closing_steps=MOST_STEPS,
-            too_far=TOO_FAR * arm.unit,
-            feasibility=DAQP.accuracy * arm.fineness,
-            **_daqp(),
             stack=out[0],
             linear=out[4],
             curvature=out[5],
@@ -380,12 +369,6 @@ class _Workspace:
             normal=out[7],
             leg_rows=out[8],
             leg_lower=out[9],
-            hard_at=(nodes + layout.hard).astype(np.int32),
-            places=len(place),
-            place=place,
-            of=of,
-            share=share,
-            node_column=layout.node_column.astype(np.int32),
             hessian=self.hessian,
             gradient=self.gradient,
             x=self.x,
@@ -435,6 +418,40 @@ class _Workspace:
             multipliers=self.multipliers,
             condense=self.condense,
         )
+
+
+def _numbers(layout: Layout) -> dict[str, Any]:
+    """Return by field what the C knows of a layout: its sizes, the places of its rows, and tolerances."""
+    arm, nodes = layout.arm, layout.node_columns
+    place, of, share, by_nodes = _places(layout)
+    return {
+        "actuators": len(arm.actuators),
+        "nodes": nodes,
+        "squares": layout.least_squares,
+        "tips": len(layout.tip_rows),
+        "hard": len(layout.hard),
+        "legs": len(layout.legs),
+        "vertices": layout.vertices,
+        "torsion": layout.torsion,
+        "coordinates": arm.home_configuration.size,
+        "by_nodes": int(by_nodes),
+        "scale": 1.0 / float(np.sqrt(layout.weights.node_rate)),
+        "actuator_weight": layout.actuator_weights,
+        "at_bound": AT_BOUND * arm.fineness,
+        "left": LEFT * arm.fineness,
+        "levers": layout.levers,
+        "worst_condition": WORST_CONDITION,
+        "settling_steps": SETTLING_STEPS,
+        "closing_steps": MOST_STEPS,
+        "too_far": TOO_FAR * arm.unit,
+        "feasibility": DAQP.accuracy * arm.fineness,
+        "hard_at": (nodes + layout.hard).astype(np.int32),
+        "places": len(place),
+        "place": place,
+        "of": of,
+        "share": share,
+        "node_column": layout.node_column.astype(np.int32),
+    }
 
 
 def _places(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32], Array, bool]:

@@ -277,35 +277,6 @@ class Layout:
         """Least length of a leg with a given direction, m; see ``_LEAST_LEG``."""
         return _LEAST_LEG * self.arm.height / max(self.vertices - 1, 1)
 
-    def record(self) -> dict[str, Any] | None:
-        """Return the curve and its stations as JSON data for verification; None without a curve.
-
-        Keys: ``breaks``, ``extraction``, ``nodes`` and ``by_arc_length`` of the curve, see ``CurveFamily``
-        and ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``,
-        whether stations are kept on the curve; ``frames``, the home frames of stations whose normals are kept
-        along the curve, else empty; ``start`` and ``start_weights``, nodes and weights of the base, and
-        ``normal``, its normal at home; ``ends_at_tip``, ``ends_along_tip``.
-        """
-        if self.shape is None:
-            return None
-        stations, family = self.arm.stations, self.shape.family
-        used = np.flatnonzero(stations.weights[self.tracked].any(axis=0))
-        return {
-            "breaks": family.breaks.tolist(),
-            "extraction": family.extraction.tolist(),
-            "nodes": self.shape.nodes.tolist(),
-            "by_arc_length": self.shape.by_arc_length,
-            "stations": stations.nodes[self.tracked][:, used].tolist(),
-            "weights": stations.weights[self.tracked][:, used].tolist(),
-            "held": self.hard_tracking,
-            "frames": stations.frames[self.tracked].tolist() if self.hard_turns else [],
-            "start": stations.nodes[0, used].tolist(),
-            "start_weights": stations.weights[0, used].tolist(),
-            "normal": stations.frames[0][:, 2].tolist(),
-            "ends_at_tip": self.ends_at_tip,
-            "ends_along_tip": self.ends_along_tip,
-        }
-
     @cached_property
     def vertex_hessian(self) -> Array:
         """(V, V) Hessian, per axis, of the objectives in the control vertices alone."""
@@ -345,3 +316,33 @@ class Layout:
             np.diff(np.eye(self.vertices), n=2, axis=0) if self.vertices > 2 else np.zeros((0, self.vertices))
         )
         return np.asarray(second.T @ second)
+
+
+def curve_record(layout: Layout) -> dict[str, Any] | None:
+    """Return the curve of a layout and its stations as JSON data for verification; None without a curve.
+
+    Keys: ``breaks``, ``extraction``, ``nodes`` and ``by_arc_length`` of the curve, see ``CurveFamily`` and
+    ``CurveShape``; ``stations`` and ``weights``, the nodes whose mean each station is; ``held``, whether they are
+    kept on the curve, and ``frames``, those of the stations at home whose normals are kept along it, or none;
+    ``start``, ``start_weights``, ``normal``, the same of the base and its normal at home; ``ends_at_tip``,
+    ``ends_along_tip``.
+    """
+    if layout.shape is None:
+        return None
+    stations, family = layout.arm.stations, layout.shape.family
+    used = np.flatnonzero(stations.weights[layout.tracked].any(axis=0))
+    return {
+        "breaks": family.breaks.tolist(),
+        "extraction": family.extraction.tolist(),
+        "nodes": layout.shape.nodes.tolist(),
+        "by_arc_length": layout.shape.by_arc_length,
+        "stations": stations.nodes[layout.tracked][:, used].tolist(),
+        "weights": stations.weights[layout.tracked][:, used].tolist(),
+        "held": layout.hard_tracking,
+        "frames": stations.frames[layout.tracked].tolist() if layout.hard_turns else [],
+        "start": stations.nodes[0, used].tolist(),
+        "start_weights": stations.weights[0, used].tolist(),
+        "normal": stations.frames[0][:, 2].tolist(),
+        "ends_at_tip": layout.ends_at_tip,
+        "ends_along_tip": layout.ends_along_tip,
+    }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ _SPARE = 8
 
 _SETTINGS = {"verbose": False, "polishing": True, "check_termination": 10}
 
-_FIRST = {
+FIRST = {
     "eps_abs": 1e-6,
     "eps_rel": 1e-6,
     "eps_prim_inf": 1e-9,
@@ -38,7 +38,7 @@ _SELDOM = {
     "max_iter": 30_000,
     "adaptive_rho_interval": 2_000,
 }
-_AGAIN = ({**_SELDOM, "scaling": 0, "rho": 0.03}, {**_SELDOM, "scaling": 10, "rho": 1.0})
+AGAIN = ({**_SELDOM, "scaling": 0, "rho": 0.03}, {**_SELDOM, "scaling": 10, "rho": 1.0})
 """Settings of further tries, for QPs on which polishing failed or the step size `rho` went to and fro.
 
 On 43 such QPs, infeasible ones among them, the first settings decided all, alone of all that were tried. The
@@ -54,13 +54,21 @@ class Osqp:
 
     All rows of the workspace are dense. Unused rows are zero and have infinite bounds, so that the sparsity
     does not change when near pairs come and go.
+
+    Parameters
+    ----------
+    first, again
+        Settings of the first try, and of further ones where its answer is not accurate.
     """
 
     accuracy = 1e-8
 
-    def __init__(self) -> None:
-        self._workspace: _Workspace | None = None
-        self._further: list[_Workspace] = []
+    def __init__(
+        self, first: Mapping[str, float] = FIRST, again: Sequence[Mapping[str, float]] = AGAIN
+    ) -> None:
+        self._first, self._after = first, again
+        self._workspace: _OsqpWorkspace | None = None
+        self._further: list[_OsqpWorkspace] = []
 
     def ask(
         self,
@@ -90,17 +98,17 @@ class Osqp:
         self._workspace = workspace
         return answer
 
-    def _workspace_for(self, size: int, bounded: int, rows: int) -> _Workspace:
+    def _workspace_for(self, size: int, bounded: int, rows: int) -> _OsqpWorkspace:
         """Return the workspace in use, a larger one that starts from its answer, or an unused one."""
         old = self._workspace
         if old is None or old.sizes[:2] != (size, bounded):
-            return _Workspace(size, bounded, rows + _SPARE)
+            return _OsqpWorkspace(size, bounded, rows + _SPARE, self._first)
         if rows <= old.sizes[2]:
             return old
-        return _Workspace(size, bounded, max(rows, 2 * old.sizes[2]), start=old.last)
+        return _OsqpWorkspace(size, bounded, max(rows, 2 * old.sizes[2]), self._first, start=old.last)
 
     def _again(
-        self, workspace: _Workspace, answer: DenseAnswer | None, off: float, *qp: Array
+        self, workspace: _OsqpWorkspace, answer: DenseAnswer | None, off: float, *qp: Array
     ) -> DenseAnswer:
         """Return an accurate answer by further tries after one of residual `off`; the next QP starts there.
 
@@ -110,7 +118,7 @@ class Osqp:
             There is no answer, or none is accurate.
         """
         if not self._further or self._further[0].sizes != workspace.sizes:
-            self._further = [_Workspace(*workspace.sizes, settings) for settings in _AGAIN]
+            self._further = [_OsqpWorkspace(*workspace.sizes, settings) for settings in self._after]
         for further in self._further:
             further.restart(answer if off <= _NEAR else None)
             found = further.solved(*qp)
@@ -126,7 +134,7 @@ class Osqp:
         return answer
 
 
-class _Workspace:
+class _OsqpWorkspace:
     """OSQP with room for QPs of `size` unknowns, the first `bounded` of them with bounds, and `capacity` rows.
 
     Its constraints are an identity over the unknowns with bounds, and dense rows below it.
@@ -144,7 +152,7 @@ class _Workspace:
         size: int,
         bounded: int,
         capacity: int,
-        settings: Mapping[str, float] = _FIRST,
+        settings: Mapping[str, float],
         *,
         start: DenseAnswer | None = None,
     ) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import CurveError, EvaluationError, SolverError
 from vgtm_qp.qp.answer import Accuracy, Closed, Move
+from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
@@ -213,9 +214,7 @@ class Attempt:
         move: Move | None = None
         covered = 1.0
 
-        def blocked(
-            reason: str, failure: FailedStepError | None = None, *, solver_failed: bool = False
-        ) -> Step:
+        def blocked(reason: str, failure: FailedStepError | None = None, solver_failed: bool = False) -> Step:
             kept = Step(StepStatus.BLOCKED, 0.0, state, reason, count, solver_failed)
             return replace(kept, solution=first and first.solution, rows=rows, failure=failure)
 
@@ -235,27 +234,17 @@ class Attempt:
             self.qps += 1
             try:
                 move = engine.move(asked, self.accuracy, phases.add)
-            except AnswerError as error:
-                return blocked(str(error), error, solver_failed=True)
-            except EvaluationError as error:
-                return blocked(str(error), solver_failed=True)
-            except InfeasibleStepError as error:
-                return blocked("no displacement keeps all limits and clearances", error)
             except SolverError as error:
-                return blocked(str(error))
+                return blocked(*_told(error))
             finally:
                 phases.add("correction")
             if first is None:
                 first, rows = move, asked.rows
             q = move.q
-            is_finite = move.closed is not None or np.isfinite(q).all()
-            if not move.furthest < _TOO_FAR * self._arm.height or not is_finite:
-                return blocked("singular pose")
-            leap = np.abs(move.vertices - state.control_vertices).max(initial=0.0)
-            if not leap < _LEAP * self._arm.height:
-                return blocked("the curve moves too far in one step")
-            # A pair that a correction pushed apart must stay listed for the next one, or the two would
-            # alternate.
+            beyond = self._leap(state, move)
+            if beyond:
+                return blocked(beyond)
+            # A pair that one correction pushed apart must stay listed for the next, or two corrections alternate.
             reach = max(reach, move.furthest)
             if move.closed is None:
                 continue
@@ -265,9 +254,7 @@ class Attempt:
             q, closed = move.closed.q, move.closed
             # Linearised rows leave a small gap between the curve's end and the tip, which is closed here.
             vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
-            if len(engine.layout.legs) and engine.layout.is_reversed(
-                vertices, base_frame(self._arm, target.base)[:, 2], closed.tip_rotation
-            ):
+            if self._reverses(engine.layout, vertices, target, closed):
                 return blocked("the curve would reverse where it begins or ends")
             gap = self._setup.gap(q, vertices, move.torsion, target.base)
             if engine.layout.hard_tracking and not gap <= self.accuracy.tracking:
@@ -276,16 +263,13 @@ class Attempt:
             phases.add("acceptance")
             if after is None:
                 continue
-            if not separation.deviation(state.q, q) < _DEVIATION * self._arm.height:
-                return blocked("the arm turns too far in one step")
-            if self._has_limit and (too_long := self._too_long(self._arm.nodes(q) - state.nodes)):
-                return blocked(too_long)
+            beyond = self._stride(state, q)
+            if beyond:
+                return blocked(beyond)
             if report.certified:
                 then = state.next(self._arm, target.duration, closed, vertices, move.torsion, after)
                 progress = covered * move.progress
-                status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
-                told: dict[str, Any] = {"gave_way": self._gave_way(gap), "gap": gap}
-                return Step(status, progress, then, "", count, solution=first.solution, rows=rows, **told)
+                return self._accepted(then, progress, gap, qps=count, solution=first.solution, rows=rows)
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")
@@ -298,6 +282,32 @@ class Attempt:
     def _is_cut_short(self, move: Move) -> bool:
         """Return whether the answer of a first QP covers a part of the piece, and not the whole of it."""
         return self._setup.tip_mode == "scaled" and _NOTHING < move.progress < WHOLE
+
+    def _leap(self, state: State, move: Move) -> str:
+        """Return why the QP's answer leads too far from `state` for its rows; empty if it does not."""
+        height = self._arm.height
+        is_finite = move.closed is not None or np.isfinite(move.q).all()
+        if not move.furthest < _TOO_FAR * height or not is_finite:
+            return "singular pose"
+        leap = np.abs(move.vertices - state.control_vertices).max(initial=0.0)
+        return "" if leap < _LEAP * height else "the curve moves too far in one step"
+
+    def _stride(self, state: State, q: Array) -> str:
+        """Return why the motion from `state` to `q` is too long for one step; empty if it is not."""
+        if not self.separation.deviation(state.q, q) < _DEVIATION * self._arm.height:
+            return "the arm turns too far in one step"
+        return self._too_long(self._arm.nodes(q) - state.nodes) if self._has_limit else ""
+
+    def _reverses(self, layout: Layout, vertices: Array, target: Target, closed: Closed) -> bool:
+        """Return whether a curve of vertices (V, 3) begins against the base's normal, or ends against the tip's."""
+        if not len(layout.legs):
+            return False
+        return layout.is_reversed(vertices, base_frame(self._arm, target.base)[:, 2], closed.tip_rotation)
+
+    def _accepted(self, state: State, progress: float, gap: float, **of_qps: Any) -> Step:
+        """Return the step to a proven `state` with the `gap` of its stations; `of_qps` are its fields of the QPs."""
+        status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
+        return Step(status, progress, state, "", gave_way=self._gave_way(gap), gap=gap, **of_qps)
 
     def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
         """Return the flaw of the configuration of a `move` from `state`, computed again, or nothing."""
@@ -312,3 +322,12 @@ class Attempt:
         if last == 0.0 or target.base is not None:
             return self._influence
         return max(last, abs(target.end - target.start) * float(np.abs(goal.velocity).max()))
+
+
+def _told(error: SolverError) -> tuple[str, FailedStepError | None, bool]:
+    """Return why an error of a QP ends an attempt, that error if it carries the QP, and whether the solver failed."""
+    if isinstance(error, AnswerError):
+        return str(error), error, True
+    if isinstance(error, InfeasibleStepError):
+        return "no displacement keeps all limits and clearances", error, False
+    return str(error), None, isinstance(error, EvaluationError)

@@ -81,7 +81,7 @@ def run(seed: int, number: int, steps: int, arms: Arms = "trusses") -> Row:
     seconds = process_time() - started
     if not targets:
         return {**found, **counts, "failures": [], "seconds": seconds}
-    certificate = verify(log.maneuver(_along(problem, targets), Stop(StopKind.INTERRUPTED)))
+    certificate = verify(log.maneuver(problem_along(problem, targets), Stop(StopKind.INTERRUPTED)))
     return {**found, **counts, "failures": certificate.failures(), "seconds": seconds}
 
 
@@ -139,8 +139,8 @@ def _pose(resolver: Resolver) -> Pose:
     return Pose(*resolver.tip())
 
 
-def _along(problem: Problem, targets: Sequence[Pose]) -> Problem:
-    """Return the problem with the path of a loop, which is known only after it."""
+def problem_along(problem: Problem, targets: Sequence[Pose]) -> Problem:
+    """Return the problem with the path of a loop through `targets`, which is known only after it."""
     track = problem.to_dict()["end_effector"]["track"]
     waypoints = [
         {

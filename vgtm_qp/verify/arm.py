@@ -19,7 +19,7 @@ _TOLERANCE = 1e-9
 """Tolerance of recorded lengths against those of the home nodes, m."""
 
 _DENSE_UNKNOWNS = 300
-"""Number of free coordinates above which singular values come from a sparse factorisation."""
+"""Number of free coordinates up to which singular values by dense matrices cost less."""
 
 
 class RecordedArm:
@@ -182,11 +182,14 @@ class RecordedArm:
             gradient[..., e, c, axis] = (longer - shorter) / (2.0 * step)
         return gradient.reshape(*gradient.shape[:-3], 6, 3), self.corners.reshape(-1, 6)
 
-    def singular_values(self, nodes: Array) -> tuple[float, float, float] | None:
+    def singular_values(
+        self, nodes: Array, *, most_dense: int = _DENSE_UNKNOWNS
+    ) -> tuple[float, float, float] | None:
         """Return the least singular value of the length Jacobian, and the least and greatest of the tip's.
 
         The length Jacobian is d lengths / d (free node positions), square in a determinate truss; the tip's
-        is d tip position / d actuated lengths. None if the truss is not determinate or has no actuator.
+        is d tip position / d actuated lengths. None if the truss is not determinate or has no actuator. With more
+        than `most_dense` free coordinates they come from a sparse factorisation.
         """
         from scipy.sparse import csc_array
 
@@ -206,7 +209,7 @@ class RecordedArm:
             if column[node] >= 0:
                 tip[3 * column[node] : 3 * column[node] + 3] += weight * np.eye(3)
         J = csc_array((values, (rows, columns)), shape=(unknowns, unknowns))
-        if unknowns > _DENSE_UNKNOWNS:
+        if unknowns > most_dense:
             return self._sparse_values(J, tip)
         dense = J.toarray()
         least = float(np.linalg.svd(dense, compute_uv=False)[-1])

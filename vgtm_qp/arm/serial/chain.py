@@ -14,7 +14,7 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.problem.arm import ArmBody, ArmTable
 from vgtm_qp.rotation import rotation_from_vector
 
-_UNROLLED = 20
+UNROLLED = 20
 """Number of joints up to which their functions are written out one after another: faster, but long in C."""
 
 _LEAST_AXIS = 1e-3
@@ -161,7 +161,7 @@ class SerialChain:
         arguments = [q, axes, positions, rotations, tip, points]
         both = ca.Function("chain", arguments, [every, jacobian])
         alone = ca.Function("chain_nodes", arguments, [every])
-        return (alone, both) if count > _UNROLLED else (alone.expand(), both.expand())
+        return (alone, both) if count > UNROLLED else (alone.expand(), both.expand())
 
     def attitude(self, joints: Array, turn: Sequence[float]) -> Array:
         """Return (3, 3) the rotation, in the base's frame, of the last frame turned by the vector `turn`."""

@@ -11,8 +11,8 @@ from vgtm_qp.arm.arm import Bays
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 
-_WIDEST = 200
-"""Greatest number of diagonals for which banded LU is faster than sparse LU."""
+WIDEST = 200
+"""Number of diagonals from which on sparse LU is faster than banded LU."""
 
 _SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
@@ -29,10 +29,17 @@ class LengthSolver:
         Members whose lengths are given; all by default.
     stations : (K, 3) int, (K, 3), optional
         Nodes and weights of stations whose displacements are given too.
+    widest : int, optional
+        Number of diagonals from which on the LU is sparse, not banded.
     """
 
     def __init__(
-        self, bays: Bays, members: Index | None = None, stations: tuple[Index, Array] | None = None
+        self,
+        bays: Bays,
+        members: Index | None = None,
+        stations: tuple[Index, Array] | None = None,
+        *,
+        widest: int = WIDEST,
     ) -> None:
         scatter, size = bays.scatter, bays.scatter.shape[1]
         members = np.arange(bays.member_count) if members is None else members
@@ -58,6 +65,7 @@ class LengthSolver:
         self._width, self._size = 2 * self._below + self._above + 1, size
         self._entry = columns * self._width + self._below + self._above + rows - columns
         self._places = rows, columns
+        self._is_wide = self._below + self._above >= widest
 
     def solve(self, gradient: Array, error: Array) -> Array:
         """Return displacements of the free nodes (N - N_c, 3), m.
@@ -76,7 +84,7 @@ class LengthSolver:
         """
         values = np.concatenate([gradient.reshape(-1)[self._flat], self._weights])
         size, known = self._size, error[self._order]
-        if self._below + self._above >= _WIDEST:
+        if self._is_wide:
             try:
                 step = splu(sparse.csc_matrix((values, self._places), shape=(size, size))).solve(known)
             except RuntimeError as reason:

@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import nearest
 from vgtm_qp.problem.fields import quoted
+from vgtm_qp.problem.urdf.frames import AT_REST, Frame, Origins, after, inverse
 from vgtm_qp.problem.urdf.shapes import Shapes
 from vgtm_qp.problem.urdf.text import Element, Mistakes, read_xml
 
 Array = NDArray[np.float64]
-Frame = tuple[Array, Array]
-"""An origin (3,), m, and an attitude (3, 3)."""
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _OTHER = ("fixed", "floating", "planar")
-_AT_REST: Frame = (np.zeros(3), np.eye(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +170,7 @@ class _Tree:
         mistakes.stop()
         self._links = self._named("link")
         mistakes.stop()
-        self._origins: dict[Element, Frame] = {}
+        self._origins = Origins(mistakes)
         self._joints = [self._joint(name, element) for name, element in self._named("joint").items()]
         if not self._links:
             mistakes.add(root, "<robot>", None, "links")
@@ -294,23 +292,23 @@ class _Tree:
 
     def moving(self, chain: Sequence[_Joint]) -> tuple[tuple[UrdfJoint, ...], Frame]:
         """Return the moving joints of the chain, each in the frame of the one before, and the tip in the last."""
-        found, frame = [], _AT_REST
+        found, frame = [], AT_REST
         for joint in chain:
-            frame = _after(frame, self._origin(joint.element, f'joint "{joint.name}"'))
+            frame = after(frame, self._origins.of(joint.element, f'joint "{joint.name}"'))
             if joint.moves:
                 found.append(self._moving(joint, frame))
-                frame = _AT_REST
+                frame = AT_REST
         return tuple(found), frame
 
     def bodies(
         self, chain: Sequence[_Joint], base: str, shapes: Shapes
     ) -> tuple[tuple[UrdfBody, ...], tuple[str, ...]]:
         """Return bodies of the chain's links and those fixed to them, and notes of what is left out."""
-        places, number, frame, link = {base: (0, _AT_REST)}, 0, _AT_REST, base
+        places, number, frame, link = {base: (0, AT_REST)}, 0, AT_REST, base
         for joint in chain:
-            frame = _after(frame, self._origin(joint.element, f'joint "{joint.name}"'))
+            frame = after(frame, self._origins.of(joint.element, f'joint "{joint.name}"'))
             if joint.moves:
-                number, frame = number + 1, _AT_REST
+                number, frame = number + 1, AT_REST
             link = joint.child
             places[link] = (number, frame)
         on_chain, notes, waiting = {joint.name for joint in chain}, [], list(places)
@@ -325,8 +323,8 @@ class _Tree:
                     what = "moves with" if other == joint.child else "carries"
                     notes.append(f'what {what} joint "{joint.name}" is left out')
                     continue
-                origin = self._origin(joint.element, f'joint "{joint.name}"')
-                places[other] = number, _after(frame, origin if other == joint.child else _inverse(origin))
+                origin = self._origins.of(joint.element, f'joint "{joint.name}"')
+                places[other] = number, after(frame, origin if other == joint.child else inverse(origin))
                 waiting.append(other)
         bodies: list[UrdfBody] = []
         for link, (number, frame) in places.items():
@@ -346,7 +344,7 @@ class _Tree:
         found = []
         for k, collision in enumerate(self._links[link].all("collision"), start=1):
             what = f'link "{link}", <collision>'
-            origin, turn = _after(frame, self._origin(collision, what))
+            origin, turn = after(frame, self._origins.of(collision, what))
             capsule = shapes.enclosing(collision, what)
             if capsule is not None:
                 ends, radius = capsule
@@ -356,59 +354,10 @@ class _Tree:
 
     def _moving(self, joint: _Joint, frame: Frame) -> UrdfJoint:
         """Return a joint of the chain with its axis and limits."""
-        element, what, mistakes = joint.element, f'joint "{joint.name}"', self._mistakes
-        given = element.first("axis")
-        axis = (1.0, 0.0, 0.0) if given is None else mistakes.numbers(given, what, "xyz", 3, (1.0, 0.0, 0.0))
-        length = 1.0 if axis is None else math.hypot(*axis)
-        if given is not None and not length > 1e-9:
-            mistakes.add(given, f"{what}, <axis> xyz", given.attributes["xyz"], "an axis that is not zero")
-            length = 1.0
-        direction = np.array(axis or (1.0, 0.0, 0.0)) / length
-        limits, rate, effort = self._limits(joint, what)
+        axis = _axis(joint, self._mistakes)
+        limits, rate, effort = _limits(joint, self._mistakes)
         kind = "prismatic" if joint.kind == "prismatic" else "revolute"
-        return UrdfJoint(joint.name, kind, direction, *frame, limits, rate, effort, self._mimic(joint))
-
-    def _limits(
-        self, joint: _Joint, what: str
-    ) -> tuple[tuple[float, float] | None, float | None, float | None]:
-        """Return limits, rate and effort of a joint. Zero rate or effort means no limit: None."""
-        mistakes, limit = self._mistakes, joint.element.first("limit")
-        if limit is None:
-            if joint.kind != "continuous":
-                mistakes.add(joint.element, f"{what}, <limit>", None, "limits, lower and upper")
-            return None, None, None
-        most = []
-        for key in ("velocity", "effort"):
-            value = mistakes.numbers(limit, what, key, 1, (0.0,)) or (0.0,)
-            if value[0] < 0.0:
-                mistakes.add(limit, f"{what}, <limit> {key}", limit.attributes[key], "0 or more")
-            most.append(value[0] if value[0] > 0.0 else None)
-        if joint.kind == "continuous":
-            return None, most[0], most[1]
-        least, greatest = (mistakes.numbers(limit, what, key, 1, (0.0,)) for key in ("lower", "upper"))
-        if least is not None and greatest is not None and not least[0] < greatest[0]:
-            found = f"lower {least[0]:g}, upper {greatest[0]:g}"
-            mistakes.add(limit, f"{what}, <limit>", found, "a lower limit below the upper one")
-        return ((least or (-1.0,))[0], (greatest or (1.0,))[0]), most[0], most[1]
-
-    def _origin(self, element: Element, what: str) -> Frame:
-        """Return the <origin> of an element: xyz, m, and roll, pitch and yaw about fixed axes, rad."""
-        origin = element.first("origin")
-        if origin is None:
-            return _AT_REST
-        if origin not in self._origins:
-            self._origins[origin] = self._placed(origin, what)
-        return self._origins[origin]
-
-    def _placed(self, origin: Element, what: str) -> Frame:
-        zero = (0.0, 0.0, 0.0)
-        at = self._mistakes.numbers(origin, what, "xyz", 3, zero) or zero
-        turn = self._mistakes.numbers(origin, what, "rpy", 3, zero) or zero
-        (sr, sp, sy), (cr, cp, cy) = np.sin(turn), np.cos(turn)
-        roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-        pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-        yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-        return np.array(at), yaw @ pitch @ roll
+        return UrdfJoint(joint.name, kind, axis, *frame, limits, rate, effort, self._mimic(joint))
 
     def _named(self, tag: str) -> dict[str, Element]:
         """Return the links or joints by name."""
@@ -465,11 +414,36 @@ class _Tree:
         self._mistakes.add(self._root, what, value, expected)
 
 
-def _after(frame: Frame, inner: Frame) -> Frame:
-    """Return a frame, given as `inner` in another `frame`, in the frame of the latter."""
-    return frame[0] + frame[1] @ inner[0], frame[1] @ inner[1]
+def _axis(joint: _Joint, mistakes: Mistakes) -> Array:
+    """Return (3,) the unit vector along the axis of a joint, in its own frame."""
+    what, given = f'joint "{joint.name}"', joint.element.first("axis")
+    axis = (1.0, 0.0, 0.0) if given is None else mistakes.numbers(given, what, "xyz", 3, (1.0, 0.0, 0.0))
+    length = 1.0 if axis is None else math.hypot(*axis)
+    if given is not None and not length > 1e-9:
+        mistakes.add(given, f"{what}, <axis> xyz", given.attributes["xyz"], "an axis that is not zero")
+        length = 1.0
+    return np.array(axis or (1.0, 0.0, 0.0)) / length
 
 
-def _inverse(frame: Frame) -> Frame:
-    """Return the inverse: the frame in which `frame` is given, as seen from `frame`."""
-    return -frame[1].T @ frame[0], frame[1].T
+def _limits(
+    joint: _Joint, mistakes: Mistakes
+) -> tuple[tuple[float, float] | None, float | None, float | None]:
+    """Return limits, rate and effort of a joint; zero rate or effort means no limit: None."""
+    what, limit = f'joint "{joint.name}"', joint.element.first("limit")
+    if limit is None:
+        if joint.kind != "continuous":
+            mistakes.add(joint.element, f"{what}, <limit>", None, "limits, lower and upper")
+        return None, None, None
+    most = []
+    for key in ("velocity", "effort"):
+        value = mistakes.numbers(limit, what, key, 1, (0.0,)) or (0.0,)
+        if value[0] < 0.0:
+            mistakes.add(limit, f"{what}, <limit> {key}", limit.attributes[key], "0 or more")
+        most.append(value[0] if value[0] > 0.0 else None)
+    if joint.kind == "continuous":
+        return None, most[0], most[1]
+    least, greatest = (mistakes.numbers(limit, what, key, 1, (0.0,)) for key in ("lower", "upper"))
+    if least is not None and greatest is not None and not least[0] < greatest[0]:
+        found = f"lower {least[0]:g}, upper {greatest[0]:g}"
+        mistakes.add(limit, f"{what}, <limit>", found, "a lower limit below the upper one")
+    return ((least or (-1.0,))[0], (greatest or (1.0,))[0]), most[0], most[1]
