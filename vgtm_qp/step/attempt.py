@@ -235,7 +235,7 @@ class Attempt:
             try:
                 move = engine.move(asked, self.accuracy, phases.add)
             except SolverError as error:
-                return blocked(*_told(error))
+                return blocked(*_reason(error))
             finally:
                 phases.add("correction")
             if first is None:
@@ -324,7 +324,7 @@ class Attempt:
         return max(last, abs(target.end - target.start) * float(np.abs(goal.velocity).max()))
 
 
-def _told(error: SolverError) -> tuple[str, FailedStepError | None, bool]:
+def _reason(error: SolverError) -> tuple[str, FailedStepError | None, bool]:
     """Return why an error of a QP ends an attempt, that error if it carries the QP, and whether the solver failed."""
     if isinstance(error, AnswerError):
         return str(error), error, True

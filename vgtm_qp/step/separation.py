@@ -257,10 +257,11 @@ class Separation:
         body, end = np.moveaxis(self._corners[chosen], 2, 0)
         far = bodies.joints[body, 1 - end]
         nodes = np.concatenate([bodies.joints[body[:, :1], end[:, :1]], far, far[:, 1:]], axis=1)
-        lower = kept.minimum_angle + kept.margin - angle
+        margin = kept.margin / self._arm.unit
+        lower = kept.minimum_angle + margin - angle
         return ClearanceRows(
             nodes,
             np.pad(gradients, ((0, 0), (0, 1), (0, 0))),
-            np.minimum(lower, 2.0 * kept.margin) if motion else lower,
+            np.minimum(lower, 2.0 * margin) if motion else lower,
             lambda k: f"angle: {bodies.names[body[k, 0]]} / {bodies.names[body[k, 1]]}",
         )
