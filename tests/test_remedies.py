@@ -47,7 +47,7 @@ def random_problem(random):
 def test_what_is_named_lets_the_arm_go_on_and_nothing_else_does(rng):
     """Of random stops few have no remedy, and no arm goes on as it is.
 
-    One in twenty has none: of ten stops three or more that have none come up once in a hundred runs, four in a thousand.
+    One in twenty has none: of ten stops four or more have none in one of a thousand runs.
     """
     stops, helped = 0, 0
     while stops < 10:
