@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 
 import numpy as np
@@ -15,9 +14,6 @@ from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.problem import bundled_problems
 from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.step.build import build_arm
-
-EVERY = 1 if os.environ.get("VGTM_EVERY_STATE") else 12
-"""States from one that is compared to the next."""
 
 SOLVERS = {
     "clarabel": {"tol_gap_abs": 1e-14, "tol_gap_rel": 1e-14, "tol_feas": 1e-14},
@@ -98,34 +94,31 @@ def test_other_solvers_give_the_first_answer_of_the_step(name, limit):
     plan, compared, task = make_plan(problem, *resolver.tip()), 0, resolver.setup.task
     value = plan.path.start
     for number, mark in enumerate(plan.marks[1:]):
-        if number % EVERY == 0:
-            goal = plan.path.at(float(mark))
-            asked = {"position": goal.position}
-            if task.turns == "pointing":
-                asked["pointing"] = goal.rotation[:, 2]
-            qp = resolver.build(**asked)
-            wanted = first_answer(resolver, asked)
-            answers = {solver: answer(qp, solver) for solver in SOLVERS}
-            if wanted is None:
-                assert not any(answers.values()), f"state {number}"
-            else:
-                columns = [label.kind for label in qp.columns]
-                of = {kind: np.array([k == kind for k in columns]) for kind in set(columns)}
-                parts = {
-                    "actuator displacement": wanted.actuators,
-                    "progress": [wanted.progress],
-                    "node displacement": wanted.nodes[resolver.setup.arm.free].reshape(-1),
-                    "vertex displacement": wanted.vertices.reshape(-1),
-                }
-                for solver, (z, tolerance) in answers.items():
-                    for kind, values in parts.items():
-                        if kind not in of:
-                            continue
-                        where = f"{solver}, state {number}, {kind}"
-                        np.testing.assert_allclose(
-                            z[of[kind]], values, atol=tolerance, rtol=0.0, err_msg=where
-                        )
-                compared += 1
+        goal = plan.path.at(float(mark))
+        asked = {"position": goal.position}
+        if task.turns == "pointing":
+            asked["pointing"] = goal.rotation[:, 2]
+        qp = resolver.build(**asked)
+        wanted = first_answer(resolver, asked)
+        answers = {solver: answer(qp, solver) for solver in SOLVERS}
+        if wanted is None:
+            assert not any(answers.values()), f"state {number}"
+        else:
+            columns = [label.kind for label in qp.columns]
+            of = {kind: np.array([k == kind for k in columns]) for kind in set(columns)}
+            parts = {
+                "actuator displacement": wanted.actuators,
+                "progress": [wanted.progress],
+                "node displacement": wanted.nodes[resolver.setup.arm.free].reshape(-1),
+                "vertex displacement": wanted.vertices.reshape(-1),
+            }
+            for solver, (z, tolerance) in answers.items():
+                for kind, values in parts.items():
+                    if kind not in of:
+                        continue
+                    where = f"{solver}, state {number}, {kind}"
+                    np.testing.assert_allclose(z[of[kind]], values, atol=tolerance, rtol=0.0, err_msg=where)
+            compared += 1
         step = resolver.follow(plan.path, value, float(mark))
         if not step.moved:
             break
