@@ -45,10 +45,7 @@ def random_problem(random):
 
 
 def test_what_is_named_lets_the_arm_go_on_and_nothing_else_does(rng):
-    """Of random stops few have no remedy, and no arm goes on as it is.
-
-    One in twenty has none: of ten stops four or more have none in one of a thousand runs.
-    """
+    """Of random stops at most one in ten has no remedy, and no arm goes on as it is."""
     stops, helped = 0, 0
     while stops < 10:
         try:
@@ -70,7 +67,7 @@ def test_what_is_named_lets_the_arm_go_on_and_nothing_else_does(rng):
             again.run(None)
             assert again.progress > attempt.progress, str(remedy)
         assert attempt.resolver.state is kept
-    assert helped >= stops - 3, (helped, stops)
+    assert helped >= stops - 1, (helped, stops)
 
 
 def test_a_remedy_of_the_wall_is_its_clearance_and_it_frees_the_arm_from_home_too():

@@ -75,8 +75,8 @@ def study_tasks(name: str, *, short: bool = False, **options: Any) -> list[Task]
     known = list(signature(tasks).parameters)[1:]
     for option in options:
         if option not in known:
-            choices = ", ".join(known) or "none"
-            raise GoalError(f'study "{name}" has no option "{option}"; it has {choices}')
+            given, *choices = (key.replace("_", "-") for key in (option, *known))
+            raise GoalError(f'study "{name}" has no option "{given}"; it has {", ".join(choices) or "none"}')
     found: list[Task] = tasks(short, **options)
     return found
 
