@@ -41,6 +41,9 @@ _PART = 0.25
 _MORE = (1.0, 2.0, 4.0)
 """Factors of a remedy's amounts that are tried."""
 
+_NOTHING = Remedy((), 1.0)
+"""No change: with it the arm goes on as it is."""
+
 Progress = Callable[[float, Step], None]
 
 
@@ -82,6 +85,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
             stop = attempt.run(progress)
             if stop is not None:
                 way, attempt, stop = _retry(problem, attempt, stop, progress)
+                stop = attempt.resumed(stop, progress)
                 stop = None if stop is None else replace(stop, remedies=helpful_remedies(attempt, stop))
     except KeyboardInterrupt:
         stop = Stop(StopKind.INTERRUPTED)
@@ -149,6 +153,7 @@ class ManeuverAttempt:
     def __init__(self, problem: Problem, resolver: Resolver) -> None:
         self.resolver, self.plan = resolver, make_plan(problem, *resolver.tip())
         self.value = self.plan.path.start
+        self.stalled = 0
         self.log = Log(resolver, self.plan.path.pose(self.value))
 
     @property
@@ -160,7 +165,7 @@ class ManeuverAttempt:
     def run(self, progress: Progress | None) -> Stop | None:
         """Step along the plan; return why the arm stopped for good, or None if it reached the end."""
         resolver, plan, arm = self.resolver, self.plan, self.resolver.setup.arm
-        stalled, last = 0, float(plan.marks[-1])
+        last = float(plan.marks[-1])
         keeps_moving = bool(np.isfinite(arm.acceleration[arm.actuators]).any())
         while self.value < last:
             aim, dt = plan.next_mark(self.value, keeps_moving=keeps_moving)
@@ -177,12 +182,22 @@ class ManeuverAttempt:
             if stop is not None:
                 self._come_to_rest()
                 return stop
-            stalled = stalled + 1 if step.progress < STALLED_PROGRESS else 0
-            if stalled >= STALLED_STEPS:
+            self.stalled = self.stalled + 1 if step.progress < STALLED_PROGRESS else 0
+            if self.stalled >= STALLED_STEPS:
                 return self._explain(aim, dt, step)
             if progress is not None:
                 progress(self.progress, step)
         return None
+
+    def resumed(self, stop: Stop | None, progress: Progress | None) -> Stop | None:
+        """Go on from a stop at which the arm stalled, wherever a later step is free; return the stop that stays.
+
+        An arm may move by millimetres off its curve for several steps, without progress, and then be free.
+        """
+        while stop is not None and self.stalled >= STALLED_STEPS and self.goes_on(_NOTHING):
+            self.stalled = 0
+            stop = self.run(progress)
+        return stop
 
     def goes_on(self, remedy: Remedy) -> bool:
         """Return whether a remedy takes the arm past the place of its stop; the attempt stays as it is."""
