@@ -45,7 +45,7 @@ def random_problem(random):
 
 
 def test_what_is_named_lets_the_arm_go_on_and_nothing_else_does(rng):
-    """Of random stops at most two in ten have no remedy (of 600 in 60 seeds 10 had none), and no arm goes on as it is."""
+    """Of ten random stops at most two have no remedy (of 600 ten had none), and no arm goes on as it is."""
     stops, helped = 0, 0
     while stops < 10:
         try:

@@ -46,7 +46,8 @@ def run(seed: int, number: int, steps: int, compiler: bool, arms: Arms = "trusse
     """Solve one scene, with a `compiler` or without, and return its row.
 
     Keys: what the scene is, see :func:`features`; ``status``, the part of the path that was ``reached``, ``states``,
-    ``failures`` of the independent check, ``stop``, ``blocked_by``, ``way_out`` and CPU ``seconds``.
+    ``failures`` of the independent check, ``stop``, ``blocked_by``, the number of ``remedies``, ``way_out`` and CPU
+    ``seconds``.
     """
     problem = varied_scene(seed, number, steps=steps, arms=arms)
     found: Row = {"module": kind_of(problem), "features": features(problem)}
@@ -61,6 +62,7 @@ def run(seed: int, number: int, steps: int, compiler: bool, arms: Arms = "trusse
             "failures": [],
             "blocked_by": str(error),
             "way_out": "",
+            "remedies": 0,
         }
         return {**found, **nothing, "states": 0, "stop": "", "seconds": process_time() - started}
     summary, stop = maneuver.summary(), maneuver.manifest["stop"]
@@ -68,6 +70,7 @@ def run(seed: int, number: int, steps: int, compiler: bool, arms: Arms = "trusse
         **found,
         **{key: summary[key] for key in ("status", "reached", "failures", "blocked_by", "way_out")},
         "states": len(maneuver.time),
+        "remedies": len(maneuver.remedies),
         "stop": stop["kind"] if stop else "",
         "seconds": process_time() - started,
     }
@@ -146,6 +149,14 @@ def text(rows: Sequence[Row]) -> str:
         counts = Counter(row[key] for row in some if row[key]).most_common()
         if counts:
             parts.append(f"{words}: {', '.join(f'{name} {count}' for name, count in counts)}.")
+    stopped = [row for row in rows if row["stop"]]
+    if stopped:
+        left = [row["stop"] for row in stopped if not row["remedies"]]
+        names = ", ".join(f"{name} {count}" for name, count in Counter(left).most_common())
+        parts.append(
+            f"Of these {len(stopped)} stops {len(stopped) - len(left)} name a change with which the arm was seen to go "
+            f"on; without one: {names or 'none'}."
+        )
     return "\n\n".join(parts)
 
 
