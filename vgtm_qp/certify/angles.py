@@ -8,8 +8,8 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.certify.decide import Decision
 from vgtm_qp.certify.motion import GivenMotion
 from vgtm_qp.certify.verdict import Finding
-from vgtm_qp.verify.check import joined_ends
 from vgtm_qp.verify.path import DIRECTION_TOLERANCE, angles
+from vgtm_qp.verify.scenes import joined_ends
 
 _GREATEST_DEPTH = 24
 _GREATEST_COUNT = 200_000

@@ -64,6 +64,12 @@ class Candidates:
         """The pairs of each shape; no group is empty."""
         return [group for pairs in self._lists for group in pairs.groups]
 
+    def forget_pieces(self) -> None:
+        """Forget the pairs with pieces, because the pieces are others now; pairs of bodies are kept."""
+        if self._lists:
+            pairs = self._lists[_TO_PIECES]
+            pairs.renew([], pairs.reference, pairs.time, -np.inf)
+
     def cover(
         self,
         X: Array,
@@ -112,12 +118,7 @@ class Candidates:
 
     def _renew_pieces(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of a body and a piece that are nearer than `horizon`, m, at `X`, the new reference."""
-        pieces, groups = self._scene.pieces, []
-        if len(pieces):
-            body, piece = _near_pieces(X, self._scene, time, horizon)
-            for shape in np.unique(pieces.shape):
-                chosen = pieces.shape[piece] == shape
-                groups.append(Group(self._scene, str(shape), body[chosen], piece[chosen]))
+        groups = _groups_with_pieces(X, self._scene, time, horizon)
         self._lists[_TO_PIECES].renew(groups, X, time, horizon if groups else np.inf)
 
     def renew_bodies(self, X: Array, time: float, horizon: float) -> None:
@@ -237,9 +238,35 @@ class Candidates:
 
 def every_pair(scene: Scene, X: Array) -> list[Group]:
     """Return groups of all pairs of a scene, with their distances at `X` (P, 3) and time 0."""
-    candidates = Candidates(scene, np.inf, np.inf)
-    candidates.cover(X, 0.0, np.inf, np.inf)
-    return candidates.groups
+    groups = every_pair_with_pieces(scene, X)
+    if scene.has_self:
+        bodies = np.arange(len(scene.bodies))
+        pairs = Group(scene, "segment", *_near_bodies(X, scene.bodies, bodies, FAR), place=_RIGID)
+        pairs.keep_near(X, 0.0, FAR)
+        groups.append(pairs)
+    return [group for group in groups if len(group)]
+
+
+def every_pair_with_pieces(scene: Scene, X: Array) -> list[Group]:
+    """Return groups of all pairs of a body and a piece, with their distances at `X` (P, 3) and time 0."""
+    bodies, groups = np.arange(len(scene.bodies)), []
+    for shape in np.unique(scene.pieces.shape).tolist() if len(scene.pieces) else []:
+        pieces = np.flatnonzero(scene.pieces.shape == shape)
+        group = Group(scene, shape, np.tile(bodies, len(pieces)), np.repeat(pieces, len(bodies)))
+        group.keep_near(X, 0.0, FAR)
+        groups.append(group)
+    return [group for group in groups if len(group)]
+
+
+def _groups_with_pieces(X: Array, scene: Scene, time: float, horizon: float) -> list[Group]:
+    """Return groups, one a shape, of the pairs of a body and a piece that may be nearer than `horizon`, m."""
+    pieces = scene.pieces
+    if not len(pieces):
+        return []
+    body, piece = _near_pieces(X, scene, time, horizon)
+    kinds = pieces.shape[piece]
+    shapes = np.unique(pieces.shape).tolist()
+    return [Group(scene, shape, body[kinds == shape], piece[kinds == shape]) for shape in shapes]
 
 
 def _moved(states: tuple[Array, ...], reference: Array) -> Array:

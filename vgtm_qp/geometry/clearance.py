@@ -14,8 +14,8 @@ from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.exact import NORMAL
 from vgtm_qp.geometry.formulas import FAR
 from vgtm_qp.geometry.groups import Found, Group, Scene
-from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, Wanted
-from vgtm_qp.geometry.shapes import Obstacle
+from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, PairNames, Wanted
+from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 from vgtm_qp.geometry.solids import Solids
 from vgtm_qp.geometry.sweep import sweep_group
 from vgtm_qp.geometry.watch import Watch, can_be_watched, is_ready
@@ -38,8 +38,8 @@ class Clearance:
         See :func:`vgtm_qp.geometry.bodies.capsules`.
     obstacles
         See :mod:`vgtm_qp.geometry.shapes`.
-    safe, influence : float
-        Surface distance to keep, and that below which a pair is near, m.
+    safe, self_safe, influence : float
+        Surface distances to keep from obstacles and between bodies, and that below which a pair is near, m.
     self_collision : bool
         Whether pairs of bodies that are not neighbours count.
     watch : bool
@@ -57,25 +57,59 @@ class Clearance:
         *,
         safe: float,
         influence: float,
+        self_safe: float = 0.0,
         self_collision: bool = True,
         watch: bool = True,
         by_fcl: bool = True,
         unit: float = 1.0,
     ) -> None:
         self.scene = Scene(bodies, obstacles, self_collision, by_fcl, unit)
-        self.bodies, self.obstacles, self.self_collision = bodies, self.scene.obstacles, self_collision
-        self.pieces, self.names, self.fcl = self.scene.pieces, self.scene.names, self.scene.fcl
-        self.safe, self.influence = safe, influence
-        self.self_influence = min(influence, 2.0 * (safe + float(bodies.radius.max(initial=0.0))))
-        self.is_watched = watch and compiler() is not None and can_be_watched(self.scene)
-        self.scene.prepare()
+        self.bodies, self.self_collision = bodies, self_collision
+        self.safe, self.self_safe, self.influence = safe, self_safe, influence
+        self._widest = float(bodies.radius.max(initial=0.0))
+        self._may_watch = watch and compiler() is not None
         self._watching: Watch | None = None
         self._candidates = Candidates(self.scene, influence, self.self_influence)
+        self._look()
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """The obstacles of the scene; see :meth:`put`."""
+        return self.scene.obstacles
+
+    @property
+    def pieces(self) -> ObstaclePieces:
+        """The convex pieces of all obstacles."""
+        return self.scene.pieces
+
+    @property
+    def names(self) -> PairNames:
+        """Names of the pairs."""
+        return self.scene.names
+
+    @property
+    def self_influence(self) -> float:
+        """Surface distance below which a pair of bodies is near, m."""
+        return min(self.influence, 2.0 * (self.safe + self._widest))
+
+    def put(self, obstacles: Sequence[Obstacle]) -> None:
+        """Put `obstacles` in the place of those that were there; what is known of pairs of bodies is kept."""
+        self.scene.put(obstacles)
+        self._candidates.forget_pieces()
+        if self._watching is not None:
+            self._watching.forget_pieces()
+        self._look()
+
+    def _look(self) -> None:
+        """See whether the obstacles can be watched, and which of them enclose space."""
+        self.is_watched = self._may_watch and can_be_watched(self.scene)
         self._solids = Solids(self.scene)
 
     def _watch(self) -> Watch | None:
-        """Return what watches the scene, once that is compiled."""
-        if self._watching is None and self.is_watched and is_ready(self.scene.shapes):
+        """Return what watches the scene, if it can be watched and once that is compiled."""
+        if not self.is_watched:
+            return None
+        if self._watching is None and is_ready(self.scene.shapes):
             self._watching = Watch(self.scene)
         return self._watching
 

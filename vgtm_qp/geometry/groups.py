@@ -55,17 +55,23 @@ class Scene:
     def __init__(
         self, bodies: Bodies, obstacles: Sequence[Obstacle], has_self: bool, by_fcl: bool, unit: float
     ) -> None:
-        self.bodies, self.obstacles, self.has_self, self.unit = bodies, tuple(obstacles), has_self, unit
+        self.bodies, self.has_self, self.unit = bodies, has_self, unit
+        self._by_fcl = by_fcl
+        self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
+        self.put(obstacles)
+
+    def put(self, obstacles: Sequence[Obstacle]) -> None:
+        """Put `obstacles` in the place of those that were there, and make the functions that steps use for them.
+
+        Groups of pairs with obstacles that were made before are of no use afterwards; those of bodies are.
+        """
+        self.obstacles = tuple(obstacles)
         self.pieces = ObstaclePieces(self.obstacles)
         names = tuple(obstacle.name for obstacle in self.obstacles)
-        self.names = PairNames(bodies, names, tuple(self.pieces.obstacle.tolist()))
-        self.fcl = FclQueries(self.pieces, unit) if by_fcl else None
+        self.names = PairNames(self.bodies, names, tuple(self.pieces.obstacle.tolist()))
+        self.fcl = FclQueries(self.pieces, self.unit) if self._by_fcl else None
         self.nothing = self._contacts(np.zeros((0, 8), dtype=np.int64), np.zeros((0, CONTACT)))
-        self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if has_self else set()))
-        self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
-
-    def prepare(self) -> None:
-        """Make the functions that steps use, so that no step has to make them."""
+        self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
         for make in (distance_function, sweep_function, *((proof_function,) if self.fcl else ())):
             for shape in self.shapes:
                 self.batch(make, shape)

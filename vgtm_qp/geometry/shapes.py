@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,6 +42,8 @@ class Obstacle:
         Whether the triangles of a mesh bound a volume; the other shapes are solid.
     allowance : float
         How much nearer bodies may come to it than to other obstacles, m: its distances are greater by that.
+    table : Any
+        The ``[[obstacle]]`` table that it was made from; None if there is none.
     """
 
     name: str
@@ -49,6 +52,33 @@ class Obstacle:
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     solid: bool = True
     allowance: float = 0.0
+    table: Any = None
+
+    def placed(
+        self, before: tuple[ArrayLike, ArrayLike], center: ArrayLike, rotation: ArrayLike, velocity: ArrayLike
+    ) -> Obstacle:
+        """Return the obstacle at another place, with another velocity, m/s.
+
+        Parameters
+        ----------
+        before
+            Center (3,), m, and rotation (3, 3) that it was made with.
+        center, rotation
+            Those that it shall have at time 0.
+
+        Raises
+        ------
+        GeometryError
+            As `box`.
+        """
+        turn, at = _rotation(self.name, rotation), _vector(self.name, "center", center)
+        pieces = self.pieces.copy()
+        if self.shape == "triangle":
+            own = (pieces[:, :9].reshape(-1, 3) - np.asarray(before[0])) @ np.asarray(before[1])
+            pieces[:, :9] = (own @ turn.T + at).reshape(-1, 9)
+        else:
+            pieces[:, :3], pieces[:, 3:12] = at, turn.ravel()
+        return replace(self, pieces=pieces, velocity=_vector(self.name, "velocity", velocity))
 
 
 def box(

@@ -20,7 +20,7 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Compiling, Kernel, compiler
 from vgtm_qp.errors import EvaluationError
-from vgtm_qp.geometry.candidates import every_pair
+from vgtm_qp.geometry.candidates import every_pair, every_pair_with_pieces
 from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
 from vgtm_qp.geometry.formulas import FURTHEST
 from vgtm_qp.geometry.groups import Found, Group, Scene
@@ -74,31 +74,40 @@ class _WatchedGroup:
     """The pairs of one shape, with bounds and contacts of the last evaluation."""
 
     def __init__(self, group: Group) -> None:
-        count = len(group)
-        self.group = group
-        piece = np.zeros((count, WIDTH)) if group.is_self else group.scene.pieces.parameters[group.other]
-        normal = np.tile([0.0, 0.0, 1.0], (count, 1))
         function, compiling = _contact(group.shape, compiler())
         contact = Kernel(function, compiled=compiling)
-        self._rows, self._contacts = np.zeros(count, dtype=np.int64), np.zeros((2 * count, CONTACT))
         self._program = Program(SOURCE, "Pairs")
         self._program.set(
-            count=count,
             is_self=int(group.is_self),
-            body=group.body.astype(np.int32),
-            other=group.other.astype(np.int32),
-            points=np.ascontiguousarray(group.points, dtype=np.int32),
-            lower=group.distance.copy(),
-            known=np.concatenate([piece, group.radius[:, None], normal], axis=1),
             next=_NEXT,
             contact=contact,
             ends=contact.inputs[0],
             pair=contact.inputs[1],
             found=contact.outputs[0],
+        )
+        self.data = self._program.data
+        self.hold(group)
+
+    def hold(self, group: Group) -> None:
+        """Watch the pairs of `group`, of the same shape, in the place of those before."""
+        count = len(group)
+        self.group = group
+        piece = np.zeros((count, WIDTH)) if group.is_self else group.scene.pieces.parameters[group.other]
+        normal = np.tile([0.0, 0.0, 1.0], (count, 1))
+        self._rows, self._contacts = np.zeros(count, dtype=np.int64), np.zeros((2 * count, CONTACT))
+        self._program.set(
+            count=count,
+            near=0,
+            is_close=0,
+            overlaps=0,
+            body=group.body.astype(np.int32),
+            other=group.other.astype(np.int32),
+            points=np.ascontiguousarray(group.points, dtype=np.int32),
+            lower=group.distance.copy(),
+            known=np.concatenate([piece, group.radius[:, None], normal], axis=1),
             rows=self._rows,
             contacts=self._contacts,
         )
-        self.data = self._program.data
 
     def address(self) -> int:
         """Return the address of the pairs for C; uses the kernels compiled meanwhile."""
@@ -122,11 +131,18 @@ class Watch:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._groups: list[_WatchedGroup] = []
+        self._of_shape: dict[str, _WatchedGroup] = {}
         self._way: Program | None = None
+        self._is_whole = True
         self._place: Array = np.zeros((0, 3))
         self._at = b""
         self._floors = self._limits = self._pairs = np.zeros(0)
         self._reach = self._wanted = (-np.inf, -np.inf)
+
+    def forget_pieces(self) -> None:
+        """Forget the pairs with pieces, because the pieces are others now; pairs of bodies are kept."""
+        self._groups = [pairs for pairs in self._groups if pairs.group.is_self]
+        self._is_whole, self._at, self._reach = False, b"", (-np.inf, -np.inf)
 
     def near(
         self,
@@ -184,6 +200,8 @@ class Watch:
             A position is not finite; the present state stays as it was.
         """
         way = self._start(places[0]) if self._way is None else self._way
+        if not self._is_whole:
+            self._hold([*map(self._watched, every_pair_with_pieces(self._scene, self._place)), *self._groups])
         places = np.ascontiguousarray(places)
         for k, pairs in enumerate(self._groups):
             self._pairs[k] = pairs.address()
@@ -203,23 +221,34 @@ class Watch:
 
     def _start(self, X: Array) -> Program:
         """List all pairs, with their distances at `X`."""
-        bodies, way = self._scene.bodies, Program(SOURCE, "Way")
-        self._groups = [_WatchedGroup(group) for group in every_pair(self._scene, X)]
-        count = len(self._groups)
-        self._pairs = np.zeros(count, dtype=np.uintp)
-        self._floors, self._limits = np.zeros(count), np.zeros(count)
-        way.set(
+        bodies, self._way = self._scene.bodies, Program(SOURCE, "Way")
+        self._way.set(
             points=len(X),
             bodies=len(bodies),
-            groups=count,
             ends=np.ascontiguousarray(bodies.points, dtype=np.int32),
             furthest=FURTHEST,
-            group=self._pairs,
-            floors=self._floors,
-            limits=self._limits,
             middle=np.zeros((len(bodies), 3)),
             turned=np.zeros(len(bodies)),
             moved=np.zeros(len(bodies)),
         )
-        self._way, self._place = way, X.copy()
-        return way
+        self._place = X.copy()
+        self._hold(list(map(self._watched, every_pair(self._scene, X))))
+        return self._way
+
+    def _watched(self, group: Group) -> _WatchedGroup:
+        """Return what watches the pairs of `group`; kernels of a shape are set up once."""
+        known = self._of_shape.get(group.shape)
+        if known is None:
+            known = self._of_shape[group.shape] = _WatchedGroup(group)
+        else:
+            known.hold(group)
+        return known
+
+    def _hold(self, groups: list[_WatchedGroup]) -> None:
+        """Watch the pairs of `groups`, whose distances are those at the present place."""
+        assert self._way is not None
+        count = len(groups)
+        self._groups, self._is_whole = groups, True
+        self._pairs = np.zeros(count, dtype=np.uintp)
+        self._floors, self._limits = np.zeros(count), np.zeros(count)
+        self._way.set(groups=count, group=self._pairs, floors=self._floors, limits=self._limits)

@@ -16,6 +16,7 @@ from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.layout import curve_record
 from vgtm_qp.result.manifest import SCHEMA_VERSION, mesh_record, recorded_versions
+from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step
 from vgtm_qp.step.stops import Stop
 
@@ -33,9 +34,18 @@ class Log:
         self.progress = 0.0
         self._resolver = resolver
         self._rows: dict[str, list[Any]] = {}
+        self._scenes = [_Scene(resolver, 0, resolver.state)]
+        self._changes, self._state = resolver.scene_changes, resolver.state
         self._clearance_rows = {"fcl": 0, "exact": 0}
         self._seconds, self._phases = 0.0, [0.0] * len(resolver.phases)
+        self._known = dict(resolver.phases)
         self._add_row(target)
+
+    def count_phases(self) -> None:
+        """Take the phases since the last call, or since the beginning, for the time of the next row's step."""
+        known, self._known = self._known, dict(self._resolver.phases)
+        self._phases = [total - known[name] for name, total in self._known.items()]
+        self._seconds = sum(self._phases)
 
     @contextmanager
     def clock(self) -> Iterator[None]:
@@ -48,6 +58,10 @@ class Log:
 
     def add(self, step: Step, target: Pose, progress: float) -> None:
         """Add the state after a step whose goal was the pose `target` of the tip."""
+        if self._resolver.scene_changes != self._changes:
+            self._changes = self._resolver.scene_changes
+            self._scenes.append(_Scene(self._resolver, len(self._rows["time"]) - 1, self._state))
+        self._state = step.state
         self._clearance_rows["fcl"] += step.fcl_rows
         self._clearance_rows["exact"] += step.exact_rows
         self.progress = progress
@@ -74,18 +88,16 @@ class Log:
         for name, value in row.items():
             self._rows.setdefault(name, []).append(value)
 
-    def maneuver(self, problem: Problem, stop: Stop | None = None, **told: Any) -> Maneuver:
+    def maneuver(
+        self, problem: Problem, stop: Stop | None = None, *, whole: float = 1.0, **told: Any
+    ) -> Maneuver:
         """Return the rows as the maneuver of a problem, not certified yet.
 
-        `told` has the other keys of the manifest, see ``result.manifest``: digests of the problem's files,
-        the retry that led out of a dead end, and the time of the set-up.
+        `whole` is the progress at the end of the path. `told` has the other keys of the manifest, see
+        ``result.manifest``: digests of the problem's files, the retry that led out of a dead end, and the time of the
+        set-up.
         """
-        resolver, setup = self._resolver, self._resolver.setup
-        meshes = {
-            obstacle.name: mesh_record(obstacle.file, len(pieces.pieces))
-            for obstacle, pieces in zip(problem.obstacle, setup.monitor.obstacles, strict=True)
-            if obstacle.shape == "mesh"
-        }
+        resolver, setup, (first, *scenes) = self._resolver, self._resolver.setup, self._scenes
         manifest = {
             "schema_version": SCHEMA_VERSION,
             "problem": problem.to_dict(),
@@ -93,16 +105,15 @@ class Log:
             "curve": curve_record(setup.layout),
             "status": "solved" if stop is None else "blocked",
             # From the last whole row: an interrupt may have come before the next one.
-            "reached": float(self._rows["progress"][-1]),
+            "reached": float(self._rows["progress"][-1]) / whole,
             "blocked_by": [] if stop is None else list(stop.names),
             "stop": None if stop is None else stop.to_dict(),
-            "recovered": [
-                {"pair": pair, "distance": apart} for pair, apart in sorted(_too_near(resolver).items())
-            ],
+            "recovered": first.recovered,
             "method": problem.method.name,
             "solver": resolver.solver,
             "directory": str((problem.source.parent if problem.source else Path.cwd()).resolve()),
-            "meshes": meshes,
+            "meshes": first.meshes,
+            **({"scenes": [scene.record() for scene in scenes]} if scenes else {}),
             "versions": recorded_versions(),
             "certificate": None,
             # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank.
@@ -111,6 +122,7 @@ class Log:
             **told,
         }
         arrays: dict[str, Any] = {name: np.asarray(rows, dtype=float) for name, rows in self._rows.items()}
+        arrays["progress"] /= whole
         rotation = arrays.pop("tip_target_rotation")
         arrays |= setup.arm.recorded(arrays.pop("configuration"), arrays.pop("quantities"))
         arrays["control_vertices"] = arrays["control_vertices"].reshape(len(rotation), -1, 3)
@@ -123,11 +135,42 @@ class Log:
         )
 
 
-def _too_near(resolver: Resolver) -> dict[str, float]:
-    """Return the pairs that are too near at home and that the method drives apart, with distances, m."""
-    names, kind = resolver.setup.monitor.names, resolver.setup.arm.bodies.kind
-    found: dict[str, float] = {}
-    for pair, distance in resolver.too_near(resolver.setup.home_state()).items():
-        name = names.clearance(pair).removeprefix(f"clearance: {kind} ").replace(f"/ {kind} ", "/ ")
-        found[name] = min(found.get(name, np.inf), distance)
-    return found
+class _Scene:
+    """The scene of a resolver from a row on, at which it was in a `state`.
+
+    Attributes
+    ----------
+    recovered : list of dict
+        Pairs that are too near in that state and that the method drives apart, with distances, m.
+    """
+
+    def __init__(self, resolver: Resolver, row: int, state: State) -> None:
+        setup = resolver.setup
+        self._row, self._obstacles = row, setup.monitor.obstacles
+        self._safe, self._self_safe = setup.safe, setup.self_safe
+        names, kind = setup.monitor.names, setup.arm.bodies.kind
+        found: dict[str, float] = {}
+        for pair, distance in resolver.too_near(state).items():
+            name = names.clearance(pair).removeprefix(f"clearance: {kind} ").replace(f"/ {kind} ", "/ ")
+            found[name] = min(found.get(name, np.inf), distance)
+        self.recovered = [{"pair": pair, "distance": apart} for pair, apart in sorted(found.items())]
+
+    @property
+    def meshes(self) -> dict[str, Any]:
+        """Records of the files of meshes, by obstacle."""
+        return {
+            obstacle.name: mesh_record(obstacle.table.file, len(obstacle.pieces))
+            for obstacle in self._obstacles
+            if obstacle.table.shape == "mesh"
+        }
+
+    def record(self) -> dict[str, Any]:
+        """Return the scene as the manifest has it."""
+        return {
+            "row": self._row,
+            "obstacle": [o.table.model_dump(mode="json", exclude_none=True) for o in self._obstacles],
+            "safe": self._safe,
+            "self_safe": self._self_safe,
+            "meshes": self.meshes,
+            "recovered": self.recovered,
+        }

@@ -43,6 +43,7 @@ class MethodResolver(Resolver, ABC):
     """
 
     def __init__(self, setup: Setup) -> None:
+        super().__init__()
         self._setup = setup
         self._state = setup.home_state()
         self._actuation = Actuation(setup)

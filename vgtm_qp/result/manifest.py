@@ -10,6 +10,8 @@ Its keys are:
 - `recovered`, pairs below their clearance in the home pose, and their distances there, m;
 - `method`; `solver`; `setup_time`, s; `versions`; `jacobian_rank`, of the last step if the method reveals it;
 - `directory`, in which relative paths of the problem start; `meshes`, from ``mesh_record`` for each mesh;
+- `scenes`, where the scene changed while the arm ran: from each `row` on, to the next one's, the tables of `obstacle`,
+  `safe` and `self_safe` of ``[clearance]``, `meshes` and `recovered` as above;
 - `certificate`, null before verification;
 - `clearance_rows`, numbers of rows by `fcl` and of `exact` ones in the QPs that moved the arm.
 """
@@ -83,12 +85,23 @@ def _is_stop(value: Any) -> bool:
     )
 
 
+def _is_scene(value: Any) -> bool:
+    return (
+        isinstance(value, dict)
+        and _is_count(value.get("row"))
+        and _is_list(value.get("obstacle"), lambda table: isinstance(table, dict))
+        and all(_is_number(value.get(key)) for key in ("safe", "self_safe"))
+        and all(_VALUES[key][0](value.get(key)) for key in ("meshes", "recovered"))
+    )
+
+
 _VALUES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "blocked_by": (lambda value: _is_list(value, _is_text), "a list of names"),
     "curve": (lambda value: isinstance(value, dict), "a JSON object, or null"),
     "stop": (_is_stop, "a JSON object, its text a string, its remedies lists of objects; or null"),
     "way_out": (_is_text, "a string"),
     "recovered": (lambda value: _is_list(value, _is_pair), "a list of pairs and distances"),
+    "scenes": (lambda value: _is_list(value, _is_scene), "a list of scenes, each with the row it begins at"),
     "problem_digests": (
         lambda value: _is_table(value, lambda x: x is None or _is_text(x)),
         "SHA-256 by name",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -72,6 +73,7 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
     options: dict[str, Any] = {
         "obstacles": list(_obstacles(problem)),
         "safe": clearance.safe,
+        "self_safe": clearance.between_members,
         "influence": clearance.influence,
         "by_fcl": clearance.distance == "fcl",
         "unit": arm.unit,
@@ -98,8 +100,6 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
         control_vertices=home.vertices,
         torsion=home.torsion,
         vertex_goals=home.vertex_goals,
-        safe=clearance.safe,
-        self_safe=clearance.between_members,
         influence=clearance.influence,
         margin=clearance.margin,
         dt=step_duration(problem.maneuver),
@@ -309,15 +309,23 @@ def _obstacles(problem: Problem) -> Iterator[shapes.Obstacle]:
 
 
 def make_obstacle(spec: Any) -> shapes.Obstacle:
-    """Return the obstacle of one ``[[obstacle]]`` table."""
+    """Return the obstacle of one ``[[obstacle]]`` table.
+
+    Raises
+    ------
+    GeometryError
+        A mesh cannot be read or has no volume.
+    """
     rotation = rotation_from_vector(spec.rotation_vector)
     if spec.shape == "box":
-        return shapes.box(spec.name, spec.center, spec.size, rotation, spec.velocity)
-    if spec.shape == "sphere":
-        return shapes.sphere(spec.name, spec.center, spec.radius, spec.velocity)
-    if spec.shape == "cylinder":
-        return shapes.cylinder(spec.name, spec.center, spec.radius, spec.height, rotation, spec.velocity)
-    return shapes.mesh(spec.name, spec.file, spec.center, rotation, spec.scale, spec.velocity)
+        made = shapes.box(spec.name, spec.center, spec.size, rotation, spec.velocity)
+    elif spec.shape == "sphere":
+        made = shapes.sphere(spec.name, spec.center, spec.radius, spec.velocity)
+    elif spec.shape == "cylinder":
+        made = shapes.cylinder(spec.name, spec.center, spec.radius, spec.height, rotation, spec.velocity)
+    else:
+        made = shapes.mesh(spec.name, spec.file, spec.center, rotation, spec.scale, spec.velocity)
+    return replace(made, table=spec)
 
 
 def step_duration(maneuver: Any) -> float:

@@ -21,6 +21,7 @@ from vgtm_qp.step.checks import checked_arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.remedies import Remedy, relaxed
 from vgtm_qp.step.resolver import Resolver
+from vgtm_qp.step.scene import Near
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.shaping import Shaping
@@ -45,6 +46,7 @@ class QPResolver(Resolver, serves="qp"):
     draws_vertices = True
 
     def __init__(self, problem: Problem | Setup) -> None:
+        super().__init__()
         setup = problem if isinstance(problem, Setup) else checked_arm(problem)
         self._separation = Separation(setup)
         self._actuation = Actuation(setup)
@@ -123,12 +125,13 @@ class QPResolver(Resolver, serves="qp"):
         """See :class:`Resolver`."""
         path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
         dt = duration(self.setup.dt if dt is None else dt)
-        share = self._until_jam(dt)
-        limits = self._actuation.limits(self.state, share * dt, slowing=True)
-        target = self._shaping.target(self.state, share * dt, path, 0.0, share, limits[:2])
-        first = self._advancer.first_share(target)
-        target = target if first == 1.0 else target.part(first)
-        return self.setup.engine.qp(self._attempt.first_input(self.state, target, first))
+        with self._lock:
+            share = self._until_jam(dt)
+            limits = self._actuation.limits(self.state, share * dt, slowing=True)
+            target = self._shaping.target(self.state, share * dt, path, 0.0, share, limits[:2])
+            first = self._advancer.first_share(target)
+            target = target if first == 1.0 else target.part(first)
+            return self.setup.engine.qp(self._attempt.first_input(self.state, target, first))
 
     def _follow(self, path: Path, start: float, end: float, dt: float, whole: float) -> Step:
         """See :class:`Resolver`; pieces are halved until one is safe."""
@@ -146,10 +149,12 @@ class QPResolver(Resolver, serves="qp"):
 
     def brake(self, path: Path | None = None, start: float = 0.0, end: float = 1.0) -> Step | None:
         """See :class:`Resolver`."""
-        braking = self._known_braking()
-        if braking is None:
-            return None
-        return self._brake(braking, path, start, end, Step(StepStatus.BLOCKED, 0.0, self.state, "", 0))
+        with self._lock:
+            braking = self._known_braking()
+            if braking is None:
+                return None
+            step = self._brake(braking, path, start, end, Step(StepStatus.BLOCKED, 0.0, self.state, "", 0))
+            return self._told(step, path, start, end)
 
     def _known_braking(self) -> Braking | None:
         """Return the steps that bring the arm to rest; None if it is at rest."""
@@ -178,6 +183,14 @@ class QPResolver(Resolver, serves="qp"):
         goal = path.at(start).over(end - start)
         stop = explain(self.setup, self._separation, state, goal, limits, last)
         return struck(stop, self.setup, self._separation, state, dt)
+
+    def _after_change(self) -> Near:
+        """See :class:`ChangingScene`; braking steps stay as they were, since the arm cannot stop sooner."""
+        braking, short = self._known_braking(), self._separation.shortfall(self._state.q, self._state.time)
+        self._state = replace(self._state, shortfall=short)
+        if braking is not None:
+            self._braking = braking.changed(self._state, lambda then: replace(then, shortfall=None))
+        return self._named(short)
 
     def too_near(self, state: State) -> Shortfall:
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""

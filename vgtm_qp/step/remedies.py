@@ -214,9 +214,10 @@ def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
     ]
     options: dict[str, Any] = {
         "safe": before.safe,
+        "self_safe": self_safe,
         "influence": before.influence,
-        "by_fcl": before.fcl is not None,
+        "by_fcl": before.scene.fcl is not None,
         "unit": setup.arm.unit,
     }
     monitor = Clearance(before.bodies, obstacles, self_collision=before.self_collision, **options)
-    return replace(setup, arm=arm, monitor=monitor, measure=None, self_safe=self_safe, minimum_angle=angle)
+    return replace(setup, arm=arm, monitor=monitor, measure=None, minimum_angle=angle)

@@ -7,6 +7,7 @@ from typing import ClassVar, NoReturn, Self
 
 from numpy.typing import ArrayLike
 
+from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError
 from vgtm_qp.problem import Problem
@@ -16,6 +17,7 @@ from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.remedies import Remedy
+from vgtm_qp.step.scene import ChangingScene, Near
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import Step
@@ -23,8 +25,8 @@ from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.step.task import duration
 
 
-class Resolver:
-    """Moves one arm step by step by the method of its problem. Threads must not share one.
+class Resolver(ChangingScene):
+    """Moves one arm step by step by the method of its problem, from one thread; others may change the scene.
 
     ``Resolver(problem)`` is an instance of the subclass that serves ``problem.method``. A call that a method cannot
     serve raises GoalError, which names the methods that can.
@@ -39,6 +41,8 @@ class Resolver:
         Name of the QP solver; None where the method solves no QP.
     rank : int or None
         Rank of the Jacobian of eq. (26) in the last step; None where the method does not reveal it.
+    listener : callable or None
+        Called after each step that moved the arm, with the pose that was asked of the tip at its end, and the step.
     draws_vertices : bool
         Whether control vertices follow goals of their own.
 
@@ -49,6 +53,7 @@ class Resolver:
     """
 
     rank: int | None = None
+    listener: Callable[[Pose, Step], None] | None = None
     draws_vertices = False
     _setup: Setup
     _actuation: Actuation
@@ -228,8 +233,18 @@ class Resolver:
             `dt` is not a positive number; the state is unchanged.
         """
         dt = duration(self.setup.dt if dt is None else dt)
-        whole = self._until_jam(dt)
-        return self._follow(path, start, start + whole * (end - start), whole * dt, whole)
+        with self._lock:
+            whole = self._until_jam(dt)
+            step = self._follow(path, start, start + whole * (end - start), whole * dt, whole)
+            return self._told(step, path, start, end)
+
+    def _told(self, step: Step, path: Path | None, start: float, end: float) -> Step:
+        """Tell the listener of a step along a piece of `path`, and return it."""
+        if self.listener is not None and step.moved:
+            # An arm that brakes is still moving to the goal before.
+            asked = None if path is None or step.braked else path.pose(start + step.progress * (end - start))
+            self.listener(asked or Pose(*self.tip()), step)
+        return step
 
     def _until_jam(self, dt: float) -> float:
         """Lock actuators that have jammed; return the share of a step of `dt`, s, until the next jam."""
@@ -264,6 +279,17 @@ class Resolver:
         if last is None:
             return Stop(StopKind.NONLINEAR)
         return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
+
+    def _after_change(self) -> Near:
+        """See :class:`ChangingScene`."""
+        return self._named(self.too_near(self.state))
+
+    def _named(self, short: Shortfall) -> Near:
+        """Return pairs below their clearance by name."""
+        names = self.setup.monitor.names
+        return {
+            names.clearance(pair).removeprefix("clearance: "): distance for pair, distance in short.items()
+        }
 
     def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""

@@ -54,13 +54,13 @@ class Separation:
         self._setup, self._arm, self._monitor = setup, setup.arm, setup.monitor
         self._approach = _APPROACH if setup.slows_down else 1.0
         self._rounding, self._between = _ROUNDING * setup.arm.fineness, _BETWEEN * setup.arm.unit
-        self._floors = setup.safe - self._rounding, setup.self_safe - self._rounding
         meeting = setup.monitor.bodies.joints
         self._corners = corners(meeting if setup.minimum_angle > 0.0 else meeting[:0])
 
     def shortfall(self, q: Array, time: float) -> Shortfall:
         """Return the pairs that are too near at a configuration; usually there are none."""
-        points, (floor, self_floor) = self._arm.points(q), self._floors
+        points, kept = self._arm.points(q), self._setup
+        floor, self_floor = kept.safe - self._rounding, kept.self_safe - self._rounding
         if self._monitor.keeps(points, time, floor, self_floor):
             return {}
         contacts = self._monitor.near(points, time, floor, self_reach=self_floor)

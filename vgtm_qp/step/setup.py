@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,6 +11,7 @@ import numpy as np
 from vgtm_qp.arm.arm import Arm, Kinematics, Pose
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.geometry.shapes import Obstacle
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.gap import Gap
@@ -41,9 +42,8 @@ class Setup:
         The curve at home, m and rad.
     vertex_goals : (V, 3) or None
         Goals of control vertices in the problem, m; NaN for those without one.
-    safe, self_safe, influence, margin : float
-        Least clearance to obstacles and between bodies, the distance below which pairs enter the QP, and the margin of
-        the QP's rows for the nonlinearity of a step, m.
+    influence, margin : float
+        The distance below which pairs enter the QP, and the margin of the QP's rows for the nonlinearity of a step, m.
     dt, minimum_angle, step_limit : float
         Duration of a step, s, least angle between bodies that meet, rad, and greatest displacement of a node in one
         step, m, infinite without a limit.
@@ -71,8 +71,6 @@ class Setup:
     control_vertices: Array
     torsion: Array
     vertex_goals: Array | None
-    safe: float
-    self_safe: float
     influence: float
     margin: float
     dt: float
@@ -88,6 +86,22 @@ class Setup:
         """Return why displacements (N, 3) of the nodes, m, are too large for one step; empty if they are not."""
         moved = float(np.linalg.norm(displacements, axis=1).max())
         return "" if moved <= self.step_limit else f"{TOO_LONG}, {self.step_limit:g} m: by {moved:.3g} m"
+
+    @property
+    def safe(self) -> float:
+        """Least clearance to obstacles, m."""
+        return self.monitor.safe
+
+    @property
+    def self_safe(self) -> float:
+        """Least clearance between bodies, m."""
+        return self.monitor.self_safe
+
+    def put(self, obstacles: Sequence[Obstacle]) -> None:
+        """Put `obstacles` in the place of those that were there."""
+        for monitor in (self.monitor, self.measure):
+            if monitor is not None:
+                monitor.put(obstacles)
 
     @property
     def slows_down(self) -> bool:

@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arrays import Array
 from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.errors import ProblemError
-from vgtm_qp.maneuver.log import Log
+from vgtm_qp.maneuver.recording import Recording
 from vgtm_qp.methods import Resolver
-from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.step.step import Step, StepStatus
-from vgtm_qp.step.stops import Stop, StopKind
 from vgtm_qp.study.drawing import label, panels, select
 from vgtm_qp.study.robustness import SEED, features, kind_of
 from vgtm_qp.study.varied import Arms, varied_scene
@@ -65,24 +62,14 @@ def run(seed: int, number: int, steps: int, arms: Arms = "trusses") -> Row:
         resolver = Resolver(problem)
     except ProblemError:
         return {**found, **counts, "failures": [], "seconds": 0.0}
-    log, targets = Log(resolver, _pose(resolver)), list[Pose]()
-    goals = _Goals(resolver, random)
-    for k in range(steps):
-        goal = goals.next()
-        path = resolver.setup.task.path_to(resolver.tip(), **goal)
-        with log.clock():
-            step = resolver.step(**goal, dt=dt)
+    recording, goals = Recording(resolver, problem), _Goals(resolver, random)
+    for _ in range(steps):
+        step = resolver.step(**goals.next(), dt=dt)
         counts[step.status] += 1
         counts["goals"] += goals.note(step)
-        if step.moved:
-            # An arm that brakes is still moving to the goal before.
-            targets.append(_pose(resolver) if step.braked else path.pose(step.progress))
-            log.add(step, targets[-1], (k + 1) / (steps + 1))
     seconds = process_time() - started
-    if not targets:
-        return {**found, **counts, "failures": [], "seconds": seconds}
-    certificate = verify(log.maneuver(problem_along(problem, targets), Stop(StopKind.INTERRUPTED)))
-    return {**found, **counts, "failures": certificate.failures(), "seconds": seconds}
+    failures = verify(recording.maneuver()).failures() if len(recording) else []
+    return {**found, **counts, "failures": failures, "seconds": seconds}
 
 
 class _Goals:
@@ -133,29 +120,6 @@ class _Goals:
         met = step.status is StepStatus.REACHED and bool(self._shares[-self._left] == 1.0)
         self._left = 0 if met else self._left - 1
         return met
-
-
-def _pose(resolver: Resolver) -> Pose:
-    return Pose(*resolver.tip())
-
-
-def problem_along(problem: Problem, targets: Sequence[Pose]) -> Problem:
-    """Return the problem with the path of a loop through `targets`, which is known only after it."""
-    track = problem.to_dict()["end_effector"]["track"]
-    waypoints = [
-        {
-            "time": float(k + 1),
-            "position": target.position.tolist(),
-            **({"pointing": target.rotation[:, 2].tolist()} if "pointing" in track else {}),
-            **(
-                {"rotation_vector": vector_from_rotation(target.rotation).tolist()}
-                if "orientation" in track
-                else {}
-            ),
-        }
-        for k, target in enumerate(targets)
-    ]
-    return problem.replace({"maneuver": {"steps": len(targets), "waypoint": waypoints}})
 
 
 def draw(rows: Sequence[Row]) -> Figure:

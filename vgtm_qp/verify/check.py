@@ -8,32 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vgtm_qp.arrays import Array, Index
+from vgtm_qp.arrays import Array
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm, arm_of
-from vgtm_qp.verify.clearance import (
-    BETWEEN_TOLERANCE,
-    CLEARANCE_TOLERANCE,
-    AgainstBody,
-    AgainstMembers,
-    Encounters,
-    Least,
-    RecordedMotion,
-)
+from vgtm_qp.verify.clearance import RecordedMotion
 from vgtm_qp.verify.curve import curve_contradictions, curve_measures
 from vgtm_qp.verify.held import held_against
-from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.verify.path import (
     DIRECTION_TOLERANCE,
     TIP_TOLERANCE,
-    angles,
     check_path,
     direction_error,
     tip_error,
 )
-from vgtm_qp.verify.recovery import excuse_recovering
+from vgtm_qp.verify.scenes import clearances_of
 
 if TYPE_CHECKING:
     from vgtm_qp.problem import Problem
@@ -45,10 +35,6 @@ LIMIT_TOLERANCE = 1e-9
 ARRAY_TOLERANCE = 1e-9
 """Tolerance of stored arrays against recomputed ones, m."""
 
-_SAFE = 0.05
-"""Default of ``clearance.safe``, m."""
-_SELF_SHARE = 0.25
-"""Default of ``clearance.self_safe``, as a share of ``safe``."""
 INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 _ROUNDING = 4.0 * float(np.finfo(float).eps)
@@ -76,7 +62,7 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
     maneuver, foreign, differing = held_against(maneuver, problem)
     arm = arm_of(maneuver)
     motion = RecordedMotion(arm, maneuver.time, maneuver.configurations)
-    clearances, clearance, self_clearance, wrong, notes = _clearances(maneuver, motion)
+    clearances, clearance, self_clearance, wrong, notes = clearances_of(maneuver, motion)
     values = _singular_values(arm, motion.states)
     if len(motion.states) > _FEW_STATES and 3 * len(arm.free) > _MANY_UNKNOWNS:
         notes.append(f"singular values are those of {_FEW_STATES} states")
@@ -179,59 +165,6 @@ def changes(time: Array, values: Array, size: float) -> tuple[Array, Array, Arra
     return rates, accelerations, rounding, (rounding[1:] + rounding[:-1]) / between
 
 
-def _clearances(
-    maneuver: Result, motion: RecordedMotion
-) -> tuple[dict[str, Measure], Array, Array, list[str], list[str]]:
-    """Return the measures, the clearances and self-clearances at each state (T,), contradictions and notes."""
-    manifest = maneuver.manifest
-    directory = Path(manifest.get("directory") or ".")
-    bodies, wrong, notes = read_obstacles(manifest["problem"], manifest.get("meshes") or {}, directory)
-    rules = manifest["problem"].get("clearance") or {}
-    safe = float(rules.get("safe", _SAFE))
-    self_safe = _SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
-    if not rules.get("self_collision", True):
-        self_safe = -np.inf
-    against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]
-    at, between, clearance = _least_clearances(motion, against)
-    self_at, self_between, self_clearance = _least_clearances(motion, members)
-    wrong = [*wrong, *members[0].contradictions()]
-    recovered = manifest.get("recovered") or []
-    if recovered:
-        kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
-        nearer, remarks = excuse_recovering(recovered, kept)
-        wrong, notes = [*wrong, *nearer], [*notes, *remarks]
-        at, between, _ = _least_clearances(motion, against)
-        self_at, self_between, _ = _least_clearances(motion, members)
-    angle = float(rules.get("minimum_angle") or -np.inf)
-    spare = BETWEEN_TOLERANCE * motion.arm.size
-    measures = {
-        "clearance": _least(at, safe - CLEARANCE_TOLERANCE),
-        "clearance_between": _least(between, safe - spare),
-        "self_clearance": _least(self_at, self_safe - CLEARANCE_TOLERANCE),
-        "self_clearance_between": _least(self_between, self_safe - spare),
-        "member_angle": _least(_member_angle(motion), angle - DIRECTION_TOLERANCE, "rad"),
-    }
-    return measures, clearance, self_clearance, wrong, notes
-
-
-def _least_clearances(motion: RecordedMotion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
-    """Return the least clearance at states, a bound of it between them, and the least at each state (T,)."""
-    count = len(motion.time)
-    each = [
-        min((pairs.at_state(state) for pairs in encounters), key=lambda least: least.value, default=Least())
-        for state in range(count)
-    ]
-    at = min(each, key=lambda least: least.value)
-    limit, bound = at, Least()
-    for step in range(count - 1):
-        for pairs in encounters:
-            limit, bound = pairs.between(step, limit, bound)
-    # The bound names an interval. If the clearance found is as low, its instant is more precise.
-    where = limit.where if bound.value >= limit.value - motion.resolution else bound.where
-    between = Least(min(bound.value, limit.value), where)
-    return at, between, np.array([least.value for least in each])
-
-
 def _difference(stored: Array, found: Array) -> Array:
     """Return (T,) differences of clearances, which may be infinite."""
     with np.errstate(invalid="ignore"):
@@ -252,29 +185,6 @@ def _jams_between_rows(maneuver: Result) -> list[str]:
         for name, since in locks_of(maneuver.manifest["problem"])
         if since <= maneuver.time[-1] and np.abs(maneuver.time - since).min() > INSTANT
     ]
-
-
-def _member_angle(motion: RecordedMotion) -> Least:
-    """Return the least angle at any state between two members that share a node, rad."""
-    pairs = joined_ends(motion.arm.members)
-    least = Least()
-    for state, ends in enumerate(motion.ends):
-        along = ends[:, 1] - ends[:, 0]
-        leaving = np.stack([along, -along], axis=1).reshape(-1, 3)
-        between = angles(leaving[pairs[:, 0]], leaving[pairs[:, 1]])
-        if len(between) and between.min() < least.value:
-            names = " / ".join(motion.arm.member_names[k // 2] for k in pairs[int(np.argmin(between))])
-            least = Least(float(between.min()), f"state {state}: {names}")
-    return least
-
-
-def joined_ends(members: Index) -> Index:
-    """Return (P, 2) the pairs of ends of members (M, 2) in one node; end e of member m has number 2 m + e."""
-    node = members.reshape(-1)
-    order = np.argsort(node, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(node[order])) + 1)
-    corners = [np.stack(np.triu_indices(len(group), 1), axis=1) for group in groups]
-    return np.concatenate([group[pair] for group, pair in zip(groups, corners, strict=True)])
 
 
 def _singular_values(arm: Arm, nodes: Array) -> Array:
@@ -302,10 +212,6 @@ def _worst(
         if len(names) and len(place) > 1:
             parts.append(names[int(place[1])])
     return Measure(value, unit, bound, "most", ", ".join(parts))
-
-
-def _least(found: Least, bound: float, unit: str = "m") -> Measure:
-    return Measure(found.value, unit, bound if np.isfinite(bound) else None, "least", found.where)
 
 
 def _least_of(values: Array, unit: str) -> Measure:

@@ -38,15 +38,26 @@ _CHUNK = 200_000
 class RecordedMotion:
     """The moving arm: times (T,), s, and states, which are nodes (T, N, 3), m, or joints and base (T, J + 6).
 
-    The ends (T, M, 2, 3), m, are those of its bodies at the states.
+    The ends (T, M, 2, 3), m, are those of its bodies at the states. In names the states count from `first` on.
     """
 
-    def __init__(self, arm: Arm, time: Array, states: Array) -> None:
-        self.arm, self.time, self.states = arm, time, states
+    def __init__(self, arm: Arm, time: Array, states: Array, first: int = 0) -> None:
+        self.arm, self.time, self.states, self.first = arm, time, states, first
         self.ends = arm.states_ends(states)
         # No bound is nearer than the rounding of positions.
         rounding = 64.0 * float(np.finfo(float).eps) * float(np.abs(self.ends).max(initial=0.0))
         self.resolution = max(RESOLUTION * arm.size, rounding)
+
+    def part(self, first: int, last: int) -> RecordedMotion:
+        """Return the motion from the state `first` to the state `last`."""
+        if (first, last) == (0, len(self.time) - 1):
+            return self
+        rows = slice(first, last + 1)
+        return RecordedMotion(self.arm, self.time[rows], self.states[rows], self.first + first)
+
+    def name(self, state: int) -> str:
+        """Return the name of a state."""
+        return f"state {self.first + state}"
 
     def ends_between(self, step: int, body: Index, share: Array) -> Array:
         """Return (P, 2, 3) the ends, m, of bodies (P,) at shares (P,) of the motion from state `step` to the next."""
@@ -126,7 +137,7 @@ class Encounters(ABC):
         low, high = ends.min(axis=1), ends.max(axis=1)
         limit, least = self._first_limit(low, high, state), Least()
         for pair in self._counting(low, high, state, state, limit):
-            least = least.or_lower(self.distances(state, pair), self._called(f"state {state}", pair))
+            least = least.or_lower(self.distances(state, pair), self._called(self.motion.name(state), pair))
         return least
 
     def _first_limit(self, low: Array, high: Array, state: int) -> float:
@@ -200,7 +211,8 @@ class Encounters(ABC):
         return self.points(pair, lambda member: self.motion.ends_between(step, member, share), time)
 
     def _called_between(self, step: int, share: Array, pair: Pairs) -> Callable[[int], str]:
-        return lambda k: self._called(f"step {step + 1} at {share[k]:.4f}", pair)(k)
+        number = self.motion.first + step + 1
+        return lambda k: self._called(f"step {number} at {share[k]:.4f}", pair)(k)
 
 
 class AgainstBody(Encounters):
@@ -239,7 +251,11 @@ class AgainstBody(Encounters):
         ends = self.motion.ends[state] - self._centers[state]
         inside = self.body.encloses(ends.reshape(-1, 3)).reshape(-1, 2).any(axis=1)
         depth = np.where(inside, -self.motion.arm.radius, np.inf)
-        return super().at_state(state).or_lower(depth, lambda k: f"state {state}: {self.name((k, 0))}")
+        return (
+            super()
+            .at_state(state)
+            .or_lower(depth, lambda k: f"{self.motion.name(state)}: {self.name((k, 0))}")
+        )
 
     def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
         """Return (P, 2, 3) the ends of the members, seen from the centre of the body."""

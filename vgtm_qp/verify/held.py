@@ -43,6 +43,11 @@ def held_against(maneuver: Result, problem: Problem | None) -> tuple[Result, lis
         return maneuver, wrong, []
     from vgtm_qp.problem.table import key_path, shown
 
+    if changes := manifest.get("scenes"):
+        wrong.append(
+            f"the scene changed {len(changes)} times while the arm ran, of which the problem says nothing"
+        )
+
     real = json.loads(dump_manifest(problem.to_dict()))
     for place, found, wanted in _differences(stored_problem(manifest["problem"]).to_dict(), real):
         if place[-1] in _FILES:

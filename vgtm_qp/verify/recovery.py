@@ -27,7 +27,7 @@ def excuse_recovering(
     except (TypeError, KeyError, ValueError) as error:
         raise ResultError(f"manifest.recovered is malformed: {error}") from None
     wrong: list[str] = []
-    until, states, found = 0, 0, 0
+    until, found, note = 0, 0, ""
     for group, floor in encounters:
         for name in sorted(wanted):
             pairs = group.pairs_named(name)
@@ -40,22 +40,29 @@ def excuse_recovering(
             since = int(kept[0]) if len(kept) else len(distance)
             if since == 0 or abs(distance[0] - wanted[name]) > CLEARANCE_TOLERANCE:
                 wrong.append(
-                    f"recovered: {name} is {distance[0]:.9g} m apart at home, not {wanted[name]:.9g} m"
+                    f"recovered: {name} is {distance[0]:.9g} m apart {_at_first(group)}, not {wanted[name]:.9g} m"
                 )
                 continue
             wrong += _nearer(group, index, name, distance[: since + 1], floor)
             group.held_from.update(dict.fromkeys(pairs, since))
-            until, states = max(until, since), len(distance)
+            until = max(until, since)
+            note = _note(wanted, group, until)
     if found < len(wanted):
         wrong.append("manifest.recovered names pairs that this arm and its obstacles do not have")
-    return wrong, [_note(wanted, until, states)] if wanted else []
+    return wrong, [note] if note else []
 
 
-def _note(distance: Mapping[str, float], until: int, states: int) -> str:
-    nearest = min(distance, key=lambda name: distance[name])
-    end = f"all keep their distances from state {until} on" if until < states else "some still are at the end"
+def _at_first(group: Encounters) -> str:
+    """Say where a scene begins."""
+    return "at home" if group.motion.first == 0 else f"at {group.motion.name(0)}"
+
+
+def _note(distance: Mapping[str, float], group: Encounters, until: int) -> str:
+    nearest, motion = min(distance, key=lambda name: distance[name]), group.motion
+    is_over = until < len(motion.time)
+    end = f"all keep their distances from {motion.name(until)} on" if is_over else "some still are at the end"
     return (
-        f"recovered: pairs too near at home: {len(distance)}, the nearest {distance[nearest]:.6g} m apart "
+        f"recovered: pairs too near {_at_first(group)}: {len(distance)}, the nearest {distance[nearest]:.6g} m apart "
         f"({nearest}); they came no nearer, and {end}"
     )
 
@@ -66,13 +73,15 @@ def _nearer(group: Encounters, pairs: Pairs, name: str, distance: Array, floor: 
     for state in range(len(distance) - 1):
         least = min(float(distance[state]), floor)
         if distance[state + 1] < least - CLEARANCE_TOLERANCE:
+            where = group.motion.name(state + 1)
             wrong.append(
-                f"recovered: {name} is {distance[state + 1]:.9g} m apart at state {state + 1} after {least:.9g} m"
+                f"recovered: {name} is {distance[state + 1]:.9g} m apart at {where} after {least:.9g} m"
             )
         limit, bound = group.divide(state, pairs, Least(), Least())
         least_between = min(limit.value, bound.value)
         if least_between < least - BETWEEN_TOLERANCE * group.motion.arm.size:
+            step = group.motion.first + state + 1
             wrong.append(
-                f"recovered: {name} comes as near as {least_between:.9g} m in step {state + 1} from {least:.9g} m"
+                f"recovered: {name} comes as near as {least_between:.9g} m in step {step} from {least:.9g} m"
             )
     return wrong
