@@ -6,6 +6,7 @@ import multiprocessing
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import islice
 from time import perf_counter
 
 import numpy as np
@@ -38,8 +39,9 @@ _FURTHER = 1e-3
 _TRIED_STEPS = 10
 _PART = 0.25
 """Share of a remedy's progress to first order from which on the arm counts as going on with it."""
-_MORE = (1.0, 2.0, 4.0)
-"""Factors of a remedy's amounts that are tried."""
+_MORE = (1.0, 2.0, 4.0, 8.0, 16.0)
+_BETWEEN = 0.75
+"""Factors of a remedy's amounts that are tried; and the share of the first that suffices which is tried after it."""
 
 _NOTHING = Remedy((), 1.0)
 """No change: with it the arm goes on as it is."""
@@ -208,7 +210,7 @@ class ManeuverAttempt:
         enough = value + _PART * remedy.progress * (aim - value)
         for _ in range(_TRIED_STEPS):
             step = resolver.follow(plan.path, value, aim, dt=dt)
-            if step.left_path or not step.moved:
+            if not step.moved or self._gives_up(step):
                 break
             value += step.progress * (aim - value)
             if value >= enough:
@@ -270,6 +272,17 @@ def _retry(
 
 
 def helpful_remedies(attempt: ManeuverAttempt, stop: Stop) -> tuple[Remedy, ...]:
-    """Return the remedies of a stop with which the arm goes on, enlarged as far as needed."""
-    enough = (next(filter(attempt.goes_on, map(remedy.times, _MORE)), None) for remedy in stop.remedies)
-    return tuple(remedy for remedy in enough if remedy is not None)
+    """Return the remedies of a stop with which the arm goes on, enlarged as far as needed.
+
+    If there are none, the first of its resorts that helps.
+    """
+
+    def enough(remedy: Remedy) -> Remedy | None:
+        for factor in _MORE:
+            if attempt.goes_on(more := remedy.times(factor)):
+                less = remedy.times(_BETWEEN * factor)
+                return less if factor > 1.0 and attempt.goes_on(less) else more
+        return None
+
+    helpful = tuple(more for remedy in stop.remedies if (more := enough(remedy)))
+    return helpful or tuple(islice((more for remedy in stop.resorts if (more := enough(remedy))), 1))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.rows.limits import RATE, STROKE
+from vgtm_qp.rows.limits import ACCELERATION, RATE, STROKE
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.separation import Separation
@@ -34,7 +34,7 @@ _FURTHER = 4.0
 FREE = 1.0 - 1e-6
 """Progress alpha, at most 1, from which on an arm counts as free."""
 
-CLEARANCE, MEMBERS, ANGLE = "clearance", "members", "angle"
+CLEARANCE, MEMBERS, ANGLE, STEP = "clearance", "members", "angle", "step limit"
 
 
 class Limit(NamedTuple):
@@ -43,7 +43,8 @@ class Limit(NamedTuple):
     Attributes
     ----------
     kind : str
-        ``"clearance"`` from an obstacle, between ``"members"``, ``"angle"``, ``"stroke"`` or ``"rate"``.
+        ``"clearance"`` from an obstacle, between ``"members"``, ``"angle"``, ``"stroke"``, ``"rate"``,
+        ``"acceleration"`` or ``"step limit"``.
     name : str
         The obstacle, or the actuator of a stroke; empty for a stroke of all actuators, and for the other
         kinds, which have one limit for all.
@@ -72,7 +73,7 @@ class FirstOrder:
         Share of the piece of path at alpha = 1, roughly the greatest share within the trust region; and the
         same share for a `reach` of 1, the factor of trust region and piece of path.
     names, limits : tuple of str, tuple of (Limit or None)
-        Of each row; None for a row that nobody can change, of a locked actuator or an acceleration.
+        Of each row; None for a row that nobody can change, of a locked actuator.
 
     Raises
     ------
@@ -116,7 +117,7 @@ class FirstOrder:
             *(limits.name(k, upper=upper) for upper in (False, True) for k in range(len(now))),
         )
         self.limits = tuple(
-            _limit(setup, name, k >= self.count - len(now)) for k, name in enumerate(self.names)
+            limit_of(setup, name, k >= self.count - len(now)) for k, name in enumerate(self.names)
         )
 
     def solve(self, kept: NDArray[np.bool_]) -> tuple[float, Array]:
@@ -220,14 +221,14 @@ def obstacle_of(setup: Setup, name: str) -> str:
     return next((o.name for o in setup.monitor.obstacles if name.endswith(f" / {o.name}")), "")
 
 
-def _limit(setup: Setup, row: str, upper: bool) -> Limit | None:
-    """Return the limit to which the row of that name belongs."""
-    kind, name = row.split(": ", 1)
+def limit_of(setup: Setup, row: str, upper: bool) -> Limit | None:
+    """Return the limit to which the row of that name belongs; None if nobody can change it."""
+    kind, _, name = row.partition(": ")
     if kind == CLEARANCE:
         obstacle = obstacle_of(setup, row)
         return Limit(CLEARANCE, obstacle) if obstacle else Limit(MEMBERS)
     if kind == ANGLE:
         return Limit(ANGLE)
-    if kind == RATE:
-        return Limit(RATE)
+    if kind in (RATE, ACCELERATION):
+        return Limit(kind)
     return Limit(STROKE, name, upper) if kind == STROKE else None

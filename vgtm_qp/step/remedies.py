@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Clearance
-from vgtm_qp.rows.limits import STROKE
-from vgtm_qp.step.first_order import ANGLE, CLEARANCE, FREE, MEMBERS, FirstOrder, Limit
+from vgtm_qp.rows.limits import ACCELERATION, RATE, STROKE
+from vgtm_qp.step.first_order import ANGLE, CLEARANCE, FREE, MEMBERS, STEP, FirstOrder, Limit, limit_of
 from vgtm_qp.step.setup import Setup
 
 MOST = 3
@@ -24,6 +24,10 @@ _BEST = 4
 """Number of sets of changes, those that take the arm furthest, that are tried with one change more."""
 _MARGIN = 1.5
 """Amount of a change over the one needed to first order, to allow for the curvature of the motion."""
+_SHARE = 0.5
+"""First amount of a change that is tried without a linear program, over the limit."""
+_STRETCH = 0.05
+"""The same for a stroke, over the arm's unit."""
 
 
 class Change(NamedTuple):
@@ -62,6 +66,8 @@ class Change(NamedTuple):
             return f"bodies of the arm: {size} less clearance"
         if kind == ANGLE:
             return f"bodies that meet: {size} less angle"
+        if kind == STEP:
+            return f"method.step_limit: {size} more"
         where = f" at its {'upper' if upper else 'lower'} end" if kind == STROKE else ""
         return f"{name}: {size} more {kind}{where}"
 
@@ -159,12 +165,65 @@ def _remedy(setup: Setup, program: FirstOrder, limits: tuple[Limit, ...]) -> Rem
         if limit.kind == ANGLE:
             unit = "rad"
         elif limit.kind not in (CLEARANCE, MEMBERS):
-            unit = " or ".join(sorted({unit for _, unit in _actuators(setup, limit)}))
+            unit = _unit(setup, limit)
             if limit.kind != STROKE:
-                size, unit = amount / setup.dt, f"{unit}/s"
+                size = amount / setup.dt ** (2 if limit.kind == ACCELERATION else 1)
         size = _rounded_up(_MARGIN * size)
         changes.append(Change(limit, min(size, greatest) if amount <= greatest else size, unit, greatest))
     return Remedy(tuple(sorted(changes, key=lambda change: change.amount)), program.progress)
+
+
+def _unit(setup: Setup, limit: Limit) -> str:
+    """Return the unit of a limit of actuators."""
+    unit = " or ".join(sorted({unit for _, unit in _actuators(setup, limit)}))
+    return unit + {RATE: "/s", ACCELERATION: "/s^2"}.get(limit.kind, "")
+
+
+def resorts(
+    setup: Setup, quantities: Array, names: Iterable[str], found: Sequence[Remedy]
+) -> Iterator[Remedy]:
+    """Yield remedies to try where none of those `found` to first order lets the arm go on.
+
+    All that were found at once; then the first one, two and three limits among the rows called `names`, the most
+    decisive first, and these of all actuators; then their obstacles out of the way, alone and with the other limits.
+    `quantities` are the arm's.
+    """
+    changes = {change.limit: change for remedy in found for change in remedy.changes}
+    if 1 < len(changes) <= MOST:
+        yield Remedy(tuple(changes.values()), 1.0)
+    arm = setup.arm
+    middle = dict(zip(arm.quantity_names, quantities > arm.stroke.mean(axis=1), strict=True))
+    each = (limit_of(setup, name, bool(middle.get(name.partition(": ")[2], True))) for name in names)
+    limits = list(dict.fromkeys(limit for limit in each if limit is not None))
+    first = [_first_try(setup, limit) for limit in limits[:MOST]]
+    yield from (Remedy(tuple(first[: k + 1]), 1.0) for k in range(len(first)))
+    common = [_first_try(setup, limit) for limit in dict.fromkeys(limit.for_all for limit in limits)]
+    if common:
+        yield Remedy(tuple(common[:MOST]), 1.0)
+    away = [Change(limit, math.inf, "m") for limit in limits if limit.kind == CLEARANCE][:MOST]
+    if away:
+        yield Remedy(tuple(away), 1.0)
+        yield Remedy((*away, *(change for change in common if change.limit.kind != CLEARANCE))[:MOST], 1.0)
+
+
+def _first_try(setup: Setup, limit: Limit) -> Change:
+    """Return a change of a limit by a share of it."""
+    most = _greatest(setup, limit)
+    if math.isfinite(most):
+        return Change(
+            limit, min(_rounded_up(_SHARE * most), most), "rad" if limit.kind == ANGLE else "m", most
+        )
+    if limit.kind == STEP:
+        return Change(limit, _rounded_up(_SHARE * setup.step_limit), "m")
+    rows = [k for k, _ in _actuators(setup, limit)]
+    values = {RATE: setup.arm.rate, ACCELERATION: setup.arm.acceleration}.get(limit.kind)
+    amount = _STRETCH * setup.arm.unit if values is None else _SHARE * float(values[rows].max())
+    return Change(limit, _rounded_up(amount), _unit(setup, limit))
+
+
+def longer_steps(setup: Setup) -> Remedy:
+    """Return the remedy of a stop because steps would be too long."""
+    return Remedy((_first_try(setup, Limit(STEP)),), 1.0)
 
 
 def _greatest(setup: Setup, limit: Limit) -> float:
@@ -191,7 +250,8 @@ def _actuators(setup: Setup, limit: Limit) -> list[tuple[int, str]]:
 def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
     """Return a setup with changed limits that shares everything else with `setup`."""
     arm = copy.copy(setup.arm)
-    arm.stroke, arm.rate = arm.stroke.copy(), arm.rate.copy()
+    arm.stroke, arm.rate, arm.acceleration = arm.stroke.copy(), arm.rate.copy(), arm.acceleration.copy()
+    step_limit = setup.step_limit
     allowance, self_safe, angle = dict[str, float](), setup.self_safe, setup.minimum_angle
     for limit, amount, *_ in changes:
         kind, name, upper = limit
@@ -202,8 +262,12 @@ def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
             self_safe = max(self_safe - amount, 0.0)
         elif kind == ANGLE:
             angle = max(angle - amount, 0.0)
+        elif kind == STEP:
+            step_limit += amount
         elif kind == STROKE:
             arm.stroke[rows, int(upper)] += amount if upper else -amount
+        elif kind == ACCELERATION:
+            arm.acceleration[rows] += amount
         else:
             arm.rate[rows] += amount
     before = setup.monitor
@@ -220,4 +284,4 @@ def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
         "unit": setup.arm.unit,
     }
     monitor = Clearance(before.bodies, obstacles, self_collision=before.self_collision, **options)
-    return replace(setup, arm=arm, monitor=monitor, measure=None, minimum_angle=angle)
+    return replace(setup, arm=arm, monitor=monitor, measure=None, minimum_angle=angle, step_limit=step_limit)

@@ -18,10 +18,11 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Arm
 from vgtm_qp.errors import SolverError
+from vgtm_qp.rows.limits import ACCELERATION
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.first_order import FirstOrder, obstacle_of
-from vgtm_qp.step.remedies import Remedy, remedies
+from vgtm_qp.step.remedies import Remedy, longer_steps, remedies, resorts
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import TOO_LONG, Setup
 from vgtm_qp.step.state import State
@@ -85,6 +86,8 @@ class Stop:
         (3,) direction in which the obstacles in the set push the arm, weighted by multipliers; zero without obstacles.
     remedies : tuple of Remedy
         Up to three alternatives, the smallest first: each lets the arm go on, to first order.
+    resorts : tuple of Remedy
+        What to try if none of them does.
     """
 
     kind: StopKind
@@ -93,6 +96,7 @@ class Stop:
     reason: str = ""
     away: tuple[float, ...] = (0.0, 0.0, 0.0)
     remedies: tuple[Remedy, ...] = ()
+    resorts: tuple[Remedy, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -156,11 +160,14 @@ def explain(
         if share <= _SINGULAR:
             return Stop(StopKind.OUT_OF_REACH if is_outward else StopKind.SINGULAR, reason=reason)
         if reason.startswith(TOO_LONG):
-            return Stop(StopKind.STEP_LIMIT, reason=reason)
+            return Stop(StopKind.STEP_LIMIT, reason=reason, remedies=(longer_steps(setup),))
         other = StopKind.ACCELERATION if _is_braking(reason) else StopKind.NONLINEAR
         kinds = {_kind(setup, name) for name in pressing}
         ways = _remedies(setup, program, make)
-        return Stop(_first(kinds, other), pressing, _obstacles(setup, pressing), reason, remedies=ways)
+        names = [*pressing, *([ACCELERATION] if _is_braking(reason) else [])]
+        others = tuple(resorts(setup, state.quantities, names, ways))
+        kind = _first(kinds, other)
+        return Stop(kind, pressing, _obstacles(setup, pressing), reason, remedies=ways, resorts=others)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
         kept[k] = False
         if program.solve(kept)[0] > bar:
@@ -177,7 +184,8 @@ def explain(
     is_stretched = kinds == {StopKind.STROKE} and np.count_nonzero(kept) >= setup.arm.segments and is_outward
     kind = StopKind.OUT_OF_REACH if is_stretched else _first(kinds, StopKind.NONLINEAR)
     ways = _remedies(setup, program, make)
-    return Stop(kind, multipliers, _obstacles(setup, multipliers), reason, tuple(away.tolist()), ways)
+    others = tuple(resorts(setup, state.quantities, multipliers, ways))
+    return Stop(kind, multipliers, _obstacles(setup, multipliers), reason, tuple(away.tolist()), ways, others)
 
 
 def _remedies(setup: Setup, program: FirstOrder, make: Callable[..., FirstOrder]) -> tuple[Remedy, ...]:
