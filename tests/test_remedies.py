@@ -17,7 +17,7 @@ from vgtm_qp.export.html import read_out
 from vgtm_qp.maneuver.solve import ManeuverAttempt, helpful_remedies
 from vgtm_qp.methods import Resolver, with_method
 from vgtm_qp.step.first_order import ANGLE, CLEARANCE, MEMBERS, Limit
-from vgtm_qp.step.remedies import Change, Remedy, relaxed
+from vgtm_qp.step.remedies import Change, Remedy, relaxed, resorts
 from vgtm_qp.step.stops import StopKind
 
 WALL = {"name": "wall", "shape": "box", "center": [1.2, 0.0, 2.0], "size": [0.3, 6.0, 6.0]}
@@ -223,3 +223,63 @@ def test_a_method_without_rows_says_why_in_its_own_words():
     assert maneuver.status == "blocked"
     assert maneuver.stopped_by == maneuver.blocked_by[0]
     assert maneuver.remedies == []
+
+
+def test_a_step_limit_is_named_with_an_amount_that_suffices():
+    problem = three_bays(
+        **{
+            "end_effector.mode": "hard",
+            "method.step_limit": 0.02,
+            "maneuver.steps": 4,
+            "maneuver.waypoint": [{"time": 8.0, "position": [0.3, 0.0, 2.5]}],
+        }
+    )
+    blocked = vq.solve(problem)
+    assert blocked.status == "blocked"
+    assert blocked.manifest["stop"]["kind"] == "step limit"
+    ((change,),) = blocked.remedies
+    assert (change["kind"], change["unit"]) == ("step limit", "m")
+    assert f"method.step_limit: {1000.0 * change['amount']:.3g} mm more" in blocked.stopped_by
+    assert vq.solve(problem.replace({"method.step_limit": 0.02 + change["amount"]})).reached > blocked.reached
+
+
+def test_accelerations_are_named_where_they_hold_a_tip_that_must_not_be_late():
+    problem = three_bays(
+        **{
+            "end_effector.mode": "hard",
+            "truss.acceleration": 0.02,
+            "maneuver.steps": 6,
+            "maneuver.waypoint": [{"time": 2.0, "position": [0.5, 0.0, 2.3]}],
+        }
+    )
+    blocked = vq.solve(problem)
+    assert blocked.status == "blocked"
+    changes = [change for remedy in blocked.remedies for change in remedy]
+    assert {change["kind"] for change in changes} == {"acceleration"}
+    assert changes[0]["unit"] == "m/s^2"
+    assert " more acceleration" in blocked.stopped_by
+    more = problem.replace({"truss.acceleration": 0.02 + changes[0]["amount"]})
+    assert vq.solve(more).reached > blocked.reached
+
+
+def test_resorts_are_the_named_limits_and_at_last_the_obstacle_out_of_the_way():
+    setup = Resolver(three_bays(obstacle=[WALL])).setup
+    name = setup.arm.quantity_names[int(setup.arm.actuators[4])]
+    rows = [f"stroke: {name}", "clearance: member B1-1 / wall", "rate: B1-2", "angle: B1-1 / B1-2"]
+    longest = setup.arm.stroke[:, 1]
+    found = list(resorts(setup, longest, [*rows, "locked: B1-3"], ()))
+    kinds = [[change.limit.kind for change in remedy.changes] for remedy in found]
+    assert kinds[:3] == [["stroke"], ["stroke", "clearance"], ["stroke", "clearance", "rate"]]
+    assert found[0].changes[0].limit == Limit("stroke", name, upper=True)
+    assert [change.limit.name for change in found[3].changes] == ["", "wall", ""]
+    assert [math.isinf(change.amount) for change in found[4].changes] == [True]
+    assert math.isinf(found[5].changes[0].amount)
+    assert all(len(remedy.changes) <= 3 for remedy in found)
+    two = (
+        Remedy((Change(Limit(ANGLE), 0.1, "rad"),), 1.0),
+        Remedy((Change(Limit("rate"), 0.1, "m/s"),), 1.0),
+    )
+    assert [change.limit.kind for change in next(resorts(setup, longest, rows, two)).changes] == [
+        "angle",
+        "rate",
+    ]

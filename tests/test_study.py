@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -165,10 +166,13 @@ def test_a_loop_counts_its_steps_and_what_breaks_is_found(monkeypatch: pytest.Mo
     assert row["reached"] + row["slowed"] + row["blocked"] == 20
     assert row["reached"]
     assert not row["failures"]
-    along = loops.problem_along
 
-    def stricter(problem: Any, targets: Any) -> Any:
-        return along(problem, targets).replace({"clearance.safe": 2.5, "clearance.influence": 3.0})
+    class Stricter(vq.Recording):
+        def maneuver(self) -> vq.Maneuver:
+            maneuver = super().maneuver()
+            rules = {"safe": 2.5, "influence": 3.0}
+            problem = {**maneuver.manifest["problem"], "clearance": rules}
+            return replace(maneuver, manifest={**maneuver.manifest, "problem": problem})
 
-    monkeypatch.setattr(loops, "problem_along", stricter)
+    monkeypatch.setattr(loops, "Recording", Stricter)
     assert "clearance" in " ".join(loops.run(7, 5, 20)["failures"])

@@ -29,9 +29,11 @@ if TYPE_CHECKING:
     from vgtm_qp.comparison.compare import Report, compare
     from vgtm_qp.export import export_maneuver
     from vgtm_qp.maneuver.maneuver import Maneuver, load_result
+    from vgtm_qp.maneuver.recording import Recording
     from vgtm_qp.maneuver.solve import solve, solve_many
     from vgtm_qp.methods import Resolver
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
+    from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere
     from vgtm_qp.result.certificate import Certificate, Measure
     from vgtm_qp.step.step import Step, StepStatus
     from vgtm_qp.verify import verify, verify_file
@@ -42,9 +44,11 @@ _HOMES = {
     "vgtm_qp.export": ("export_maneuver",),
     "vgtm_qp.result.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),
+    "vgtm_qp.maneuver.recording": ("Recording",),
     "vgtm_qp.maneuver.solve": ("solve", "solve_many"),
     "vgtm_qp.comparison.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
+    "vgtm_qp.problem.obstacle": ("Box", "Cylinder", "Mesh", "Sphere"),
     "vgtm_qp.methods": ("Resolver",),
     "vgtm_qp.step.step": ("Step", "StepStatus"),
     "vgtm_qp.arm.truss.build": ("build_truss",),
@@ -55,22 +59,27 @@ _HOMES = {
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Box",
     "Certificate",
     "Certifier",
     "CurveError",
+    "Cylinder",
     "ExportError",
     "Finding",
     "GoalError",
     "Maneuver",
     "Measure",
+    "Mesh",
     "MissingExtraError",
     "Mistake",
     "Problem",
     "ProblemError",
+    "Recording",
     "Report",
     "Resolver",
     "ResultError",
     "SolverError",
+    "Sphere",
     "Step",
     "StepStatus",
     "Truss",

@@ -72,9 +72,9 @@ def count(least: int, greatest: int) -> Within:
 class ByKey:
     """Annotation of a union of tables, of which the value of one key picks one.
 
-    The key is a ``Literal`` of strings in each table; it may be missing if a table has a default for it. If
-    given, `pick` returns the table for a value, or None, instead. Values `later` are reserved: messages say
-    that this version does not serve them.
+    The key is a ``Literal`` of strings in each table; it may be missing if a table has a default for it, unless it has
+    to be `in_file`. If given, `pick` returns the table for a value, or None, instead. Values `later` are reserved:
+    messages say that this version does not serve them.
     """
 
     def __init__(
@@ -83,7 +83,9 @@ class ByKey:
         pick: Callable[[Any], type[BaseModel] | None] | None = None,
         *,
         later: Iterable[str] = (),
+        in_file: bool = False,
     ) -> None:
+        self._in_file = in_file
         self.key, self.pick, self.later = key, pick or self._by_key, ",".join(later)
         # Both are read from the tables of the union when its schema is built.
         self.tables: dict[str, type[BaseModel]] = {}
@@ -94,7 +96,7 @@ class ByKey:
         for table in tables:
             field = table.model_fields[self.key]
             self.tables |= dict.fromkeys(get_args(field.annotation), table)
-            self.default = self.default if field.is_required() else field.default
+            self.default = self.default if self._in_file or field.is_required() else field.default
         return core_schema.tagged_union_schema(
             {_tag(table): handler.generate_schema(table) for table in tables},
             lambda value: _tag(self.pick(value)),

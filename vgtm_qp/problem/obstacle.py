@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from vgtm_qp.problem.fields import (
     ORIGIN,
@@ -23,7 +23,14 @@ from vgtm_qp.problem.fields import (
 from vgtm_qp.problem.table import Place, Table
 
 
+def _names_shape(schema: dict[str, Any]) -> None:
+    """Require the shape in a file; in Python the class says it."""
+    schema["required"] = [*schema.get("required", ()), "shape"]
+
+
 class _Obstacle(Table):
+    model_config = ConfigDict(json_schema_extra=_names_shape)
+
     name: Name = Field(description="its name in messages and results")
     center: Vector = Field(description="position of its centre at time 0, m")
     rotation_vector: Vector = Field(default=ORIGIN, description="attitude, rad")
@@ -33,21 +40,21 @@ class _Obstacle(Table):
 class Box(_Obstacle, called="a box"):
     """A box centred at `center`."""
 
-    shape: Literal["box"]
+    shape: Literal["box"] = "box"
     size: Edges = Field(description="edge length, or [sx, sy, sz], m")
 
 
 class Sphere(_Obstacle, called="a sphere"):
     """A sphere."""
 
-    shape: Literal["sphere"]
+    shape: Literal["sphere"] = "sphere"
     radius: Length = Field(description="radius, m")
 
 
 class Cylinder(_Obstacle, called="a cylinder"):
     """A cylinder centred at `center`, its axis along its own z."""
 
-    shape: Literal["cylinder"]
+    shape: Literal["cylinder"] = "cylinder"
     radius: Length = Field(description="radius, m")
     height: Length = Field(description="height along its axis, m")
 
@@ -55,13 +62,13 @@ class Cylinder(_Obstacle, called="a cylinder"):
 class Mesh(_Obstacle, called="a mesh"):
     """A triangle mesh from a file."""
 
-    shape: Literal["mesh"]
+    shape: Literal["mesh"] = "mesh"
     file: File = Field(description="STL or OBJ file, relative to the problem file")
     center: Vector = Field(default=ORIGIN, description="position of the mesh's own origin at time 0, m")
     scale: Factor = Field(default=1.0, description="factor that brings the file's unit to metres")
 
 
-Obstacle = Annotated[Box | Sphere | Cylinder | Mesh, ByKey("shape")]
+Obstacle = Annotated[Box | Sphere | Cylinder | Mesh, ByKey("shape", in_file=True)]
 
 
 class ClearanceTable(Table, called="[clearance]"):
