@@ -176,3 +176,14 @@ def test_a_loop_counts_its_steps_and_what_breaks_is_found(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(loops, "Recording", Stricter)
     assert "clearance" in " ".join(loops.run(7, 5, 20)["failures"])
+
+
+def test_a_loop_through_a_scene_that_changes_keeps_everything() -> None:
+    row = loops.run(31, 4, 40, changes=0.5)
+    assert row["changes"] > 10
+    assert row["change_cost"] > 0.0
+    assert not row["failures"]
+    told = loops.text([{**row, "seed": 31, "number": 4}])
+    assert f"{row['changes']} changes of the scene" in told
+    assert {"changes": 0.5}.items() <= loops.tasks(True, changes=0.5)[0].items()
+    assert "changes" not in loops.tasks(True)[0]

@@ -119,6 +119,10 @@ def study(
         int | None,
         Parameter(help="solve one scene in so many without a compiler, too, of robustness: 10 by default"),
     ] = None,
+    changes: Annotated[
+        float | None,
+        Parameter(help="share of steps before which the scene changes, of loops: 0 by default"),
+    ] = None,
     output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
     json: Json = False,
 ) -> int:
@@ -140,7 +144,15 @@ def study(
     for option, value in counts.items():
         if value is not None and value < 1:
             raise GoalError(f"{option} must be 1 or more, not {value}")
-    given = {"scenes": scenes, "seed": seed, "arms": arms, "without_compiler": without_compiler}
+    if changes is not None and not 0.0 <= changes <= 1.0:
+        raise GoalError(f"--changes must be from 0 to 1, not {changes:g}")
+    given = {
+        "scenes": scenes,
+        "seed": seed,
+        "arms": arms,
+        "without_compiler": without_compiler,
+        "changes": changes,
+    }
     options = {key: value for key, value in given.items() if value is not None}
     for name in titles:
         study_tasks(name, short=short, **options)

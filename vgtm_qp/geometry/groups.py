@@ -163,15 +163,15 @@ class Group:
     def _set(self, body: Index, other: Index, distance: Array) -> None:
         bodies = self.scene.bodies
         self.distance, self.radius = distance, bodies.radius[body]
-        ends = bodies.points[body]
-        other_ends = bodies.points[other] if self.is_self else ends
         if self.is_self:
             self.radius = self.radius + bodies.radius[other]
         else:
             self.radius = self.radius - self.scene.pieces.allowance[other]
-        self.numbers = np.pad(np.column_stack([ends, other_ends, body, other]), ((0, 0), (0, 2)))
-        self.numbers[:, 6] = self.is_self
+        self.numbers = np.zeros((len(body), 8), dtype=np.int64)
         self.points, self.body, self.other = self.numbers[:, :4], self.numbers[:, 4], self.numbers[:, 5]
+        self.points[:, :2] = bodies.points[body]
+        self.points[:, 2:] = bodies.points[other] if self.is_self else self.points[:, :2]
+        self.body[:], self.other[:], self.numbers[:, 6] = body, other, self.is_self
 
     def __len__(self) -> int:
         return len(self.body)

@@ -186,8 +186,9 @@ class QPResolver(Resolver, serves="qp"):
 
     def _after_change(self) -> Near:
         """See :class:`ChangingScene`; braking steps stay as they were, since the arm cannot stop sooner."""
-        braking, short = self._known_braking(), self._separation.shortfall(self._state.q, self._state.time)
-        self._state = replace(self._state, shortfall=short)
+        braking, state = self._known_braking(), self._state
+        short = self._separation.shortfall(state.q, state.time, tracked=True)
+        self._state = replace(state, shortfall=short)
         if braking is not None:
             self._braking = braking.changed(self._state, lambda then: replace(then, shortfall=None))
         return self._named(short)

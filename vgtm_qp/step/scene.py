@@ -27,9 +27,10 @@ Near = dict[str, float]
 class ChangingScene(ABC):
     """The obstacles of one arm, and the clearances that it keeps; both may change between two steps.
 
-    Each change takes effect with the next step, and costs about as much as one; a shape that the scene has not had yet
-    costs more the first time. Other threads may call these methods: a change waits for the step that runs. An arm that
-    is nearer than it should be afterwards does not come nearer, and the next steps drive it away.
+    Each change takes effect with the next step, and costs about as much as one. A shape that the scene has not had yet
+    costs more the first time, up to 0.2 s, and so does the first scene in which nothing moves: a loop that cannot wait
+    adds one of each before it starts. Other threads may call these methods: a change waits for the step that runs. An
+    arm that is nearer than it should be afterwards does not come nearer, and the next steps drive it away.
     """
 
     def __init__(self) -> None:

@@ -57,13 +57,16 @@ class Separation:
         meeting = setup.monitor.bodies.joints
         self._corners = corners(meeting if setup.minimum_angle > 0.0 else meeting[:0])
 
-    def shortfall(self, q: Array, time: float) -> Shortfall:
-        """Return the pairs that are too near at a configuration; usually there are none."""
+    def shortfall(self, q: Array, time: float, *, tracked: bool = False) -> Shortfall:
+        """Return the pairs that are too near at a configuration; usually there are none.
+
+        `tracked` says whether it is that of an accepted state, see ``Clearance.near``.
+        """
         points, kept = self._arm.points(q), self._setup
         floor, self_floor = kept.safe - self._rounding, kept.self_safe - self._rounding
-        if self._monitor.keeps(points, time, floor, self_floor):
+        if not tracked and self._monitor.keeps(points, time, floor, self_floor):
             return {}
-        contacts = self._monitor.near(points, time, floor, self_reach=self_floor)
+        contacts = self._monitor.near(points, time, floor, self_reach=self_floor, tracked=tracked)
         found: dict[Pair, float] = {}
         for k in range(len(contacts)):
             pair = contacts.pair(k)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from time import process_time
+from time import process_time, thread_time
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from vgtm_qp.maneuver.recording import Recording
 from vgtm_qp.methods import Resolver
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.step.step import Step, StepStatus
+from vgtm_qp.study.disturbance import Disturbance
 from vgtm_qp.study.drawing import label, panels, select
 from vgtm_qp.study.robustness import SEED, features, kind_of
 from vgtm_qp.study.varied import Arms, varied_scene
@@ -35,20 +36,27 @@ _STRIDE = (1e-4, 1e-2)
 
 
 def tasks(
-    short: bool, *, scenes: int | None = None, seed: int = SEED, steps: int = 250, arms: Arms = "trusses"
+    short: bool,
+    *,
+    scenes: int | None = None,
+    seed: int = SEED,
+    steps: int = 250,
+    arms: Arms = "trusses",
+    changes: float = 0.0,
 ) -> list[Task]:
-    """Return one task a loop of so many steps."""
+    """Return one task a loop of so many steps; before a share of these the scene `changes`."""
     count = scenes if scenes is not None else 3 if short else 400
     scene = {"seed": seed, "steps": min(steps, 40) if short else steps, "arms": arms}
-    return [{**scene, "number": k} for k in range(count)]
+    more = {"changes": changes} if changes else {}
+    return [{**scene, **more, "number": k} for k in range(count)]
 
 
-def run(seed: int, number: int, steps: int, arms: Arms = "trusses") -> Row:
+def run(seed: int, number: int, steps: int, arms: Arms = "trusses", changes: float = 0.0) -> Row:
     """Run one loop and return its row.
 
     Keys: ``module``, ``features`` of the scene; numbers of steps ``reached``, ``slowed`` and ``blocked``;
-    number of ``goals`` that were met; ``failures`` of the independent check of all states and motions; and
-    CPU ``seconds`` of the steps alone.
+    number of ``goals`` that were met; ``failures`` of the independent check of all states and motions; CPU ``seconds``
+    of the steps alone; and where the scene changes those of ``Disturbance.row``.
     """
     problem = varied_scene(seed, number, arms=arms)
     found: Row = {"module": kind_of(problem), "features": features(problem)}
@@ -63,13 +71,21 @@ def run(seed: int, number: int, steps: int, arms: Arms = "trusses") -> Row:
     except ProblemError:
         return {**found, **counts, "failures": [], "seconds": 0.0}
     recording, goals = Recording(resolver, problem), _Goals(resolver, random)
+    disturbance, times = (
+        Disturbance(resolver, np.random.default_rng([seed, number, 3]), changes),
+        list[float](),
+    )
     for _ in range(steps):
-        step = resolver.step(**goals.next(), dt=dt)
+        disturbance.before_step()
+        goal, clock = goals.next(), thread_time()
+        step = resolver.step(**goal, dt=dt)
+        times.append(thread_time() - clock)
         counts[step.status] += 1
         counts["goals"] += goals.note(step)
     seconds = process_time() - started
     failures = verify(recording.maneuver()).failures() if len(recording) else []
-    return {**found, **counts, "failures": failures, "seconds": seconds}
+    row = {**found, **counts, "failures": failures, "seconds": seconds}
+    return {**row, **disturbance.row(float(np.median(times)))} if changes else row
 
 
 class _Goals:
@@ -157,5 +173,12 @@ def text(rows: Sequence[Row]) -> str:
         f"Loops with a state, or a way between two, that breaks a tolerance by the independent check: {len(broken)}.",
         markdown_table(("", *map(str, StepStatus), "loops"), lines),
     ]
+    if rows[0].get("changes") is not None:
+        disturbed = [row for row in rows if row["changes"]]
+        middle = float(np.median([row["change_cost"] for row in disturbed])) if disturbed else 0.0
+        parts.append(
+            f"{sum(row['changes'] for row in disturbed)} changes of the scene, in the middle of a loop at {middle:.2g} "
+            f"of its median step's CPU time; {sum(row['dear_changes'] for row in disturbed)} at more than two of them."
+        )
     parts += [f"Loop {row['number']}: {'; '.join(row['failures'][:3])}" for row in broken]
     return "\n\n".join(parts)

@@ -103,8 +103,8 @@ def run_study(
     progress
         Called with the number of tasks done, and of all tasks.
     options
-        Of the study: ``scenes`` and ``seed`` of tracking, robustness and loops, ``arms`` of the last two, and
-        ``without_compiler`` of robustness.
+        Of the study: ``scenes`` and ``seed`` of tracking, robustness and loops, ``arms`` of the last two,
+        ``without_compiler`` of robustness, and ``changes`` of loops.
 
     Raises
     ------

@@ -1,0 +1,109 @@
+"""Random changes of the scene round a running arm, and what they cost."""
+
+from __future__ import annotations
+
+from time import thread_time
+from typing import Any
+
+import numpy as np
+
+from vgtm_qp.arrays import Array
+from vgtm_qp.methods import Resolver
+from vgtm_qp.problem.obstacle import Box, Cylinder, Sphere
+from vgtm_qp.study.workers import Row
+
+_MOST = 8
+"""Greatest number of obstacles; more are removed."""
+_NEAREST, _FURTHEST = 0.15, 0.9
+"""Distances of a new obstacle's centre from a point of the arm, over its height."""
+_SIZES = (0.02, 0.12)
+"""Least and greatest size of a new obstacle, over the arm's height."""
+_FASTEST = 0.05
+"""Greatest coordinate of a velocity, m/s."""
+_DEAR = 2.0
+"""A change that takes more CPU time than so many median steps of the loop is dear."""
+_FAR = 1e3
+"""Where shapes are tried for the first time, over the arm's height."""
+
+
+class Disturbance:
+    """Changes the scene of a `resolver` before a `share` of its steps.
+
+    Obstacles come, move, change their velocity and go, and the clearance changes. One that would come into the arm
+    goes again at once.
+    """
+
+    def __init__(self, resolver: Resolver, random: np.random.Generator, share: float) -> None:
+        self._resolver, self._random, self._share = resolver, random, share
+        self._safe, self._height = resolver.setup.safe, resolver.setup.arm.height
+        self._seconds: list[float] = []
+        self._made = 0
+        if share > 0.0:
+            # The first obstacle of a shape costs more.
+            for shape in range(3):
+                self._add(shape, np.full(3, _FAR * self._height))
+                resolver.remove_obstacle(resolver.obstacles[-1].name)
+
+    def before_step(self) -> None:
+        """Change the scene, or leave it."""
+        if self._random.random() >= self._share:
+            return
+        names = [obstacle.name for obstacle in self._resolver.obstacles]
+        kinds = [self._come, self._move, self._stop, self._go, self._keep]
+        change = self._come if not names else kinds[int(self._random.integers(len(kinds)))]
+        if len(names) > _MOST:
+            change = self._go
+        started = thread_time()
+        change(str(self._random.choice(names)) if names else "")
+        self._seconds.append(thread_time() - started)
+
+    def _come(self, _: str) -> None:
+        way = self._random.normal(size=3)
+        way *= self._height * self._random.uniform(_NEAREST, _FURTHEST) / np.linalg.norm(way)
+        nodes = self._resolver.state.nodes
+        near = self._add(int(self._random.integers(3)), nodes[int(self._random.integers(len(nodes)))] + way)
+        if min(near.values(), default=1.0) <= 0.0:
+            self._resolver.remove_obstacle(self._resolver.obstacles[-1].name)
+
+    def _add(self, shape: int, center: Array) -> dict[str, float]:
+        random, self._made = self._random, self._made + 1
+        sizes = self._height * random.uniform(*_SIZES, size=3)
+        place: dict[str, Any] = {"name": f"thing {self._made}", "center": center}
+        if random.random() < 0.5:
+            place["velocity"] = random.uniform(-_FASTEST, _FASTEST, size=3)
+        if shape == 0:
+            return self._resolver.add_obstacle(Sphere(**place, radius=sizes[0]))
+        turned = {**place, "rotation_vector": random.normal(size=3)}
+        if shape == 1:
+            return self._resolver.add_obstacle(Box(**turned, size=sizes))
+        return self._resolver.add_obstacle(Cylinder(**turned, radius=sizes[0], height=sizes[1]))
+
+    def _move(self, name: str) -> None:
+        resolver = self._resolver
+        number = [obstacle.name for obstacle in resolver.obstacles].index(name)
+        table = resolver.obstacles[number]
+        center = np.add(table.center, np.multiply(resolver.state.time, table.velocity))
+        moved = center + self._random.normal(scale=0.02 * self._height, size=3)
+        near = resolver.move_obstacle(name, center=moved)
+        if min(near.values(), default=1.0) <= 0.0:
+            resolver.move_obstacle(name, center=center)
+
+    def _stop(self, name: str) -> None:
+        still = self._random.random() < 0.5
+        velocity = np.zeros(3) if still else self._random.uniform(-_FASTEST, _FASTEST, size=3)
+        self._resolver.move_obstacle(name, velocity=velocity)
+
+    def _go(self, name: str) -> None:
+        self._resolver.remove_obstacle(name)
+
+    def _keep(self, _: str) -> None:
+        self._resolver.set_clearance(safe=self._safe * self._random.uniform(0.5, 1.5))
+
+    def row(self, step: float) -> Row:
+        """Return the number of ``changes``, the median of their CPU times over that of a `step`, and how many are dear.
+
+        Keys: ``changes``, ``change_cost`` and ``dear_changes``.
+        """
+        costs = np.array(self._seconds) / max(step, 1e-9)
+        middle = float(np.median(costs)) if len(costs) else 0.0
+        return {"changes": len(costs), "change_cost": middle, "dear_changes": int(np.sum(costs > _DEAR))}
