@@ -16,6 +16,7 @@ from vgtm_qp.errors import ResultError
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.methods import with_method
 from vgtm_qp.step.build import make_obstacle
+from vgtm_qp.view.drawing import drawing_of_maneuver
 
 CUBE = {"name": "cube", "shape": "box", "center": [1.3, 0.0, 2.0], "size": 0.5}
 
@@ -269,6 +270,30 @@ def test_a_serial_arm_keeps_clear_of_what_comes():
         resolver.step(position=np.add(tip, [0.03 * k, 0.0, 0.0]))
     certificate = vq.verify(recording.maneuver())
     assert certificate.ok, str(certificate)
+
+
+def test_pictures_show_each_obstacle_while_it_is_there(tmp_path):
+    problem = three_bays(obstacle=[CUBE])
+    resolver = vq.Resolver(problem)
+    tip, recording = resolver.tip()[0], vq.Recording(resolver, problem)
+    for k in range(9):
+        if k == 3:
+            resolver.add_obstacle(vq.Sphere(name="ball", center=[-0.9, 0.0, 2.5], radius=0.2))
+        if k == 6:
+            resolver.move_obstacle("cube", center=[1.5, 0.0, 2.0])
+            resolver.remove_obstacle("ball")
+        resolver.step(position=np.add(tip, [0.01 * k, 0.0, 0.0]))
+    maneuver = recording.maneuver()
+    drawn = drawing_of_maneuver(maneuver).obstacles
+    times = {(mesh.name, mesh.since, mesh.until) for mesh in drawn}
+    third, sixth = maneuver.time[[3, 6]].tolist()
+    assert times == {("cube", -np.inf, sixth), ("ball", third, sixth), ("cube", sixth, np.inf)}
+    assert [sum(mesh.is_there(time) for mesh in drawn) for time in maneuver.time[[0, 4, 8]]] == [1, 2, 1]
+    assert maneuver.plot(frames=3).axes
+    for suffix in ("html", "csv"):
+        assert vq.export_maneuver(maneuver, tmp_path / f"loop.{suffix}").is_file()
+    with pytest.raises(vq.ExportError, match="this one changed while the arm ran"):
+        vq.export_maneuver(maneuver, tmp_path / "loop.xml")
 
 
 def test_other_threads_may_change_the_scene_while_steps_run():

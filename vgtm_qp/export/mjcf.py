@@ -90,8 +90,10 @@ def mjcf(maneuver: Result) -> str:
 
 
 def modelled_arm(maneuver: Result) -> Arm:
-    """Return the arm of a maneuver; ExportError if a MuJoCo model would differ from it."""
+    """Return the arm of a maneuver; ExportError if a MuJoCo model would differ from it or from its scene."""
     arm = arm_of(maneuver)
+    if maneuver.manifest.get("scenes"):
+        raise ExportError("a MuJoCo model has one scene; this one changed while the arm ran")
     if isinstance(arm, RecordedArm) and not arm.has_pin_joints:
         raise ExportError("a MuJoCo model needs pin joints; this truss has joint_offset > 0")
     return arm

@@ -75,7 +75,7 @@ class Disturbance:
             return self._resolver.add_obstacle(Sphere(**place, radius=sizes[0]))
         turned = {**place, "rotation_vector": random.normal(size=3)}
         if shape == 1:
-            return self._resolver.add_obstacle(Box(**turned, size=sizes))
+            return self._resolver.add_obstacle(Box(**{**turned, "size": sizes}))
         return self._resolver.add_obstacle(Cylinder(**turned, radius=sizes[0], height=sizes[1]))
 
     def _move(self, name: str) -> None:

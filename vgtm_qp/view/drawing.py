@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +37,8 @@ class ObstacleMesh:
     """The surface of an obstacle.
 
     Its triangles, `vertices` (K, 3), m, and `faces` (F, 3), are relative to its own origin, in directions of
-    the base frame. The origin is at `center` (3,), m, at time 0 and has the `velocity` (3,), m/s.
+    the base frame. The origin is at `center` (3,), m, at time 0 and has the `velocity` (3,), m/s. The obstacle is there
+    from the time `since`, s, to before `until`.
     """
 
     name: str
@@ -45,6 +46,12 @@ class ObstacleMesh:
     faces: Index
     center: Array
     velocity: Array
+    since: float = -np.inf
+    until: float = np.inf
+
+    def is_there(self, time: float) -> bool:
+        """Return whether the obstacle is in the scene at `time`, s."""
+        return self.since <= time < self.until
 
     def position(self, time: float) -> Array:
         """Return (3,) the position of the obstacle's origin at `time`, s, in m."""
@@ -102,8 +109,31 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
     """Return the drawing of a result, from its manifest; ResultError if its record of the arm is wrong."""
     manifest = maneuver.manifest
     arm = arm_of(maneuver)
-    vertices = maneuver.control_vertices.shape[1]
-    return make_drawing(manifest["problem"], arm, vertices, manifest.get("directory") or ".")
+    vertices, directory = maneuver.control_vertices.shape[1], Path(manifest.get("directory") or ".")
+    drawing = make_drawing(manifest["problem"], arm, vertices, directory)
+    if not manifest.get("scenes"):
+        return drawing
+    there = [
+        replace(mesh, since=since, until=until)
+        for entry, since, until in _lifetimes(maneuver)
+        for mesh in obstacle_meshes([entry], directory)
+    ]
+    return replace(drawing, obstacles=tuple(there))
+
+
+def _lifetimes(maneuver: Result) -> list[tuple[Mapping[str, Any], float, float]]:
+    """Return each obstacle that was ever in the scene of a maneuver, and from when to when, s."""
+    found: list[tuple[Mapping[str, Any], float, float]] = []
+    there: list[tuple[Mapping[str, Any], float]] = [
+        (entry, -np.inf) for entry in maneuver.manifest["problem"].get("obstacle") or ()
+    ]
+    for scene in maneuver.manifest["scenes"]:
+        time, entries = float(maneuver.time[scene["row"]]), list(scene["obstacle"])
+        found += [(entry, since, time) for entry, since in there if entry not in entries]
+        there = [(entry, since) for entry, since in there if entry in entries]
+        known = [entry for entry, _ in there]
+        there += [(entry, time) for entry in entries if entry not in known]
+    return [*found, *((entry, since, np.inf) for entry, since in there)]
 
 
 def make_drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory: str | Path) -> Drawing:

@@ -161,7 +161,13 @@ class _View:
         corners = np.array([[x, y, self.ground] for x in self.floor[:, 0] for y in self.floor[:, 1]])
         inside = projection.flat(np.concatenate([arm, corners, maneuver.tip_target_position]))
         times = maneuver.time[seen]
-        around = [place for surface in self.surfaces for time in times for place in surface.polygons(time)]
+        around = [
+            place
+            for surface in self.surfaces
+            for time in times
+            if surface.mesh.is_there(time)
+            for place in surface.polygons(time)
+        ]
         least, most = with_surroundings(inside, around, 0.3 * np.ptp(inside, axis=0).max())
         pad = 0.03 * float((most - least).max())
         self.low, self.high = least - pad, most + pad
@@ -240,7 +246,8 @@ class _View:
         """Draw arm and obstacles, farthest first."""
         maneuver, drawing, projection = self.maneuver, self.drawing, self.projection
         time, nodes = float(maneuver.time[row]), maneuver.nodes[row]
-        surfaces = sorted(self.surfaces, key=lambda surface: surface.depth(time))
+        there = [surface for surface in self.surfaces if surface.mesh.is_there(time)]
+        surfaces = sorted(there, key=lambda surface: surface.depth(time))
         for k, surface in enumerate(surfaces, start=1):
             _draw_surface(axes, surface, time, 2.0 * k)
         ends = drawing.arm.ends(nodes)

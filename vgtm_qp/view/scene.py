@@ -100,9 +100,12 @@ class ArmScene:
                 self._curve.points = numbers(_segments(self._drawing.curve(control_vertices)))
                 self._polygon.points = numbers(_segments(control_vertices))
                 self._vertices.points = numbers(control_vertices)
+            is_changing = any(np.isfinite((mesh.since, mesh.until)).any() for mesh in self._drawing.obstacles)
             for mesh, handle in zip(self._drawing.obstacles, self._obstacles, strict=True):
                 if mesh.velocity.any():
                     handle.position = mesh.position(time)
+                if is_changing:
+                    handle.visible = mesh.is_there(time)
 
     def add_path(
         self, name: str, points: Array, *, colour: Any = PATH_COLOUR, thickness: float = 0.012
@@ -132,9 +135,11 @@ class ArmScene:
         )
 
     def _add_obstacle(self, mesh: ObstacleMesh) -> Any:
-        group = self._scene.add_frame(f"/obstacles/{mesh.name}", show_axes=False, position=mesh.center)
+        # An obstacle that was moved is drawn once for each place.
+        path = f"/obstacles/{mesh.name}" + (f" from {mesh.since:g} s" if np.isfinite(mesh.since) else "")
+        group = self._scene.add_frame(path, show_axes=False, position=mesh.center)
         self._scene.add_mesh_simple(
-            f"/obstacles/{mesh.name}/surface",
+            f"{path}/surface",
             mesh.vertices.astype(np.float32),
             mesh.faces.astype(np.uint32),
             color=_rgb(OBSTACLE_COLOUR),
@@ -143,7 +148,7 @@ class ArmScene:
             side="double",
             cast_shadow=False,
         )
-        self._scene.add_label(f"/obstacles/{mesh.name}/name", mesh.name, anchor="center-center")
+        self._scene.add_label(f"{path}/name", mesh.name, anchor="center-center")
         return group
 
     def _add_ground(self, nodes: Array) -> None:
