@@ -22,6 +22,7 @@ import contextlib
 import ctypes
 import gc
 import hashlib
+import logging
 import os
 import pickle
 import queue
@@ -31,7 +32,6 @@ import stat
 import subprocess
 import sys
 import threading
-import warnings
 import weakref
 from collections import Counter
 from functools import cache
@@ -45,6 +45,8 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import EvaluationError
 
 Array = NDArray[np.float64]
+
+_LOG = logging.getLogger(__name__)
 
 FLAGS = (
     "-O2",
@@ -447,7 +449,7 @@ def finish_compiling() -> bool:
 @cache
 def _warn(text: str) -> None:
     """Warn once that kernels are slow, and why."""
-    warnings.warn(text, stacklevel=2)
+    _LOG.warning(text)
 
 
 def _warned_of(folder: Path) -> bool:
