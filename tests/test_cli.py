@@ -66,7 +66,7 @@ def test_solve_writes_a_verified_result_and_prints_a_table(capsys, folder):
 
 
 def test_solve_as_json_is_one_document_with_the_keys_of_the_contract(capsys):
-    code, out, err = run(capsys, "solve", "free.toml", "--json", "-o", "a/b.npz")
+    code, out, err = run(capsys, "solve", "free.toml", "--json", "-o", "b.npz")
     summary = json.loads(out)
     assert (code, err) == (0, WARNING)
     assert set(summary) >= {
@@ -75,8 +75,8 @@ def test_solve_as_json_is_one_document_with_the_keys_of_the_contract(capsys):
         "blocked_by", "result",
     }  # fmt: skip
     assert set(summary["step_time"]) >= {"median", "p95", "p99", "phases"}
-    assert (summary["status"], summary["result"]) == ("solved", "a/b.npz")
-    assert Path("a/b.npz").is_file()
+    assert (summary["status"], summary["result"]) == ("solved", "b.npz")
+    assert Path("b.npz").is_file()
 
 
 def test_options_stand_in_for_those_of_the_problem(capsys):
@@ -141,6 +141,12 @@ def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
         (["solve", "free.toml", "--solver", "magic"], ['--solver: found "magic"', '"daqp", "', '"osqp"']),
         (["solve", "free.toml", "-o", "result.txt"], ["--output", ".npz"]),
         (["solve", "free.toml", "-o", "/proc/none/result.npz"], ["--output", "/proc"]),
+        (["solve", "free.toml", "-o", "none/result.npz"], ["--output", "none is missing"]),
+        (["solve", "free.toml", "-o", "free.toml/result.npz"], ["--output", "free.toml is a file"]),
+        (["solve", "free.toml", "--figure", "none/frames.pdf"], ["--figure", "none is missing"]),
+        (["solve", "free.toml", "--html", "none/page.html"], ["--html", "none is missing"]),
+        (["export", "a.npz", "--to", "csv", "-o", "none/a.csv"], ["--output", "none is missing"]),
+        (["bench", "--figure", "none/bars.pdf"], ["--figure", "none is missing"]),
         (["solve", "free.toml", "--figure", "frames.gif"], ["--figure", ".pdf"]),
         (["solve", "none.toml"], ["none.toml", "five_bay_two_cubes"]),
         (["solve", "far.toml"], ["far.toml", "maneuver.waypoint[0].position", "out of any reach"]),
@@ -164,6 +170,7 @@ def test_wrong_usage_gives_2_and_names_the_choices(capsys, folder, tokens, words
     else:
         assert out == ""
     assert not list(folder.glob("*.npz"))
+    assert not (folder / "none").exists()
 
 
 def test_mistakes_of_a_file_are_listed_one_a_line_and_as_data(capsys, folder):

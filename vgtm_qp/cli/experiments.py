@@ -43,7 +43,9 @@ def compare(
         list[str] | None,
         Parameter(help="methods by name, all of them with all; ten by default", consume_multiple=True),
     ] = None,
-    output: Annotated[Path | None, Output(help="folder for compare.md, .json and .pdf")] = None,
+    output: Annotated[
+        Path | None, Output(help="folder for compare.md, .json and .pdf; made if it is missing")
+    ] = None,
     json: Json = False,
 ) -> int:
     """Solve problems by several methods and show what each of them keeps; a method that fails is shown as failed.
@@ -119,7 +121,9 @@ def study(
         int | None,
         Parameter(help="solve one scene in so many without a compiler, too, of robustness: 10 by default"),
     ] = None,
-    output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
+    output: Annotated[
+        Path, Output(help="folder of the results; made if it is missing, with a folder for each study")
+    ] = Path("studies"),
     json: Json = False,
 ) -> int:
     """Run studies and write rows (CSV, JSON), a figure (PDF) and a text (Markdown) for each.

@@ -86,12 +86,17 @@ def _write(stream: TextIO | None, text: str) -> None:
 
 
 def check_writable(path: Path, option: str, suffixes: Sequence[str]) -> None:
-    """Raise ProblemError where `path` cannot be written or lacks one of `suffixes`; create nothing."""
+    """Raise ProblemError where `path` cannot be written or lacks one of `suffixes`; create nothing, not even folders."""
+    folder = path.absolute().parent
     if path.suffix.lower() not in suffixes:
         expected = f"the name of a file that ends in {' or '.join(suffixes)}"
     elif path.is_dir():
         expected = "the name of a file; this is a folder"
-    elif hindrance := why_not_writable(path.absolute().parent):
+    elif not folder.is_dir():
+        expected = (
+            f"a place in a folder that there is; {folder} is {'a file' if folder.exists() else 'missing'}"
+        )
+    elif hindrance := why_not_writable(folder):
         expected = f"a place that can be written; {hindrance}"
     else:
         return
