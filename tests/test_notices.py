@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
+import re
 import subprocess
 import sys
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import vgtm_qp as vq
 from vgtm_qp.cli import main
+from vgtm_qp.cli.output import bar
 from vgtm_qp.notices import spoken, telling
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -87,3 +92,88 @@ def test_the_command_tells_warnings_of_other_libraries_in_one_line_too(monkeypat
     err = capsys.readouterr().err
     assert err.startswith(line)
     assert err.count("\n") == 1
+
+
+class Terminal(io.StringIO):
+    """A terminal that keeps what is drawn on it."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def terminal_for(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    """Put a terminal in the place of stderr; a fixture's would be replaced by what pytest captures."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "200")
+    for name in ("NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.delenv(name, raising=False)
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    return terminal
+
+
+def test_what_takes_long_shows_a_bar_on_a_terminal_until_it_is_done(tmp_path, monkeypatch, capsys):
+    terminal = terminal_for(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VGTM_CC", "none")
+    solve = ["solve", "five_bay_free", "--steps", "3", "--html", "page.html"]
+    pytest.importorskip("viser")
+    assert main(solve) == 0
+    drawn = terminal.getvalue()
+    phases = ("set-up", "verifying", "page")
+    assert all(f"five-bay arm, free: {phase}" in drawn for phase in phases)
+    assert "five-bay arm, free \x1b" in drawn
+    assert [name for name in ("result", "html") if f"{name}: " in capsys.readouterr().out]
+    for tokens, word in (
+        (["export", "five_bay_free.npz", "--to", "gif"], "five_bay_free.gif: writing"),
+        (["export", "five_bay_free.npz", "--to", "csv"], "five_bay_free.csv: writing"),
+        (["certify", "five_bay_free", "five_bay_free.csv"], "five_bay_free.csv: certifying"),
+        (["verify", "five_bay_free.npz"], "five_bay_free.npz: verifying"),
+        (["check", "five_bay_free"], "five-bay arm, free: checking"),
+        (["study", "figure4", "--short"], "Figure 4"),
+    ):
+        assert main(tokens) == 0
+        assert word in terminal.getvalue()
+
+
+def test_the_bench_names_the_scene_on_its_bar_and_in_lines_elsewhere(monkeypatch):
+    terminal = terminal_for(monkeypatch)
+
+    def measured(scenes, *_: object, progress, **__: object) -> dict[str, object]:
+        for scene in scenes:
+            progress(scene)
+        raise vq.GoalError("enough")
+
+    monkeypatch.setattr("vgtm_qp.bench.report.measure", measured)
+    tokens = ["bench", "--bays", "5", "6", "--tracking", "exact", "--distance", "exact"]
+    assert main(tokens) == 2
+    assert "bench: " in terminal.getvalue()
+    assert "1/2" in terminal.getvalue()
+    assert not re.search(r"^[12]/2 ", terminal.getvalue(), re.MULTILINE)
+    told = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", told)
+    assert main(tokens) == 2
+    assert [line[:4] for line in told.getvalue().splitlines()[:2]] == ["1/2 ", "2/2 "]
+    assert "\x1b" not in told.getvalue()
+
+
+def test_a_bar_says_how_long_it_takes_in_words(monkeypatch):
+    terminal = terminal_for(monkeypatch)
+    clock = iter(np.arange(0.0, 1e6, 25.0))
+    monkeypatch.setattr("rich.console.monotonic", lambda: next(clock))
+    with bar("things", shown=True, counted=True) as advance:
+        for done in range(4):
+            advance(done, 4)
+    assert re.search(r"\d+ min \d+ s", terminal.getvalue())
+    assert "0:0" not in terminal.getvalue()
+
+
+def test_no_bar_is_drawn_where_nobody_looks(monkeypatch):
+    terminal = terminal_for(monkeypatch)
+    with bar("things", shown=False) as advance:
+        advance(1, 2)
+    told = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", told)
+    with bar("things", shown=True) as advance:
+        advance(1, 2)
+    assert (terminal.getvalue(), told.getvalue()) == ("", "")

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable
 from typing import Any
 
-from vgtm_qp.cli.output import ExitCode, Json, answer, table, why_not_writable
+from vgtm_qp.cli.output import ExitCode, Json, answer, table, waiting, why_not_writable
 
 _CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
 _SPEED = "five_bay_free"
@@ -53,25 +53,29 @@ def doctor(*, json: Json = False) -> int:
     hindrance = f"CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else ""
     if not hindrance and cache.exists() and (reason := distrust(cache)):
         hindrance = f"IS NOT USED, kernels run uncompiled: {reason}"
+    with waiting("doctor: compiling kernels, timing steps", shown=not json):
+        tried = {
+            "solvers": _tried(_solvers),
+            "kernels": _tried(_kernels),
+            "speed": _tried(lambda: _speed(compiler() is not None and not hindrance)),
+            "fcl": _tried(_fcl),
+        }
     found: dict[str, Any] = {
         "versions": {"python": platform.python_version(), "system": platform.platform()}
         | versions(("vgtm-qp", *_CORE)),
-        "solvers": _tried(_solvers),
         "compiler": compiler(),
         "cache": {
             "folder": str(cache),
             "kernels": len(list(cache.glob("*.so"))),
             "hindrance": f"; {hindrance}" if hindrance else "",
         },
-        "kernels": _tried(_kernels),
-        "speed": _tried(lambda: _speed(compiler() is not None and not hindrance)),
-        "fcl": _tried(_fcl),
+        **tried,
         "extras": {
             extra: [name for name, found in versions(names).items() if not found]
             for extra, names in _EXTRAS.items()
         },
     }
-    broken = [name for name in ("solvers", "kernels", "speed", "fcl") if not found[name]["ok"]]
+    broken = [name for name, trial in tried.items() if not trial["ok"]]
     broken += [name for name in _CORE if not found["versions"][name]]
     found["ok"] = not broken
     verdict = f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order"

@@ -21,6 +21,7 @@ from vgtm_qp.cli.output import (
     document,
     following,
     note,
+    on_terminal,
     say,
 )
 
@@ -257,10 +258,16 @@ def _measured(
     if not pinned:
         note("vgtm bench: BLAS was loaded before its threads could be held to one")
 
-    def follow(under_way: BenchScene) -> None:
-        note(f"{scenes.index(under_way) + 1}/{len(scenes)} {under_way.name}")
+    with bar("bench", shown=True, counted=True) as advance:
 
-    return measure(scenes, baselines, seconds=seconds, steps=steps, cold=cold, pinned=pinned, progress=follow)
+        def follow(under_way: BenchScene) -> None:
+            done = scenes.index(under_way)
+            advance(done, len(scenes), f"bench: {under_way.name}")
+            if not on_terminal():
+                note(f"{done + 1}/{len(scenes)} {under_way.name}")
+
+        given: dict[str, Any] = {"seconds": seconds, "steps": steps, "cold": cold, "pinned": pinned}
+        return measure(scenes, baselines, **given, progress=follow)
 
 
 def _draw_phases(found: dict[str, Any], file: Path) -> None:
