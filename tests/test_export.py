@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import csv
+import json
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -127,6 +128,43 @@ def test_a_bag_is_read_back_by_rosbags(maneuver: vq.Maneuver, tmp_path: Path):
     assert len(trajectories) == 1
     assert list(trajectories[0].joint_names) == list(maneuver.actuator_names)
     assert np.array_equal([point.positions for point in trajectories[0].points], lengths)
+
+
+def test_the_folder_of_a_bag_opens_as_a_ros_2_bag(maneuver: vq.Maneuver, tmp_path: Path, capsys):
+    from rosbags.rosbag2 import Reader
+
+    maneuver.save(tmp_path / "t.npz")
+    assert main(["export", str(tmp_path / "t.npz"), "--to", "mcap", "--json"]) == 0
+    written = json.loads(capsys.readouterr().out)
+    assert written["bag"] == str(tmp_path)
+    with Reader(tmp_path) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        stamps = [stamp for _, stamp, _ in reader.messages()]
+        assert (reader.start_time, reader.end_time) == (stamps[0], stamps[-1] + 1)
+        assert reader.message_count == len(stamps)
+    assert counts == {"/joint_states": len(maneuver.time), "/joint_trajectory": 1}
+    about = yaml.safe_load((tmp_path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert about["files"][0]["path"] == "t.mcap"
+    assert about["storage_identifier"] == "mcap"
+
+
+@pytest.mark.parametrize(
+    "metadata", ["", "rosbag2_bagfile_information: 3", "{", None], ids=["empty", "other", "broken", "a bag's"]
+)
+def test_the_metadata_of_other_files_is_left_as_it_is(
+    maneuver: vq.Maneuver, tmp_path: Path, caplog, metadata
+):
+    file = tmp_path / "metadata.yaml"
+    if metadata is None:
+        export_maneuver(maneuver, tmp_path / "first.mcap")
+        export_maneuver(maneuver, tmp_path / "first.mcap")
+        assert not caplog.messages
+    else:
+        file.write_text(metadata)
+    before = file.read_text()
+    export_maneuver(maneuver, tmp_path / "second.mcap")
+    assert file.read_text() == before
+    assert "second.mcap" in caplog.messages[-1]
 
 
 def test_mujoco_reads_the_model_and_finds_the_lengths_at_every_keyframe(

@@ -157,6 +157,7 @@ def export(
 ) -> None:
     """Write a result as an offline page, animation, figure, table, ROS 2 bag or message, or MuJoCo model."""
     from vgtm_qp.export import FORMATS, export_maneuver
+    from vgtm_qp.export.trajectory import bag_files
     from vgtm_qp.maneuver.maneuver import load_result
 
     suffix = FORMATS[to].suffix
@@ -164,8 +165,17 @@ def export(
     check_writable(path, "--output", (suffix,))
     with _about(result), bar(f"{path.name}: writing", shown=not json) as advance:
         file = export_maneuver(load_result(result), path, to=to, progress=partial(advance, total=1.0))
-    written = {"result": str(result), "format": to, "file": str(file), "bytes": file.stat().st_size}
-    answer(written, f"{to}: {file}", as_json=json)
+    written: dict[str, Any] = {
+        "result": str(result),
+        "format": to,
+        "file": str(file),
+        "bytes": file.stat().st_size,
+    }
+    said = f"{to}: {file}"
+    if to == "mcap" and bag_files(file.parent) == [file.name]:
+        written["bag"] = str(file.parent)
+        said += f"\nROS 2 bag: {file.parent}, by the metadata.yaml in it"
+    answer(written, said, as_json=json)
 
 
 @contextmanager

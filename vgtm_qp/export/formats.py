@@ -25,6 +25,8 @@ class Format(NamedTuple):
     function: str
     is_slow: bool = False
     """Whether the function draws many frames, and tells the share that is done."""
+    describe: str = ""
+    """Function that describes the file in another one beside it, by maneuver and path."""
 
     def content(self, maneuver: Result, progress: Callable[[float], None] | None = None) -> bytes:
         """Return what a file of a maneuver holds; a slow format calls `progress` with the share that is done."""
@@ -40,7 +42,7 @@ FORMATS = {
     "pdf": Format(".pdf", "pictures", "pdf"),
     "png": Format(".png", "pictures", "png"),
     "csv": Format(".csv", "trajectory", "csv_text"),
-    "mcap": Format(".mcap", "trajectory", "mcap_bytes"),
+    "mcap": Format(".mcap", "trajectory", "mcap_bytes", describe="describe_bag"),
     "ros": Format(".yaml", "trajectory", "ros_text"),
     "mjcf": Format(".xml", "mjcf", "mjcf"),
 }
@@ -55,6 +57,8 @@ def export_maneuver(
     progress: Callable[[float], None] | None = None,
 ) -> Path:
     """Write a maneuver in another form and return the file's path; an error leaves an old file as it was.
+
+    A ROS 2 bag gets its ``metadata.yaml`` beside it, unless the folder has one that is about other files.
 
     Parameters
     ----------
@@ -88,4 +92,6 @@ def export_maneuver(
         raise ExportError(f'{path}: a {to} cannot be "{path.suffix}"; choices: {form.suffix}')
     with replacing(path, ExportError) as scratch:
         scratch.write_bytes(form.content(maneuver, progress))
+    if form.describe:
+        getattr(import_module(f"vgtm_qp.export.{form.module}"), form.describe)(maneuver, path)
     return path
