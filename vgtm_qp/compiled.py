@@ -147,7 +147,10 @@ def is_sound(path: Path) -> bool:
         digest = digest_file(path)
         if not distrust(path) and not distrust(digest):
             with path.open("rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest() == digest.read_text().strip()
+                return (
+                    hashlib.file_digest(file, "sha256").hexdigest()
+                    == digest.read_text(encoding="utf-8").strip()
+                )
     return False
 
 
@@ -155,7 +158,7 @@ def is_sound(path: Path) -> bool:
 def _machine() -> str:
     """Return what a ``-march=native`` library depends on beside its source."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return ""
     return next((line for line in lines if line.startswith(("flags", "Features"))), "")

@@ -84,7 +84,7 @@ def compare(
     report = sum(reports[1:], reports[0])
     for name, text in (("compare.md", report.markdown()), ("compare.json", report.json() + "\n")):
         with replacing(folder / name) as scratch:
-            scratch.write_text(text)
+            scratch.write_text(text, encoding="utf-8")
     save_figure(report.figure(), folder / "compare.pdf")
     answer(report.to_dict(), report.markdown(), as_json=json)
     note(f"written: {folder / 'compare.md'}, compare.json, compare.pdf")
@@ -164,7 +164,7 @@ def study(
                 return ExitCode.INTERRUPTED
         written.append({"study": name, "title": title, "folder": str(place)})
         if not json:
-            say((place / f"{name}.md").read_text())
+            say((place / f"{name}.md").read_text(encoding="utf-8"))
     if json:
         document({"studies": written})
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -30,6 +31,10 @@ Switch = partial(Parameter, negative="")
 Json = Annotated[bool, Switch(show_default=False, help="print exactly one JSON document on stdout")]
 ProblemName = Annotated[str, Parameter(help="problem file, or the name of a bundled problem (vgtm list)")]
 ResultFile = Annotated[Path, Parameter(name="RESULT", help="result file, .npz")]
+
+
+_READER_ENDED = {errno.EPIPE, errno.EINVAL}
+"""Error numbers of the system, EINVAL on Windows, where nobody reads any more what is written."""
 
 
 class ExitCode(IntEnum):
@@ -81,7 +86,9 @@ def _write(stream: TextIO | None, text: str) -> None:
     encoding = stream.encoding or "utf-8"
     try:
         print(text.encode(encoding, "replace").decode(encoding), file=stream, flush=True)
-    except BrokenPipeError:
+    except OSError as error:
+        if error.errno not in _READER_ENDED:
+            raise
         # What is left in the buffer would fail again when Python closes the stream at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
