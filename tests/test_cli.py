@@ -373,7 +373,19 @@ def test_the_package_gives_its_names_and_keeps_the_function_verify():
         vq.no_such_name  # noqa: B018
 
 
-@pytest.mark.parametrize(("shell", "code"), [("bash", 0), ("zsh", 0), ("tcsh", 2)])
+def test_the_version_is_that_of_the_distribution_or_unknown(monkeypatch):
+    import importlib.metadata
+
+    assert vq.__version__ == importlib.metadata.version("vgtm-qp")
+
+    def absent(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", absent)
+    assert vq.__version__ == "0+unknown"
+
+
+@pytest.mark.parametrize(("shell", "code"), [("bash", 0), ("zsh", 0), ("fish", 0), ("tcsh", 2)])
 def test_completion_is_installed_for_the_shell_that_is_named(shell, code, tmp_path):
     program = "import sys; from vgtm_qp.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "--install-completion", "--shell", shell]

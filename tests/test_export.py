@@ -6,6 +6,7 @@ import builtins
 import csv
 import json
 import re
+import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -240,9 +241,10 @@ def test_pictures_are_of_their_kind(
 def test_an_animation_shows_every_state_and_moves(arm_between_cubes: vq.Maneuver, tmp_path: Path):
     from PIL import Image
 
-    few = _first_states(arm_between_cubes, 4)
-    with Image.open(export_maneuver(few, tmp_path / "arm.gif")) as animation:
+    few, shares = _first_states(arm_between_cubes, 4), []
+    with Image.open(export_maneuver(few, tmp_path / "arm.gif", progress=shares.append)) as animation:
         assert animation.n_frames == 4
+        assert shares == [0.25, 0.5, 0.75, 1.0]
         pictures = []
         for k in range(4):
             animation.seek(k)
@@ -259,6 +261,26 @@ def test_a_video_has_a_frame_for_each_state(arm_between_cubes: vq.Maneuver, tmp_
     assert frames == 3
 
 
+def test_a_mujoco_that_cannot_be_loaded_is_not_said_to_be_missing(
+    maneuver: vq.Maneuver, tmp_path: Path, monkeypatch, capsys
+):
+    real = builtins.__import__
+
+    def broken(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "mujoco":
+            raise ImportError("libmujoco.so: cannot open shared object file")
+        return real(name, *rest, **more)
+
+    monkeypatch.delitem(sys.modules, "mujoco", raising=False)
+    monkeypatch.setattr(builtins, "__import__", broken)
+    file = maneuver.save(tmp_path / "t.npz")
+    assert main(["replay", str(file)]) == 2
+    err = capsys.readouterr().err
+    assert "libmujoco.so" in err
+    assert "vgtm doctor" in err
+    assert "not installed" not in err
+
+
 def test_a_missing_extra_is_named_with_the_pip_line(
     maneuver: vq.Maneuver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -267,7 +289,7 @@ def test_a_missing_extra_is_named_with_the_pip_line(
 
     def without(name: str, *arguments: Any, **options: Any) -> Any:
         if name.split(".")[0] in absent:
-            raise ImportError(name)
+            raise ModuleNotFoundError(name)
         return import_module(name, *arguments, **options)
 
     still = _first_states(maneuver, 1)

@@ -159,7 +159,7 @@ def following(title: str, *, shown: bool) -> Iterator[Progress]:
                 signal.signal(signal.SIGINT, before)
 
 
-class Advance(Protocol):
+class MoveBar(Protocol):
     """Moves a bar to `done` of `total`, and gives it another `title`."""
 
     def __call__(self, done: float, total: float, title: str = "") -> None:
@@ -174,7 +174,7 @@ def waiting(title: str, *, shown: bool) -> Iterator[None]:
 
 
 @contextmanager
-def bar(title: str, *, shown: bool, counted: bool = False, first: str = "") -> Iterator[Advance]:
+def bar(title: str, *, shown: bool, counted: bool = False, first: str = "") -> Iterator[MoveBar]:
     """Give the function that moves a bar if stderr is a terminal.
 
     Beside the bar are a percentage or, if things are `counted`, their number, the time that has passed and that is
