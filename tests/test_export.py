@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import csv
+import importlib
 import json
 import re
 import sys
@@ -293,6 +294,9 @@ def test_a_missing_extra_is_named_with_the_pip_line(
         return import_module(name, *arguments, **options)
 
     still = _first_states(maneuver, 1)
+    # Matplotlib, which these import, cannot do without Pillow.
+    for form in FORMATS.values():
+        importlib.import_module(f"vgtm_qp.export.{form.module}")
     monkeypatch.setattr(builtins, "__import__", without)
     for name, extra in {
         "html": "view",
