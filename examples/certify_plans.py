@@ -57,9 +57,12 @@ print(spline([0.0, 1.5, 3.0, 4.5, 6.0, 7.5, 9.0], folded))
 points = "".join(
     f"- positions: {row}\n  time_from_start: {{sec: {2 * k}, nanosec: 0}}\n" for k, row in enumerate(folded)
 )
-Path("recorded.yaml").write_text(f"joint_names: [shoulder, elbow, wrist]\npoints:\n{points}")
+out = Path("out")
+out.mkdir(exist_ok=True)
+recorded = out / "recorded.yaml"
+recorded.write_text(f"joint_names: [shoulder, elbow, wrist]\npoints:\n{points}")
 try:
-    print(f"from ROS: {vq.Certifier(problem).certify_file('recorded.yaml')}")
+    print(f"from ROS: {vq.Certifier(problem).certify_file(recorded)}")
 except vq.MissingExtraError as error:
     print(f"from ROS: {error}")
 

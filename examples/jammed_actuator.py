@@ -1,5 +1,7 @@
 """An actuator jams on the way: the arm goes on with those that are left."""
 
+from pathlib import Path
+
 import numpy as np
 
 import vgtm_qp as vq
@@ -19,4 +21,6 @@ print(f"verified: {hurt.certificate.ok}; clearance {hurt.clearance.min():.4f} m"
 if hurt.status != "solved":
     print("stopped by", hurt.stopped_by)
 
-hurt.plot_strokes().savefig("jammed_actuator.png", dpi=150)
+out = Path("out")
+out.mkdir(exist_ok=True)
+hurt.plot_strokes().savefig(out / "jammed_actuator.png", dpi=150)

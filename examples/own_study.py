@@ -20,7 +20,9 @@ for x in (1.2, 1.6, 2.0, 2.4):
         f"{sensitivity:.1f} mm at the tip for 1 mm of actuator error, verified: {maneuver.certificate.ok}"
     )
 
-with Path("own_study.csv").open("w", newline="") as file:
+out = Path("out")
+out.mkdir(exist_ok=True)
+with (out / "own_study.csv").open("w", newline="") as file:
     writer = csv.writer(file)
     writer.writerow(
         ["goal x [m]", "status", "reached x [m]", "tip error per mm of actuator error [mm]", "verified"]
@@ -33,4 +35,4 @@ axes.plot([row[0] for row in rows], [row[2] for row in rows], marker="o")
 axes.axline((rows[0][0], rows[0][0]), slope=1.0, color="0.7", linestyle="--", label="as asked")
 axes.set(xlabel="goal x (m)", ylabel="reached x (m)")
 axes.legend(frameon=False)
-figure.savefig("own_study.png", dpi=150)
+figure.savefig(out / "own_study.png", dpi=150)

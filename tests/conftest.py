@@ -54,7 +54,9 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     if named or config.option.capture == "no":
         return 0
     cores = os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS", "")
-    return int(cores) if cores.isdigit() else len(os.sched_getaffinity(0))
+    if cores.isdigit():
+        return int(cores)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @pytest.hookimpl(tryfirst=True)

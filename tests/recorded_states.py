@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import sys
 import time
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -488,9 +488,7 @@ CASES: dict[str, Case] = {case.name: case for maker in (_bundled, _scenes, _loop
 
 def record(case: Case) -> Recording:
     """Run a case and return what came of it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return _record_loop(case) if case.loop else _record_maneuver(case)
+    return _record_loop(case) if case.loop else _record_maneuver(case)
 
 
 def _record_maneuver(case: Case) -> Recording:
@@ -672,6 +670,7 @@ def _summary(apart: Mapping[str, float], failed: Sequence[str]) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Record, compare or list the cases."""
+    logging.getLogger("vgtm_qp").setLevel(logging.ERROR)
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -72,6 +72,37 @@ def test_long_classes_and_functions_are_found(kind: str, most: int) -> None:
     assert not found(most + 1, f"Something. {REASON}its options are.")
 
 
+SPEAKERS = {
+    "cli/output.py": "the command's",
+    "bench/fresh.py": "a process's answer to the one that started it",
+}
+"""Files that may print, and whose output that is."""
+
+
+def spoken_aloud(tree: ast.Module) -> Iterator[int]:
+    """Yield the lines that print, or warn otherwise than by ``logging``."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            if name in (
+                "print",
+                "warn",
+                "warnings.warn",
+                "traceback.print_exc",
+                "sys.stdout.write",
+                "sys.stderr.write",
+            ):
+                yield node.lineno
+
+
+def test_library_code_logs_and_prints_nothing() -> None:
+    files = {file.relative_to(PACKAGE).as_posix(): file for file in PACKAGE.rglob("*.py")}
+    found = {
+        name: list(spoken_aloud(ast.parse(file.read_text(encoding="utf-8")))) for name, file in files.items()
+    }
+    assert {name for name, lines in found.items() if lines} == set(SPEAKERS)
+
+
 def is_private(name: str) -> bool:
     """Return whether a name is for its own module or class alone; ``_repr_html_`` and its like belong to protocols."""
     return name.startswith("_") and not name.endswith("_") and name not in OPEN

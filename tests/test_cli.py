@@ -66,7 +66,7 @@ def test_solve_writes_a_verified_result_and_prints_a_table(capsys, folder):
 
 
 def test_solve_as_json_is_one_document_with_the_keys_of_the_contract(capsys):
-    code, out, err = run(capsys, "solve", "free.toml", "--json", "-o", "a/b.npz")
+    code, out, err = run(capsys, "solve", "free.toml", "--json", "-o", "b.npz")
     summary = json.loads(out)
     assert (code, err) == (0, WARNING)
     assert set(summary) >= {
@@ -75,8 +75,8 @@ def test_solve_as_json_is_one_document_with_the_keys_of_the_contract(capsys):
         "blocked_by", "result",
     }  # fmt: skip
     assert set(summary["step_time"]) >= {"median", "p95", "p99", "phases"}
-    assert (summary["status"], summary["result"]) == ("solved", "a/b.npz")
-    assert Path("a/b.npz").is_file()
+    assert (summary["status"], summary["result"]) == ("solved", "b.npz")
+    assert Path("b.npz").is_file()
 
 
 def test_options_stand_in_for_those_of_the_problem(capsys):
@@ -141,6 +141,12 @@ def test_a_blocked_maneuver_gives_3_and_keeps_what_was_solved(capsys, folder):
         (["solve", "free.toml", "--solver", "magic"], ['--solver: found "magic"', '"daqp", "', '"osqp"']),
         (["solve", "free.toml", "-o", "result.txt"], ["--output", ".npz"]),
         (["solve", "free.toml", "-o", "/proc/none/result.npz"], ["--output", "/proc"]),
+        (["solve", "free.toml", "-o", "none/result.npz"], ["--output", "none is missing"]),
+        (["solve", "free.toml", "-o", "free.toml/result.npz"], ["--output", "free.toml is a file"]),
+        (["solve", "free.toml", "--figure", "none/frames.pdf"], ["--figure", "none is missing"]),
+        (["solve", "free.toml", "--html", "none/page.html"], ["--html", "none is missing"]),
+        (["export", "a.npz", "--to", "csv", "-o", "none/a.csv"], ["--output", "none is missing"]),
+        (["bench", "--figure", "none/bars.pdf"], ["--figure", "none is missing"]),
         (["solve", "free.toml", "--figure", "frames.gif"], ["--figure", ".pdf"]),
         (["solve", "none.toml"], ["none.toml", "five_bay_two_cubes"]),
         (["solve", "far.toml"], ["far.toml", "maneuver.waypoint[0].position", "out of any reach"]),
@@ -164,6 +170,7 @@ def test_wrong_usage_gives_2_and_names_the_choices(capsys, folder, tokens, words
     else:
         assert out == ""
     assert not list(folder.glob("*.npz"))
+    assert not (folder / "none").exists()
 
 
 def test_mistakes_of_a_file_are_listed_one_a_line_and_as_data(capsys, folder):
@@ -366,7 +373,19 @@ def test_the_package_gives_its_names_and_keeps_the_function_verify():
         vq.no_such_name  # noqa: B018
 
 
-@pytest.mark.parametrize(("shell", "code"), [("bash", 0), ("zsh", 0), ("tcsh", 2)])
+def test_the_version_is_that_of_the_distribution_or_unknown(monkeypatch):
+    import importlib.metadata
+
+    assert vq.__version__ == importlib.metadata.version("vgtm-qp")
+
+    def absent(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", absent)
+    assert vq.__version__ == "0+unknown"
+
+
+@pytest.mark.parametrize(("shell", "code"), [("bash", 0), ("zsh", 0), ("fish", 0), ("tcsh", 2)])
 def test_completion_is_installed_for_the_shell_that_is_named(shell, code, tmp_path):
     program = "import sys; from vgtm_qp.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "--install-completion", "--shell", shell]

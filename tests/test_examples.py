@@ -11,7 +11,7 @@ import pytest
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
 
 SAYS = {
-    "first_maneuver": ("solved in 50 steps", "vgtm export first_maneuver.npz --to html"),
+    "first_maneuver": ("solved in 50 steps", "vgtm export out/first_maneuver.npz --to html"),
     "own_truss": ("6 free motions", "solved; verified: True"),
     "control_loop": ("400 cycles at 200 Hz", "certified: True"),
     "compare_methods": ("curve-pseudoinverse", "pseudoinverse", "qp"),
@@ -27,6 +27,11 @@ SAYS = {
     "panda_among_shelves": ("Panda among shelves", "upper board", "| qp                      | yes"),
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
 }
+
+
+def test_what_examples_write_is_ignored_by_git():
+    ignored = (EXAMPLES[0].parents[1] / ".gitignore").read_text(encoding="utf-8").splitlines()
+    assert "out/" in ignored
 
 
 def test_each_example_is_tried():
@@ -51,5 +56,6 @@ def test_an_example_runs(
     printed = capsys.readouterr().out
     for words in SAYS[example.stem]:
         assert words in printed
-    for picture in tmp_path.glob("*.png"):
+    assert {place.name for place in tmp_path.iterdir()} <= {"out"}
+    for picture in tmp_path.glob("out/*.png"):
         assert picture.stat().st_size > 5_000

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import builtins
 import csv
+import importlib
+import json
 import re
+import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -129,6 +132,43 @@ def test_a_bag_is_read_back_by_rosbags(maneuver: vq.Maneuver, tmp_path: Path):
     assert np.array_equal([point.positions for point in trajectories[0].points], lengths)
 
 
+def test_the_folder_of_a_bag_opens_as_a_ros_2_bag(maneuver: vq.Maneuver, tmp_path: Path, capsys):
+    from rosbags.rosbag2 import Reader
+
+    maneuver.save(tmp_path / "t.npz")
+    assert main(["export", str(tmp_path / "t.npz"), "--to", "mcap", "--json"]) == 0
+    written = json.loads(capsys.readouterr().out)
+    assert written["bag"] == str(tmp_path)
+    with Reader(tmp_path) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        stamps = [stamp for _, stamp, _ in reader.messages()]
+        assert (reader.start_time, reader.end_time) == (stamps[0], stamps[-1] + 1)
+        assert reader.message_count == len(stamps)
+    assert counts == {"/joint_states": len(maneuver.time), "/joint_trajectory": 1}
+    about = yaml.safe_load((tmp_path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert about["files"][0]["path"] == "t.mcap"
+    assert about["storage_identifier"] == "mcap"
+
+
+@pytest.mark.parametrize(
+    "metadata", ["", "rosbag2_bagfile_information: 3", "{", None], ids=["empty", "other", "broken", "a bag's"]
+)
+def test_the_metadata_of_other_files_is_left_as_it_is(
+    maneuver: vq.Maneuver, tmp_path: Path, caplog, metadata
+):
+    file = tmp_path / "metadata.yaml"
+    if metadata is None:
+        export_maneuver(maneuver, tmp_path / "first.mcap")
+        export_maneuver(maneuver, tmp_path / "first.mcap")
+        assert not caplog.messages
+    else:
+        file.write_text(metadata)
+    before = file.read_text()
+    export_maneuver(maneuver, tmp_path / "second.mcap")
+    assert file.read_text() == before
+    assert "second.mcap" in caplog.messages[-1]
+
+
 def test_mujoco_reads_the_model_and_finds_the_lengths_at_every_keyframe(
     maneuver: vq.Maneuver, tmp_path: Path
 ):
@@ -202,9 +242,10 @@ def test_pictures_are_of_their_kind(
 def test_an_animation_shows_every_state_and_moves(arm_between_cubes: vq.Maneuver, tmp_path: Path):
     from PIL import Image
 
-    few = _first_states(arm_between_cubes, 4)
-    with Image.open(export_maneuver(few, tmp_path / "arm.gif")) as animation:
+    few, shares = _first_states(arm_between_cubes, 4), []
+    with Image.open(export_maneuver(few, tmp_path / "arm.gif", progress=shares.append)) as animation:
         assert animation.n_frames == 4
+        assert shares == [0.25, 0.5, 0.75, 1.0]
         pictures = []
         for k in range(4):
             animation.seek(k)
@@ -221,6 +262,26 @@ def test_a_video_has_a_frame_for_each_state(arm_between_cubes: vq.Maneuver, tmp_
     assert frames == 3
 
 
+def test_a_mujoco_that_cannot_be_loaded_is_not_said_to_be_missing(
+    maneuver: vq.Maneuver, tmp_path: Path, monkeypatch, capsys
+):
+    real = builtins.__import__
+
+    def broken(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "mujoco":
+            raise ImportError("libmujoco.so: cannot open shared object file")
+        return real(name, *rest, **more)
+
+    monkeypatch.delitem(sys.modules, "mujoco", raising=False)
+    monkeypatch.setattr(builtins, "__import__", broken)
+    file = maneuver.save(tmp_path / "t.npz")
+    assert main(["replay", str(file)]) == 2
+    err = capsys.readouterr().err
+    assert "libmujoco.so" in err
+    assert "vgtm doctor" in err
+    assert "not installed" not in err
+
+
 def test_a_missing_extra_is_named_with_the_pip_line(
     maneuver: vq.Maneuver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -229,10 +290,13 @@ def test_a_missing_extra_is_named_with_the_pip_line(
 
     def without(name: str, *arguments: Any, **options: Any) -> Any:
         if name.split(".")[0] in absent:
-            raise ImportError(name)
+            raise ModuleNotFoundError(name)
         return import_module(name, *arguments, **options)
 
     still = _first_states(maneuver, 1)
+    # Matplotlib, which these import, cannot do without Pillow.
+    for form in FORMATS.values():
+        importlib.import_module(f"vgtm_qp.export.{form.module}")
     monkeypatch.setattr(builtins, "__import__", without)
     for name, extra in {
         "html": "view",

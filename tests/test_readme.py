@@ -134,6 +134,12 @@ def test_the_reference_is_written_as_it_stands():
     assert written(document.replace("| required |", "| 3 |")) == document
 
 
+def test_the_changelog_begins_with_this_version():
+    text = DOCUMENTS["vgtm_qp/README.md"].split("## Changelog\n")[1].split("\n## ")[0]
+    versions = re.findall(r"^### (\S+?),? ", text, flags=re.MULTILINE)
+    assert versions[0] == PROJECT["version"]
+
+
 def test_every_example_has_its_row():
     rows = [re.match(r"\| `(\w+\.py)`", row) for row in table("script")]
     assert sorted(row[1] for row in rows if row) == sorted(

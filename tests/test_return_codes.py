@@ -189,8 +189,7 @@ def test_why_an_arm_stops_is_told_of_a_pose_whose_lengths_do_not_determine_it(mo
 
 
 SCENES = """
-import json, sys, warnings
-warnings.simplefilter("ignore")
+import json, sys
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.study.scenes import random_scene
 for seed, number in json.loads(sys.argv[1]):

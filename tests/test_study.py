@@ -41,6 +41,13 @@ def test_a_run_that_dies_hangs_or_raises_loses_itself_alone(tmp_path: Path) -> N
     assert "longer than 4 s" in rows[4]["failed"]
 
 
+def test_a_process_tells_a_warning_of_its_tasks_once(capfd: pytest.CaptureFixture[str]) -> None:
+    tasks = [{"value": value} for value in (1, 1, 2, 1)]
+    assert len(dict(run_processes("study_tasks:warn", tasks, 1))) == 4
+    told = [line for line in capfd.readouterr().err.splitlines() if "doubtful" in line]
+    assert told == [f"warning: task of value {value} is doubtful" for value in (1, 2)]
+
+
 def test_processes_and_a_cluster_give_the_rows_of_one_process(tmp_path: Path) -> None:
     tasks = [{"offset": offset, "problem": "five_bay_free"} for offset in (0.02, 0.1)]
     function = "vgtm_qp.study.joints:run"

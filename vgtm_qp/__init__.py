@@ -105,9 +105,13 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that ``vgtm --help`` pays for none of them (PEP 562)."""
     if name == "__version__":
-        from importlib.metadata import version
+        from importlib.metadata import PackageNotFoundError, version
 
-        return version("vgtm-qp")
+        try:
+            return version("vgtm-qp")
+        except PackageNotFoundError:
+            # A source tree that was never installed.
+            return "0+unknown"
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
     value = getattr(import_module(_HOME_OF[name]), name)

@@ -274,7 +274,7 @@ def _publish(made: Path, target: Path) -> None:
     """Move a file of the cache to its place, its digest before it."""
     made.chmod(0o644)
     digest = digest_file(made)
-    digest.write_text(hashlib.sha256(made.read_bytes()).hexdigest())
+    digest.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="utf-8")
     digest.chmod(0o644)
     # Other processes would make a file again whose digest is not there yet.
     digest.replace(digest_file(target))

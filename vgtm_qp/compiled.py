@@ -22,6 +22,7 @@ import contextlib
 import ctypes
 import gc
 import hashlib
+import logging
 import os
 import pickle
 import queue
@@ -31,7 +32,6 @@ import stat
 import subprocess
 import sys
 import threading
-import warnings
 import weakref
 from collections import Counter
 from functools import cache
@@ -45,6 +45,8 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import EvaluationError
 
 Array = NDArray[np.float64]
+
+_LOG = logging.getLogger(__name__)
 
 FLAGS = (
     "-O2",
@@ -145,7 +147,10 @@ def is_sound(path: Path) -> bool:
         digest = digest_file(path)
         if not distrust(path) and not distrust(digest):
             with path.open("rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest() == digest.read_text().strip()
+                return (
+                    hashlib.file_digest(file, "sha256").hexdigest()
+                    == digest.read_text(encoding="utf-8").strip()
+                )
     return False
 
 
@@ -153,7 +158,7 @@ def is_sound(path: Path) -> bool:
 def _machine() -> str:
     """Return what a ``-march=native`` library depends on beside its source."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return ""
     return next((line for line in lines if line.startswith(("flags", "Features"))), "")
@@ -447,7 +452,7 @@ def finish_compiling() -> bool:
 @cache
 def _warn(text: str) -> None:
     """Warn once that kernels are slow, and why."""
-    warnings.warn(text, stacklevel=2)
+    _LOG.warning(text)
 
 
 def _warned_of(folder: Path) -> bool:

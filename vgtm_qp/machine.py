@@ -81,7 +81,8 @@ def machine_record() -> dict[str, Any]:
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
-        "load": [round(value, 2) for value in os.getloadavg()],
+        # Windows does not know it.
+        "load": [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else [],
         "system": platform.platform(),
         "python": platform.python_version(),
         "compiler": compiler(),

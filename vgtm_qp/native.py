@@ -40,7 +40,9 @@ _TYPES: dict[str, Any] = {"int": ctypes.c_int, "double": ctypes.c_double, "Kerne
 @cache
 def structure(source: Path, name: str) -> type[ctypes.Structure]:
     """Return the structure of that `name` in a C source as a class of ctypes; its pointers are addresses."""
-    body = next(match[1] for match in _STRUCT.finditer(source.read_text()) if match[2] == name)
+    body = next(
+        match[1] for match in _STRUCT.finditer(source.read_text(encoding="utf-8")) if match[2] == name
+    )
     fields: list[tuple[str, Any]] = []
     for declaration in _COMMENT.sub("", body).split(";"):
         words = declaration.replace("const ", "").split(None, 1)
@@ -63,7 +65,8 @@ def building(source: Path) -> Building:
 
 @cache
 def _building(source: Path, *_: object) -> Building:
-    return Building(source.stem, _HEADER.read_text() + source.read_text(), (f"-I{INCLUDES}",))
+    text = "".join(file.read_text(encoding="utf-8") for file in (_HEADER, source))
+    return Building(source.stem, text, (f"-I{INCLUDES}",))
 
 
 class Program:

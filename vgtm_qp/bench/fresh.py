@@ -9,16 +9,22 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 from itertools import pairwise
 from pathlib import Path
-from time import perf_counter, time
+from time import perf_counter, process_time, time
 from typing import Any
 
 from vgtm_qp.errors import SolverError
+
+resource: Any
+try:
+    import resource
+except ImportError:
+    # Windows has no such module.
+    resource = None
 
 _PACKAGE_PARENT = Path(__file__).resolve().parents[2]
 _STEPS = 5
@@ -29,7 +35,7 @@ _HELP = "from vgtm_qp.cli import main; main(['--help'])"
 def measure_start() -> dict[str, float]:
     """Return CPU seconds of a bare interpreter, of one that imports the package, and of ``vgtm --help``.
 
-    Each is the least of three runs, since disturbances only add to it.
+    Each is the least of three runs, since disturbances only add to it; on Windows, by the clock.
     """
     scripts = {"python": "pass", "import": "import vgtm_qp", "help": _HELP}
     return {name: min(_cpu_seconds_of(script) for _ in range(_REPEATS)) for name, script in scripts.items()}
@@ -123,7 +129,7 @@ def _measured(problem: dict[str, Any]) -> dict[str, float]:
 
 
 def _peak_memory() -> int:
-    """Return the greatest resident memory of this process, bytes.
+    """Return the greatest resident memory of this process, bytes; 0 where the system does not tell.
 
     On Linux ``ru_maxrss`` begins with what the parent had when it forked; the status file does not.
     """
@@ -134,20 +140,24 @@ def _peak_memory() -> int:
     for line in status.splitlines():
         if line.startswith("VmHWM:"):
             return 1024 * int(line.split()[1])
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if resource is None:
+        return 0
+    peak = int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def _cpu_seconds() -> float:
-    """Return the CPU time of this process and of the children that it waited for, s."""
+    """Return the CPU time of this process and of the children that it waited for, s; on Windows without these."""
+    if resource is None:
+        return process_time()
     both = (resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(usage.ru_utime + usage.ru_stime for usage in both)
+    return float(sum(usage.ru_utime + usage.ru_stime for usage in both))
 
 
 def _cpu_seconds_of(script: str) -> float:
-    before = _cpu_seconds()
+    before, clock = _cpu_seconds(), perf_counter()
     subprocess.run([sys.executable, "-P", "-c", script], check=True, capture_output=True, env=_environment())
-    return _cpu_seconds() - before
+    return perf_counter() - clock if resource is None else _cpu_seconds() - before
 
 
 def _environment() -> dict[str, str]:

@@ -17,12 +17,12 @@ def render(document: dict[str, Any]) -> str:
 
 def _parts(document: dict[str, Any]) -> Iterator[str]:
     machine, start, settings = document["machine"], document["start"], document["settings"]
-    load = machine["load"][0]
+    load = f", load {machine['load'][0]}" if machine["load"] else ""
     threads = "one BLAS thread" if settings["one_blas_thread"] else "BLAS THREADS NOT PINNED"
     versions = ", ".join(f"{name} {version}" for name, version in document["versions"].items() if version)
     at = f"Commit {document['commit'][:12]}, " if document["commit"] else ""
     yield (
-        f"{at}{machine['processor']}, {machine['cores']} cores, load {load}, Python {machine['python']}, {threads}\n"
+        f"{at}{machine['processor']}, {machine['cores']} cores{load}, Python {machine['python']}, {threads}\n"
         f"{versions}\n"
         f"CPU to start: python {start['python']:.3f} s, import vgtm_qp {start['import']:.3f} s, "
         f"vgtm --help {start['help']:.3f} s"

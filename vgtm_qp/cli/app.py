@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import Any
 
 from cyclopts import App, CycloptsError, UnknownCommandError, UnknownOptionError, UnusedCliTokensError
 
@@ -23,6 +22,7 @@ from vgtm_qp.cli.results import export, replay, verify, view
 from vgtm_qp.cli.solve import solve
 from vgtm_qp.errors import AlteredResultError, ProblemError, VgtmError, nearest
 from vgtm_qp.machine import noting_interrupts
+from vgtm_qp.notices import telling
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 """Error numbers of the system for a disk that is full or fails."""
@@ -134,17 +134,16 @@ def _lacks_room(error: BaseException | None) -> bool:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Print the package's own warnings as one line on stderr each; those of libraries keep their file and line."""
-    with warnings.catch_warnings():
-        show = warnings.showwarning
+    """Print warnings in one line on stderr each, those of other libraries with their kind and place."""
 
-        def line(message: Warning | str, category: type[Warning], *place: Any, **to: Any) -> None:
-            if category is UserWarning:
-                note(f"warning: {message}")
-            else:
-                show(message, category, *place, **to)
+    def show(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object, **__: object
+    ) -> None:
+        place = "" if category is UserWarning else f" ({category.__name__}, {filename}:{lineno})"
+        note(f"warning: {' '.join(str(message).split())}{place}")
 
-        warnings.showwarning = line
+    with warnings.catch_warnings(), telling(note):
+        warnings.showwarning = show
         yield
 
 

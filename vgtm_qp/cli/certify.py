@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from vgtm_qp.cli.output import ExitCode, Json, ProblemName, answer
+from vgtm_qp.cli.output import ExitCode, Json, ProblemName, answer, waiting
 
 
 def certify(
@@ -31,7 +31,8 @@ def certify(
     from vgtm_qp.certify.certify import Certifier
     from vgtm_qp.problem import load_problem
 
-    verdict = Certifier(load_problem(problem)).certify_file(trajectory)
+    with waiting(f"{trajectory.name}: certifying", shown=not json):
+        verdict = Certifier(load_problem(problem)).certify_file(trajectory)
     found = {"trajectory": str(trajectory), **verdict.to_dict()}
     answer(found, f"{trajectory}: {verdict}", as_json=json)
     return ExitCode.SOLVED if verdict.certified else ExitCode.UNVERIFIED

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from vgtm_qp.cli.output import ExitCode, Json, answer, table, why_not_writable
+from vgtm_qp.cli.output import ExitCode, Json, answer, table, waiting, why_not_writable
 
 _CORE = ("numpy", "scipy", "casadi", "daqp", "osqp", "piqp", "qpsolvers", "python-fcl", "trimesh", "pydantic")
 _SPEED = "five_bay_free"
@@ -35,6 +36,14 @@ _EXTRAS = {
 }
 
 
+_NO_WHEELS = {"pin": ("win32",)}
+"""Packages that are not made for some systems, by ``sys.platform``."""
+_MUJOCO = ("mujoco", "mujoco-core", "mujoco-studio")
+"""Packages that MuJoCo consists of; before version 4 it was the first one alone, with the same files."""
+_ANEW = f"pip uninstall {' '.join(_MUJOCO)}, then pip install 'vgtm-qp[mujoco]'"
+_BALL = "<mujoco><worldbody><body><freejoint/><geom size='0.1' mass='1'/></body></worldbody></mujoco>"
+
+
 def doctor(*, json: Json = False) -> int:
     """Show versions, solvers, the C compiler and its cache, whether kernels and FCL work, and how long a step takes.
 
@@ -53,25 +62,30 @@ def doctor(*, json: Json = False) -> int:
     hindrance = f"CANNOT BE WRITTEN, kernels run uncompiled: {hindrance}" if hindrance else ""
     if not hindrance and cache.exists() and (reason := distrust(cache)):
         hindrance = f"IS NOT USED, kernels run uncompiled: {reason}"
+    with waiting("doctor: compiling kernels, timing steps", shown=not json):
+        tried = {
+            "solvers": _tried(_solvers),
+            "kernels": _tried(_kernels),
+            "speed": _tried(lambda: _speed(compiler() is not None and not hindrance)),
+            "fcl": _tried(_fcl),
+        }
     found: dict[str, Any] = {
         "versions": {"python": platform.python_version(), "system": platform.platform()}
         | versions(("vgtm-qp", *_CORE)),
-        "solvers": _tried(_solvers),
         "compiler": compiler(),
         "cache": {
             "folder": str(cache),
             "kernels": len(list(cache.glob("*.so"))),
             "hindrance": f"; {hindrance}" if hindrance else "",
         },
-        "kernels": _tried(_kernels),
-        "speed": _tried(lambda: _speed(compiler() is not None and not hindrance)),
-        "fcl": _tried(_fcl),
+        **tried,
+        "mujoco": _tried(_mujoco) if versions(("mujoco",))["mujoco"] else None,
         "extras": {
             extra: [name for name, found in versions(names).items() if not found]
             for extra, names in _EXTRAS.items()
         },
     }
-    broken = [name for name in ("solvers", "kernels", "speed", "fcl") if not found[name]["ok"]]
+    broken = [name for name, trial in tried.items() if not trial["ok"]]
     broken += [name for name in _CORE if not found["versions"][name]]
     found["ok"] = not broken
     verdict = f"not in order: {', '.join(broken)}" if broken else "all that a maneuver needs is in order"
@@ -90,10 +104,19 @@ def _report(found: dict[str, Any]) -> str:
         ("one step", found["speed"]["says"]),
         ("FCL", found["fcl"]["says"]),
     ]
-    for extra, missing in found["extras"].items():
-        state = f"missing {', '.join(missing)}: pip install 'vgtm-qp[{extra}]'" if missing else "installed"
-        rows.append((f"extra [{extra}]", state))
+    rows += [(f"extra [{extra}]", _state(extra, missing)) for extra, missing in found["extras"].items()]
+    if found["mujoco"] is not None:
+        rows.append(("MuJoCo", found["mujoco"]["says"]))
     return table(rows)
+
+
+def _state(extra: str, missing: Sequence[str]) -> str:
+    """Return in words what an extra lacks, and whether it can be had on this system."""
+    never = [name for name in missing if sys.platform in _NO_WHEELS.get(name, ())]
+    left = [name for name in missing if name not in never]
+    words = [f"missing {', '.join(left)}: pip install 'vgtm-qp[{extra}]'"] if left else []
+    words += [f"{', '.join(never)} is not made for this system"] if never else []
+    return "; ".join(words) or "installed"
 
 
 def _tried(trial: Callable[[], str]) -> dict[str, Any]:
@@ -159,6 +182,27 @@ def _speed(can_compile: bool) -> str:
     if not is_compiled:
         return f"{slow:.2g} ms, interpreted, for five bays"
     return f"{fast:.2g} ms for five bays; {slow:.2g} ms where kernels are interpreted, {slow / fast:.1f} times as long"
+
+
+def _mujoco() -> str:
+    """Let a ball fall for a moment, and compare the versions of the parts, which an upgrade by halves mixes."""
+    from vgtm_qp.machine import versions
+
+    try:
+        import mujoco
+
+        parts = {"mujoco as imported": mujoco.__version__, "its library": mujoco.mj_versionString()}
+        data = mujoco.MjData(model := mujoco.MjModel.from_xml_string(_BALL))
+        mujoco.mj_step(model, data, 10)
+    except (ImportError, AttributeError, TypeError, OSError) as error:
+        raise ImportError(f"{error}; {_ANEW}") from None
+    parts |= {name: found for name, found in versions(_MUJOCO).items() if found}
+    if len(set(parts.values())) > 1:
+        said = ", ".join(f"{name} {found}" for name, found in parts.items())
+        raise ImportError(f"versions are mixed, {said}; {_ANEW}")
+    if not -1.0 < data.qpos[2] < 0.0:
+        raise ArithmeticError(f"a ball that falls is at {data.qpos[2]} m")
+    return f"{mujoco.__version__}, a ball falls"
 
 
 def _fcl() -> str:

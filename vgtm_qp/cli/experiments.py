@@ -21,6 +21,7 @@ from vgtm_qp.cli.output import (
     document,
     following,
     note,
+    on_terminal,
     say,
 )
 
@@ -43,7 +44,9 @@ def compare(
         list[str] | None,
         Parameter(help="methods by name, all of them with all; ten by default", consume_multiple=True),
     ] = None,
-    output: Annotated[Path | None, Output(help="folder for compare.md, .json and .pdf")] = None,
+    output: Annotated[
+        Path | None, Output(help="folder for compare.md, .json and .pdf; made if it is missing")
+    ] = None,
     json: Json = False,
 ) -> int:
     """Solve problems by several methods and show what each of them keeps; a method that fails is shown as failed.
@@ -81,7 +84,7 @@ def compare(
     report = sum(reports[1:], reports[0])
     for name, text in (("compare.md", report.markdown()), ("compare.json", report.json() + "\n")):
         with replacing(folder / name) as scratch:
-            scratch.write_text(text)
+            scratch.write_text(text, encoding="utf-8")
     save_figure(report.figure(), folder / "compare.pdf")
     answer(report.to_dict(), report.markdown(), as_json=json)
     note(f"written: {folder / 'compare.md'}, compare.json, compare.pdf")
@@ -123,7 +126,9 @@ def study(
         float | None,
         Parameter(help="share of steps before which the scene changes, of loops: 0 by default"),
     ] = None,
-    output: Annotated[Path, Output(help="folder of the results")] = Path("studies"),
+    output: Annotated[
+        Path, Output(help="folder of the results; made if it is missing, with a folder for each study")
+    ] = Path("studies"),
     json: Json = False,
 ) -> int:
     """Run studies and write rows (CSV, JSON), a figure (PDF) and a text (Markdown) for each.
@@ -171,7 +176,7 @@ def study(
                 return ExitCode.INTERRUPTED
         written.append({"study": name, "title": title, "folder": str(place)})
         if not json:
-            say((place / f"{name}.md").read_text())
+            say((place / f"{name}.md").read_text(encoding="utf-8"))
     if json:
         document({"studies": written})
     else:
@@ -265,10 +270,16 @@ def _measured(
     if not pinned:
         note("vgtm bench: BLAS was loaded before its threads could be held to one")
 
-    def follow(under_way: BenchScene) -> None:
-        note(f"{scenes.index(under_way) + 1}/{len(scenes)} {under_way.name}")
+    with bar("bench", shown=True, counted=True) as advance:
 
-    return measure(scenes, baselines, seconds=seconds, steps=steps, cold=cold, pinned=pinned, progress=follow)
+        def follow(under_way: BenchScene) -> None:
+            done = scenes.index(under_way)
+            advance(done, len(scenes), f"bench: {under_way.name}")
+            if not on_terminal():
+                note(f"{done + 1}/{len(scenes)} {under_way.name}")
+
+        given: dict[str, Any] = {"seconds": seconds, "steps": steps, "cold": cold, "pinned": pinned}
+        return measure(scenes, baselines, **given, progress=follow)
 
 
 def _draw_phases(found: dict[str, Any], file: Path) -> None:

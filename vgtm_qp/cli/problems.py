@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vgtm_qp.cli.output import Json, ProblemName, answer, document, note, table
+from vgtm_qp.cli.output import Json, ProblemName, answer, document, note, table, waiting
 
 
 def check(problem: ProblemName, /, *, json: Json = False) -> None:
@@ -16,14 +16,15 @@ def check(problem: ProblemName, /, *, json: Json = False) -> None:
 
     loaded = load_problem(problem)
     source = str(loaded.source or loaded.name)
-    setup = build_arm(loaded)
-    mistakes = check_problem(loaded, setup)
-    if mistakes:
-        raise loaded.error(mistakes)
-    if loaded.method.name != "qp":
-        # Other methods have further requirements of an arm.
-        Resolver(loaded)
-    warnings = find_warnings(loaded, setup)
+    with waiting(f"{loaded.name}: checking", shown=not json):
+        setup = build_arm(loaded)
+        mistakes = check_problem(loaded, setup)
+        if mistakes:
+            raise loaded.error(mistakes)
+        if loaded.method.name != "qp":
+            # Other methods have further requirements of an arm.
+            Resolver(loaded)
+        warnings = find_warnings(loaded, setup)
     for warning in warnings:
         note(f"{source}: warning: {warning}")
     arm = setup.arm.describe()

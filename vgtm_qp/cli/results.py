@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,11 +17,13 @@ from vgtm_qp.cli.output import (
     Output,
     ResultFile,
     answer,
+    bar,
     check_writable,
     document,
     note,
     say,
     table,
+    waiting,
 )
 
 if TYPE_CHECKING:
@@ -63,7 +66,8 @@ def verify(
         try:
             with _about(path):
                 maneuver = load_result(path)
-                certificate = certify(maneuver, problem=real)
+                with waiting(f"{path.name}: verifying", shown=not json):
+                    certificate = certify(maneuver, problem=real)
         except ResultError as error:
             is_altered = isinstance(error, AlteredResultError)
             codes.append(ExitCode.UNVERIFIED if is_altered else ExitCode.USAGE)
@@ -129,8 +133,16 @@ def view(
     with _about(Path(shown)):
         loaded = load_result(shown) if shown.lower().endswith(".npz") else load_problem(shown)
         note("interrupt (Ctrl-C) to end")
+        until_ready = ExitStack()
+
+        def ready(address: str) -> None:
+            until_ready.close()
+            say(address)
+
         try:
-            serve(loaded, port=port, ready=say)
+            with until_ready:
+                until_ready.enter_context(waiting(f"{Path(shown).name}: set-up", shown=True))
+                serve(loaded, port=port, ready=ready)
         except KeyboardInterrupt:
             note("ended")
 
@@ -145,15 +157,25 @@ def export(
 ) -> None:
     """Write a result as an offline page, animation, figure, table, ROS 2 bag or message, or MuJoCo model."""
     from vgtm_qp.export import FORMATS, export_maneuver
+    from vgtm_qp.export.trajectory import bag_files
     from vgtm_qp.maneuver.maneuver import load_result
 
     suffix = FORMATS[to].suffix
     path = result.with_suffix(suffix) if output is None else output
     check_writable(path, "--output", (suffix,))
-    with _about(result):
-        file = export_maneuver(load_result(result), path, to=to)
-    written = {"result": str(result), "format": to, "file": str(file), "bytes": file.stat().st_size}
-    answer(written, f"{to}: {file}", as_json=json)
+    with _about(result), bar(f"{path.name}: writing", shown=not json) as advance:
+        file = export_maneuver(load_result(result), path, to=to, progress=partial(advance, total=1.0))
+    written: dict[str, Any] = {
+        "result": str(result),
+        "format": to,
+        "file": str(file),
+        "bytes": file.stat().st_size,
+    }
+    said = f"{to}: {file}"
+    if to == "mcap" and bag_files(file.parent) == [file.name]:
+        written["bag"] = str(file.parent)
+        said += f"\nROS 2 bag: {file.parent}, by the metadata.yaml in it"
+    answer(written, said, as_json=json)
 
 
 @contextmanager
@@ -176,7 +198,7 @@ def replay(result: ResultFile, /, *, json: Json = False) -> None:
     from vgtm_qp.export.replay import replay as run
     from vgtm_qp.maneuver.maneuver import load_result
 
-    with _about(result):
+    with _about(result), waiting(f"{result.name}: replaying", shown=not json):
         replayed = run(load_result(result))
     rows = [("", "certificate", "kinematic", "physics"), *replayed.rows()]
     answer({"result": str(result), **replayed.to_dict()}, table(rows, indent="  "), as_json=json)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,12 +14,15 @@ from vgtm_qp.cli.output import (
     Output,
     ProblemName,
     answer,
+    bar,
     check_writable,
     following,
     note,
     table,
+    waiting,
 )
 from vgtm_qp.cli.results import outcome_code
+from vgtm_qp.notices import spoken
 
 if TYPE_CHECKING:
     from vgtm_qp.problem import Problem
@@ -69,14 +73,17 @@ def solve(
         maneuver = run(loaded, progress=progress, verify=False)
     # Saved before it is verified, so that an interrupt of the verification loses nothing.
     maneuver.save(result)
-    maneuver = maneuver.with_certificate(certify(maneuver))
+    with waiting(f"{loaded.name}: verifying", shown=not json):
+        maneuver = maneuver.with_certificate(certify(maneuver))
     maneuver.save(result)
     if figure is not None:
         from vgtm_qp.view.figure import save_figure
 
-        save_figure(maneuver.plot(), figure)
+        with waiting(f"{loaded.name}: drawing", shown=not json):
+            save_figure(maneuver.plot(), figure)
     if html is not None:
-        export_maneuver(maneuver, html, to="html")
+        with bar(f"{loaded.name}: page", shown=not json) as advance:
+            export_maneuver(maneuver, html, to="html", progress=partial(advance, total=1.0))
 
     files = {"result": result, "figure": figure, "html": html}
     written = {name: str(path) for name, path in files.items() if path is not None}
@@ -136,8 +143,8 @@ def _report(summary: dict[str, Any], *, serial: bool) -> str:
         ("tip error", _number(summary["max_tip_error"], "m", "not tracked")),
         ("tip direction error", _number(summary["max_tip_direction_error"], "rad", "not tracked")),
         ("off the curve", _off_curve(summary)),
-        ("time of a step, median and 99 %", f"{_milliseconds(step['median'])}, {_milliseconds(step['p99'])}"),
-        ("set-up", _milliseconds(summary["setup_time"])),
+        ("time of a step, median and 99 %", f"{_spoken(step['median'])}, {_spoken(step['p99'])}"),
+        ("set-up", _spoken(summary["setup_time"])),
         ("method and solver", ", ".join(filter(None, (summary["method"], summary["solver"])))),
     ]
     return "\n".join([*lines, table(rows, indent="  ")])
@@ -154,5 +161,5 @@ def _number(value: float | None, unit: str, absent: str = "-") -> str:
     return absent if value is None else f"{value:.6g} {unit}"
 
 
-def _milliseconds(seconds: float | None) -> str:
-    return "-" if seconds is None else f"{1000 * seconds:.3g} ms"
+def _spoken(seconds: float | None) -> str:
+    return "-" if seconds is None else spoken(seconds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,30 +23,42 @@ class Format(NamedTuple):
     suffix: str
     module: str
     function: str
+    is_slow: bool = False
+    """Whether the function draws many frames, and tells the share that is done."""
+    describe: str = ""
+    """Function that describes the file in another one beside it, by maneuver and path."""
 
-    def content(self, maneuver: Result) -> bytes:
-        """Return what a file of a maneuver holds."""
+    def content(self, maneuver: Result, progress: Callable[[float], None] | None = None) -> bytes:
+        """Return what a file of a maneuver holds; a slow format calls `progress` with the share that is done."""
         function = getattr(import_module(f"vgtm_qp.export.{self.module}"), self.function)
-        content: bytes | str = function(maneuver)
+        content: bytes | str = function(maneuver, progress) if self.is_slow else function(maneuver)
         return content.encode() if isinstance(content, str) else content
 
 
 FORMATS = {
-    "html": Format(".html", "html", "html_text"),
-    "gif": Format(".gif", "pictures", "gif"),
-    "mp4": Format(".mp4", "pictures", "mp4"),
+    "html": Format(".html", "html", "html_text", is_slow=True),
+    "gif": Format(".gif", "pictures", "gif", is_slow=True),
+    "mp4": Format(".mp4", "pictures", "mp4", is_slow=True),
     "pdf": Format(".pdf", "pictures", "pdf"),
     "png": Format(".png", "pictures", "png"),
     "csv": Format(".csv", "trajectory", "csv_text"),
-    "mcap": Format(".mcap", "trajectory", "mcap_bytes"),
+    "mcap": Format(".mcap", "trajectory", "mcap_bytes", describe="describe_bag"),
     "ros": Format(".yaml", "trajectory", "ros_text"),
     "mjcf": Format(".xml", "mjcf", "mjcf"),
 }
 """Every format by the name that ``vgtm export --to`` takes."""
 
 
-def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None) -> Path:
+def export_maneuver(
+    maneuver: Result,
+    path: str | Path,
+    *,
+    to: str | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
     """Write a maneuver in another form and return the file's path; an error leaves an old file as it was.
+
+    A ROS 2 bag gets its ``metadata.yaml`` beside it, unless the folder has one that is about other files.
 
     Parameters
     ----------
@@ -55,6 +68,8 @@ def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None
         File to write.
     to
         Name of the format, one of `FORMATS`; by default that of the suffix of `path`.
+    progress
+        Called with the share that is done, 0 to 1, after each frame of a page, an animation or a video.
 
     Raises
     ------
@@ -76,5 +91,7 @@ def export_maneuver(maneuver: Result, path: str | Path, *, to: str | None = None
     if form.module == "pictures" and path.suffix.lower() != form.suffix:
         raise ExportError(f'{path}: a {to} cannot be "{path.suffix}"; choices: {form.suffix}')
     with replacing(path, ExportError) as scratch:
-        scratch.write_bytes(form.content(maneuver))
+        scratch.write_bytes(form.content(maneuver, progress))
+    if form.describe:
+        getattr(import_module(f"vgtm_qp.export.{form.module}"), form.describe)(maneuver, path)
     return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from html import escape
 
 import numpy as np
@@ -15,7 +16,7 @@ _LONGEST = 20.0
 _FRAMES = 200
 
 
-def html_text(maneuver: Result) -> str:
+def html_text(maneuver: Result, progress: Callable[[float], None] | None = None) -> str:
     """Return a page that needs no network and no server; it plays in real time, longer maneuvers in 20 s.
 
     Between states the nodes move on straight lines, as the certificate assumes.
@@ -44,6 +45,8 @@ def html_text(maneuver: Result) -> str:
             scene.move(moving[k], curves[k], float(moment), coarse=True)
             label.text = read_out(maneuver, float(moment), float(maneuver.clearance[row]), off[row])
             recording.insert_sleep(pause)
+            if progress is not None:
+                progress((k + 1) / len(at))
         page: str = recording.as_html()
     title = escape(f"{drawing.name or 'maneuver'} ({maneuver.status})")
     return page.replace("<title>Viser</title>", f"<title>{title}</title>", 1)

@@ -32,13 +32,13 @@ def png(maneuver: Result) -> bytes:
     return _written(".png", partial(save_figure, plot_frames(maneuver)))
 
 
-def gif(maneuver: Result) -> bytes:
-    """Return the maneuver as an animation in real time, in 12 s if it is longer."""
+def gif(maneuver: Result, progress: Callable[[float], None] | None = None) -> bytes:
+    """Return the maneuver as an animation in real time, in 12 s if it is longer; see :meth:`Format.content`."""
     try:
         from PIL import Image
     except ImportError:
         raise MissingExtraError("export", "pillow") from None
-    pictures, duration = _pictures(maneuver)
+    pictures, duration = _pictures(maneuver, progress)
     # One palette for all frames, so that colours do not flicker and frames differ only where the arm moved.
     middle = Image.fromarray(np.concatenate([pictures[0], pictures[len(pictures) // 2], pictures[-1]]))
     palette: Any = middle.quantize(colors=128, dither=Image.Dither.NONE)
@@ -54,13 +54,13 @@ def gif(maneuver: Result) -> bytes:
     return file.getvalue()
 
 
-def mp4(maneuver: Result) -> bytes:
+def mp4(maneuver: Result, progress: Callable[[float], None] | None = None) -> bytes:
     """Return the animation of :func:`gif` as a video."""
     try:
         import imageio_ffmpeg
     except ImportError:
         raise MissingExtraError("export", "imageio-ffmpeg") from None
-    pictures, duration = _pictures(maneuver)
+    pictures, duration = _pictures(maneuver, progress)
 
     def write(path: Path) -> None:
         height, width, _ = pictures[0].shape
@@ -75,7 +75,9 @@ def mp4(maneuver: Result) -> bytes:
     return _written(".mp4", write)
 
 
-def _pictures(maneuver: Result) -> tuple[list[NDArray[np.uint8]], float]:
+def _pictures(
+    maneuver: Result, progress: Callable[[float], None] | None
+) -> tuple[list[NDArray[np.uint8]], float]:
     """Return (H, W, 3) pictures, H and W even as video needs them, and the duration of all, s."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -88,6 +90,8 @@ def _pictures(maneuver: Result) -> tuple[list[NDArray[np.uint8]], float]:
         canvas.draw()
         picture = np.asarray(canvas.buffer_rgba())[..., :3]
         pictures.append(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2].copy())
+        if progress is not None:
+            progress(len(pictures) / len(rows))
     return pictures, min(float(maneuver.time[-1] - maneuver.time[0]), _LONGEST) or 1.0
 
 

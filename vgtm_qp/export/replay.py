@@ -115,8 +115,10 @@ class _Simulation:
     def __init__(self, maneuver: Result) -> None:
         try:
             import mujoco
-        except ImportError:
+        except ModuleNotFoundError:
             raise MissingExtraError("mujoco", "mujoco") from None
+        except ImportError as error:
+            raise ExportError(f"MuJoCo cannot be loaded: {error}; vgtm doctor says what to do") from None
         self._mujoco, self._maneuver = mujoco, maneuver
         self._arm = modelled_arm(maneuver)
         try:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import csv
+import logging
 from io import BytesIO, StringIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError, MissingExtraError
+from vgtm_qp.result.file import replacing
 from vgtm_qp.result.result import Result
+
+_LOG = logging.getLogger(__name__)
 
 _HEADER = """std_msgs/Header header
 {own}
@@ -42,6 +47,13 @@ int32 sec
 uint32 nanosec"""
 )
 """Definition of trajectory_msgs/msg/JointTrajectory."""
+
+METADATA = "metadata.yaml"
+"""Name of the file that makes a folder a ROS 2 bag."""
+_BAG = "rosbag2_bagfile_information"
+_TRAJECTORY = ("/joint_trajectory", "trajectory_msgs/msg/JointTrajectory")
+_STATES = ("/joint_states", "sensor_msgs/msg/JointState")
+"""Topics of a bag, with their types."""
 
 
 def step_rates(maneuver: Result) -> Array:
@@ -100,12 +112,8 @@ def joint_trajectory(maneuver: Result) -> dict[str, Any]:
 
 def ros_text(maneuver: Result) -> str:
     """Return a JointTrajectory as YAML, in the form that ``ros2 topic pub`` takes."""
-    try:
-        import yaml
-    except ImportError:
-        raise MissingExtraError("export", "pyyaml") from None
     return str(
-        yaml.safe_dump(joint_trajectory(maneuver), sort_keys=False, default_flow_style=None, width=10_000)
+        _yaml().safe_dump(joint_trajectory(maneuver), sort_keys=False, default_flow_style=None, width=10_000)
     )
 
 
@@ -115,12 +123,14 @@ def mcap_bytes(maneuver: Result) -> bytes:
         from mcap_ros2.writer import Writer
     except ImportError:
         raise MissingExtraError("export", "mcap-ros2-support") from None
+    # Needed for the metadata, and missed before anything is written.
+    _yaml()
     trajectory, file = joint_trajectory(maneuver), BytesIO()
     with Writer(file) as writer:
-        state_schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
-        trajectory_schema = writer.register_msgdef("trajectory_msgs/msg/JointTrajectory", JOINT_TRAJECTORY)
+        state_schema = writer.register_msgdef(_STATES[1], JOINT_STATE)
+        trajectory_schema = writer.register_msgdef(_TRAJECTORY[1], JOINT_TRAJECTORY)
         first = _nanoseconds(float(maneuver.time[0]))
-        writer.write_message("/joint_trajectory", trajectory_schema, trajectory, first, first)
+        writer.write_message(_TRAJECTORY[0], trajectory_schema, trajectory, first, first)
         for k, (time, point) in enumerate(zip(maneuver.time, trajectory["points"], strict=True)):
             message = {
                 "header": {"stamp": _split(float(time)), "frame_id": "base"},
@@ -130,8 +140,77 @@ def mcap_bytes(maneuver: Result) -> bytes:
                 "effort": [],
             }
             stamp = _nanoseconds(float(time))
-            writer.write_message("/joint_states", state_schema, message, stamp, stamp, sequence=k)
+            writer.write_message(_STATES[0], state_schema, message, stamp, stamp, sequence=k)
     return file.getvalue()
+
+
+def describe_bag(maneuver: Result, path: Path) -> None:
+    """Write the ``metadata.yaml`` of the bag `path` beside it, by which its folder opens as a ROS 2 bag.
+
+    A file of that name that is about other files is left as it is, with a warning.
+    """
+    file = path.with_name(METADATA)
+    if file.exists() and bag_files(path.parent) != [path.name]:
+        _LOG.warning(
+            "%s is about other files, and left as it is: a folder opens as one ROS 2 bag; write %s into another",
+            file,
+            path.name,
+        )
+        return
+    with replacing(file, ExportError) as scratch:
+        scratch.write_text(metadata_text(maneuver, path.name), encoding="utf-8")
+
+
+def bag_files(folder: Path) -> list[str] | None:
+    """Return the files of the ROS 2 bag that a folder is, by its ``metadata.yaml``; None where it is none."""
+    yaml = _yaml()
+    try:
+        found = yaml.safe_load((folder / METADATA).read_text(encoding="utf-8"))
+        return [str(name) for name in found[_BAG]["relative_file_paths"]]
+    except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
+        return None
+
+
+def metadata_text(maneuver: Result, name: str) -> str:
+    """Return the metadata of a bag in the file `name`, in version 5: all of ROS 2 since Humble reads that."""
+    first, last = (_nanoseconds(float(time)) for time in maneuver.time[[0, -1]])
+    counts = {_TRAJECTORY: 1, _STATES: len(maneuver.time)}
+    span = {
+        "duration": {"nanoseconds": last - first},
+        "starting_time": {"nanoseconds_since_epoch": first},
+        "message_count": sum(counts.values()),
+    }
+    topics = [
+        {
+            "topic_metadata": {
+                "name": topic,
+                "type": kind,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": "",
+            },
+            "message_count": count,
+        }
+        for (topic, kind), count in counts.items()
+    ]
+    found = {
+        "version": 5,
+        "storage_identifier": "mcap",
+        "relative_file_paths": [name],
+        **span,
+        "topics_with_message_count": topics,
+        "compression_format": "",
+        "compression_mode": "",
+        "files": [{"path": name, **span}],
+    }
+    return str(_yaml().safe_dump({_BAG: found}, sort_keys=False))
+
+
+def _yaml() -> Any:
+    try:
+        import yaml
+    except ImportError:
+        raise MissingExtraError("export", "pyyaml") from None
+    return yaml
 
 
 def _nanoseconds(seconds: float) -> int:

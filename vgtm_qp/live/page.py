@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import traceback
-import warnings
+import logging
 from collections.abc import Callable
 from functools import partial
 from html import escape
@@ -27,6 +26,8 @@ from vgtm_qp.verify.arm import arm_of
 from vgtm_qp.view.drawing import CURVE_COLOUR, camera_for, resampled, stroke_colours
 from vgtm_qp.view.scene import ArmScene
 from vgtm_qp.view.server import LOOPBACK, is_loopback, is_unspecified, viser_server
+
+_LOG = logging.getLogger(__name__)
 
 _PERIOD = 1.0 / 30.0
 _READ_OUT_PERIOD = 0.1
@@ -62,9 +63,9 @@ def view(
     GoalError if host or port cannot be used.
     """
     if not is_loopback(host):
-        warnings.warn(
-            f"the page is served at {host}: whoever reaches this machine can move the arm, without a password",
-            stacklevel=2,
+        _LOG.warning(
+            "the page is served at %s: whoever reaches this machine can move the arm, without a password",
+            host,
         )
     maneuver = shown if isinstance(shown, Maneuver) else None
     if maneuver:
@@ -175,8 +176,8 @@ class Page:
         except Exception as error:
             said = f"internal error, {type(error).__name__}: {error}; this is a bug in vgtm, please report it"
             if said != self.message:
-                # The traceback is printed once, not thirty times a second.
-                traceback.print_exc()
+                # The traceback is told once, not thirty times a second.
+                _LOG.exception(said)
             self._pause()
             self.message = said
 

@@ -67,10 +67,15 @@ class _FusedCode(IntEnum):
 
 @cache
 def _daqp() -> dict[str, int]:
-    """Return the addresses of the functions of DAQP in CasADi's wheel, whose headers ``fused.c`` includes."""
+    """Return the addresses of the functions of DAQP in CasADi's wheel, whose headers ``fused.c`` includes.
+
+    There are none where the wheel has DAQP in no library of its own.
+    """
     found = Path(ca.__file__).parent.glob("*daqp.*")
     of_daqp = (path for path in found if path.stem in ("libdaqp", "daqp") and path.suffix in _LIBRARIES)
-    library = ctypes.CDLL(str(next(of_daqp)))
+    if (file := next(of_daqp, None)) is None:
+        return {}
+    library = ctypes.CDLL(str(file))
     names = {"quadprog": "daqp_quadprog", "defaults": "daqp_default_settings"}
     return {field: ctypes.cast(library[name], ctypes.c_void_p).value or 0 for field, name in names.items()}
 
@@ -250,7 +255,7 @@ class _FusedWorkspace:
                 for kernel in self.kernels:
                     kernel.prepare()
                 return False
-            self._is_ready = self._source.library is not None
+            self._is_ready = self._source.library is not None and bool(_daqp())
             if self._is_ready:
                 self._start()
         return self._is_ready

@@ -7,7 +7,7 @@ by those who call for steps, for the maneuver.
 
 from __future__ import annotations
 
-import warnings
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -41,6 +41,8 @@ from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
 from vgtm_qp.step.path import base_motion
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import TipTask
+
+_LOG = logging.getLogger(__name__)
 
 _CONDENSED_ALL_THE_SAME = (
     "elastic end effector: the elimination along the bays does not know its slacks, so the QP is condensed onto the "
@@ -269,7 +271,7 @@ def make_engine(
         return GeneralEngine(layout, kinematics, task, by_bays, compiled=compiled)
     is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
     if layout.elastic_tip and not is_short:
-        warnings.warn(_CONDENSED_ALL_THE_SAME, stacklevel=2)
+        _LOG.warning(_CONDENSED_ALL_THE_SAME)
     is_quick = not plain and not layout.elastic_tip
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
         fused = FusedSolver(layout, dense_solver(solver), compiled=compiled)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import logging
 from collections.abc import Iterator
 
 import numpy as np
@@ -21,6 +21,8 @@ from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.task import over_all_nodes, tip_response
 
+_LOG = logging.getLogger(__name__)
+
 _POINT = 1e-6
 """Length of the member that stands for a point, over the arm's unit: distances are printed less precisely."""
 
@@ -38,7 +40,7 @@ def checked_arm(problem: Problem) -> Setup:
     if mistakes:
         raise problem.error(mistakes)
     for excess in excess_of_freedom(problem, setup):
-        warnings.warn(f"{excess.key} = {excess.value}: {excess.expected}", stacklevel=3)
+        _LOG.warning("%s = %s: %s", excess.key, excess.value, excess.expected)
     return setup
 
 

@@ -131,7 +131,7 @@ def run_study(
         answers = run_processes(function, waiting, 1 if study.timed else workers)
     else:
         answers = run_here(function, waiting)
-    with log.open("a") as file:
+    with log.open("a", encoding="utf-8") as file:
         for finished, (k, row) in enumerate(answers, start=done + 1):
             key = keys[left[k]]
             known[key] = row
@@ -148,7 +148,7 @@ def _known_rows(log: Path) -> dict[str, Row]:
     """Return the rows of an earlier run by the keys of their tasks; a line cut by a crash is skipped."""
     rows: dict[str, Row] = {}
     if log.exists():
-        for line in log.read_text().splitlines():
+        for line in log.read_text(encoding="utf-8").splitlines():
             try:
                 entry = json.loads(line)
             except json.JSONDecodeError:
@@ -170,9 +170,9 @@ def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None
         "machine": found,
         "rows": rows,
     }
-    (place / f"{name}.json").write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
+    (place / f"{name}.json").write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     flat = [{key: value for key, value in row.items() if not isinstance(value, list | dict)} for row in rows]
-    with (place / f"{name}.csv").open("w", newline="") as file:
+    with (place / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys(key for row in flat for key in row)))
         writer.writeheader()
         writer.writerows(flat)
@@ -182,4 +182,4 @@ def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None
     lines += [f"Not counted: a run that failed, {row['failed']}" for row in rows if "failed" in row]
     at = f", commit {data['commit'][:12]}" if data["commit"] else ""
     lines += [f"Measured on: {sentence(found)}{at}. Made again by `{command}`.", ""]
-    (place / f"{name}.md").write_text("\n".join(lines))
+    (place / f"{name}.md").write_text("\n".join(lines), encoding="utf-8")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import signal
+import sys
 import threading
 import time
 import traceback
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -16,6 +19,7 @@ from typing import Any
 
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.machine import noting_interrupts, pin_threads
+from vgtm_qp.notices import ROOT, Notices
 
 Task = dict[str, Any]
 Row = dict[str, Any]
@@ -152,6 +156,7 @@ def _serve(pipe: Connection, is_alone: bool) -> None:
     from vgtm_qp.compiled import OFTEN, SELDOM, compile_after
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.getLogger(ROOT).addHandler(Notices(partial(print, file=sys.stderr, flush=True)))
     # Beside other processes, compiling the kernels of an arm costs more than it gains in a few maneuvers.
     compile_after(OFTEN if is_alone else SELDOM)
     while True:
