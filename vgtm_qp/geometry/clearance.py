@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from vgtm_qp.arrays import Array, Index
+from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import compiler
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.candidates import Candidates
-from vgtm_qp.geometry.exact import NORMAL
 from vgtm_qp.geometry.formulas import FAR
-from vgtm_qp.geometry.groups import Found, Group, Scene
+from vgtm_qp.geometry.groups import Found, Scene
 from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, PairNames, Wanted
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 from vgtm_qp.geometry.solids import Solids
@@ -169,19 +168,11 @@ class Clearance:
                     needed = group.chosen(wanted, pairs, found)
                     found, pairs = found[needed], pairs[needed]
                 if group.shape == "triangle":
-                    kept = self._distinct(group, pairs, found)
+                    kept = group.distinct(pairs, found)
                     found, pairs = found[kept], pairs[kept]
                 parts.append(group.contacts(X, time, pairs, found, by_fcl))
         candidates.refresh_where_due(X, time)
         return self.scene.contacts(self._solids.with_enclosed(parts, X, time))
-
-    def _distinct(self, group: Group, rows: Index, found: Array) -> Index:
-        """Return the nearest contact of each group with the same body, mesh, normal and place on the body."""
-        order = np.argsort(found[:, 0], kind="stable")
-        bodies, meshes = group.body[rows], self.pieces.obstacle[group.other[rows]]
-        normal, place = np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2])
-        like = np.column_stack([bodies, meshes, normal, place])
-        return order[np.sort(np.unique(like[order], axis=0, return_index=True)[1])]
 
     def least(self, X: Array, time: float = 0.0, *, among: str = "all") -> tuple[float, Pair | None]:
         """Return the exact least clearance, m, and its pair; ``(inf, None)`` where there is no pair.

@@ -258,6 +258,14 @@ class Group:
         """Return which of the contacts `found` (R, ``CONTACT``) of the pairs `rows` are wanted."""
         return by(self.body[rows], self.other[rows], found[:, 0], is_self=self.is_self)
 
+    def distinct(self, rows: Index, found: Array) -> Index:
+        """Return the nearest of the contacts `found` of `rows` with the same body, mesh, normal and place on the body."""
+        order = np.argsort(found[:, 0], kind="stable")
+        bodies, meshes = self.body[rows], self.scene.pieces.obstacle[self.other[rows]]
+        normal, place = np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2])
+        like = np.column_stack([bodies, meshes, normal, place])
+        return order[np.sort(np.unique(like[order], axis=0, return_index=True)[1])]
+
     def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> Found:
         """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`; if `by_fcl`, replaced by FCL's.
 

@@ -34,7 +34,7 @@ class Log:
         self.progress = 0.0
         self._resolver = resolver
         self._rows: dict[str, list[Any]] = {}
-        self._scenes = [_Scene(resolver, 0, resolver.state)]
+        self._scenes = [_RecordedScene(resolver, 0, resolver.state)]
         self._changes, self._state = resolver.scene_changes, resolver.state
         self._clearance_rows = {"fcl": 0, "exact": 0}
         self._seconds, self._phases = 0.0, [0.0] * len(resolver.phases)
@@ -60,7 +60,7 @@ class Log:
         """Add the state after a step whose goal was the pose `target` of the tip."""
         if self._resolver.scene_changes != self._changes:
             self._changes = self._resolver.scene_changes
-            self._scenes.append(_Scene(self._resolver, len(self._rows["time"]) - 1, self._state))
+            self._scenes.append(_RecordedScene(self._resolver, len(self._rows["time"]) - 1, self._state))
         self._state = step.state
         self._clearance_rows["fcl"] += step.fcl_rows
         self._clearance_rows["exact"] += step.exact_rows
@@ -135,7 +135,7 @@ class Log:
         )
 
 
-class _Scene:
+class _RecordedScene:
     """The scene of a resolver from a row on, at which it was in a `state`.
 
     Attributes

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.comparison.tables import markdown_table
-from vgtm_qp.errors import ProblemError
+from vgtm_qp.errors import GoalError, ProblemError
 from vgtm_qp.maneuver.recording import Recording
 from vgtm_qp.methods import Resolver
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
@@ -44,7 +44,12 @@ def tasks(
     arms: Arms = "trusses",
     changes: float = 0.0,
 ) -> list[Task]:
-    """Return one task a loop of so many steps; before a share of these the scene `changes`."""
+    """Return one task a loop of so many steps; before a share of these the scene `changes`.
+
+    GoalError if that is no share.
+    """
+    if not 0.0 <= changes <= 1.0:
+        raise GoalError(f"--changes must be from 0 to 1, not {changes:g}")
     count = scenes if scenes is not None else 3 if short else 400
     scene = {"seed": seed, "steps": min(steps, 40) if short else steps, "arms": arms}
     more = {"changes": changes} if changes else {}
