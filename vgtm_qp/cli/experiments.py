@@ -94,6 +94,10 @@ def compare(
     return ExitCode.SOLVED
 
 
+_OPTIONS = ("scenes", "seed", "arms", "without_compiler", "changes")
+"""Options that some of the studies have."""
+
+
 def study(
     names: Annotated[
         list[str],
@@ -149,9 +153,8 @@ def study(
     for option, value in counts.items():
         if value is not None and value < 1:
             raise GoalError(f"{option} must be 1 or more, not {value}")
-    given = {"scenes": scenes, "seed": seed, "arms": arms, "without_compiler": without_compiler}
-    given["changes"] = changes
-    options = {key: value for key, value in given.items() if value is not None}
+    given = zip(_OPTIONS, (scenes, seed, arms, without_compiler, changes), strict=True)
+    options = {key: value for key, value in given if value is not None}
     for name in titles:
         study_tasks(name, short=short, **options)
     written: list[dict[str, str]] = []

@@ -259,7 +259,7 @@ class Group:
         return by(self.body[rows], self.other[rows], found[:, 0], is_self=self.is_self)
 
     def distinct(self, rows: Index, found: Array) -> Index:
-        """Return the nearest of the contacts `found` of `rows` with the same body, mesh, normal and place on the body."""
+        """Return the nearest of contacts of `rows` with the same body, mesh, normal and place on the body."""
         order = np.argsort(found[:, 0], kind="stable")
         bodies, meshes = self.body[rows], self.scene.pieces.obstacle[self.other[rows]]
         normal, place = np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2])
