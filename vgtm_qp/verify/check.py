@@ -47,7 +47,7 @@ ARRAY_TOLERANCE = 1e-9
 
 _SAFE = 0.05
 """Default of ``clearance.safe``, m."""
-_SELF_SHARE = 0.25
+SELF_SHARE = 0.25
 """Default of ``clearance.self_safe``, as a share of ``safe``."""
 INSTANT = 1e-9
 """Times that differ by less are the same, s."""
@@ -188,7 +188,7 @@ def _clearances(
     bodies, wrong, notes = read_obstacles(manifest["problem"], manifest.get("meshes") or {}, directory)
     rules = manifest["problem"].get("clearance") or {}
     safe = float(rules.get("safe", _SAFE))
-    self_safe = _SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
+    self_safe = SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
     if not rules.get("self_collision", True):
         self_safe = -np.inf
     against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]
