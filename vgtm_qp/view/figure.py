@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
+from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
@@ -30,6 +31,7 @@ from vgtm_qp.view.drawing import (
     drawing_of_maneuver,
     heading,
     off_curve,
+    resampled,
     stroke_colours,
     with_surroundings,
 )
@@ -50,6 +52,36 @@ _NUMBERS, _NAME, _ASLANT = 2.5, 11.5, 0.3
 """Points from an axis to its numbers and to its name; above this share of a direction a text stands at its side."""
 _ABOVE = 100.0
 _NOTHING = np.zeros((0, 3))
+_STAGE = 4.2
+"""Greatest height of the panel of an animation, inches."""
+
+
+class _Shown(NamedTuple):
+    """What is drawn at a `time`, s: nodes, lengths and control vertices, and the tip's way so far and ahead, m."""
+
+    time: float
+    nodes: Array
+    lengths: Array
+    vertices: Array
+    behind: Array
+    ahead: Array
+
+    @classmethod
+    def at(cls, maneuver: Result, time: float) -> _Shown:
+        """Return it at any time of a maneuver, between two states on straight lines."""
+
+        def now(values: Array) -> Array:
+            return np.asarray(resampled(maneuver.time, values, np.array([time]))[0])
+
+        tip, target = maneuver.tip_position, maneuver.tip_target_position
+        return cls(
+            time,
+            now(maneuver.nodes),
+            now(maneuver.member_lengths),
+            now(maneuver.control_vertices),
+            np.concatenate([tip[maneuver.time <= time], now(tip)[None]]),
+            np.concatenate([now(target)[None], target[maneuver.time > time]]),
+        )
 
 
 def _style(label: str, colour: Any, order: int, **more: Any) -> dict[str, Any]:
@@ -102,11 +134,32 @@ def plot_frames(
     return View(maneuver, rows, azimuth, elevation).figure(rows, titles, _off_somewhere(maneuver, off))
 
 
-def each_frame(maneuver: Result, rows: Sequence[int]) -> Iterator[Figure]:
-    """Yield one figure for each of the states `rows`, all in the view that holds the whole maneuver."""
-    view = View(maneuver, list(range(len(maneuver.time))))
-    for row in _rows(maneuver, rows):
-        yield view.figure([row], [f"{maneuver.time[row]:.2f} s"])
+def each_picture(maneuver: Result, times: Array, dots_per_inch: int) -> Iterator[NDArray[np.uint8]]:
+    """Yield one picture (H, W, 3) for each of the `times`, s, in the view that holds the whole maneuver.
+
+    Between two states everything is on straight lines, as in the certificate. What stays in all pictures is drawn once.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    view = View(maneuver, range(len(maneuver.time)))
+    with mpl.rc_context(RC):
+        figure, axes, size = view.stage()
+        figure.set_dpi(dots_per_inch)
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.draw()
+        background, staying = canvas.copy_from_bbox(figure.bbox), set(axes.get_children())
+        for time in times.tolist():
+            canvas.restore_region(background)
+            view.draw_at(axes, time, size)
+            axes.annotate(
+                f"{time:.2f} s", (0.5, 1.0), (0.0, 3.0), "axes fraction", "offset points", ha="center"
+            )
+            added = [artist for artist in axes.get_children() if artist not in staying]
+            for artist in sorted(added, key=lambda artist: artist.get_zorder()):
+                axes.draw_artist(artist)
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            for artist in added:
+                artist.remove()
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:
@@ -202,19 +255,41 @@ class View:
         room = (WIDTH - 2 * MARGIN - (columns - 1) * _GAP) / columns
         return np.asarray(extent * min(room / extent[0], tallest / extent[1]))
 
+    def stage(self) -> tuple[Figure, Axes, Array]:
+        """Return a figure with a floor and a legend and no state, its one panel and the panel's size, inches."""
+        size = self.size(1, _STAGE)
+        total = float(FOOT + size[1] + _TITLE + _GAP)
+        figure = Figure(figsize=(WIDTH, total))
+        (axes,) = panels_from(figure, total, size, _TITLE, 1, 1)
+        self._draw_floor(axes, size, ruler=True, labels=True)
+        self.draw_legend(figure, 0.0)
+        return figure, axes, size
+
     def draw(self, axes: Axes, row: int, size: Array, *, ruler: bool, labels: bool) -> None:
         """Draw a state into a panel of a `size`, inches; ticks along z with a `ruler`, along x and y with `labels`."""
+        self._draw_floor(axes, size, ruler=ruler, labels=labels)
+        self.draw_at(axes, float(self.maneuver.time[row]), size)
+
+    def draw_at(self, axes: Axes, time: float, size: Array) -> None:
+        """Draw arm, obstacles and the tip's way at a time, s, into a panel with a floor."""
+        shown = _Shown.at(self.maneuver, time)
+        self._draw_state(axes, shown, self._scale(size))
+        axes.plot(*self.projection.flat(shown.ahead).T, **_AHEAD)
+        axes.plot(*self.projection.flat(shown.behind).T, markevery=[-1], **_BEHIND)
+        waypoints = self.maneuver.manifest["problem"]["maneuver"].get("waypoint") or ()
+        goals = np.array([w["position"] for w in waypoints if w.get("position")]).reshape(-1, 3)
+        axes.plot(*self.projection.flat(goals).T, **_GOAL)
+
+    def _scale(self, size: Array) -> float:
+        """Return the points a metre in a panel of a size, inches."""
+        return float(size[0] * _POINTS_PER_INCH / (self.high - self.low)[0])
+
+    def _draw_floor(self, axes: Axes, size: Array, *, ruler: bool, labels: bool) -> None:
+        """Draw the floor's lines, and ticks in metres: along x and y with `labels`, along z with `ruler`."""
         axes.set_xlim(self.low[0], self.high[0])
         axes.set_ylim(self.low[1], self.high[1])
         axes.set_axis_off()
-        scale = float(size[0] * _POINTS_PER_INCH / (self.high - self.low)[0])
-        self._draw_floor(axes, scale, ruler=ruler, labels=labels)
-        self._draw_state(axes, row, scale)
-        self._draw_tip(axes, row)
-
-    def _draw_floor(self, axes: Axes, scale: float, *, ruler: bool, labels: bool) -> None:
-        """Draw the floor's lines, and ticks in metres: along x and y with `labels`, along z with `ruler`."""
-        flat, ground = self.projection.flat, self.ground
+        flat, ground, scale = self.projection.flat, self.ground, self._scale(size)
         x, y = (np.arange(low, high + self.step / 2, self.step) for low, high in self.floor.T)
         ends = [[[u, y[0], ground], [u, y[-1], ground]] for u in x]
         ends += [[[x[0], v, ground], [x[-1], v, ground]] for v in y]
@@ -239,10 +314,9 @@ class View:
             axes.plot(*places.T, color=_GRID, linewidth=0.7, marker="_", markersize=3.0, zorder=0.1)
             _label(axes, "z", z, places, np.array([-1.0, 0.0]), scale)
 
-    def _draw_state(self, axes: Axes, row: int, scale: float) -> None:
+    def _draw_state(self, axes: Axes, shown: _Shown, scale: float) -> None:
         """Draw arm and obstacles, farthest first."""
-        maneuver, drawing, projection = self.maneuver, self.drawing, self.projection
-        time, nodes = float(maneuver.time[row]), maneuver.nodes[row]
+        drawing, projection, time, nodes = self.drawing, self.projection, shown.time, shown.nodes
         surfaces = sorted(self.surfaces, key=lambda surface: surface.depth(time))
         for k, surface in enumerate(surfaces, start=1):
             _draw_surface(axes, surface, time, 2.0 * k)
@@ -252,8 +326,9 @@ class View:
         width = np.repeat(np.maximum(2.0 * drawing.arm.radius * scale, _THINNEST), cuts)
         # The nodes of a truss are a little wider than its members, the joints of a serial arm are marks on its links.
         wider = 1.15 if drawing.arm.stretches.any() else 0.5
-        ball_size = (wider * float(np.median(width)) + CASING) ** 2
-        colour = np.repeat(drawing.colours(maneuver.member_lengths[row]), cuts, axis=0)
+        ball: Any = {"color": DARK, "marker": "o", "linestyle": "none", "markeredgewidth": 0.0}
+        ball["markersize"] = wider * float(np.median(width)) + CASING
+        colour = np.repeat(drawing.colours(shown.lengths), cuts, axis=0)
         middles = cut.mean(axis=1)
         depth, layer = projection.depth(middles), layers(middles, surfaces, time)
         node_depth, node_layer = projection.depth(nodes), layers(nodes, surfaces, time)
@@ -277,21 +352,12 @@ class View:
                 axes.add_collection(LineCollection(list(lines), colors=colours, linewidths=widths, **style))
                 x, y = projection.flat(nodes[balls[slot == j]]).T
                 above = style["zorder"] + 0.1 / _SLICES
-                axes.scatter(x, y, s=ball_size, color=[DARK], linewidths=0.0, zorder=above)
+                axes.plot(x, y, zorder=above, **ball)
         if drawing.curve_weights.size:
-            vertices = maneuver.control_vertices[row]
+            vertices = shown.vertices
             effects = [Stroke(linewidth=2.6, foreground="white"), Normal()]
             axes.plot(*projection.flat(vertices).T, **_POLYGON)
             axes.plot(*projection.flat(drawing.curve(vertices)).T, path_effects=effects, **_CURVE)
-
-    def _draw_tip(self, axes: Axes, row: int) -> None:
-        """Draw the tip's path and its targets."""
-        maneuver, flat = self.maneuver, self.projection.flat
-        axes.plot(*flat(maneuver.tip_target_position[row:]).T, **_AHEAD)
-        axes.plot(*flat(maneuver.tip_position[: row + 1]).T, markevery=[-1], **_BEHIND)
-        waypoints = maneuver.manifest["problem"]["maneuver"].get("waypoint") or ()
-        goals = np.array([w["position"] for w in waypoints if w.get("position")]).reshape(-1, 3)
-        axes.plot(*flat(goals).T, **_GOAL)
 
     def draw_legend(self, figure: Figure, room: float) -> None:
         """Draw the meaning of colours and marks, above some `room` at the foot, inches."""
