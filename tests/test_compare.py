@@ -108,13 +108,16 @@ def test_methods_that_are_no_list_of_methods_are_refused(methods: object, says: 
 def test_the_command_writes_table_data_and_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "out"
     arguments = ["compare", "five_bay_free", "--methods", "qp,curve-pseudoinverse-corrected"]
-    assert main([*arguments, "--output", str(folder), "--json"]) == 0
+    figure = tmp_path / "compared.png"
+    assert main([*arguments, "--output", str(folder), "--figure", str(figure), "--json"]) == 0
+    assert figure.read_bytes().startswith(b"\x89PNG")
     data = json.loads(capsys.readouterr().out)
     assert [row["solved"] for row in data["rows"]] == [True, True]
     assert json.loads((folder / "compare.json").read_text()) == data
     assert "curve-pseudoinverse-corrected" in (folder / "compare.md").read_text()
     assert (folder / "compare.pdf").read_bytes().startswith(b"%PDF")
     assert main(["compare", "five_bay_free", "--methods", "magic"]) == 2
+    assert main(["compare", "five_bay_free", "--figure", "compared.gif"]) == 2
 
 
 def test_the_study_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
