@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from figures import clipped_and_overlapping
 from matplotlib.figure import Figure
 
 import vgtm_qp as vq
@@ -66,7 +67,9 @@ def test_the_report_as_table_data_and_figure(report: vq.Report, tmp_path: Path) 
     assert table.count("\n| ") == 1 + len(METHODS)
     assert "Measured on:" in table
     assert [row["method"] for row in json.loads(report.json())["rows"]] == METHODS
-    report.figure().savefig(tmp_path / "compare.pdf")
+    figure = report.figure()
+    assert clipped_and_overlapping(figure) == ([], [])
+    figure.savefig(tmp_path / "compare.pdf")
     assert (tmp_path / "compare.pdf").stat().st_size > 10_000
 
 

@@ -48,8 +48,8 @@ _GRID = (0.80, 0.80, 0.82)
 _EDGE: Any = tuple(0.6 * channel for channel in OBSTACLE_COLOUR)
 _PIECES, _MANY_MEMBERS, _SLICES = 8, 1500, 12
 _THINNEST = 0.5
-_NUMBERS, _NAME, _ASLANT = 2.5, 11.5, 0.3
-"""Points from an axis to its numbers and to its name; above this share of a direction a text stands at its side."""
+_NUMBERS, _NAME, _ASLANT, _STEEP = 2.5, 11.5, 0.3, 0.7
+"""Points from an axis to its numbers and to its name; shares of a direction above which texts stand at its side."""
 _ABOVE = 100.0
 _NOTHING = np.zeros((0, 3))
 _STAGE = 4.2
@@ -297,22 +297,25 @@ class View:
         axes.add_collection(LineCollection(lines, colors=[_GRID], linewidths=0.5, zorder=0.1))
         toward = self.projection.axes[2]
         front = np.array([x[-1] if toward[0] > 0 else x[0], y[-1] if toward[1] > 0 else y[0]])
+        crowded = False
         if labels:
             along_x = np.stack([x, np.full_like(x, front[1]), np.full_like(x, ground)], axis=1)
             along_y = np.stack([np.full_like(y, front[0]), y, np.full_like(y, ground)], axis=1)
             middle = flat(np.array([*self.floor.mean(axis=0), ground]))
             for name, values, places in (("x", x, along_x), ("y", y, along_y)):
                 # The corner that both have in common has its number once, on x.
-                once = places if name == "x" else places[~np.isclose(y, front[1])]
-                known = values if name == "x" else y[~np.isclose(y, front[1])]
-                _label(axes, name, known, flat(once), _aside(flat(places), middle), scale)
+                once = np.ones(len(values), dtype=bool) if name == "x" else ~np.isclose(y, front[1])
+                aside = _aside(flat(places), middle)
+                crowded = crowded or bool(aside[0] < -_STEEP)
+                _label(axes, name, values[once], flat(places[once]), aside, scale)
         if ruler:
             corners = np.array([[u, v, ground] for u in (x[0], x[-1]) for v in (y[0], y[-1])])
             foot = corners[int(np.argmin(flat(corners)[:, 0]))]
-            z = ground + np.arange(0.0, self.top - ground + self.step / 2, self.step)
+            z = ground + np.arange(0.0, self.top - ground + 1e-9 * self.step, self.step)
             places = flat(np.column_stack([np.tile(foot[:2], (len(z), 1)), z]))
             axes.plot(*places.T, color=_GRID, linewidth=0.7, marker="_", markersize=3.0, zorder=0.1)
-            _label(axes, "z", z, places, np.array([-1.0, 0.0]), scale)
+            # Where numbers of the floor stand at the left of its corner, the one of z there would lie upon them.
+            _label(axes, "z", z[crowded:], places[crowded:], np.array([-1.0, 0.0]), scale)
 
     def _draw_state(self, axes: Axes, shown: _Shown, scale: float) -> None:
         """Draw arm and obstacles, farthest first."""
@@ -373,8 +376,11 @@ class View:
             scalar = mpl.cm.ScalarMappable(Normalize(low, high), colours)
             figure.colorbar(scalar, cax=bar, orientation="horizontal", label=label)
         body = {"color": FIXED_COLOUR, "linewidth": 2.6, "label": arm.rigid_body}
-        curve = (_CURVE, _POLYGON) if self.drawing.curve_weights.size else ()
-        handles: list[Any] = [Line2D([], [], **style) for style in (body, *curve, _BEHIND, _AHEAD, _GOAL)]
+        styles: list[dict[str, Any]] = [body] if not arm.stretches.all() else []
+        styles += [_CURVE, _POLYGON] if self.drawing.curve_weights.size else []
+        styles += [_BEHIND, _AHEAD]
+        styles += [_GOAL] if self.maneuver.manifest["problem"]["maneuver"].get("waypoint") else []
+        handles: list[Any] = [Line2D([], [], **style) for style in styles]
         if self.surfaces:
             face = (*OBSTACLE_COLOUR, 0.30)
             handles.append(Patch(facecolor=face, edgecolor=_EDGE, linewidth=0.8, label="obstacle"))
