@@ -48,7 +48,7 @@ _GRID = (0.80, 0.80, 0.82)
 _EDGE: Any = tuple(0.6 * channel for channel in OBSTACLE_COLOUR)
 _PIECES, _MANY_MEMBERS, _SLICES = 8, 1500, 12
 _THINNEST = 0.5
-_NUMBERS, _NAME, _ASLANT, _STEEP = 2.5, 11.5, 0.3, 0.7
+_NUMBERS, _NAME, _ASLANT, _STEEP = 2.5, 11.5, 0.3, 0.4
 """Points from an axis to its numbers and to its name; shares of a direction above which texts stand at its side."""
 _ABOVE = 100.0
 _NOTHING = np.zeros((0, 3))
