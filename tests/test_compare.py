@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from figures import clipped_and_overlapping
 from matplotlib.figure import Figure
 
 import vgtm_qp as vq
@@ -66,7 +67,9 @@ def test_the_report_as_table_data_and_figure(report: vq.Report, tmp_path: Path) 
     assert table.count("\n| ") == 1 + len(METHODS)
     assert "Measured on:" in table
     assert [row["method"] for row in json.loads(report.json())["rows"]] == METHODS
-    report.figure().savefig(tmp_path / "compare.pdf")
+    figure = report.figure()
+    assert clipped_and_overlapping(figure) == ([], [])
+    figure.savefig(tmp_path / "compare.pdf")
     assert (tmp_path / "compare.pdf").stat().st_size > 10_000
 
 
@@ -108,13 +111,16 @@ def test_methods_that_are_no_list_of_methods_are_refused(methods: object, says: 
 def test_the_command_writes_table_data_and_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "out"
     arguments = ["compare", "five_bay_free", "--methods", "qp,curve-pseudoinverse-corrected"]
-    assert main([*arguments, "--output", str(folder), "--json"]) == 0
+    figure = tmp_path / "compared.png"
+    assert main([*arguments, "--output", str(folder), "--figure", str(figure), "--json"]) == 0
+    assert figure.read_bytes().startswith(b"\x89PNG")
     data = json.loads(capsys.readouterr().out)
     assert [row["solved"] for row in data["rows"]] == [True, True]
     assert json.loads((folder / "compare.json").read_text()) == data
     assert "curve-pseudoinverse-corrected" in (folder / "compare.md").read_text()
     assert (folder / "compare.pdf").read_bytes().startswith(b"%PDF")
     assert main(["compare", "five_bay_free", "--methods", "magic"]) == 2
+    assert main(["compare", "five_bay_free", "--figure", "compared.gif"]) == 2
 
 
 def test_the_study_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,17 +1,21 @@
-"""Every example runs as it stands, in an empty folder, and does what its first line says."""
+"""Every example and notebook runs as it stands, in a new folder, and does what its first line says."""
 
 from __future__ import annotations
 
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
+from nbclient import NotebookClient
 
-EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 SAYS = {
-    "first_maneuver": ("solved in 50 steps", "vgtm export out/first_maneuver.npz --to html"),
     "own_truss": ("6 free motions", "solved; verified: True"),
     "control_loop": ("400 cycles at 200 Hz", "certified: True"),
     "compare_methods": ("curve-pseudoinverse", "pseudoinverse", "qp"),
@@ -28,6 +32,12 @@ SAYS = {
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
 }
 
+SHOWS = {
+    "first_maneuver": ("solved in 50 steps", "clearance between", "written: first_maneuver.xml"),
+    "own_arm": ("solved and verified: True\n", "3 free motions", 'did you mean "top"?'),
+    "control_loop": ("slowed    held by clearance: member", "blocked   held by", "stroke: ", "rate: "),
+}
+
 
 def test_what_examples_write_is_ignored_by_git():
     ignored = (EXAMPLES[0].parents[1] / ".gitignore").read_text(encoding="utf-8").splitlines()
@@ -36,6 +46,7 @@ def test_what_examples_write_is_ignored_by_git():
 
 def test_each_example_is_tried():
     assert {example.stem for example in EXAMPLES} == set(SAYS)
+    assert {notebook.stem for notebook in NOTEBOOKS} == set(SHOWS)
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.stem)
@@ -59,3 +70,20 @@ def test_an_example_runs(
     assert {place.name for place in tmp_path.iterdir()} <= {"out"}
     for picture in tmp_path.glob("out/*.png"):
         assert picture.stat().st_size > 5_000
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
+def test_a_notebook_runs_and_ends_with_something_seen(notebook: Path, tmp_path: Path):
+    # Notebooks find the files of problems beside their own folder.
+    shutil.copytree(ROOT / "problems", tmp_path / "problems")
+    (tmp_path / "examples").mkdir()
+    book = nbformat.read(notebook, as_version=4)
+    nbformat.validate(book)
+    code = [cell for cell in book.cells if cell.cell_type == "code"]
+    assert not any(cell.outputs or cell.execution_count for cell in code), "no outputs are stored"
+    NotebookClient(book, timeout=300, resources={"metadata": {"path": str(tmp_path / "examples")}}).execute()
+    outputs = [output for cell in code for output in cell.outputs]
+    told = "".join(output.get("text") or output.get("data", {}).get("text/html", "") for output in outputs)
+    for words in SHOWS[notebook.stem]:
+        assert words in told
+    assert any("image/png" in output.get("data", {}) for output in code[-1].outputs)

@@ -24,6 +24,8 @@ from vgtm_qp.export import FORMATS, export_maneuver
 from vgtm_qp.export.mjcf import mjcf, node_masses
 from vgtm_qp.export.trajectory import step_rates, through_rates
 from vgtm_qp.verify.arm import RecordedArm
+from vgtm_qp.view.drawing import drawing_of_maneuver
+from vgtm_qp.view.figure import each_picture
 
 MOVING = {
     "name": "drone",
@@ -191,6 +193,26 @@ def test_mujoco_reads_the_model_and_finds_the_lengths_at_every_keyframe(
         assert np.allclose(data.mocap_pos[drone], center, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["five_bay_two_cubes", "station_arm_past_a_module"])
+def test_mujoco_opens_with_arm_tip_and_obstacles_in_the_picture(name: str):
+    import mujoco
+
+    few = vq.solve(vq.load_problem(name).replace({"maneuver.steps": 10}), verify=False)
+    model: Any = mujoco.MjModel.from_xml_string(mjcf(few))
+    camera: Any = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    turn, tilt = np.radians([camera.azimuth, camera.elevation])
+    ahead = np.array([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)])
+    eye = np.asarray(camera.lookat) - camera.distance * ahead
+    seen = [few.nodes.reshape(-1, 3), few.tip_position, *drawing_of_maneuver(few).surfaces()]
+    rays = np.concatenate(seen) - eye
+    along = rays @ ahead
+    aside = np.linalg.norm(rays - along[:, None] * ahead, axis=1)
+    # In a picture that is at least as wide as it is high.
+    assert np.all(np.arctan2(aside, along) < 0.5 * np.radians(model.vis.global_.fovy))
+    assert np.all(along > model.vis.map.znear * model.stat.extent)
+
+
 def test_mujoco_holds_the_truss_up_by_its_actuators(maneuver: vq.Maneuver):
     import mujoco
 
@@ -239,27 +261,40 @@ def test_pictures_are_of_their_kind(
     assert path.read_bytes().startswith(magic)
 
 
-def test_an_animation_shows_every_state_and_moves(arm_between_cubes: vq.Maneuver, tmp_path: Path):
+def test_an_animation_is_smooth_and_moves(arm_between_cubes: vq.Maneuver, tmp_path: Path):
     from PIL import Image
 
     few, shares = _first_states(arm_between_cubes, 4), []
     with Image.open(export_maneuver(few, tmp_path / "arm.gif", progress=shares.append)) as animation:
-        assert animation.n_frames == 4
-        assert shares == [0.25, 0.5, 0.75, 1.0]
-        pictures = []
-        for k in range(4):
+        assert len(shares) == animation.n_frames
+        assert shares == sorted(shares)
+        assert shares[-1] == 1.0
+        pictures, pauses = [], []
+        for k in range(animation.n_frames):
             animation.seek(k)
             pictures.append(np.asarray(animation.convert("RGB")).copy())
+            pauses.append(animation.info["duration"] / 1000.0)
+    assert max(pauses[:-1]) <= 1.0 / 15.0, "at least fifteen pictures a second"
+    assert sum(pauses[:-1]) == pytest.approx(few.time[-1] - few.time[0], abs=0.07)
     assert tuple(pictures[0][0, 0]) == (255, 255, 255)
     assert all((one != other).any() for one, other in pairwise(pictures))
 
 
-def test_a_video_has_a_frame_for_each_state(arm_between_cubes: vq.Maneuver, tmp_path: Path):
+def test_a_video_has_as_many_pictures_as_an_animation(arm_between_cubes: vq.Maneuver, tmp_path: Path):
     import imageio_ffmpeg
+    from PIL import Image
 
-    path = export_maneuver(_first_states(arm_between_cubes, 3), tmp_path / "arm.mp4")
-    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
-    assert frames == 3
+    few = _first_states(arm_between_cubes, 3)
+    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(export_maneuver(few, tmp_path / "arm.mp4")))
+    with Image.open(export_maneuver(few, tmp_path / "arm.gif")) as animation:
+        assert frames == animation.n_frames
+
+
+def test_a_picture_between_two_states_is_between_them(arm_between_cubes: vq.Maneuver):
+    at_state, between, next_state = each_picture(arm_between_cubes, np.array([0.2, 0.3, 0.4]), 40)
+    assert at_state.shape == between.shape == next_state.shape
+    assert (at_state != between).any()
+    assert (between != next_state).any()
 
 
 def test_a_mujoco_that_cannot_be_loaded_is_not_said_to_be_missing(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from figures import clipped_and_overlapping
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -124,6 +125,13 @@ def test_a_figure_shows_units_and_the_range_of_lengths(maneuver: vq.Maneuver):
     assert bar.get_xlim() == pytest.approx(
         tuple(drawing_of_maneuver(maneuver).arm.stroke[maneuver.member_actuated][0])
     )
+
+
+@pytest.mark.parametrize("azimuth", [None, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0])
+def test_no_words_of_a_figure_are_clipped_or_lie_upon_others(maneuver: vq.Maneuver, azimuth: float | None):
+    clipped, upon = clipped_and_overlapping(plot_frames(maneuver, frames=2, azimuth=azimuth))
+    assert not clipped
+    assert not upon
 
 
 @pytest.mark.parametrize(("suffix", "start"), [(".pdf", b"%PDF"), (".png", b"\x89PNG"), (".svg", b"<?xml")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from figures import clipped_and_overlapping
 from matplotlib.figure import Figure
 from synthetic import maneuver_of, place, tripod
 
@@ -32,6 +33,16 @@ def test_clearance_is_drawn_in_millimetres_above_what_is_forbidden(maneuver: vq.
     assert max(patch.get_extents().transformed(axes.transData.inverted()).y1 for patch in axes.patches) == (
         pytest.approx(safe)
     )
+
+
+@pytest.mark.smoke
+def test_the_legend_of_clearances_lies_above_the_plot(maneuver: vq.Maneuver):
+    figure = maneuver.plot_clearance()
+    assert clipped_and_overlapping(figure) == ([], [])
+    (axes,) = figure.axes
+    assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1
+    least = {line.get_label(): line.get_ydata()[0] for line in axes.lines}
+    assert 1000.0 * maneuver.manifest["problem"]["clearance"]["safe"] * 0.25 in least.values()
 
 
 @pytest.mark.smoke

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
 import shutil
 import tomllib
 from functools import reduce
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from key_reference import TABLES, reference, written
 
 from vgtm_qp.cli import main
 from vgtm_qp.cli.app import app
-from vgtm_qp.problem import Problem, load_problem
+from vgtm_qp.problem import Problem, bundled_problems, load_problem
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -168,6 +170,28 @@ def test_the_equations_are_where_the_table_says():
                 assert reduce(getattr, name.split("."), module) is not None
                 named += 1
     assert named > 40
+
+
+def test_the_gallery_has_twelve_small_pictures_and_their_commands():
+    gallery = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "gallery" / "make.py")))
+    shown = list(gallery.pictures())
+    assert len(shown) == len(table("picture")) == 12
+    files = {ROOT / "examples" / picture for picture, _ in shown}
+    assert sum(file.stat().st_size for file in files) < 1_500_000
+    assert {
+        file for file in (ROOT / "examples" / "gallery").iterdir() if file.suffix in gallery.WIDEST
+    } < files
+    problems = set(bundled_problems())
+    for picture, command in shown:
+        for program, *arguments in map(shlex.split, command.split(" && ")):
+            if program == "python":
+                assert (ROOT / arguments[0]).is_file()
+                assert Path(picture).stem.split("_qp")[0] in (ROOT / arguments[0]).read_text()
+                continue
+            assert program == "vgtm"
+            assert Path(arguments[1]).stem in problems
+            app.parse_args(arguments)
+        assert Path(picture).name in command or Path(picture).stem in command or program == "python"
 
 
 def test_what_it_shows_and_how_it_is_cited():

@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parents[1]
 tables = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "studies" / "tables.py")))
 DOCUMENT = tables.DOCUMENT.read_text(encoding="utf-8")
 WORDS = re.compile(
-    r"\| (`\[+[\w.]+\]+`|extra|command|exit code|equation|beyond the paper|`name`|what you see|folder|word|script) \|"
+    r"\| (`\[+[\w.]+\]+`|extra|command|exit code|equation|beyond the paper|`name`|what you see|folder|word|script"
+    r"|notebook|picture) \|"
 )
 """Heads of the tables that hold words, not figures; other tests compare those of README.md with the code."""
 

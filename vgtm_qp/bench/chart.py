@@ -10,12 +10,10 @@ from matplotlib.figure import Figure
 
 from vgtm_qp.bench.report import LEAST_BAYS
 from vgtm_qp.bench.tables import phase_names, time_text
+from vgtm_qp.view.style import COLOURS, RC, WIDTH
 
-_RC: Any = {"font.size": 8.0, "pdf.fonttype": 42, "svg.fonttype": "none"}
-_COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#bbbbbb", "#66ccee", "#aa3377")
-"""A palette that colour-blind people can tell apart (Paul Tol's bright scheme)."""
-_WIDTH, _BAR, _REST = 7.1, 0.21, 0.62
-"""Inches: of the figure, of a bar and the gap to the next, and of axis and title of a panel."""
+_BAR, _REST = 0.21, 0.62
+"""Inches: of a bar and the gap to the next, and of axis and title of a panel."""
 
 
 def plot_phases(document: dict[str, Any]) -> Figure:
@@ -25,14 +23,14 @@ def plot_phases(document: dict[str, Any]) -> Figure:
     short = [scene for scene in scenes if scene["bays"] < LEAST_BAYS]
     long = [scene for scene in scenes if scene["bays"] >= LEAST_BAYS]
     groups = [group for group in (short, long) if group]
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         heights = [_REST + _BAR * len(group) for group in groups]
-        figure = Figure(figsize=(_WIDTH, sum(heights) + 0.3), layout="constrained")
+        figure = Figure(figsize=(WIDTH, sum(heights) + 0.3), layout="constrained")
         panels = figure.subplots(len(groups), squeeze=False, height_ratios=heights).ravel()
         for axes, group in zip(panels, groups, strict=True):
             _draw(axes, group, names)
         handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncol=len(names), frameon=False)
+        figure.legend(handles, labels, loc="outside upper center", ncol=len(names))
     return figure
 
 
@@ -43,7 +41,7 @@ def _draw(axes: Axes, scenes: list[dict[str, Any]], names: list[str]) -> None:
     left = [0.0] * len(scenes)
     for k, name in enumerate(names):
         parts = [factor * scene["breakdown"]["phases"].get(name, 0.0) for scene in scenes]
-        axes.barh(places, parts, left=left, height=0.72, color=_COLOURS[k % len(_COLOURS)], label=name)
+        axes.barh(places, parts, left=left, height=0.72, color=COLOURS[k % len(COLOURS)], label=name)
         left = [at + part for at, part in zip(left, parts, strict=True)]
     for place, end, scene in zip(places, left, scenes, strict=True):
         axes.annotate(
@@ -56,6 +54,5 @@ def _draw(axes: Axes, scenes: list[dict[str, Any]], names: list[str]) -> None:
     axes.set_yticks(places, [scene["name"] for scene in scenes])
     axes.invert_yaxis()
     axes.set_xlim(0.0, 1.12 * factor * longest)
-    axes.set_xlabel(f"mean time of a step, {unit}")
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_xlabel(f"mean time of a step ({unit})")
     axes.tick_params(axis="y", length=0.0)

@@ -47,6 +47,9 @@ def compare(
     output: Annotated[
         Path | None, Output(help="folder for compare.md, .json and .pdf; made if it is missing")
     ] = None,
+    figure: Annotated[
+        Path | None, Parameter(help="the figure once more, in a file of this name: .pdf, .png or .svg")
+    ] = None,
     json: Json = False,
 ) -> int:
     """Solve problems by several methods and show what each of them keeps; a method that fails is shown as failed.
@@ -60,11 +63,13 @@ def compare(
     from vgtm_qp.methods.presets import check_methods
     from vgtm_qp.problem import load_problem
     from vgtm_qp.result.file import replacing
-    from vgtm_qp.view.figure import save_figure
+    from vgtm_qp.view.figure import SUFFIXES, save_figure
 
     names = [name for entry in methods or DEFAULT_METHODS for name in entry.split(",")]
     names = list(PRESETS) if names == ["all"] else names
     check_methods(names)
+    if figure is not None:
+        check_writable(figure, "--figure", SUFFIXES)
     loaded = [load_problem(problem) for problem in problems]
     folder = output or Path("compare")
     folder.mkdir(parents=True, exist_ok=True)
@@ -85,7 +90,10 @@ def compare(
     for name, text in (("compare.md", report.markdown()), ("compare.json", report.json() + "\n")):
         with replacing(folder / name) as scratch:
             scratch.write_text(text, encoding="utf-8")
-    save_figure(report.figure(), folder / "compare.pdf")
+    drawn = report.figure()
+    save_figure(drawn, folder / "compare.pdf")
+    if figure is not None:
+        save_figure(drawn, figure)
     answer(report.to_dict(), report.markdown(), as_json=json)
     note(f"written: {folder / 'compare.md'}, compare.json, compare.pdf")
     if report.interrupted:

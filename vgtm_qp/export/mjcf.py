@@ -17,7 +17,9 @@ from vgtm_qp.verify.arm import Arm, RecordedArm, arm_of
 from vgtm_qp.view.drawing import (
     FIXED_COLOUR,
     OBSTACLE_COLOUR,
+    Drawing,
     ObstacleMesh,
+    camera_for,
     drawing_of_maneuver,
     stroke_colours,
 )
@@ -33,6 +35,11 @@ ACTUATOR_GROUP = 1
 
 _STIFFNESS, _TURNING = 2.0e5, 2.0e4
 """Of the position actuators of members, N/m, and of joints, N m/rad or N/m."""
+_AWAY = 1.5
+"""Distance of MuJoCo's own camera from the centre, as a share of the extent."""
+_LIGHT = (0.5, 0.5, 0.5)
+_WIDEST = (1280, 960)
+"""Greatest size of a picture that is rendered without a window, pixels."""
 _LEAST_MASS = 1e-6
 """kg and kg m^2 of bodies between joints in one place."""
 _STIFF = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}
@@ -65,18 +72,15 @@ def mjcf(maneuver: Result) -> str:
     root = Element("mujoco", model=name)
     _add(root, "compiler", angle="radian", autolimits="true", boundmass=_LEAST_MASS, boundinertia=_LEAST_MASS)
     _add(root, "option", timestep=TIME_STEP, integrator="implicitfast", gravity=(0.0, 0.0, -9.81))
-    extent = float(np.ptp(maneuver.nodes.reshape(-1, 3), axis=0).max())
-    _add(root, "statistic", extent=extent, center=maneuver.nodes.reshape(-1, 3).mean(axis=0))
-    visual = _add(root, "visual")
-    _add(visual, "headlight", ambient=(0.4, 0.4, 0.4), diffuse=(0.5, 0.5, 0.5))
-    asset, world = _add(root, "asset"), _add(root, "worldbody")
-    _add(world, "light", pos=(0.0, 0.0, 3.0 * extent), dir=(0.2, 0.3, -1.0), directional="true")
+    drawing = drawing_of_maneuver(maneuver)
+    asset, world = _add_view(root, maneuver, drawing), _add(root, "worldbody")
+    _add(world, "light", pos=(0.0, 0.0, 0.0), dir=(-0.3, 0.5, -0.8), directional="true", diffuse=_LIGHT)
     names = [str(node) for node in maneuver.manifest["arm"].get("node_names") or ()]
     if isinstance(arm, RecordedChain):
         _add_joints(world, arm)
     else:
         _add_nodes(world, arm, names)
-    obstacles = drawing_of_maneuver(maneuver).obstacles
+    obstacles = drawing.obstacles
     tables = {entry["name"]: entry for entry in maneuver.manifest["problem"].get("obstacle") or ()}
     for mesh in obstacles:
         _add_obstacle(asset, world, mesh, tables[mesh.name], float(maneuver.time[0]))
@@ -87,6 +91,31 @@ def mjcf(maneuver: Result) -> str:
     _add_keyframes(root, maneuver, arm, [mesh for mesh in obstacles if mesh.velocity.any()])
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_view(root: Element, maneuver: Result, drawing: Drawing) -> Element:
+    """Add camera and light, with which a viewer opens: the arm in all states, its tip and obstacles are in the picture.
+
+    Return the element of the assets, with a bright sky.
+    """
+    camera = camera_for(drawing, maneuver.nodes, maneuver.tip_position)
+    away, ahead = np.linalg.norm(camera.target - camera.position), camera.target - camera.position
+    turn, tilt = np.arctan2(ahead[1], ahead[0]), np.arcsin(ahead[2] / away)
+    _add(root, "statistic", extent=away / _AWAY, center=camera.target)
+    visual = _add(root, "visual")
+    view = {
+        "azimuth": np.degrees(turn),
+        "elevation": np.degrees(tilt),
+        "fovy": np.degrees(camera.field_of_view),
+    }
+    _add(visual, "global", **view, offwidth=_WIDEST[0], offheight=_WIDEST[1])
+    _add(
+        visual, "headlight", ambient=(0.45, 0.45, 0.45), diffuse=(0.35, 0.35, 0.35), specular=(0.0, 0.0, 0.0)
+    )
+    asset = _add(root, "asset")
+    sky: dict[str, Any] = {"type": "skybox", "builtin": "gradient", "width": 64, "height": 384}
+    _add(asset, "texture", name="sky", **sky, rgb1=(1.0, 1.0, 1.0), rgb2=(0.82, 0.85, 0.89))
+    return asset
 
 
 def modelled_arm(maneuver: Result) -> Arm:

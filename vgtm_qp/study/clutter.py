@@ -13,9 +13,10 @@ from vgtm_qp.comparison.tables import crossed_table, wilson_interval
 from vgtm_qp.geometry import shapes
 from vgtm_qp.problem import Problem
 from vgtm_qp.study.arms import bending_problem, built_truss
-from vgtm_qp.study.drawing import MARKS, label, panels, select
+from vgtm_qp.study.drawing import label, legend_above, panels, select
 from vgtm_qp.study.scenes import is_clear
 from vgtm_qp.study.workers import Row, Task
+from vgtm_qp.view.style import MARKS
 
 SEED = 1991
 
@@ -90,7 +91,7 @@ def successes(problem: Problem, methods: Sequence[str]) -> Row:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw the success of each method against the number of cubes, with 95 % intervals."""
-    figure, axes = panels(1, 1, width=5.6, height=3.6)
+    figure, axes = panels(1, 1, width=5.6, height=3.2)
     densities = sorted({row["cubes"] for row in rows})
     methods = rows[0]["methods"] if rows else []
     for k, (mark, method) in enumerate(zip(MARKS, methods, strict=False)):
@@ -106,7 +107,8 @@ def draw(rows: Sequence[Row]) -> Figure:
             **style,
         )
     axes[0].set_ylim(-0.03, 1.03)
-    label(axes[0], "cubes", "part of the scenes solved")
+    label(axes[0], "cubes", "part of the scenes solved", legend=False)
+    legend_above(axes[0])
     return figure
 
 

@@ -62,7 +62,7 @@ def run(module: str, bays: int, steps: int) -> Row:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw arms of one module, and the measures against the number of bays."""
-    figure, axes = panels(2, 3, width=3.0, height=2.9)
+    figure, axes = panels(2, 3, height=2.5)
     shown = [row for row in select(rows, module="octahedral") if "nodes" in row][:3]
     for panel, row in zip(axes, shown, strict=False):
         draw_arm(panel, row["nodes"], row, f"{row['bays']} bays", row["curve"])
@@ -73,7 +73,7 @@ def draw(rows: Sequence[Row]) -> Figure:
             mine = select(rows, module=module)
             if mine and max(row[key] for row in mine) > _EXACT:
                 draw_line(panel, k, module, mine, "bays", key)
-        label(panel, "bays", name, log="xy")
+        label(panel, "bays", name.translate({91: "(", 93: ")"}), log="xy")
         mark_bays(panel, [row["bays"] for row in rows])
     return figure
 

@@ -13,6 +13,7 @@ from vgtm_qp.curve.families import make_family
 from vgtm_qp.study.arms import furthest
 from vgtm_qp.study.drawing import label, panels
 from vgtm_qp.study.workers import Row, Task
+from vgtm_qp.view.drawing import CURVE_COLOUR, POLYGON_COLOUR
 
 _POLYGON = ((0.0, 0.0), (0.0, 1.0), (0.9, 1.8), (0.3, 2.9), (1.5, 3.3), (2.4, 2.6))
 _FAMILIES: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -40,14 +41,19 @@ def run(family: str, options: dict[str, Any], samples: int) -> Row:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw each curve with the polygon."""
-    figure, axes = panels(1, len(rows), width=2.3, height=2.8)
+    figure, axes = panels(1, len(rows), height=2.6)
     for panel, row in zip(axes, rows, strict=True):
         panel.plot(
-            *np.array(_POLYGON).T, "o--", color="0.5", markersize=3, linewidth=0.8, label="control polygon"
+            *np.array(_POLYGON).T,
+            "s--",
+            color=POLYGON_COLOUR,
+            markersize=2.4,
+            linewidth=0.7,
+            label="control polygon",
         )
-        panel.plot(*np.array(row["points"]).T, color="tab:red", linewidth=1.4, label="curve")
+        panel.plot(*np.array(row["points"]).T, color=CURVE_COLOUR, linewidth=1.4, label="curve")
         panel.set_aspect("equal")
-        label(panel, "x [m]", "z [m]", _name(row), legend=row is rows[0])
+        label(panel, "x (m)", "z (m)", _name(row).replace(", ", "\n", 1), legend=row is rows[0])
     return figure
 
 

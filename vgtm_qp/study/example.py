@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from vgtm_qp.comparison.compare import run_method
 from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.problem import load_problem
-from vgtm_qp.study.drawing import draw_arm, panels
+from vgtm_qp.study.drawing import OBSTACLE, draw_arm, panels
 from vgtm_qp.study.workers import Row, Task
 
 _FRAMES = 5
@@ -45,7 +45,7 @@ def run(method: str, steps: int) -> Row:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw frames, a row a method."""
-    figure, axes = panels(len(rows), _FRAMES, width=1.8, height=2.7)
+    figure, axes = panels(len(rows), _FRAMES, height=2.2)
     for i, row in enumerate(rows):
         for j in range(_FRAMES):
             panel = axes[_FRAMES * i + j]
@@ -53,7 +53,7 @@ def draw(rows: Sequence[Row]) -> Figure:
                 panel.set_axis_off()
                 continue
             for x, _, z, edge in row["cubes"]:
-                panel.add_patch(Rectangle((x - edge / 2, z - edge / 2), edge, edge, color="0.8"))
+                panel.add_patch(Rectangle((x - edge / 2, z - edge / 2), edge, edge, **OBSTACLE))
             frame = row["frames"][j]
             title = f"{row['method']}\nstep {frame['step']}"
             draw_arm(panel, frame["nodes"], row, title, xlim=(-1.8, 2.1), ylim=(-0.2, 4.4))

@@ -46,7 +46,7 @@ def draw(rows: Sequence[Row]) -> Figure:
     for k, problem in enumerate(_PROBLEMS):
         mine = [row for row in select(rows, problem=problem) if row["posed"] == row["steps"]]
         draw_line(axes[0], k, problem, mine, "offset", "tip_error")
-    label(axes[0], "joint offset [m]", "greatest tip error [m]", log="xy")
+    label(axes[0], "joint offset (m)", "greatest tip error (m)", log="xy")
     return figure
 
 

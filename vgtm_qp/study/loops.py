@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.comparison.tables import markdown_table
@@ -17,7 +18,7 @@ from vgtm_qp.methods import Resolver
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.study.disturbance import Disturbance
-from vgtm_qp.study.drawing import label, panels, select
+from vgtm_qp.study.drawing import label, legend_above, panels, select
 from vgtm_qp.study.robustness import SEED, features, kind_of
 from vgtm_qp.study.varied import Arms, varied_scene
 from vgtm_qp.study.workers import Row, Task
@@ -153,8 +154,8 @@ def draw(rows: Sequence[Row]) -> Figure:
         axes[0].fill_between(range(len(ordered)), below, below + counts, step="mid", label=str(status))
         below += counts
     label(axes[0], "loops, by steps that reached their goal", "steps", legend=False)
-    # Outside, because the bars fill the panel.
-    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
+    legend_above(axes[0], 3)
     return figure
 
 

@@ -44,16 +44,17 @@ def run(problem: str, method: str, vertices: int) -> Row:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw reach, travel of the solved maneuvers, and step time."""
-    figure, axes = panels(1, 3, width=3.4, height=3.1)
+    figure, axes = panels(1, 3, height=2.7)
     for k, (problem, method) in enumerate(_CASES):
         name, mine = f"{problem}: {method}", select(rows, problem=problem, method=method)
         timed = [row for row in mine if row["step_time"] is not None]
         draw_line(axes[0], k, name, mine, "vertices", "reached")
         draw_line(axes[1], k, name, select(mine, solved=True), "vertices", "travel")
         draw_line(axes[2], k, name, timed, "vertices", "step_time", factor=1e3)
-    label(axes[0], "control vertices", "part of the path", "how far")
-    label(axes[1], "control vertices", "actuator travel [m]", "solved maneuvers", legend=False)
-    label(axes[2], "control vertices", "median step [ms]", "time", legend=False, log="y")
+    label(axes[0], "control vertices", "part of the path", "how far", legend=False)
+    label(axes[1], "control vertices", "actuator travel (m)", "solved maneuvers", legend=False)
+    label(axes[2], "control vertices", "median step (ms)", "time", legend=False, log="y")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncol=2)
     return figure
 
 

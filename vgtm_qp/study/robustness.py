@@ -111,7 +111,7 @@ def features(problem: Problem) -> list[str]:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw how far the scenes that were not solved came, by what stopped them."""
-    figure, axes = panels(1, 1, width=5.6, height=3.2)
+    figure, axes = panels(1, 1, width=5.6, height=2.6)
     kinds = sorted({row["stop"] for row in rows if row["stop"]}) or ["nothing"]
     for k, kind in enumerate(kinds):
         reached = sorted(row["reached"] for row in select(rows, stop=kind))
@@ -119,7 +119,7 @@ def draw(rows: Sequence[Row]) -> Figure:
         axes[0].plot(reached, places, "o", markersize=3, label=kind)
     axes[0].set_yticks(range(len(kinds)), kinds)
     axes[0].set_xlim(0.0, 1.0)
-    label(axes[0], "part of the path", "stopped by")
+    label(axes[0], "part of the path", "stopped by", legend=False)
     return figure
 
 

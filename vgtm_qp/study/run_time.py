@@ -14,7 +14,7 @@ from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.maneuver.solve import compile_steps
 from vgtm_qp.methods import Resolver, with_method
 from vgtm_qp.study.arms import bending_problem
-from vgtm_qp.study.drawing import draw_line, label, mark_bays, panels, select
+from vgtm_qp.study.drawing import draw_line, label, legend_above, mark_bays, panels, select
 from vgtm_qp.study.workers import Row, Task
 
 _STEPS = 50
@@ -85,13 +85,14 @@ def run(bays: int, method: str, cubes: bool) -> Row:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw time against bays, without and with cubes."""
-    figure, axes = panels(1, 2, width=4.2, height=3.6)
+    figure, axes = panels(1, 2, height=3.3)
     for panel, cubes, names in zip(axes, (False, True), (_NAMES, _WITH_CUBES), strict=True):
         for k, (method, name) in enumerate(names.items()):
             style = "-" if method == "qp" else "--" if method.startswith("curve") else ":"
             draw_line(panel, k, name, _of(rows, method, cubes), "bays", "time", style=style)
         title = "two cubes, clearance watched" if cubes else "no obstacles"
-        label(panel, "bays", f"processor time of {_STEPS} steps [s]", title, log="xy")
+        label(panel, "bays", f"processor time of {_STEPS} steps (s)", log="xy", legend=False)
+        legend_above(panel, 1, title)
         mark_bays(panel, [row["bays"] for row in select(rows, cubes=cubes)])
     return figure
 

@@ -55,7 +55,7 @@ def run(module: str, steps: int) -> Row:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw the segment at four times, a row a module."""
-    figure, axes = panels(len(rows), _FRAMES, width=1.9, height=2.6)
+    figure, axes = panels(len(rows), _FRAMES, height=2.6)
     for i, row in enumerate(rows):
         for j, frame in enumerate(row["frames"]):
             panel, title = axes[_FRAMES * i + j], f"{row['module']}, step {frame['step']}"

@@ -160,7 +160,10 @@ def _known_rows(log: Path) -> dict[str, Row]:
 
 def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None:
     """Write rows, figure and text into the folder of a study; failed rows are in the data and named in the text."""
+    import matplotlib as mpl
+
     from vgtm_qp.view.figure import save_figure
+    from vgtm_qp.view.style import RC
 
     name, module, found = place.name, import_module(study.module), machine()
     data: dict[str, Any] = {
@@ -177,7 +180,9 @@ def _write(study: Study, place: Path, rows: Sequence[Row], command: str) -> None
         writer.writeheader()
         writer.writerows(flat)
     counted = [row for row in rows if "failed" not in row]
-    save_figure(module.draw(counted), place / f"{name}.pdf")
+    with mpl.rc_context(RC):
+        figure = module.draw(counted)
+    save_figure(figure, place / f"{name}.pdf")
     lines = [f"## {study.title}", "", module.text(counted).strip(), ""]
     lines += [f"Not counted: a run that failed, {row['failed']}" for row in rows if "failed" in row]
     at = f", commit {data['commit'][:12]}" if data["commit"] else ""

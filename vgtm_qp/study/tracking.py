@@ -83,12 +83,12 @@ def run(seed: int, number: int, steps: int, tracking: str) -> Row:
 
 def draw(rows: Sequence[Row]) -> Figure:
     """Draw the number of solved scenes, and the share of their steps that are exact."""
-    figure, axes = panels(1, 2, width=3.4, height=2.8)
+    figure, axes = panels(1, 2, height=2.6)
     forms = [form for form in TRACKINGS if select(rows, tracking=form)]
     solved = [select(rows, tracking=form, status="solved") for form in forms]
     axes[0].bar(forms, [len(some) for some in solved])
     axes[1].bar(forms, [100.0 * (_exact(some) or 0.0) for some in solved])
-    for panel, text in zip(axes, ("scenes solved", "steps on the curve to 1e-6 m [%]"), strict=True):
+    for panel, text in zip(axes, ("scenes solved", "steps on the curve to 1e-6 m (%)"), strict=True):
         label(panel, "tracking", text, legend=False)
         panel.tick_params("x", rotation=40)
     return figure

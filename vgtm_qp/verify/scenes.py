@@ -29,7 +29,7 @@ from vgtm_qp.verify.recovery import excuse_recovering
 
 _SAFE = 0.05
 """Default of ``clearance.safe``, m."""
-_SELF_SHARE = 0.25
+SELF_SHARE = 0.25
 """Default of ``clearance.self_safe``, as a share of ``safe``."""
 
 _NAMED = 8
@@ -121,7 +121,7 @@ def _clearances(scene: _Scene, motion: RecordedMotion, directory: Path) -> Clear
     bodies, wrong, notes = read_obstacles(scene.problem, scene.meshes, directory)
     rules = scene.problem.get("clearance") or {}
     safe = float(rules.get("safe", _SAFE))
-    self_safe = _SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
+    self_safe = SELF_SHARE * safe if rules.get("self_safe") is None else float(rules["self_safe"])
     if not rules.get("self_collision", True):
         self_safe = -np.inf
     against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]

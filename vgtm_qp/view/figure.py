@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
+from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
@@ -29,29 +31,57 @@ from vgtm_qp.view.drawing import (
     drawing_of_maneuver,
     heading,
     off_curve,
+    resampled,
     stroke_colours,
     with_surroundings,
 )
 from vgtm_qp.view.projection import ProjectedMesh, Projection, layers, pieces
+from vgtm_qp.view.style import CASING, DARK, RC, WIDTH
 
 SUFFIXES = (".pdf", ".png", ".svg")
-_RC: Any = {"font.size": 8.0, "font.family": "sans-serif", "pdf.fonttype": 42, "svg.fonttype": "none"}
-_WIDTH = 7.1
 _GREATEST_HEIGHT = 9.0
-_MARGIN, _GAP, _TITLE, _FOOT, _NOTE = 0.42, 0.16, 0.24, 0.95, 0.16
+MARGIN, FOOT = 0.42, 0.95
+"""Inches at the sides of a figure of panels, and at its foot for the legend."""
+_GAP, _TITLE, _NOTE = 0.16, 0.24, 0.16
 _POINTS_PER_INCH = 72.0
-_DARK = (0.12, 0.12, 0.14)
 _GRID = (0.80, 0.80, 0.82)
 _EDGE: Any = tuple(0.6 * channel for channel in OBSTACLE_COLOUR)
 _PIECES, _MANY_MEMBERS, _SLICES = 8, 1500, 12
-_THINNEST, _CASING = 0.5, 0.7
-_LABELS = {
-    "x": ((0.0, -2.5), (0.0, -10.5), "center", "top"),
-    "y": ((4.0, -1.0), (13.0, -5.0), "left", "center"),
-    "z": ((-3.0, 0.0), (-13.0, 0.0), "right", "center"),
-}
-"""Offsets of the numbers and the name of an axis, points, and their alignment."""
+_THINNEST = 0.5
+_NUMBERS, _NAME, _ASLANT, _STEEP = 2.5, 11.5, 0.3, 0.4
+"""Points from an axis to its numbers and to its name; shares of a direction above which texts stand at its side."""
 _ABOVE = 100.0
+_NOTHING = np.zeros((0, 3))
+_STAGE = 4.2
+"""Greatest height of the panel of an animation, inches."""
+
+
+class _Shown(NamedTuple):
+    """What is drawn at a `time`, s: nodes, lengths and control vertices, and the tip's way so far and ahead, m."""
+
+    time: float
+    nodes: Array
+    lengths: Array
+    vertices: Array
+    behind: Array
+    ahead: Array
+
+    @classmethod
+    def at(cls, maneuver: Result, time: float) -> _Shown:
+        """Return it at any time of a maneuver, between two states on straight lines."""
+
+        def now(values: Array) -> Array:
+            return np.asarray(resampled(maneuver.time, values, np.array([time]))[0])
+
+        tip, target = maneuver.tip_position, maneuver.tip_target_position
+        return cls(
+            time,
+            now(maneuver.nodes),
+            now(maneuver.member_lengths),
+            now(maneuver.control_vertices),
+            np.concatenate([tip[maneuver.time <= time], now(tip)[None]]),
+            np.concatenate([now(target)[None], target[maneuver.time > time]]),
+        )
 
 
 def _style(label: str, colour: Any, order: int, **more: Any) -> dict[str, Any]:
@@ -101,14 +131,35 @@ def plot_frames(
         titles = [f"({chr(ord('a') + k)}) {title}" for k, title in enumerate(titles)]
     off = off_curve(maneuver)
     titles = [f"{title}\n{off[row]}".strip() for title, row in zip(titles, rows, strict=True)]
-    return _View(maneuver, rows, azimuth, elevation).figure(rows, titles, _off_somewhere(maneuver, off))
+    return View(maneuver, rows, azimuth, elevation).figure(rows, titles, _off_somewhere(maneuver, off))
 
 
-def each_frame(maneuver: Result, rows: Sequence[int]) -> Iterator[Figure]:
-    """Yield one figure for each of the states `rows`, all in the view that holds the whole maneuver."""
-    view = _View(maneuver, list(range(len(maneuver.time))))
-    for row in _rows(maneuver, rows):
-        yield view.figure([row], [f"{maneuver.time[row]:.2f} s"])
+def each_picture(maneuver: Result, times: Array, dots_per_inch: int) -> Iterator[NDArray[np.uint8]]:
+    """Yield one picture (H, W, 3) for each of the `times`, s, in the view that holds the whole maneuver.
+
+    Between two states everything is on straight lines, as in the certificate. What stays in all pictures is drawn once.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    view = View(maneuver, range(len(maneuver.time)))
+    with mpl.rc_context(RC):
+        figure, axes, size = view.stage()
+        figure.set_dpi(dots_per_inch)
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.draw()
+        background, staying = canvas.copy_from_bbox(figure.bbox), set(axes.get_children())
+        for time in times.tolist():
+            canvas.restore_region(background)
+            view.draw_at(axes, time, size)
+            axes.annotate(
+                f"{time:.2f} s", (0.5, 1.0), (0.0, 3.0), "axes fraction", "offset points", ha="center"
+            )
+            added = [artist for artist in axes.get_children() if artist not in staying]
+            for artist in sorted(added, key=lambda artist: artist.get_zorder()):
+                axes.draw_artist(artist)
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            for artist in added:
+                artist.remove()
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:
@@ -119,7 +170,7 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise VgtmError(f'{path}: a figure cannot be "{path.suffix}"; choices: {", ".join(SUFFIXES)}')
-    with replacing(path) as scratch, mpl.rc_context(_RC):
+    with replacing(path) as scratch, mpl.rc_context(RC):
         figure.savefig(scratch, dpi=220, format=path.suffix[1:].lower())
     return path
 
@@ -134,15 +185,20 @@ def _off_somewhere(maneuver: Result, off: Sequence[str]) -> str:
     return f"stations are off the curve in {count} of {len(off) - 1} states, by {most}"
 
 
-class _View:
-    """The part of space in all panels, m: the arm in the states `seen`, and near parts of obstacles.
+class View:
+    """The part of space in all panels, m: the arm in the states `seen`, `others` (K, 3), and near parts of obstacles.
 
     The paper goes from `low` to `high` (2,). The `floor` (2, 2), least and greatest x and y, is at the height `ground`
     and has lines every `step`; ticks with the same spacing go up to `top`.
     """
 
     def __init__(
-        self, maneuver: Result, seen: list[int], azimuth: float | None = None, elevation: float = 0.21
+        self,
+        maneuver: Result,
+        seen: Sequence[int],
+        azimuth: float | None = None,
+        elevation: float = 0.21,
+        others: Array = _NOTHING,
     ) -> None:
         self.maneuver, self.drawing = maneuver, drawing_of_maneuver(maneuver)
         if azimuth is None:
@@ -150,7 +206,7 @@ class _View:
             azimuth = heading(maneuver.tip_position) - np.radians(70.0)
         self.projection = projection = Projection(azimuth, elevation)
         self.surfaces = [ProjectedMesh(mesh, projection) for mesh in self.drawing.obstacles]
-        arm = maneuver.nodes[seen].reshape(-1, 3)
+        arm = np.concatenate([maneuver.nodes[seen].reshape(-1, 3), others])
         size = float(np.ptp(arm, axis=0).max())
         self.step = _round_step(size / 6.0)
         self.ground = float(maneuver.nodes[0, self.drawing.arm.base, 2].min())
@@ -172,56 +228,74 @@ class _View:
         pad = 0.03 * float((most - least).max())
         self.low, self.high = least - pad, most + pad
 
+    def of(self, maneuver: Result) -> View:
+        """Return the same view of another maneuver among the same obstacles."""
+        view = copy(self)
+        view.maneuver, view.drawing = maneuver, drawing_of_maneuver(maneuver)
+        return view
+
     def figure(self, rows: Sequence[int], titles: Sequence[str], note: str = "") -> Figure:
         """Return a figure of states side by side, with a note at its foot."""
         columns = min(3, len(rows)) if len(rows) != 4 else 4
-        with mpl.rc_context(_RC):
-            title_lines = 1 + max(title.count("\n") for title in titles)
+        lines = -(-len(rows) // columns)
+        with mpl.rc_context(RC):
+            title = _TITLE * (1 + max(title.count("\n") for title in titles))
             room = _NOTE if note else 0.0
-            figure, panels, scale = self._panels(len(rows), columns, _TITLE * title_lines, _FOOT + room)
-            for k, (row, axes, title) in enumerate(zip(rows, panels, titles, strict=True)):
+            size = self.size(columns, (_GREATEST_HEIGHT - FOOT - room) / lines - title - _GAP)
+            total = FOOT + room + lines * (size[1] + title + _GAP)
+            figure = Figure(figsize=(WIDTH, total))
+            panels = panels_from(figure, total, size, title, len(rows), columns)
+            for k, (row, axes, text) in enumerate(zip(rows, panels, titles, strict=True)):
                 at_left, at_bottom = k % columns == 0, k + columns >= len(rows)
-                self._draw_floor(axes, scale, ruler=at_left, labels=at_left and at_bottom)
-                self._draw_state(axes, row, scale)
-                self._draw_tip(axes, row)
-                axes.set_title(title, fontsize=8.0, pad=3.0)
-            self._draw_legend(figure, room)
+                self.draw(axes, row, size, ruler=at_left, labels=at_left and at_bottom)
+                axes.set_title(text, fontsize=8.0, pad=3.0)
+            self.draw_legend(figure, room)
             if note:
-                at = 1.0 - _MARGIN / _WIDTH, 0.06 / float(figure.get_figheight())
-                figure.text(*at, note, ha="right", va="bottom", fontsize=7.0, color=_DARK)
+                at = 1.0 - MARGIN / WIDTH, 0.06 / total
+                figure.text(*at, note, ha="right", va="bottom", fontsize=7.0, color=DARK)
         return figure
 
-    def _panels(
-        self, count: int, columns: int, title: float, foot: float
-    ) -> tuple[Figure, list[Axes], float]:
-        """Return the figure, one axes a frame at equal scale, and points a metre.
-
-        There is room for a `title` above each frame and for the `foot` of all, inches.
-        """
-        lines = -(-count // columns)
+    def size(self, columns: int, tallest: float) -> Array:
+        """Return (2,) the size of a panel if there are so many `columns` and none may be taller, inches."""
         extent = self.high - self.low
-        room = (_WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) / columns
-        height = (_GREATEST_HEIGHT - foot - lines * (title + _GAP)) / lines
-        inches = min(room / extent[0], height / extent[1])
-        width, tall = extent * inches
-        total = foot + lines * (tall + title + _GAP)
-        left = (_WIDTH - columns * width - (columns - 1) * _GAP) / 2
-        figure = Figure(figsize=(_WIDTH, total))
-        panels = []
-        for k in range(count):
-            line, column = divmod(k, columns)
-            x = left + column * (width + _GAP)
-            y = total - (line + 1) * (tall + title + _GAP) + _GAP
-            axes = figure.add_axes((x / _WIDTH, y / total, width / _WIDTH, tall / total))
-            axes.set_xlim(self.low[0], self.high[0])
-            axes.set_ylim(self.low[1], self.high[1])
-            axes.set_axis_off()
-            panels.append(axes)
-        return figure, panels, float(inches * _POINTS_PER_INCH)
+        room = (WIDTH - 2 * MARGIN - (columns - 1) * _GAP) / columns
+        return np.asarray(extent * min(room / extent[0], tallest / extent[1]))
 
-    def _draw_floor(self, axes: Axes, scale: float, *, ruler: bool, labels: bool) -> None:
+    def stage(self) -> tuple[Figure, Axes, Array]:
+        """Return a figure with a floor and a legend and no state, its one panel and the panel's size, inches."""
+        size = self.size(1, _STAGE)
+        total = float(FOOT + size[1] + _TITLE + _GAP)
+        figure = Figure(figsize=(WIDTH, total))
+        (axes,) = panels_from(figure, total, size, _TITLE, 1, 1)
+        self._draw_floor(axes, size, ruler=True, labels=True)
+        self.draw_legend(figure, 0.0)
+        return figure, axes, size
+
+    def draw(self, axes: Axes, row: int, size: Array, *, ruler: bool, labels: bool) -> None:
+        """Draw a state into a panel of a `size`, inches; ticks along z with a `ruler`, along x and y with `labels`."""
+        self._draw_floor(axes, size, ruler=ruler, labels=labels)
+        self.draw_at(axes, float(self.maneuver.time[row]), size)
+
+    def draw_at(self, axes: Axes, time: float, size: Array) -> None:
+        """Draw arm, obstacles and the tip's way at a time, s, into a panel with a floor."""
+        shown = _Shown.at(self.maneuver, time)
+        self._draw_state(axes, shown, self._scale(size))
+        axes.plot(*self.projection.flat(shown.ahead).T, **_AHEAD)
+        axes.plot(*self.projection.flat(shown.behind).T, markevery=[-1], **_BEHIND)
+        waypoints = self.maneuver.manifest["problem"]["maneuver"].get("waypoint") or ()
+        goals = np.array([w["position"] for w in waypoints if w.get("position")]).reshape(-1, 3)
+        axes.plot(*self.projection.flat(goals).T, **_GOAL)
+
+    def _scale(self, size: Array) -> float:
+        """Return the points a metre in a panel of a size, inches."""
+        return float(size[0] * _POINTS_PER_INCH / (self.high - self.low)[0])
+
+    def _draw_floor(self, axes: Axes, size: Array, *, ruler: bool, labels: bool) -> None:
         """Draw the floor's lines, and ticks in metres: along x and y with `labels`, along z with `ruler`."""
-        flat, ground = self.projection.flat, self.ground
+        axes.set_xlim(self.low[0], self.high[0])
+        axes.set_ylim(self.low[1], self.high[1])
+        axes.set_axis_off()
+        flat, ground, scale = self.projection.flat, self.ground, self._scale(size)
         x, y = (np.arange(low, high + self.step / 2, self.step) for low, high in self.floor.T)
         ends = [[[u, y[0], ground], [u, y[-1], ground]] for u in x]
         ends += [[[x[0], v, ground], [x[-1], v, ground]] for v in y]
@@ -229,33 +303,42 @@ class _View:
         axes.add_collection(LineCollection(lines, colors=[_GRID], linewidths=0.5, zorder=0.1))
         toward = self.projection.axes[2]
         front = np.array([x[-1] if toward[0] > 0 else x[0], y[-1] if toward[1] > 0 else y[0]])
+        crowded = False
         if labels:
             along_x = np.stack([x, np.full_like(x, front[1]), np.full_like(x, ground)], axis=1)
             along_y = np.stack([np.full_like(y, front[0]), y, np.full_like(y, ground)], axis=1)
+            middle = flat(np.array([*self.floor.mean(axis=0), ground]))
             for name, values, places in (("x", x, along_x), ("y", y, along_y)):
-                _label(axes, name, values, flat(places), scale)
+                # The corner that both have in common has its number once, on x.
+                once = np.ones(len(values), dtype=bool) if name == "x" else ~np.isclose(y, front[1])
+                aside = _aside(flat(places), middle)
+                crowded = crowded or bool(aside[0] < -_STEEP)
+                _label(axes, name, values[once], flat(places[once]), aside, scale)
         if ruler:
             corners = np.array([[u, v, ground] for u in (x[0], x[-1]) for v in (y[0], y[-1])])
             foot = corners[int(np.argmin(flat(corners)[:, 0]))]
-            z = ground + np.arange(0.0, self.top - ground + self.step / 2, self.step)
+            z = ground + np.arange(0.0, self.top - ground + 1e-9 * self.step, self.step)
             places = flat(np.column_stack([np.tile(foot[:2], (len(z), 1)), z]))
             axes.plot(*places.T, color=_GRID, linewidth=0.7, marker="_", markersize=3.0, zorder=0.1)
-            _label(axes, "z", z, places, scale)
+            # Where numbers of the floor stand at the left of its corner, the one of z there would lie upon them.
+            _label(axes, "z", z[crowded:], places[crowded:], np.array([-1.0, 0.0]), scale)
 
-    def _draw_state(self, axes: Axes, row: int, scale: float) -> None:
+    def _draw_state(self, axes: Axes, shown: _Shown, scale: float) -> None:
         """Draw arm and obstacles, farthest first."""
-        maneuver, drawing, projection = self.maneuver, self.drawing, self.projection
-        time, nodes = float(maneuver.time[row]), maneuver.nodes[row]
+        drawing, projection, time, nodes = self.drawing, self.projection, shown.time, shown.nodes
         there = [surface for surface in self.surfaces if surface.mesh.is_there(time)]
         surfaces = sorted(there, key=lambda surface: surface.depth(time))
         for k, surface in enumerate(surfaces, start=1):
             _draw_surface(axes, surface, time, 2.0 * k)
         ends = drawing.arm.ends(nodes)
         cuts = _PIECES if len(ends) <= _MANY_MEMBERS else 1
-        cut = pieces(ends, cuts)
+        cut, bare = pieces(ends, cuts), pieces(ends, cuts, overlap=0.0)
         width = np.repeat(np.maximum(2.0 * drawing.arm.radius * scale, _THINNEST), cuts)
-        ball_size = (1.15 * float(np.median(width)) + _CASING) ** 2
-        colour = np.repeat(drawing.colours(maneuver.member_lengths[row]), cuts, axis=0)
+        # The nodes of a truss are a little wider than its members, the joints of a serial arm are marks on its links.
+        wider = 1.15 if drawing.arm.stretches.any() else 0.5
+        ball: Any = {"color": DARK, "marker": "o", "linestyle": "none", "markeredgewidth": 0.0}
+        ball["markersize"] = wider * float(np.median(width)) + CASING
+        colour = np.repeat(drawing.colours(shown.lengths), cuts, axis=0)
         middles = cut.mean(axis=1)
         depth, layer = projection.depth(middles), layers(middles, surfaces, time)
         node_depth, node_layer = projection.depth(nodes), layers(nodes, surfaces, time)
@@ -267,33 +350,26 @@ class _View:
             borders = np.array([depth[part[-1]] for part in slices[:-1]])
             slot = np.searchsorted(borders, node_depth[balls])
             for j, part in enumerate(slices):
-                # A dark line below each member, a little wider, separates it from things behind it.
+                # A dark line below each member, a little wider, separates it from things behind it. It ends where its
+                # piece does, so that the next piece hides its end.
                 lines = np.repeat(projection.flat(cut[part]), 2, axis=0)
+                lines[::2] = projection.flat(bare[part])
                 widths = np.repeat(width[part], 2)
-                widths[::2] += _CASING
+                widths[::2] += CASING
                 colours = np.repeat(colour[part], 2, axis=0)
-                colours[::2] = _DARK
+                colours[::2] = DARK
                 style: Any = {"capstyle": "butt", "zorder": 2.0 * k + 1.0 + j / (2.0 * _SLICES)}
                 axes.add_collection(LineCollection(list(lines), colors=colours, linewidths=widths, **style))
                 x, y = projection.flat(nodes[balls[slot == j]]).T
                 above = style["zorder"] + 0.1 / _SLICES
-                axes.scatter(x, y, s=ball_size, color=[_DARK], linewidths=0.0, zorder=above)
+                axes.plot(x, y, zorder=above, **ball)
         if drawing.curve_weights.size:
-            vertices = maneuver.control_vertices[row]
+            vertices = shown.vertices
             effects = [Stroke(linewidth=2.6, foreground="white"), Normal()]
             axes.plot(*projection.flat(vertices).T, **_POLYGON)
             axes.plot(*projection.flat(drawing.curve(vertices)).T, path_effects=effects, **_CURVE)
 
-    def _draw_tip(self, axes: Axes, row: int) -> None:
-        """Draw the tip's path and its targets."""
-        maneuver, flat = self.maneuver, self.projection.flat
-        axes.plot(*flat(maneuver.tip_target_position[row:]).T, **_AHEAD)
-        axes.plot(*flat(maneuver.tip_position[: row + 1]).T, markevery=[-1], **_BEHIND)
-        waypoints = maneuver.manifest["problem"]["maneuver"].get("waypoint") or ()
-        goals = np.array([w["position"] for w in waypoints if w.get("position")]).reshape(-1, 3)
-        axes.plot(*flat(goals).T, **_GOAL)
-
-    def _draw_legend(self, figure: Figure, room: float) -> None:
+    def draw_legend(self, figure: Figure, room: float) -> None:
         """Draw the meaning of colours and marks, above some `room` at the foot, inches."""
         width, height = figure.get_size_inches()
         arm = self.drawing.arm
@@ -302,25 +378,44 @@ class _View:
             alike = len(strokes) == 1
             low, high = strokes[0] if alike else (0.0, 1.0)
             label = "length of actuated members (m)" if alike else "actuated members, share of the stroke"
-            bar = figure.add_axes((_MARGIN / width, (0.52 + room) / height, 2.3 / width, 0.09 / height))
+            bar = figure.add_axes((MARGIN / width, (0.52 + room) / height, 2.3 / width, 0.09 / height))
             colours = ListedColormap(stroke_colours(np.linspace(0.0, 1.0, 256)).tolist())
             scalar = mpl.cm.ScalarMappable(Normalize(low, high), colours)
             figure.colorbar(scalar, cax=bar, orientation="horizontal", label=label)
         body = {"color": FIXED_COLOUR, "linewidth": 2.6, "label": arm.rigid_body}
-        curve = (_CURVE, _POLYGON) if self.drawing.curve_weights.size else ()
-        handles: list[Any] = [Line2D([], [], **style) for style in (body, *curve, _BEHIND, _AHEAD, _GOAL)]
+        styles: list[dict[str, Any]] = [body] if not arm.stretches.all() else []
+        styles += [_CURVE, _POLYGON] if self.drawing.curve_weights.size else []
+        styles += [_BEHIND, _AHEAD]
+        styles += [_GOAL] if self.maneuver.manifest["problem"]["maneuver"].get("waypoint") else []
+        handles: list[Any] = [Line2D([], [], **style) for style in styles]
         if self.surfaces:
             face = (*OBSTACLE_COLOUR, 0.30)
             handles.append(Patch(facecolor=face, edgecolor=_EDGE, linewidth=0.8, label="obstacle"))
         figure.legend(
             handles=handles,
             loc="lower right",
-            bbox_to_anchor=(1.0 - _MARGIN / width, (0.08 + room) / height),
+            bbox_to_anchor=(1.0 - MARGIN / width, (0.08 + room) / height),
             ncol=3,
-            frameon=False,
-            fontsize=7.0,
             handlelength=2.2,
         )
+
+
+def panels_from(
+    figure: Figure, top: float, size: Array, title: float, count: int, columns: int
+) -> list[Axes]:
+    """Add so many panels of a `size` to a figure, and return them: `columns` side by side, the rest below.
+
+    The first ones have their titles, for which there is a height of `title`, below the `top` above the figure's
+    foot; all in inches.
+    """
+    (width, tall), (whole, high) = size, figure.get_size_inches()
+    left = (whole - columns * width - (columns - 1) * _GAP) / 2
+    panels = []
+    for k in range(count):
+        line, column = divmod(k, columns)
+        x, y = left + column * (width + _GAP), top - (line + 1) * (tall + title) - line * _GAP
+        panels.append(figure.add_axes((x / whole, y / high, width / whole, tall / high)))
+    return panels
 
 
 def _rows(maneuver: Result, frames: int | Sequence[int]) -> list[int]:
@@ -342,18 +437,26 @@ def _round_step(size: float) -> float:
     return float(next(step for step in steps if step >= size * (1 - 1e-9)))
 
 
-def _label(axes: Axes, name: str, values: Array, places: Array, scale: float) -> None:
-    """Write numbers at ticks (K, 2) of an axis, as many as fit, and its name with the unit."""
+def _aside(places: Array, middle: Array) -> Array:
+    """Return (2,) the direction on paper that leads away from a point to an edge (K, 2), at right angles to it."""
+    x, y = places[-1] - places[0]
+    normal = np.array([-y, x]) / max(float(np.hypot(x, y)), 1e-12)
+    return np.asarray(normal if normal @ (places.mean(axis=0) - middle) > 0.0 else -normal)
+
+
+def _label(axes: Axes, name: str, values: Array, places: Array, aside: Array, scale: float) -> None:
+    """Write numbers `aside` of an axis at its ticks (K, 2), as many as fit, and its name with the unit."""
+    if not len(values):
+        return
     apart = scale * float(np.linalg.norm(places[-1] - places[0])) / max(len(values) - 1, 1)
     every = int(np.ceil((9.0 if name == "z" else 13.0) / max(apart, 1e-3)))
-    shift, name_shift, ha, va = _LABELS[name]
-    text: dict[str, Any] = {"textcoords": "offset points", "ha": ha, "va": va, "color": _DARK}
-    # The common corner of x and y has its number once, on x.
-    first = 1 if name == "y" else 0
-    for value, place in list(zip(values, places, strict=True))[first::every]:
-        axes.annotate(f"{value:g}", place, shift, fontsize=6.5, **text)
+    ha = "center" if abs(aside[0]) < _ASLANT else "left" if aside[0] > 0.0 else "right"
+    va = "center" if abs(aside[1]) < _ASLANT else "bottom" if aside[1] > 0.0 else "top"
+    text: dict[str, Any] = {"textcoords": "offset points", "ha": ha, "va": va, "color": DARK}
+    for value, place in list(zip(values, places, strict=True))[::every]:
+        axes.annotate(f"{value:g}", place, tuple(_NUMBERS * aside), fontsize=6.5, **text)
     text |= {"fontsize": 7.0, "rotation": 90.0 * (name == "z")}
-    axes.annotate(f"{name} (m)", places.mean(axis=0), name_shift, **text)
+    axes.annotate(f"{name} (m)", places.mean(axis=0), tuple(_NAME * aside), **text)
 
 
 def _draw_surface(axes: Axes, surface: ProjectedMesh, time: float, zorder: float) -> None:

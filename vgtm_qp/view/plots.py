@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -13,37 +12,34 @@ from matplotlib.figure import Figure
 from vgtm_qp.arrays import Array
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import arm_of
+from vgtm_qp.verify.scenes import SELF_SHARE
 from vgtm_qp.verify.curve import TRACKING_TOLERANCE, greatest_gaps
 from vgtm_qp.verify.path import TIP_TOLERANCE, tip_error
+from vgtm_qp.view.style import BOUND_COLOUR, COLOURS, DASHES, FORBIDDEN, RC
 
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Distinct in every common form of colour blindness (Okabe and Ito, 2008)."""
-_DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)))
-_FORBIDDEN: Any = {
-    "facecolor": "#f3d7d2",
-    "edgecolor": "#b91c1c",
-    "hatch": "////",
-    "linewidth": 0.0,
-    "alpha": 0.55,
-}
-_STYLE: Any = {"font.size": 8.0, "axes.spines.top": False, "axes.spines.right": False, "pdf.fonttype": 42}
 _SIZE = (4.6, 2.7)
 _NAMED = 5
 _SMALLEST = 1e-17
 
 
 def _draw_clearance(axes: Axes, maneuver: Result) -> None:
-    """Draw the least distances to obstacles and between members over time, mm."""
-    safe = 1000.0 * float(maneuver.manifest["problem"]["clearance"]["safe"])
-    both = {"to obstacles": maneuver.clearance, "between members": maneuver.self_clearance}
+    """Draw the least distances to obstacles and between bodies over time, mm, above those that are forbidden."""
+    rules = maneuver.manifest["problem"]["clearance"]
+    safe, own = 1000.0 * float(rules["safe"]), rules.get("self_safe")
+    bodies = f"between {arm_of(maneuver).body}s"
+    both = {"to obstacles": maneuver.clearance, bodies: maneuver.self_clearance}
     shown = [(name, values) for name, values in both.items() if np.isfinite(values).any()]
-    for (name, values), colour, dash in zip(shown, _COLOURS, _DASHES, strict=False):
+    for (name, values), colour, dash in zip(shown, COLOURS, DASHES, strict=False):
         axes.plot(maneuver.time, 1000.0 * values, color=colour, linestyle=dash, label=name)
     floor = min(0.0, *(1100.0 * float(values.min()) for _, values in shown)) if shown else 0.0
-    axes.axhspan(floor, safe, label=f"below {safe:g} mm", **_FORBIDDEN)
+    axes.axhspan(floor, safe, label=f"too near an obstacle: below {safe:g} mm", **FORBIDDEN)
+    if rules.get("self_collision", True) and any(name == bodies for name, _ in shown):
+        least = SELF_SHARE * safe if own is None else 1000.0 * float(own)
+        axes.axhline(least, color=COLOURS[1], linestyle=":", label=f"least {bodies}: {least:g} mm")
     axes.set_ylim(bottom=floor)
     axes.set_ylabel("least clearance (mm)")
-    axes.legend(frameon=False)
+    # Above the axes, where nothing is drawn.
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncol=2, borderaxespad=0.3)
 
 
 def _draw_strokes(axes: Axes, maneuver: Result) -> None:
@@ -63,16 +59,16 @@ def _draw_strokes(axes: Axes, maneuver: Result) -> None:
     order = np.argsort(np.minimum(share, 1.0 - share).min(axis=0), kind="stable")
     for k in order[_NAMED:][::-1]:
         axes.plot(maneuver.time, values[:, k], color="0.78", linewidth=0.8)
-    for k, colour, dash in zip(order[:_NAMED], _COLOURS, _DASHES, strict=False):
+    for k, colour, dash in zip(order[:_NAMED], COLOURS, DASHES, strict=False):
         name = arm.quantity_names[actuators[k]]
         axes.plot(maneuver.time, values[:, k], color=colour, linestyle=dash, label=name)
     room = 0.08 * (top - bottom)
-    axes.axhspan(bottom - room, bottom, **_FORBIDDEN)
-    axes.axhspan(top, top + room, **_FORBIDDEN)
+    axes.axhspan(bottom - room, bottom, **FORBIDDEN)
+    axes.axhspan(top, top + room, **FORBIDDEN)
     axes.set_ylim(bottom - room, top + room)
     unit = "length (m)" if maneuver.joints is None else "value (rad or m)"
     axes.set_ylabel(f"actuator {unit}" if alike else "part of the stroke (%)")
-    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), title="nearest a limit")
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title="nearest a limit")
 
 
 def _draw_tip_error(axes: Axes, maneuver: Result) -> None:
@@ -92,11 +88,11 @@ def _draw_error(axes: Axes, maneuver: Result, error: Array | None, tolerance: fl
     """Draw errors (T,), m, if there are any, and their tolerance, which is relative to the arm's size."""
     if error is not None:
         shown = np.maximum(error, _SMALLEST)
-        axes.semilogy(maneuver.time, shown, color=_COLOURS[0], marker=".", markersize=3.0)
+        axes.semilogy(maneuver.time, shown, color=COLOURS[0], marker=".", markersize=3.0)
     level = tolerance * arm_of(maneuver).size
-    axes.axhline(level, color="#b91c1c", linestyle="--", linewidth=0.9, label="tolerance")
+    axes.axhline(level, color=BOUND_COLOUR, linestyle="--", linewidth=0.9, label="tolerance")
     axes.set_ylim(bottom=_SMALLEST / 2.0)
-    axes.legend(frameon=False)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.3)
 
 
 def _draw_step_time(axes: Axes, maneuver: Result) -> None:
@@ -105,7 +101,7 @@ def _draw_step_time(axes: Axes, maneuver: Result) -> None:
     phases = 1000.0 * maneuver.phase_time[1:]
     total = 1000.0 * maneuver.step_time[1:]
     below = np.zeros(len(steps))
-    for values, name, colour in zip(phases.T, maneuver.phase_names, _COLOURS, strict=False):
+    for values, name, colour in zip(phases.T, maneuver.phase_names, COLOURS, strict=False):
         axes.bar(steps, values, bottom=below, width=1.0, color=colour, label=str(name))
         below += values
     axes.bar(steps, np.maximum(total - below, 0.0), bottom=below, width=1.0, color="0.8", label="the rest")
@@ -115,7 +111,7 @@ def _draw_step_time(axes: Axes, maneuver: Result) -> None:
             axes.axhline(value, color="0.15", linestyle=dash, linewidth=0.9, label=f"{name}: {value:.2g} ms")
         axes.set_xlim(0.5, len(steps) + 0.5)
     axes.set(xlabel="step", ylabel="computing time (ms)")
-    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 _DRAW: dict[str, Callable[[Axes, Result], None]] = {
@@ -129,7 +125,7 @@ _DRAW: dict[str, Callable[[Axes, Result], None]] = {
 
 def plot(quantity: str, maneuver: Result, axes: Axes | None) -> Figure:
     """Draw a quantity of a maneuver into `axes`, or those of a new figure unknown to pyplot; return the figure."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(RC):
         if axes is None:
             axes = Figure(figsize=_SIZE, layout="constrained").add_subplot()
         axes.set_xlabel("time (s)")

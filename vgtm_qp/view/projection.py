@@ -93,9 +93,9 @@ def layers(points: Array, surfaces: list[ProjectedMesh], time: float) -> Index:
     return order
 
 
-def pieces(ends: Array, count: int) -> Array:
-    """Return (M * count, 2, 3) members (M, 2, 3) in `count` pieces that overlap a little, to hide seams."""
+def pieces(ends: Array, count: int, overlap: float = 0.1) -> Array:
+    """Return (M * count, 2, 3) members (M, 2, 3) in `count` pieces, which overlap by so much of one, to hide seams."""
     share = np.linspace(0.0, 1.0, count + 1)
-    shares = np.clip(np.stack([share[:-1] - 0.1 / count, share[1:] + 0.1 / count], axis=1), 0.0, 1.0)
+    shares = np.clip(np.stack([share[:-1] - overlap / count, share[1:] + overlap / count], axis=1), 0.0, 1.0)
     along = ends[:, 1] - ends[:, 0]
     return np.asarray(ends[:, None, None, 0] + shares[..., None] * along[:, None, None]).reshape(-1, 2, 3)
