@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,6 +52,8 @@ _THINNEST = 0.5
 _NUMBERS, _NAME, _ASLANT, _STEEP = 2.5, 11.5, 0.3, 0.4
 """Points from an axis to its numbers and to its name; shares of a direction above which texts stand at its side."""
 _ABOVE = 100.0
+_MANY_GOALS = 20
+"""Greatest number of waypoints that are marked: a record of a loop has one a step."""
 _NOTHING = np.zeros((0, 3))
 _STAGE = 4.2
 """Greatest height of the panel of an animation, inches."""
@@ -282,9 +285,7 @@ class View:
         self._draw_state(axes, shown, self._scale(size))
         axes.plot(*self.projection.flat(shown.ahead).T, **_AHEAD)
         axes.plot(*self.projection.flat(shown.behind).T, markevery=[-1], **_BEHIND)
-        waypoints = self.maneuver.manifest["problem"]["maneuver"].get("waypoint") or ()
-        goals = np.array([w["position"] for w in waypoints if w.get("position")]).reshape(-1, 3)
-        axes.plot(*self.projection.flat(goals).T, **_GOAL)
+        axes.plot(*self.projection.flat(self._goals).T, **_GOAL)
 
     def _scale(self, size: Array) -> float:
         """Return the points a metre in a panel of a size, inches."""
@@ -369,6 +370,13 @@ class View:
             axes.plot(*projection.flat(vertices).T, **_POLYGON)
             axes.plot(*projection.flat(drawing.curve(vertices)).T, path_effects=effects, **_CURVE)
 
+    @cached_property
+    def _goals(self) -> Array:
+        """Positions (K, 3) of the waypoints, m; none if there are many."""
+        waypoints = self.maneuver.manifest["problem"]["maneuver"].get("waypoint") or ()
+        goals = np.array([w["position"] for w in waypoints if w.get("position")]).reshape(-1, 3)
+        return goals if len(goals) <= _MANY_GOALS else goals[:0]
+
     def draw_legend(self, figure: Figure, room: float) -> None:
         """Draw the meaning of colours and marks, above some `room` at the foot, inches."""
         width, height = figure.get_size_inches()
@@ -386,7 +394,7 @@ class View:
         styles: list[dict[str, Any]] = [body] if not arm.stretches.all() else []
         styles += [_CURVE, _POLYGON] if self.drawing.curve_weights.size else []
         styles += [_BEHIND, _AHEAD]
-        styles += [_GOAL] if self.maneuver.manifest["problem"]["maneuver"].get("waypoint") else []
+        styles += [_GOAL] if len(self._goals) else []
         handles: list[Any] = [Line2D([], [], **style) for style in styles]
         if self.surfaces:
             face = (*OBSTACLE_COLOUR, 0.30)
