@@ -81,8 +81,8 @@ def test_every_row_agrees_with_the_closed_form_and_with_finite_differences(seed,
     assert not exact.by_fcl.any()
     if shape != "triangle":
         # Of a body inside a closed mesh there is one row, which leads out, in the place of all others.
-        assert monitor.fcl.asked == len(found)
-        assert monitor.fcl.refused == np.count_nonzero(~found.by_fcl)
+        assert monitor.scene.fcl.asked == len(found)
+        assert monitor.scene.fcl.refused == np.count_nonzero(~found.by_fcl)
     touching = exact.distance + np.where(exact.is_self, 2.0, 1.0) * RADIUS <= NORMAL_FROM
     assert not (found.by_fcl & touching).any()
     # FCL errs at bodies parallel to edges on round coordinates, and at rims by some 2e-6 m now and then; elsewhere it
@@ -198,11 +198,11 @@ def test_lies_are_caught(shape, lie, monkeypatch, rng):
         compared += len(found)
         with monkeypatch.context() as patched:
             lie_always(patched, lie, monitor, X)
-            asked, refused = monitor.fcl.asked, monitor.fcl.refused
+            asked, refused = monitor.scene.fcl.asked, monitor.scene.fcl.refused
             lied = near(monitor, X, by_fcl=True)
         assert not lied.by_fcl.any()
         assert_same(lied, exact)
-        assert monitor.fcl.refused - refused == monitor.fcl.asked - asked == len(found)
+        assert monitor.scene.fcl.refused - refused == monitor.scene.fcl.asked - asked == len(found)
 
 
 def test_a_right_distance_and_normal_at_another_place_of_the_body_are_caught(monkeypatch):
@@ -251,7 +251,7 @@ def test_poses_that_fcl_errs_at_fall_to_the_closed_form_and_are_counted(watch):
     assert found.body.tolist() == [0, 1]
     assert found.by_fcl.tolist() == [False, True]
     assert found.distance[0] == pytest.approx(np.hypot(0.25, 0.5), abs=1e-12)
-    assert (monitor.fcl.asked, monitor.fcl.refused) == (2, 1)
+    assert (monitor.scene.fcl.asked, monitor.scene.fcl.refused) == (2, 1)
 
 
 @pytest.mark.smoke

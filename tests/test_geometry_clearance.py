@@ -201,7 +201,7 @@ def test_straight_arm_beside_cubes_on_round_coordinates(bays):
             least[near.pair(k)] = min(least.get(near.pair(k), np.inf), float(near.distance[k]))
         for pair, distance in least.items():
             assert distance == pytest.approx(expected[pair], abs=1e-9)
-    assert clearance.fcl.asked > 0
+    assert clearance.scene.fcl.asked > 0
 
 
 def test_parallel_member_has_two_rows():

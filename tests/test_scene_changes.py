@@ -13,6 +13,8 @@ from arms import three_bays
 
 import vgtm_qp as vq
 from vgtm_qp.errors import ResultError
+from vgtm_qp.geometry import shapes
+from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.methods import with_method
 from vgtm_qp.step.build import make_obstacle
@@ -203,6 +205,45 @@ def test_a_pose_nearer_than_the_new_clearance_says_so_and_recovers():
         if not short:
             break
     assert not resolver.state.shortfall
+
+
+def test_a_pair_with_a_floor_of_its_own_lowers_no_other():
+    """The one too near may come apart, the other has to keep its clearance all the way."""
+    obstacles = [shapes.sphere("near", [0.4, 0.0, 0.5], 0.3), shapes.sphere("far", [-0.45, 0.0, 0.5], 0.3)]
+    monitor = Clearance(capsules([[0, 1]], 0.05), obstacles, safe=0.08, influence=0.5)
+    start = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+    def failing(shift, least):
+        places = np.stack([start, start + np.array([shift, 0.0, 0.0])])
+        report = monitor.along(places, 0.0, 0.1, 0.08, lowered={(0, 0, False): least})
+        assert report.certified == (not len(report.failing))
+        return {report.failing.name(k).rpartition(" / ")[2] for k in range(len(report.failing))}
+
+    assert failing(-0.015, 0.05) == set()
+    assert failing(-0.04, 0.05) == {"far"}
+    assert failing(0.01, 0.05) == {"near"}
+    assert failing(0.01, -np.inf) == set()
+    assert failing(-0.04, -np.inf) == {"far"}
+
+
+def test_what_an_arm_cannot_brake_before_is_told_at_once():
+    problem = three_bays(**{"truss.acceleration": 0.2, "truss.rate": 0.5})
+    resolver = vq.Resolver(problem)
+    tip = resolver.tip()[0]
+    for _ in range(12):
+        resolver.step(position=np.add(tip, [0.9, 0.0, -0.3]), dt=0.1)
+    nodes = resolver.state.nodes
+    wall = {"name": "wall", "center": [nodes[:, 0].max() + 0.12, 0.0, 2.0], "size": [0.02, 4.0, 4.0]}
+    near = resolver.add_obstacle(vq.Box(**wall))
+    braking = [resolver.state]
+    while resolver.brake() is not None:
+        braking.append(resolver.state)
+    points = [resolver.setup.arm.points(state.q) for state in braking]
+    least = min(resolver.setup.monitor.least(X, among="obstacles")[0] for X in points)
+    assert len(braking) > 2
+    assert least < problem.clearance.safe
+    assert min(near.values()) == pytest.approx(least, abs=2e-3)
+    assert all(name.endswith(" / wall") for name in near)
 
 
 def test_wrong_changes_are_goal_errors_that_change_nothing(tmp_path):

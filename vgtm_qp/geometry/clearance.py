@@ -12,7 +12,7 @@ from vgtm_qp.compiled import compiler
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.formulas import FAR
-from vgtm_qp.geometry.groups import Found, Scene
+from vgtm_qp.geometry.groups import Found, Lowered, Scene
 from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, PairNames, Wanted
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 from vgtm_qp.geometry.solids import Solids
@@ -252,6 +252,7 @@ class Clearance:
         self_floor: float | None = None,
         *,
         thorough: bool = True,
+        lowered: Lowered | None = None,
     ) -> BetweenReport:
         """Prove that no surface distance falls below its floor on straight pieces of equal duration.
 
@@ -271,6 +272,9 @@ class Clearance:
             overlap already. Only the watch can prove them; without it they count as zero.
         thorough : bool
             False if nothing is tried after the watch, where there is one.
+        lowered : Lowered or None
+            Other floors of some pairs, minus infinity for those that do not count. The watch does not know them, and is
+            not asked then.
 
         Raises
         ------
@@ -278,21 +282,28 @@ class Clearance:
             A position is not finite; so do `near` and `least`.
         """
         self_floor = floor if self_floor is None else self_floor
-        if (watch := self._watch()) is not None:
+        if not lowered and (watch := self._watch()) is not None:
             proven = watch.follow(places, floor, self_floor)
             if proven or not thorough:
                 return BetweenReport(proven, min(floor, self_floor), np.zeros(0), self.scene.nothing)
         pieces, lowest = len(places) - 1, np.inf
         for k in range(pieces):
             since, until = (start_time + j / pieces * (end_time - start_time) for j in (k, k + 1))
-            report = self._between(places[k], places[k + 1], since, until, floor, self_floor)
+            report = self._between(places[k], places[k + 1], since, until, floor, self_floor, lowered or {})
             lowest = min(lowest, report.clearance)
             if not report.certified:
                 break
         return replace(report, clearance=lowest, fraction=(k + report.fraction) / pieces)
 
     def _between(
-        self, start: Array, end: Array, start_time: float, end_time: float, floor: float, self_floor: float
+        self,
+        start: Array,
+        end: Array,
+        start_time: float,
+        end_time: float,
+        floor: float,
+        self_floor: float,
+        lowered: Lowered,
     ) -> BetweenReport:
         """Return the proof for one piece, without the watch."""
         floor, self_floor = max(floor, 0.0), max(self_floor, 0.0)
@@ -306,14 +317,20 @@ class Clearance:
             lowest = min(lowest, others, float(lower[~open_].min(initial=np.inf)))
             rows = np.flatnonzero(open_)
             if len(rows):
-                result = sweep_group(group, rows, start, end, start_time, end_time, least)
+                floors = group.floors(rows, least, lowered) if lowered else least
+                result = sweep_group(group, rows, start, end, start_time, end_time, floors)
                 lowest = min(lowest, result.lowest)
                 if len(result.rows):
                     parts.append((group.numbers[result.rows], result.contacts))
                     fractions.append(result.fraction)
-        for part in self._solids.enclosed(start, start_time):
-            parts.append(part)
-            fractions.append(np.full(len(part[0]), 1.0 / 32.0))
+        for numbers, found in self._solids.enclosed(start, start_time):
+            owner = self.pieces.obstacle[numbers[:, 5]].tolist()
+            counts = [
+                (b, o, False) not in lowered for b, o in zip(numbers[:, 4].tolist(), owner, strict=True)
+            ]
+            if any(counts):
+                parts.append((numbers[counts], found[counts]))
+                fractions.append(np.full(sum(counts), 1.0 / 32.0))
         failing = self.scene.contacts(parts)
         lowest = min(lowest, float(failing.distance.min(initial=np.inf)))
         return BetweenReport(not parts, lowest, np.concatenate(fractions), failing)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import casadi as ca
@@ -27,6 +27,9 @@ from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 
 Found = tuple[Index, Array]
 """The ``Group.numbers`` (R, 8) of pairs, and their contacts (R, ``CONTACT``)."""
+
+Lowered = Mapping[tuple[int, int, bool], float]
+"""Floors of some pairs, m: by body, obstacle or other body, and whether it is a body."""
 
 _FIRST = 16
 """Number of pairs, nearest at the reference, that are searched first for the least distance."""
@@ -257,6 +260,18 @@ class Group:
     def chosen(self, by: Wanted, rows: Index, found: Array) -> Mask:
         """Return which of the contacts `found` (R, ``CONTACT``) of the pairs `rows` are wanted."""
         return by(self.body[rows], self.other[rows], found[:, 0], is_self=self.is_self)
+
+    def floors(self, rows: Index, floor: float, lowered: Lowered) -> Array:
+        """Return the floor (R,) of each of the pairs `rows`: `floor`, m, or that in `lowered`."""
+        floors = np.full(len(rows), floor)
+        body, other = self.body[rows], self.other[rows]
+        if not self.is_self:
+            other = self.scene.pieces.obstacle[other]
+        for (first, second, is_self), least in lowered.items():
+            if is_self == self.is_self:
+                same = (body == first) & (other == second)
+                floors[same | (body == second) & (other == first) if is_self else same] = least
+        return floors
 
     def distinct(self, rows: Index, found: Array) -> Index:
         """Return the nearest of contacts of `rows` with the same body, mesh, normal and place on the body."""

@@ -68,18 +68,25 @@ class _Sweep:
 
 
 def sweep_group(
-    group: Group, rows: Index, start: Array, end: Array, start_time: float, end_time: float, floor: float
+    group: Group,
+    rows: Index,
+    start: Array,
+    end: Array,
+    start_time: float,
+    end_time: float,
+    floor: float | Array,
 ) -> SweepResult:
-    """Return which of the pairs `rows` are proven to stay above `floor` over the motion."""
+    """Return which of the pairs `rows` (R,) are proven to stay above `floor`, one or (R,), over the motion."""
     sweep = _Sweep(group, rows, start, end, start_time, end_time)
     count = len(rows)
+    floor = np.broadcast_to(floor, count)
     # The motion of few pairs is cut at once, as finely as a call allows at no extra cost.
     pieces = max(_PIECES // count, 1)
     k = np.repeat(np.arange(count), pieces)
     cuts = np.arange(pieces + 1) / pieces
     left, right = np.tile(cuts[:-1], count), np.tile(cuts[1:], count)
     bounds = sweep.bounds(k, left, right)
-    if (bounds[:, 0] >= floor).all():
+    if (bounds[:, 0] >= floor[k]).all():
         return SweepResult(float(bounds[:, 0].min()), rows[:0], left[:0], np.zeros((0, CONTACT)))
     failed = np.zeros(count, dtype=bool)
     worst, proven = np.full(count, np.inf), np.full(count, np.inf)
@@ -88,13 +95,13 @@ def sweep_group(
         if depth:
             bounds = sweep.bounds(k, left, right)
         # A negated comparison is true for NaN.
-        open_ = ~(bounds[:, 0] >= floor)
+        open_ = ~(bounds[:, 0] >= floor[k])
         np.minimum.at(proven, k[~open_], bounds[~open_, 0])
         for distance, where in ((bounds[:, 1], left), (bounds[:, 2], right)):
             np.minimum.at(worst, k, distance)
             here = distance == worst[k]
             fraction[k[here]] = where[here]
-            failed[k[~(distance >= floor)]] = True
+            failed[k[~(distance >= floor[k])]] = True
         if depth == _DEPTH:
             failed[k[open_]] = True
         split = open_ & ~failed[k]

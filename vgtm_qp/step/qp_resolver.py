@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -185,13 +186,22 @@ class QPResolver(Resolver, serves="qp"):
         return struck(stop, self.setup, self._separation, state, dt)
 
     def _after_change(self) -> Near:
-        """See :class:`ChangingScene`; braking steps stay as they were, since the arm cannot stop sooner."""
+        """See :class:`ChangingScene`; braking steps stay as they were, since the arm cannot stop sooner.
+
+        Pairs that come too near while the arm brakes are too near as well.
+        """
         braking, state = self._known_braking(), self._state
         short = self._separation.shortfall(state.q, state.time, tracked=True)
-        self._state = replace(state, shortfall=short)
+        self._state, near = replace(state, shortfall=short), self._named(short)
         if braking is not None:
             self._braking = braking.changed(self._state, lambda then: replace(then, shortfall=None))
-        return self._named(short)
+            for then, _ in self._braking.steps:
+                failing = self._separation.between(state.q, then.q, state.time, then.time, short).failing
+                for k in range(len(failing)):
+                    name = failing.name(k).removeprefix("clearance: ")
+                    near[name] = min(near.get(name, math.inf), float(failing.distance[k]))
+                state = then
+        return near
 
     def too_near(self, state: State) -> Shortfall:
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""

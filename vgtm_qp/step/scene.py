@@ -21,7 +21,7 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 
 Near = dict[str, float]
-"""Pairs that are below their clearance, by name, with their distances, m."""
+"""Pairs that are below their clearance, or will be while the arm brakes, by name, with their distances, m."""
 
 
 class ChangingScene(ABC):

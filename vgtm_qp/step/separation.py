@@ -99,17 +99,21 @@ class Separation:
     def between(
         self, start: Array, end: Array, start_time: float, end_time: float, before: Shortfall
     ) -> BetweenReport:
-        """Return the proof that no pair falls below its clearance, or the least one at the start if less."""
+        """Return the proof that no pair falls below its clearance, or below its own at the start if that is less."""
         floor, self_floor = self._setup.safe, self._setup.self_safe
         for pair, distance in before.items():
             if pair.is_self:
                 self_floor = min(self_floor, distance)
             else:
                 floor = min(floor, distance)
-        along, ways = self._monitor.along, self._arm.ways
+        along, ways, lowered = self._monitor.along, self._arm.ways, self._lowered(before)
         if not self._arm.leaves_chords:
             floors = floor - self._rounding, max(self_floor - self._rounding, 0.0)
-            return along(ways(start, end, 1), start_time, end_time, *floors)
+            places = ways(start, end, 1)
+            report = along(places, start_time, end_time, *floors)
+            if report.certified and lowered:
+                report = along(places, start_time, end_time, *self._floors(-self._rounding), lowered=lowered)
+            return report
         deviation = self.deviation(start, end)
         # In k pieces, the deviation from the chords is 1 / k^2 of the whole. Most motions need only one
         # piece.
@@ -123,7 +127,27 @@ class Separation:
             report = along(ways(start, end, pieces), start_time, end_time, *floors, thorough=is_last)
             if report.certified:
                 break
+        if report.certified and lowered:
+            places, floors = ways(start, end, pieces), self._floors(spare)
+            lowered = {pair: least + spare for pair, least in lowered.items()}
+            report = along(places, start_time, end_time, *floors, lowered=lowered)
         return report
+
+    def _floors(self, more: float) -> tuple[float, float]:
+        """Return the least clearances from obstacles and between bodies, m, and `more`."""
+        return self._setup.safe + more, max(self._setup.self_safe + more, 0.0)
+
+    def _lowered(self, before: Shortfall) -> dict[tuple[int, int, bool], float]:
+        """Return the floors of pairs that are too near already, m.
+
+        Surfaces that overlap have none: that they come no nearer is proven together with all others.
+        """
+        found: dict[tuple[int, int, bool], float] = {}
+        for (body, other, is_self), distance in before.items():
+            pair = body, other if is_self else int(self._monitor.pieces.obstacle[other]), is_self
+            least = distance - self._rounding if distance > 0.0 else -math.inf
+            found[pair] = min(found.get(pair, math.inf), least)
+        return found
 
     def deviation(self, start: Array, end: Array) -> float:
         """Return a bound of how much nearer two points come to each other than their chords, m."""

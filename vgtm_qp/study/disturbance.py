@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from time import thread_time
 from typing import Any
 
@@ -29,13 +30,15 @@ _FAR = 1e3
 class Disturbance:
     """Changes the scene of a `resolver` before a `share` of its steps.
 
-    Obstacles come, move, change their velocity and go, and the clearance changes. One that would come into the arm
-    goes again at once.
+    Obstacles come, move, change their velocity and go, and the clearance changes. What would put an obstacle into the
+    arm, or so near that an arm with limited accelerations cannot brake in time, is taken back at once.
     """
 
     def __init__(self, resolver: Resolver, random: np.random.Generator, share: float) -> None:
         self._resolver, self._random, self._share = resolver, random, share
         self._safe, self._height = resolver.setup.safe, resolver.setup.arm.height
+        arm = resolver.setup.arm
+        self._is_heavy = bool(np.isfinite(arm.acceleration[arm.actuators]).any())
         self._seconds: list[float] = []
         self._made = 0
         if share > 0.0:
@@ -57,12 +60,16 @@ class Disturbance:
         change(str(self._random.choice(names)) if names else "")
         self._seconds.append(thread_time() - started)
 
+    def _is_bad(self, near: dict[str, float]) -> bool:
+        """Return whether a change leaves the arm inside an obstacle, or no way to brake before it comes too near."""
+        return min(near.values(), default=math.inf) <= 0.0 or (self._is_heavy and bool(near))
+
     def _come(self, _: str) -> None:
         way = self._random.normal(size=3)
         way *= self._height * self._random.uniform(_NEAREST, _FURTHEST) / np.linalg.norm(way)
         nodes = self._resolver.state.nodes
         near = self._add(int(self._random.integers(3)), nodes[int(self._random.integers(len(nodes)))] + way)
-        if min(near.values(), default=1.0) <= 0.0:
+        if self._is_bad(near):
             self._resolver.remove_obstacle(self._resolver.obstacles[-1].name)
 
     def _add(self, shape: int, center: Array) -> dict[str, float]:
@@ -79,25 +86,29 @@ class Disturbance:
         return self._resolver.add_obstacle(Cylinder(**turned, radius=sizes[0], height=sizes[1]))
 
     def _move(self, name: str) -> None:
-        resolver = self._resolver
-        number = [obstacle.name for obstacle in resolver.obstacles].index(name)
-        table = resolver.obstacles[number]
-        center = np.add(table.center, np.multiply(resolver.state.time, table.velocity))
-        moved = center + self._random.normal(scale=0.02 * self._height, size=3)
-        near = resolver.move_obstacle(name, center=moved)
-        if min(near.values(), default=1.0) <= 0.0:
-            resolver.move_obstacle(name, center=center)
+        self._put(name, shift=self._random.normal(scale=0.02 * self._height, size=3))
 
     def _stop(self, name: str) -> None:
         still = self._random.random() < 0.5
         velocity = np.zeros(3) if still else self._random.uniform(-_FASTEST, _FASTEST, size=3)
-        self._resolver.move_obstacle(name, velocity=velocity)
+        self._put(name, velocity=velocity)
+
+    def _put(self, name: str, *, shift: Array | None = None, velocity: Array | None = None) -> None:
+        """Move an obstacle, and put it back if that is bad."""
+        resolver = self._resolver
+        table = next(obstacle for obstacle in resolver.obstacles if obstacle.name == name)
+        center = np.add(table.center, np.multiply(resolver.state.time, table.velocity))
+        moved = center if shift is None else center + shift
+        if self._is_bad(resolver.move_obstacle(name, center=moved, velocity=velocity)):
+            resolver.move_obstacle(name, center=center, velocity=table.velocity)
 
     def _go(self, name: str) -> None:
         self._resolver.remove_obstacle(name)
 
     def _keep(self, _: str) -> None:
-        self._resolver.set_clearance(safe=self._safe * self._random.uniform(0.5, 1.5))
+        before = self._resolver.setup.safe
+        if self._is_bad(self._resolver.set_clearance(safe=self._safe * self._random.uniform(0.5, 1.5))):
+            self._resolver.set_clearance(safe=before)
 
     def row(self, step: float) -> Row:
         """Return the number of ``changes``, the median of their CPU times over that of a `step`, and how many are dear.
