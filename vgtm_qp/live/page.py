@@ -9,6 +9,7 @@ from threading import Event
 from time import perf_counter
 from typing import Any
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.live.curves import Curves
 from vgtm_qp.live.handles import Handles
 from vgtm_qp.live.journey import GoalTools
@@ -96,6 +97,11 @@ class Page:
     def moment(self) -> float:
         """Time up to which a solved maneuver was played, s."""
         return self._player.moment
+
+    @property
+    def goal(self) -> Array:
+        """(3,) where the goal was dropped, m."""
+        return self._goal.goal
 
     @property
     def message(self) -> str:

@@ -10,8 +10,8 @@ from vgtm_qp.live.reading import Reading
 from vgtm_qp.live.session import Session
 from vgtm_qp.view.drawing import stroke_colours
 
-_GREY, _RED = "#6b7280", "#b91c1c"
-_COLOURS = {"at rest": _GREY, "moving": "#0b7a5b", "slowed": "#b45309", "blocked": _RED, "stopped": _RED}
+_GREY, _RED, _AMBER = "#6b7280", "#b91c1c", "#b45309"
+_COLOURS = {"at rest": _GREY, "moving": "#0b7a5b", "slowed": _AMBER, "blocked": _RED, "stopped": _RED}
 _MOST_ACTIVE, _MOST_NEAR = 6, 2
 
 
@@ -76,11 +76,11 @@ def _outcome(reading: Reading, said: str) -> str:
         text += f"<div id='why' style='color:{_RED}'>{escape(reading.why)}</div>"
     for name, distance, least in reading.too_near[:_MOST_NEAR]:
         text += (
-            f"<div class='too-near' style='color:#b45309'>{escape(name)} too near: {1000.0 * distance:.1f} mm, "
-            f"{1000.0 * (least - distance):.1f} mm less than safe</div>"
+            f"<div class='too-near' style='color:{_AMBER}'>{escape(name)}: {1000.0 * distance:.1f} mm, "
+            f"{1000.0 * (least - distance):.1f} mm too near</div>"
         )
     if (more := len(reading.too_near) - _MOST_NEAR) > 0:
-        text += f"<div class='too-near' style='color:#b45309'>and {more} more</div>"
+        text += f"<div class='too-near' style='color:{_AMBER}'>and {more} more</div>"
     return text
 
 
