@@ -33,7 +33,7 @@ FLAGS = [
     "--disable-background-networking",
 ]
 PERIOD = 1.0 / 30.0
-PATIENCE = 40.0
+PATIENCE = 300.0
 """Seconds that a busy machine may take for what an idle one does at once; every wait ends with what is waited for."""
 OF_VISER = "Unable to preventDefault inside passive event listener invocation."
 """What the browser says whenever a hand takes hold of a ball: viser's page listens to pointers passively. Harmless."""

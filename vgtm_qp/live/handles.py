@@ -27,14 +27,14 @@ class Handles:
     def rebuild(self) -> None:
         """Put the balls of another session into its scene."""
         session = self._stage.session
-        vertices, unit = session.control_vertices, self._stage.scene.unit
-        self._target = self._add("/tip target", session.target, 0.085 * unit, _TARGET_COLOUR, self._drag_tip)
+        vertices, ball = session.control_vertices, self._stage.scene.ball
+        self._target = self._add("/tip target", session.target, ball, _TARGET_COLOUR, self._drag_tip)
         colour = tuple(round(255 * channel) for channel in CURVE_COLOUR)
         # The first vertex belongs to the base; the last one has the ball of the tip.
         inner = range(1, len(vertices) - 1) if session.vertices_can_be_wanted else ()
         self._vertices = {
             i: self._add(
-                f"/control vertex {i}", vertices[i], 0.06 * unit, colour, partial(self._drag_vertex, i)
+                f"/control vertex {i}", vertices[i], 0.7 * ball, colour, partial(self._drag_vertex, i)
             )
             for i in inner
         }

@@ -77,16 +77,16 @@ class GoalTools:
         """Put the goal of another session into its scene: where the path of its maneuver ends."""
         stage = self._stage
         scene, goal = stage.server.scene, np.asarray(stage.path[-1], dtype=float)
-        unit = stage.scene.unit
+        unit, ball = stage.scene.unit, stage.scene.ball
         self._gizmo = scene.add_transform_controls(
             "/goal",
-            scale=0.45 * unit,
+            scale=max(0.45 * unit, 3.5 * ball),
             disable_rotations=True,
             disable_sliders=True,
             depth_test=False,
             position=goal,
         )
-        scene.add_icosphere("/goal/ball", radius=0.07 * unit, color=_GOAL_COLOUR, opacity=0.8)
+        scene.add_icosphere("/goal/ball", radius=0.8 * ball, color=_GOAL_COLOUR, opacity=0.8)
         gizmo = self._gizmo
         stage.inbox.on(gizmo.on_update, lambda _: self._drop(gizmo.position), newest="goal")
         self.journey = None

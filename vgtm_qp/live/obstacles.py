@@ -18,9 +18,9 @@ NONE = "(none)"
 """What the drop-down shows while no obstacle is chosen."""
 
 _SIZE = 0.5
-"""Diameter or edge of a new obstacle, over the arm's unit of length."""
+"""Diameter or edge of a new obstacle, over the size of the arm's parts; it is larger beside a thick arm."""
 _ROOM = 0.1
-"""Distance from the arm that a new obstacle has over the least one, over the arm's unit of length."""
+"""Distance from the arm that a new obstacle has over the least one, over the size of the arm's parts."""
 _ANGLES = np.radians(np.arange(-90.0, 270.0, 15.0))
 
 
@@ -52,8 +52,9 @@ class ObstacleTools:
     def rebuild(self) -> None:
         """Put the gizmo into the scene of another session, at no obstacle."""
         stage = self._stage
+        scale = max(0.6 * stage.scene.unit, 5.0 * stage.scene.ball)
         self._gizmo = gizmo = stage.server.scene.add_transform_controls(
-            "/chosen obstacle", scale=0.6 * stage.scene.unit, depth_test=False, visible=False
+            "/chosen obstacle", scale=scale, depth_test=False, visible=False
         )
         stage.inbox.on(gizmo.on_update, self._grip)
         stage.inbox.on(gizmo.on_update, lambda _: self._drag(), newest="obstacle")
@@ -116,7 +117,7 @@ class ObstacleTools:
         session = self._stage.session
         names = {table.name for table in session.obstacles}
         name = next(name for k in range(1, len(names) + 2) if (name := f"{shape} {k}") not in names)
-        session.add_obstacle(make(name, _SIZE * self._stage.scene.unit))
+        session.add_obstacle(make(name, max(_SIZE * self._stage.scene.unit, 4.0 * self._stage.scene.ball)))
         self.choose(name)
 
     def _box(self, name: str, size: float) -> Box:

@@ -55,6 +55,8 @@ class ArmScene:
     ----------
     unit : float
         The size of the arm's parts, m.
+    ball : float
+        Radius of a ball that stands out at the arm, m.
     """
 
     def __init__(self, server: Any, drawing: Drawing, nodes: Array, control_vertices: Array) -> None:
@@ -62,6 +64,7 @@ class ArmScene:
 
         self._server, self._scene, self._drawing = server, server.scene, drawing
         arm, self.unit = drawing.arm, float(drawing.arm.size)
+        self.ball = max(0.085 * self.unit, 1.8 * float(np.median(arm.radius)))
         self._scene.set_up_direction("+z")
         self._scene.world_axes.visible = False
         self._add_ground(nodes)
