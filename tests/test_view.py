@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import vgtm_qp as vq
-from vgtm_qp.live.page import read_out, view
+from vgtm_qp.live.page import view
+from vgtm_qp.live.readout import read_out
 from vgtm_qp.live.session import Session
 from vgtm_qp.methods import method_name, methods_for
 
@@ -319,8 +320,8 @@ def test_a_result_plays_back_and_goes_home(tab: Any, page_of: Any, maneuver: vq.
     # The button says Pause only while the arm moves, and a busy browser may never show that: what stays is waited for.
     tab.get_by_role("button", name="Play", exact=True).click()
     wait_for_strokes(tab, "> 1")
+    tab.get_by_role("tab", name="Move", exact=True).click()
     tab.get_by_role("button", name="Home", exact=True).click()
-    tab.get_by_role("button", name="Play", exact=True).wait_for()
     wait_for_strokes(tab, "== 1")
     assert tab.strangers == []
 

@@ -4,63 +4,76 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path as FilePath
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.methods import Resolver
+from vgtm_qp.errors import GoalError
+from vgtm_qp.live.reading import OUTCOMES, Hold, Reading, TooNear
+from vgtm_qp.methods import Resolver, method_name
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.problem import Problem
+from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere
 from vgtm_qp.rows.curve import fitted
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.verify.arm import recorded_arm
-from vgtm_qp.view.drawing import make_drawing
-
-OUTCOMES = {StepStatus.REACHED: "moving", StepStatus.SLOWED: "slowed", StepStatus.BLOCKED: "blocked"}
+from vgtm_qp.view.drawing import make_drawing, obstacle_meshes
 
 _REACHED = 1e-4
 _STRIDE = 0.06
 _RETRY_AFTER = 10
-
-
-class Reading(NamedTuple):
-    """What the page shows: one of `OUTCOMES` or ``"at rest"``, and what holds the arm back, most decisive first.
-
-    Then all active rows of the last QP; the least distances to obstacles and between members that share no
-    node, m; the pair nearest to an obstacle; the greatest gap between stations and curve, m, NaN without a
-    curve; whether exact tracking gave way in the last step; and the computing time of that step, s.
-    """
-
-    outcome: str
-    stopped_by: tuple[str, ...]
-    active: tuple[str, ...]
-    clearance: float
-    self_clearance: float
-    nearest: str
-    gap: float
-    gave_way: bool
-    step_time: float
+_CRAWL = 1e-3
+"""Share of a step below which an arm counts as held, so that the page says what would let it go on."""
 
 
 class Session:
-    """One arm, its resolver, and its goals. Threads must not share a session."""
+    """One arm, its resolver, and its goals. Threads must not share a session.
+
+    Attributes
+    ----------
+    drawing : Drawing
+        The arm and the obstacles as they are now.
+    target : (3,)
+        Where the tip is wanted, m.
+    vertex_goals : dict
+        Where control vertices are wanted, m, by index.
+    method : str
+        Name of the method.
+    steps : int
+        Number of steps tried so far.
+    """
+
+    target: Array
+    vertex_goals: dict[int, Array]
 
     def __init__(self, problem: Problem) -> None:
-        self.problem = self._given = problem
+        self._problem = self._given = problem
+        self._scene_changed = False
         self._resolver = Resolver(problem)
         arm = self._resolver.setup.arm
-        directory = problem.source.parent if problem.source else "."
+        self._directory = problem.source.parent if problem.source else FilePath()
         recorded = recorded_arm(arm.record(), arm.bodies.joints)
         vertices = len(self.state.control_vertices)
         self._drawn = self._resolver.setup
-        self.drawing = make_drawing(problem.to_dict(), recorded, vertices, directory)
-        self._step_time = 0.0
+        self.drawing = make_drawing(problem.to_dict(), recorded, vertices, self._directory)
+        self.method = method_name(problem)
+        self._step_time, self._dt, self.steps = 0.0, 1.0, 0
         self._put(self.state)
+
+    @property
+    def problem(self) -> Problem:
+        """The problem with the method, weights, clearance and obstacles of now."""
+        if self._scene_changed:
+            there = [table.model_dump(mode="json", exclude_none=True) for table in self.obstacles]
+            self._problem, self._scene_changed = self._problem.replace({"obstacle": there}), False
+        return self._problem
 
     @property
     def nodes(self) -> Array:
@@ -94,7 +107,7 @@ class Session:
     def want_tip(self, position: Array) -> None:
         """Ask for the tip at `position` (3,), m."""
         self.target = np.array(position, dtype=float)
-        self._waiting = 0
+        self._wake()
 
     def want_vertex(self, index: int, position: Array | None) -> None:
         """Ask for control vertex `index` at `position` (3,), m; None lets it go."""
@@ -102,11 +115,26 @@ class Session:
             self.vertex_goals.pop(index, None)
         else:
             self.vertex_goals[index] = np.array(position, dtype=float)
-        self._waiting = 0
+        self._wake()
+
+    def _wake(self) -> None:
+        """Let the arm try again at once, and forget why it stopped."""
+        self._waiting, self._why = 0, ""
+
+    def halt(self) -> str:
+        """Drop all goals where the arm is; return what held it back, or an empty text."""
+        why = self.explained()
+        self.target, self.vertex_goals = self.tip, {}
+        self._halted = bool(why)
+        return why
 
     def go_home(self) -> None:
         """Put the arm into its home pose, at rest, and drop all goals."""
-        self._put(self._resolver.setup.home_state())
+        self._put(self._aware(self._resolver.setup.home_state()))
+
+    def _aware(self, state: State) -> State:
+        """Return a state that knows what is too near, so that the arm keeps away from it even at rest."""
+        return replace(state, shortfall=self._resolver.too_near(state) or None)
 
     def put_at(self, time: float, q: Array, control_vertices: Array) -> None:
         """Put the arm at rest in configuration `q` with `control_vertices` (V, 3), m, and drop all goals."""
@@ -124,24 +152,35 @@ class Session:
     def _put(self, state: State) -> None:
         self._resolver.state = _with_curve(state, self._resolver.setup)
         self.target = self.tip
-        self.vertex_goals: dict[int, Array] = {}
-        self._waiting = 0
+        self.vertex_goals = {}
         self._held_by: tuple[str, ...] = ()
         self._last: Step | None = None
+        self._halted = False
+        self._wake()
 
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change values of the problem, by key path, and go on from the same state.
 
         VgtmError, and no change, if a value is wrong or the method cannot serve this problem.
         """
-        self._use(self.problem.replace(settings))
+        problem = self.problem.replace(settings)
+        if set(settings) == {"clearance.safe"}:
+            clearance = problem.clearance
+            self._resolver.set_clearance(safe=clearance.safe, self_safe=clearance.between_members)
+            self._problem = problem
+            self._wake()
+        else:
+            self._use(problem)
 
     def _use(self, problem: Problem) -> None:
         """Go on with another problem from the same state."""
-        resolver = Resolver(problem)
-        resolver.state = _with_curve(self.state, resolver.setup)
-        self.problem, self._resolver = problem, resolver
-        self._waiting, self._held_by = 0, ()
+        resolver, short = Resolver(problem), bool(self.state.shortfall)
+        resolver.state = replace(_with_curve(self.state, resolver.setup), shortfall=None)
+        self._problem, self._resolver, self._scene_changed = problem, resolver, False
+        if short:
+            resolver.state = self._aware(resolver.state)
+        self.method, self._held_by, self._last = method_name(problem), (), None
+        self._wake()
 
     def use_method(self, name: str) -> None:
         """Change to the method called `name`, with those keys of the original problem that it has.
@@ -151,36 +190,119 @@ class Session:
         given = self._given.to_dict()["method"]
         self._use(with_method(self.problem.replace({"method": given}), name))
 
+    @property
+    def obstacles(self) -> tuple[Box | Sphere | Cylinder | Mesh, ...]:
+        """The obstacles of the scene; their centers are those at time 0."""
+        return self._resolver.obstacles
+
+    def obstacle(self, name: str) -> Box | Sphere | Cylinder | Mesh:
+        """Return the obstacle called `name`, its center where it is now.
+
+        GoalError if there is none.
+        """
+        for table in self.obstacles:
+            if table.name == name:
+                now = np.add(table.center, np.multiply(self.state.time, table.velocity))
+                return table.model_copy(update={"center": tuple(now.tolist())})
+        raise GoalError(f"there is no obstacle {name!r}; {len(self.obstacles)} others are there")
+
+    def add_obstacle(self, obstacle: Box | Sphere | Cylinder | Mesh) -> None:
+        """Put an obstacle into the scene, its center where it is now; GoalError if its name is taken."""
+        self._resolver.add_obstacle(obstacle)
+        self._redraw(obstacle.name)
+
+    def move_obstacle(self, name: str, *, center: ArrayLike, rotation_vector: ArrayLike) -> None:
+        """Put an obstacle at `center` (3,), m, in an attitude `rotation_vector` (3,), rad.
+
+        GoalError, and no change, if there is none of that name.
+        """
+        self._resolver.move_obstacle(name, center=center, rotation_vector=rotation_vector)
+        self._redraw(name)
+
+    def remove_obstacle(self, name: str) -> None:
+        """Take an obstacle out of the scene; GoalError if there is none of that name."""
+        self._resolver.remove_obstacle(name)
+        self._redraw(name)
+
+    def _redraw(self, name: str) -> None:
+        """Let problem and drawing follow a change of the obstacle called `name`."""
+        self._scene_changed = True
+        self._wake()
+        there = {table.name: table for table in self.obstacles}
+        known = {mesh.name: mesh for mesh in self.drawing.obstacles}
+        fresh = [there[name].model_dump(mode="json", exclude_none=True)] if name in there else []
+        known |= {mesh.name: mesh for mesh in obstacle_meshes(fresh, self._directory)}
+        shown = tuple(mesh for key, mesh in known.items() if key in there)
+        self.drawing = replace(self.drawing, obstacles=shown)
+
     def advance(self, dt: float) -> bool:
         """Make one step of duration `dt`, s, towards the goals; return whether the arm moved.
 
-        A blocked arm tries again after a moment, since obstacles may have moved away.
+        An arm that is nearer to something than it should be drives away from it. A blocked arm tries again after a
+        moment, since obstacles may have moved away.
         """
-        away = self.target - self.tip
-        distance = float(np.linalg.norm(away))
-        if distance <= _REACHED and not self.vertex_goals:
-            self._last, self._held_by = None, ()
+        distance = float(np.linalg.norm(self.target - self.tip))
+        if distance <= _REACHED and not self.vertex_goals and not self.state.shortfall:
+            if not self._halted:
+                self._last, self._held_by = None, ()
             return False
+        self._halted = False
         if self._waiting > 0:
             self._waiting -= 1
             return False
         if self.vertices_can_be_wanted:
             self._resolver.control_vertex_goals = dict(self.vertex_goals)
-        position, rotation = self.pose()
-        ends = np.stack([position, position + away * min(1.0, _STRIDE / max(distance, _REACHED))])
-        path = Path(np.array([0.0, 1.0]), ends, np.stack([rotation, rotation]))
         started, before = perf_counter(), self.state.nodes
-        step = self._resolver.follow(path, 0.0, 1.0, dt=dt)
+        self._dt = dt
+        step = self._resolver.follow(self._piece(), 0.0, 1.0, dt=dt)
         self._step_time = perf_counter() - started
-        self._last = step
+        self._last, self.steps = step, self.steps + 1
         if step.status is StepStatus.REACHED:
             self._held_by = ()
         elif step.active or not self._held_by:
             self._held_by = step.blocked_by
+        if step.progress > _CRAWL:
+            self._why = ""
         if step.status is StepStatus.BLOCKED:
             self._waiting = _RETRY_AFTER
             return False
         return bool(np.max(np.abs(self.state.nodes - before)) > 1e-9)
+
+    def _piece(self) -> Path:
+        """Return the next piece of the straight way to the target."""
+        position, rotation = self.pose()
+        away = self.target - position
+        share = min(1.0, _STRIDE / max(float(np.linalg.norm(away)), _REACHED))
+        ends = np.stack([position, position + share * away])
+        return Path(np.array([0.0, 1.0]), ends, np.stack([rotation, rotation]))
+
+    def explained(self) -> str:
+        """Return in a sentence what holds the arm and what would let it go on; empty if nothing does.
+
+        It takes some ten milliseconds the first time after the arm has moved, and nothing afterwards.
+        """
+        last = self._last
+        if last is None or last.status is StepStatus.REACHED or last.progress > _CRAWL:
+            return ""
+        if not self._why:
+            self._why = str(self._resolver.explain(self._piece(), 0.0, 1.0, dt=self._dt, last=last))
+        return self._why
+
+    @property
+    def safe(self) -> float:
+        """Least distance from an obstacle that is kept, m."""
+        return self._resolver.setup.safe
+
+    @property
+    def step_time(self) -> float:
+        """Computing time of the last step, s."""
+        return self._step_time
+
+    @property
+    def clearance(self) -> float:
+        """Least distance to an obstacle, m; infinite without one."""
+        setup, state = self._resolver.setup, self.state
+        return setup.monitor.least(setup.arm.points(state.q), state.time, among="obstacles")[0]
 
     def reading(self) -> Reading:
         """Return the readings of the present state."""
@@ -188,17 +310,59 @@ class Session:
         monitor, points = setup.monitor, setup.arm.points(state.q)
         clearance, pair = monitor.least(points, state.time, among="obstacles")
         last = self._last
+        outcome = "at rest" if last is None else "stopped" if self._halted else OUTCOMES[last.status]
+        too_near = self._too_near()
+        holding = [name for name in self._held_by if name.startswith("clearance: ")]
+        is_held = outcome in ("slowed", "blocked", "stopped")
+        wanted = holding if is_held else [f"clearance: {name}" for name, *_ in too_near]
         return Reading(
-            outcome="at rest" if last is None else OUTCOMES[last.status],
+            outcome=outcome,
             stopped_by=self._held_by,
+            why=self.explained(),
             active=() if last is None else last.active,
             clearance=clearance,
             self_clearance=monitor.least(points, state.time, among="members")[0],
             nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),
+            too_near=too_near,
+            hold=self._hold(wanted) if wanted else None,
             gap=setup.gap_of(state),
             gave_way=last is not None and last.gave_way,
             step_time=self._step_time,
         )
+
+    def _too_near(self) -> tuple[TooNear, ...]:
+        """Return the pairs below their clearance, the worst first."""
+        monitor = self._resolver.setup.monitor
+        short = self._resolver.too_near(self.state)
+        found = [
+            TooNear(
+                monitor.names.clearance(pair).removeprefix("clearance: "),
+                distance,
+                monitor.self_safe if pair.is_self else monitor.safe,
+            )
+            for pair, distance in short.items()
+        ]
+        return tuple(sorted(found, key=lambda one: one.distance - one.least))
+
+    def _hold(self, wanted: list[str]) -> Hold | None:
+        """Return the first of the `wanted` clearance rows that is near, with its nearest points; None if none is."""
+        setup, state = self._resolver.setup, self.state
+        points = setup.arm.points(state.q)
+        near = setup.monitor.near(points, state.time)
+        rows = {near.name(k): k for k in np.argsort(-near.distance).tolist()}
+        k = next((rows[name] for name in wanted if name in rows), None)
+        if k is None:
+            return None
+        body, other, is_self = near.pair(k)
+        bodies, names = setup.monitor.bodies, near.names
+        ours = near.weights[k, :2] @ points[near.points[k, :2]]
+        away = float(bodies.radius[body] + near.distance[k]) * near.normal[k]
+        obstacle = "" if is_self else names.obstacles[names.owner[other]]
+        shown: tuple[int, ...] = (body, other) if is_self else (body,)
+        if len(bodies.names) != len(self.drawing.arm.radius):
+            shown = ()
+        name, distance = near.name(k).removeprefix("clearance: "), float(near.distance[k])
+        return Hold(name, distance, shown, obstacle, np.stack([ours, ours - away]))
 
 
 def _with_curve(state: State, setup: Setup) -> State:

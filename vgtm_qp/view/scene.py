@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,19 @@ _FIXED_POINT = 2.0**-12
 """Resolution of recorded coordinates, m: a quarter of a millimetre, so that a recording compresses."""
 
 
+MARK_COLOUR = (0.92, 0.0, 0.72)
+"""What holds the arm back: bodies, obstacles and the line between them."""
+
+
+@dataclass(eq=False)
+class _DrawnObstacle:
+    """An obstacle, and its handles in the scene."""
+
+    mesh: ObstacleMesh
+    frame: Any
+    surface: Any
+
+
 def import_viser() -> Any:
     """Return the module ``viser``; raise MissingExtraError if it is not installed."""
     try:
@@ -34,13 +49,22 @@ def import_viser() -> Any:
 
 
 class ArmScene:
-    """Draws one arm into a viser scene once, and moves it afterwards."""
+    """Draws one arm into a viser scene once, and moves it afterwards.
+
+    Attributes
+    ----------
+    unit : float
+        The size of the arm's parts, m.
+    ball : float
+        Radius of a ball that stands out at the arm, m.
+    """
 
     def __init__(self, server: Any, drawing: Drawing, nodes: Array, control_vertices: Array) -> None:
         import trimesh
 
         self._server, self._scene, self._drawing = server, server.scene, drawing
-        arm = drawing.arm
+        arm, self.unit = drawing.arm, float(drawing.arm.size)
+        self.ball = max(0.085 * self.unit, 1.8 * float(np.median(arm.radius)))
         self._scene.set_up_direction("+z")
         self._scene.world_axes.visible = False
         self._add_ground(nodes)
@@ -71,7 +95,10 @@ class ArmScene:
                 point_size=0.05,
                 point_shape="circle",
             )
-        self._obstacles = [self._add_obstacle(mesh) for mesh in drawing.obstacles]
+        self._marked: list[int] = []
+        self._line: Any = None
+        self._said: Any = None
+        self._obstacles = {_path(mesh): self._add_obstacle(mesh) for mesh in drawing.obstacles}
 
     def move(self, nodes: Array, control_vertices: Array, time: float, *, coarse: bool = False) -> None:
         """Show the arm at `nodes` (N, 3) and `control_vertices` (V, 3), m, and obstacles at `time`, s.
@@ -85,7 +112,9 @@ class ArmScene:
 
         arm = self._drawing.arm
         position, wxyz, span = map(numbers, _placement(arm.ends(nodes)))
-        colours = _instance_rgb(self._drawing.colours(arm.lengths(nodes)))
+        shown = self._drawing.colours(arm.lengths(nodes))
+        shown[self._marked] = MARK_COLOUR
+        colours = _instance_rgb(shown)
         with self._server.atomic():
             for which, handle in self._members:
                 handle.batched_positions = position[which]
@@ -94,6 +123,7 @@ class ArmScene:
                     scales = np.array(handle.batched_scales)
                     scales[:, 2] = span[which]
                     handle.batched_scales = scales
+                if not np.array_equal(handle.batched_colors, colours[which]):
                     handle.batched_colors = colours[which]
             self._nodes.batched_positions = numbers(nodes)
             if self._curve is not None and self._polygon is not None and self._vertices is not None:
@@ -101,11 +131,48 @@ class ArmScene:
                 self._polygon.points = numbers(_segments(control_vertices))
                 self._vertices.points = numbers(control_vertices)
             is_changing = any(np.isfinite((mesh.since, mesh.until)).any() for mesh in self._drawing.obstacles)
-            for mesh, handle in zip(self._drawing.obstacles, self._obstacles, strict=True):
-                if mesh.velocity.any():
-                    handle.position = mesh.position(time)
+            for drawn in self._obstacles.values():
+                if drawn.mesh.velocity.any():
+                    drawn.frame.position = drawn.mesh.position(time)
                 if is_changing:
-                    handle.visible = mesh.is_there(time)
+                    drawn.frame.visible = drawn.mesh.is_there(time)
+
+    def put(self, obstacles: Sequence[ObstacleMesh], time: float) -> None:
+        """Show `obstacles` in the place of those that were there, where they are at `time`, s."""
+        wanted = {_path(mesh): mesh for mesh in obstacles}
+        with self._server.atomic():
+            for path in [path for path in self._obstacles if path not in wanted]:
+                self._obstacles.pop(path).frame.remove()
+            for path, mesh in wanted.items():
+                drawn = self._obstacles.get(path)
+                if drawn is None:
+                    drawn = self._obstacles[path] = self._add_obstacle(mesh)
+                elif drawn.mesh.vertices is not mesh.vertices:
+                    # Faces and vertices go together: another shape may have taken the name.
+                    drawn.surface.vertices = mesh.vertices.astype(np.float32)
+                    drawn.surface.faces = mesh.faces.astype(np.uint32)
+                drawn.mesh = mesh
+                drawn.frame.position = mesh.position(time)
+
+    def mark(self, bodies: Sequence[int], obstacles: Collection[str], line: Array | None, said: str) -> None:
+        """Show bodies, by index, with the next `move`, and obstacles, by name, as what holds the arm; so the `line`.
+
+        Its two points (2, 3), m, are those where a body and an obstacle are nearest, and have the label `said`; None
+        for no line.
+        """
+        self._marked = list(bodies)
+        for drawn in self._obstacles.values():
+            colour = MARK_COLOUR if drawn.mesh.name in obstacles else OBSTACLE_COLOUR
+            if tuple(drawn.surface.color) != tuple(_rgb(colour)):
+                drawn.surface.color = tuple(_rgb(colour).tolist())
+        if self._line is None and line is not None:
+            self._line = self.add_path("/hold", line, colour=MARK_COLOUR, thickness=0.03 * self.unit)
+            self._said = self._scene.add_label("/hold label", said, anchor="bottom-center")
+        if self._line is not None:
+            self._line.visible = self._said.visible = line is not None
+        if self._line is not None and line is not None:
+            self._line.points = _segments(line).astype(np.float32)
+            self._said.position, self._said.text = line[1], said
 
     def add_path(
         self, name: str, points: Array, *, colour: Any = PATH_COLOUR, thickness: float = 0.012
@@ -134,11 +201,10 @@ class ArmScene:
             **more,
         )
 
-    def _add_obstacle(self, mesh: ObstacleMesh) -> Any:
-        # An obstacle that was moved is drawn once for each place.
-        path = f"/obstacles/{mesh.name}" + (f" from {mesh.since:g} s" if np.isfinite(mesh.since) else "")
-        group = self._scene.add_frame(path, show_axes=False, position=mesh.center)
-        self._scene.add_mesh_simple(
+    def _add_obstacle(self, mesh: ObstacleMesh) -> _DrawnObstacle:
+        path = _path(mesh)
+        frame = self._scene.add_frame(path, show_axes=False, position=mesh.center)
+        surface = self._scene.add_mesh_simple(
             f"{path}/surface",
             mesh.vertices.astype(np.float32),
             mesh.faces.astype(np.uint32),
@@ -149,7 +215,7 @@ class ArmScene:
             cast_shadow=False,
         )
         self._scene.add_label(f"{path}/name", mesh.name, anchor="center-center")
-        return group
+        return _DrawnObstacle(mesh, frame, surface)
 
     def _add_ground(self, nodes: Array) -> None:
         base = nodes[self._drawing.arm.base]
@@ -165,6 +231,11 @@ class ArmScene:
             section_color=(198, 202, 208),
             position=(0.0, 0.0, float(base[:, 2].min()) - 0.002),
         )
+
+
+def _path(mesh: ObstacleMesh) -> str:
+    """Return where an obstacle is in the scene; one that was moved is drawn once for each place."""
+    return f"/obstacles/{mesh.name}" + (f" from {mesh.since:g} s" if np.isfinite(mesh.since) else "")
 
 
 def _placement(ends: Array) -> tuple[Array, Array, Array]:
