@@ -8,7 +8,16 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
+FOLDER = Path(__file__).resolve().parents[1] / "examples"
+OWN_PARTS = sorted((FOLDER / "own_parts").glob("*.py"))
+EXAMPLES = [*sorted(FOLDER.glob("*.py")), *OWN_PARTS]
+MOST_LINES = 30
+"""Of an example of a part of one's own."""
+
+
+def called(example: Path) -> str:
+    return example.relative_to(FOLDER).with_suffix("").as_posix()
+
 
 SAYS = {
     "first_maneuver": ("solved in 50 steps", "vgtm export out/first_maneuver.npz --to html"),
@@ -26,19 +35,25 @@ SAYS = {
     "snakes": ("snake of 15 universal joints", "lower cube", "qp "),
     "panda_among_shelves": ("Panda among shelves", "upper board", "| qp                      | yes"),
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
+    "own_parts/module": ("36 members; solved; verified: True",),
 }
 
 
 def test_what_examples_write_is_ignored_by_git():
-    ignored = (EXAMPLES[0].parents[1] / ".gitignore").read_text(encoding="utf-8").splitlines()
+    ignored = (FOLDER.parent / ".gitignore").read_text(encoding="utf-8").splitlines()
     assert "out/" in ignored
 
 
 def test_each_example_is_tried():
-    assert {example.stem for example in EXAMPLES} == set(SAYS)
+    assert {called(example) for example in EXAMPLES} == set(SAYS)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.stem)
+@pytest.mark.parametrize("example", OWN_PARTS, ids=called)
+def test_a_part_of_ones_own_takes_few_lines(example: Path):
+    assert len(example.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=called)
 def test_an_example_runs(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -54,7 +69,7 @@ def test_an_example_runs(
             raise
         pytest.skip(str(ended))
     printed = capsys.readouterr().out
-    for words in SAYS[example.stem]:
+    for words in SAYS[called(example)]:
         assert words in printed
     assert {place.name for place in tmp_path.iterdir()} <= {"out"}
     for picture in tmp_path.glob("out/*.png"):

@@ -13,6 +13,7 @@ from vgtm_qp.errors import (
     GoalError,
     MissingExtraError,
     Mistake,
+    PartError,
     ProblemError,
     ResultError,
     SolverError,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from vgtm_qp.maneuver.recording import Recording
     from vgtm_qp.maneuver.solve import solve, solve_many
     from vgtm_qp.methods import Resolver
+    from vgtm_qp.parts import register
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
     from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere
     from vgtm_qp.result.certificate import Certificate, Measure
@@ -50,6 +52,7 @@ _HOMES = {
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
     "vgtm_qp.problem.obstacle": ("Box", "Cylinder", "Mesh", "Sphere"),
     "vgtm_qp.methods": ("Resolver",),
+    "vgtm_qp.parts": ("register",),
     "vgtm_qp.step.step": ("Step", "StepStatus"),
     "vgtm_qp.arm.truss.build": ("build_truss",),
     "vgtm_qp.arm.truss.mobility": ("describe",),
@@ -72,6 +75,7 @@ __all__ = [
     "Mesh",
     "MissingExtraError",
     "Mistake",
+    "PartError",
     "Problem",
     "ProblemError",
     "Recording",
@@ -95,6 +99,7 @@ __all__ = [
     "load_problem",
     "load_result",
     "problem_schema",
+    "register",
     "solve",
     "solve_many",
     "verify",

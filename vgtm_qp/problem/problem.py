@@ -11,6 +11,7 @@ from pydantic import Field, PrivateAttr, WithJsonSchema
 
 from vgtm_qp.errors import Mistake, ProblemError, VgtmError
 from vgtm_qp.notebook import html_table
+from vgtm_qp.parts import find_part
 from vgtm_qp.problem.arm import FROM_URDF, OF_URDF, ArmTable
 from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
@@ -18,7 +19,7 @@ from vgtm_qp.problem.method import Method
 from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
 from vgtm_qp.problem.shape import BezierCurve, Curve
 from vgtm_qp.problem.table import Place, Table, key_path, shown, unique, value_at
-from vgtm_qp.problem.truss import Truss
+from vgtm_qp.problem.truss import GraphTruss, Truss
 
 SCHEMA_VERSION = 1
 
@@ -131,6 +132,10 @@ class Problem(Table, called="a problem"):
         data = self.to_dict()
         if any(f"arm.{key}" in changes for key in OF_URDF):
             data["arm"] = {key: value for key, value in data["arm"].items() if key not in FROM_URDF}
+        made_from = self.truss.made_from if isinstance(self.truss, GraphTruss) else None
+        if made_from is not None and find_part("module", made_from["module"]) is not None:
+            # The keys are those of the user's own module, which makes the graph again.
+            data["truss"] = dict(made_from)
         for key, value in changes.items():
             table = data
             *outer, last = key.split(".")

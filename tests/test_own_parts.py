@@ -1,0 +1,172 @@
+"""Parts that a user brings: by argument and by entry point, with a message for each way to get them wrong."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import vgtm_qp as vq
+from vgtm_qp.parts import find_part, part_names
+
+WAYPOINT = {"maneuver.waypoint": [{"time": 2.0, "position": [0.05, 0.0, 1.9]}], "maneuver.steps": 2}
+
+
+def tripod(*, bays: int, height: float = 1.0, short: float = 0.5) -> dict[str, Any]:
+    """Return stacked platforms on six legs; shorter ones than `short` are refused."""
+    if height < short:
+        raise ValueError(f"a height of {height:g} m is below {short:g} m")
+    nodes, members, faces = [], [], []
+    for layer in range(bays + 1):
+        angles = (layer % 2) * np.pi / 3.0 + 2.0 * np.pi * np.arange(3) / 3.0
+        points = np.column_stack([0.5 * np.cos(angles), 0.5 * np.sin(angles), np.full(3, layer * height)])
+        faces.append([f"n{layer}-{k}" for k in range(3)])
+        nodes += [
+            {"name": name, "position": point, "fixed": layer == 0}
+            for name, point in zip(faces[-1], points, strict=True)
+        ]
+        for k in range(3) if layer else ():
+            members.append({"name": f"edge{layer}-{k}", "nodes": [faces[-1][k], faces[-1][(k + 1) % 3]]})
+            for j in (k, (k + 1) % 3) if layer % 2 else (k, (k + 2) % 3):
+                ends = [faces[-1][k], faces[-2][j]]
+                members.append({"name": f"leg{layer}-{k}{j}", "nodes": ends, "actuated": True})
+    return {"node": nodes, "member": members, "tip": faces[-1], "faces": faces}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _parts() -> None:
+    vq.register("module", "tripod", tripod)
+
+
+def with_truss(**keys: Any) -> vq.Problem:
+    table = {"module": "tripod", "bays": 2, "stroke": [0.5, 2.0], **keys}
+    return vq.load_problem("five_bay_free").replace({"truss": table, **WAYPOINT})
+
+
+# Modules.
+
+
+def test_a_module_moves_and_its_result_needs_it_no_more(tmp_path: Path):
+    problem = with_truss(rate=0.4, member_radius=0.02, locked=["leg2-00"])
+    maneuver = vq.solve(problem)
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok, str(maneuver.certificate)
+    assert maneuver.manifest["problem"]["truss"]["module"] == "graph"
+    assert maneuver.manifest["problem"]["truss"]["rate"] == 0.4
+    maneuver.save(tmp_path / "own.npz")
+    assert vq.verify_file(tmp_path / "own.npz", problem=problem).ok
+    other = vq.verify_file(tmp_path / "own.npz", problem=problem.replace({"truss.height": 1.1}))
+    assert not other.ok
+
+
+def test_keys_of_a_module_can_be_replaced():
+    problem = with_truss()
+    taller = problem.replace({"truss.bays": 3, "truss.rate": 0.2})
+    assert taller.truss is not None
+    assert len(taller.truss.node) == 12  # type: ignore[union-attr]
+    assert taller.truss.rate == 0.2
+    assert problem.replace({"name": "another"}).truss == problem.truss
+
+
+@pytest.mark.parametrize(
+    ("keys", "key", "expected"),
+    [
+        ({"module": "tripot"}, "truss.module", 'did you mean "tripod"?'),
+        ({"heigth": 1.0}, "truss.heigth", 'did you mean "height"?'),
+        ({"bays": "five"}, "truss.bays", "integer"),
+        ({"height": 0.4}, "truss", "a height of 0.4 m is below 0.5 m"),
+        ({"rate": -1.0}, "truss.rate", "a limit greater than 0"),
+        ({"stroke": [1.5, 2.0]}, "truss.stroke", "a stroke that holds the home length"),
+    ],
+)
+def test_mistakes_in_the_table_of_a_module_are_named(keys: dict[str, Any], key: str, expected: str):
+    with pytest.raises(vq.ProblemError) as caught:
+        with_truss(**keys)
+    for mistake in caught.value.mistakes:
+        assert mistake.key.startswith(key)
+        assert expected in mistake.expected
+
+
+def test_a_key_that_a_module_needs_is_missed():
+    with pytest.raises(vq.ProblemError, match=r"truss\.bays: found nothing; expected a value"):
+        vq.load_problem("five_bay_free").replace({"truss": {"module": "tripod"}})
+
+
+@pytest.mark.parametrize(
+    ("answer", "expected"),
+    [
+        (lambda: None, "returned nothing"),
+        (lambda: {"node": [], "member": [], "tip": []}, "at least"),
+        (lambda: {**tripod(bays=1), "nodes": []}, 'did you mean "node"'),
+        (lambda: {**tripod(bays=1), "tip": ["n9-0"]}, "the name of one of"),
+    ],
+)
+def test_wrong_answers_of_a_module_are_mistakes(answer: Callable[[], Any], expected: str):
+    vq.register("module", "wrong", answer)
+    with pytest.raises(vq.ProblemError, match=re.escape(expected)):
+        vq.load_problem("five_bay_free").replace({"truss": {"module": "wrong"}})
+
+
+# Registration.
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "part", "expected"),
+    [
+        ("modul", "mine", tripod, 'did you mean "module"?'),
+        ("module", "octahedral", tripod, "is a module of the package"),
+        ("module", "a,b", tripod, "a string without commas"),
+        ("module", 3, tripod, "a string without commas"),
+        ("module", "mine", {}, "expected a function"),
+        ("module", "mine", lambda *lengths: {}, "parameters that have names"),
+        ("module", "mine", lambda **keys: {}, "parameters that have names"),
+    ],
+)
+def test_what_cannot_be_registered_is_refused(kind: Any, name: Any, part: Any, expected: str):
+    with pytest.raises(vq.PartError, match=re.escape(expected)):
+        vq.register(kind, name, part)
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Install a package with one good part and two bad ones, and return its name."""
+    name = "parts_of_a_tester"
+    (tmp_path / f"{name}.py").write_text(
+        "def single(*, height: float = 1.0):\n"
+        "    ground = [[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0]]\n"
+        "    nodes = [{'name': f'g{k}', 'position': p, 'fixed': True} for k, p in enumerate(ground)]\n"
+        "    legs = [{'name': f'leg {k}', 'nodes': [f'g{k}', 'top'], 'actuated': True} for k in range(3)]\n"
+        "    top = {'name': 'top', 'position': [0.0, 0.0, height]}\n"
+        "    return {'node': [*nodes, top], 'member': legs, 'tip': ['top'], 'stroke': [0.5, 3.0]}\n",
+        encoding="utf-8",
+    )
+    info = tmp_path / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", encoding="utf-8")
+    (info / "entry_points.txt").write_text(
+        f"[vgtm_qp.modules]\nsingle = {name}:single\nabsent = {name}:other\noctahedral = {name}:single\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    yield name
+    sys.modules.pop(name, None)
+
+
+def test_an_installed_module_is_found_by_its_entry_point(installed: str):
+    assert {"single", "absent"} <= set(part_names("module"))
+    assert "octahedral" not in part_names("module")
+    keys = {"truss": {"module": "single", "height": 1.2}, "method.tracking": "none", **WAYPOINT}
+    changed = {"maneuver.waypoint": [{"time": 2.0, "position": [0.1, 0.0, 1.3]}]}
+    problem = vq.load_problem("five_bay_free").replace(keys | changed)
+    assert vq.solve(problem).certificate.ok
+    assert find_part("module", "single") is not None
+
+
+def test_an_installed_part_that_cannot_be_imported_is_a_mistake(installed: str):
+    with pytest.raises(vq.ProblemError, match=f"cannot be imported from {installed}:other"):
+        vq.load_problem("five_bay_free").replace({"truss": {"module": "absent"}})
