@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from vgtm_qp import parts
+
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
 OWN_PARTS = sorted((FOLDER / "own_parts").glob("*.py"))
 EXAMPLES = [*sorted(FOLDER.glob("*.py")), *OWN_PARTS]
@@ -36,6 +38,7 @@ SAYS = {
     "panda_among_shelves": ("Panda among shelves", "upper board", "| qp                      | yes"),
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
     "own_parts/module": ("36 members; solved; verified: True",),
+    "own_parts/solver": ("solved in 50 steps; verified: True",),
 }
 
 
@@ -58,6 +61,8 @@ def test_an_example_runs(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
+    # What an example registers is not there for later tests.
+    monkeypatch.setattr(parts, "REGISTERED", {kind: {} for kind in parts.REGISTERED})
     # A plain install has none of the extras.
     for extra in ("viser", "mcap", "mujoco", "distributed", "dask"):
         monkeypatch.setitem(sys.modules, extra, None)

@@ -12,7 +12,11 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
+from vgtm_qp import parts
 from vgtm_qp.parts import find_part, part_names
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.dense import EQUALITY
+from vgtm_qp.qp.numbers import UNBOUNDED
 
 WAYPOINT = {"maneuver.waypoint": [{"time": 2.0, "position": [0.05, 0.0, 1.9]}], "maneuver.steps": 2}
 
@@ -38,8 +42,9 @@ def tripod(*, bays: int, height: float = 1.0, short: float = 0.5) -> dict[str, A
     return {"node": nodes, "member": members, "tip": faces[-1], "faces": faces}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _parts() -> None:
+@pytest.fixture(autouse=True)
+def _forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "REGISTERED", {kind: {} for kind in parts.REGISTERED})
     vq.register("module", "tripod", tripod)
 
 
@@ -112,6 +117,100 @@ def test_wrong_answers_of_a_module_are_mistakes(answer: Callable[[], Any], expec
         vq.load_problem("five_bay_free").replace({"truss": {"module": "wrong"}})
 
 
+# Solvers.
+
+
+class ByDaqp:
+    """Answers by DAQP, spoilt as `spoil` does it, and writes into what it is given."""
+
+    accuracy = 1e-10
+    made = asked = 0
+
+    def __init__(self) -> None:
+        type(self).made += 1
+
+    def __call__(self, P: Any, q: Any, A: Any, lower: Any, upper: Any) -> Any:
+        type(self).asked += 1
+        assert np.array_equal(np.isposinf(upper), upper > 1e20)
+        found = DAQP.ask(
+            P, q, A, np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), sense(lower, upper)
+        )
+        for array in (P, q, A, lower, upper):
+            array[:] = np.nan
+        return self.spoil(found.x, found.multipliers)
+
+    @staticmethod
+    def spoil(x: Any, y: Any) -> Any:
+        return x, y
+
+
+def sense(lower: Any, upper: Any) -> Any:
+    return np.where(lower == upper, EQUALITY, 0).astype(np.int32)
+
+
+def solved_by(spoil: Callable[[Any, Any], Any], bays: int = 5) -> vq.Maneuver:
+    part = type("Spoilt", (ByDaqp,), {"spoil": staticmethod(spoil)})
+    vq.register("solver", "mine", part)
+    changes = {"method.solver": "mine", "maneuver.steps": 4, "truss.bays": bays}
+    near = {"maneuver.waypoint": [{"time": 10.0, "position": [0.2, 0.0, 0.8 * bays]}]}
+    return vq.solve(vq.load_problem("five_bay_free").replace(changes | near))
+
+
+@pytest.mark.parametrize("bays", [5, 20])
+def test_a_solver_gives_the_maneuver_that_daqp_gives(bays: int):
+    ByDaqp.made = ByDaqp.asked = 0
+    maneuver = solved_by(lambda x, y: (x, y), bays)
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok
+    known = vq.solve(vq.Problem.from_dict(maneuver.manifest["problem"]).replace({"method.solver": "daqp"}))
+    np.testing.assert_allclose(maneuver.nodes, known.nodes, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "spoil", [lambda x, y: (x + 1e-3, y), lambda x, y: (x, 2 * y + 1), lambda x, y: None]
+)
+def test_wrong_answers_of_a_solver_move_nothing(spoil: Callable[[Any, Any], Any]):
+    maneuver = solved_by(spoil)
+    assert (maneuver.status, maneuver.steps) == ("blocked", 0)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda x, y: x[:3], "returned ndarray; expected two arrays"),
+        (lambda x, y: (x, y[:2]), "expected two arrays"),
+        (lambda x, y: 1, "returned int"),
+    ],
+)
+def test_answers_of_another_form_are_errors(spoil: Callable[[Any, Any], Any], expected: str):
+    with pytest.raises(vq.PartError, match=expected):
+        solved_by(spoil)
+
+
+def test_what_a_solver_raises_is_not_lost():
+    class Breaking(ByDaqp):
+        is_broken = False
+
+        def __call__(self, *qp: Any) -> Any:
+            if self.is_broken:
+                raise KeyError("no such row")
+            return super().__call__(*qp)
+
+    vq.register("solver", "breaking", Breaking)
+    resolver = vq.Resolver(vq.load_problem("five_bay_free").replace({"method.solver": "breaking"}))
+    assert resolver.step(position=[0.02, 0.0, 4.0]).progress == 1.0
+    Breaking.is_broken = True
+    with pytest.raises(KeyError, match="no such row"):
+        resolver.step(position=[0.04, 0.0, 4.0])
+
+
+def test_an_unknown_solver_is_answered_with_those_of_ones_own():
+    vq.register("solver", "simplex-of-mine", ByDaqp)
+    problem = vq.load_problem("five_bay_free").replace({"method.solver": "simplex-of-min"})
+    with pytest.raises(vq.ProblemError, match='did you mean "simplex-of-mine"'):
+        vq.Resolver(problem)
+
+
 # Registration.
 
 
@@ -149,7 +248,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", encoding="utf-8")
     (info / "entry_points.txt").write_text(
-        f"[vgtm_qp.modules]\nsingle = {name}:single\nabsent = {name}:other\noctahedral = {name}:single\n",
+        f"[vgtm_qp.modules]\nsingle = {name}:single\nabsent = {name}:other\noctahedral = {name}:single\n"
+        f"[vgtm_qp.solvers]\nabsent = {name}:other\n",
         encoding="utf-8",
     )
     monkeypatch.syspath_prepend(tmp_path)
@@ -170,3 +270,5 @@ def test_an_installed_module_is_found_by_its_entry_point(installed: str):
 def test_an_installed_part_that_cannot_be_imported_is_a_mistake(installed: str):
     with pytest.raises(vq.ProblemError, match=f"cannot be imported from {installed}:other"):
         vq.load_problem("five_bay_free").replace({"truss": {"module": "absent"}})
+    with pytest.raises(vq.ProblemError, match=r"method\.solver.*cannot be imported"):
+        vq.Resolver(vq.load_problem("five_bay_free").replace({"method.solver": "absent"}))

@@ -29,7 +29,8 @@ _TAKEN: dict[str, frozenset[str]] = {
 }
 """Names of the package's own parts, which no other part can have."""
 
-_registered: dict[str, dict[str, Part]] = {kind: {} for kind in _GROUPS}
+REGISTERED: dict[str, dict[str, Part]] = {kind: {} for kind in _GROUPS}
+"""The parts of this process by kind and name; those of installed packages once they have been asked for."""
 
 
 def register(kind: Kind, name: str, part: Part) -> None:
@@ -53,12 +54,12 @@ def register(kind: Kind, name: str, part: Part) -> None:
     PartError
         There is no such kind, the name is that of a part of the package, or the part cannot be called so.
     """
-    _registered[_known_kind(kind)][_free_name(kind, name)] = _fitting(kind, name, part)
+    REGISTERED[_known_kind(kind)][_free_name(kind, name)] = _fitting(kind, name, part)
 
 
 def part_names(kind: Kind) -> list[str]:
     """Return the names of the parts of a kind that are registered or installed, sorted."""
-    return sorted({*_registered[kind], *_installed(kind)} - _TAKEN[kind])
+    return sorted({*REGISTERED[kind], *_installed(kind)} - _TAKEN[kind])
 
 
 def find_part(kind: Kind, name: object) -> Part | None:
@@ -71,7 +72,7 @@ def find_part(kind: Kind, name: object) -> Part | None:
     """
     if not isinstance(name, str) or name in _TAKEN[kind]:
         return None
-    if name not in _registered[kind]:
+    if name not in REGISTERED[kind]:
         entry = _installed(kind).get(name)
         if entry is None:
             return None
@@ -79,8 +80,8 @@ def find_part(kind: Kind, name: object) -> Part | None:
             part = entry.load()
         except Exception as error:  # the import runs somebody else's code
             raise PartError(f'the {kind} "{name}" cannot be imported from {entry.value}: {error}') from error
-        _registered[kind][name] = _fitting(kind, name, part)
-    return _registered[kind][name]
+        REGISTERED[kind][name] = _fitting(kind, name, part)
+    return REGISTERED[kind][name]
 
 
 def part_keys(part: Part) -> dict[str, tuple[Any, Any]]:

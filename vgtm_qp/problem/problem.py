@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, PrivateAttr, WithJsonSchema
 
-from vgtm_qp.errors import Mistake, ProblemError, VgtmError
+from vgtm_qp.errors import Mistake, PartError, ProblemError, VgtmError
 from vgtm_qp.notebook import html_table
 from vgtm_qp.parts import find_part
 from vgtm_qp.problem.arm import FROM_URDF, OF_URDF, ArmTable
@@ -157,11 +157,11 @@ class Problem(Table, called="a problem"):
     def blaming(self, place: Place, expected: str) -> Iterator[None]:
         """Raise any other error of this package as a mistake at a place, with what is `expected` there.
 
-        An error that ends in "; expected ..." has its own expectation.
+        An error that ends in "; expected ..." has its own expectation. That of a part of the user's own stays one.
         """
         try:
             yield
-        except ProblemError:
+        except (ProblemError, PartError):
             raise
         except VgtmError as error:
             found, _, other = str(error).partition("; expected ")

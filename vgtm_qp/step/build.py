@@ -21,9 +21,10 @@ from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
-from vgtm_qp.errors import Mistake, nearest
+from vgtm_qp.errors import Mistake, PartError, nearest
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.parts import find_part
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
@@ -297,7 +298,12 @@ def elastic_engine(
 def check_solver(problem: Problem) -> None:
     """Raise ProblemError if the problem's QP solver is unknown or not installed."""
     name = problem.method.solver
-    if name != DEFAULT_SOLVER and name not in (choices := available_solvers()):
+    try:
+        own = find_part("solver", name)
+    except PartError as error:
+        expected = f"a solver that can be used; {error}"
+        raise problem.error([problem.mistake(("method", "solver"), expected)]) from error
+    if own is None and name != DEFAULT_SOLVER and name not in (choices := available_solvers()):
         expected = f"one of the solvers installed here, {quoted(choices)}{nearest(name, choices)}"
         mistake = problem.mistake(("method", "solver"), expected)
         raise problem.error([mistake])
