@@ -37,6 +37,10 @@ SAYS = {
     "snakes": ("snake of 15 universal joints", "lower cube", "qp "),
     "panda_among_shelves": ("Panda among shelves", "upper board", "| qp                      | yes"),
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
+    "own_parts/curve": (
+        "tension 0.0: solved; on the curve: True; True",
+        "tension 0.2: solved; on the curve: True; True",
+    ),
     "own_parts/module": ("36 members; solved; verified: True",),
     "own_parts/solver": ("solved in 50 steps; verified: True",),
 }

@@ -13,6 +13,7 @@ import pytest
 
 import vgtm_qp as vq
 from vgtm_qp import parts
+from vgtm_qp.curve.families import b_spline, beta_spline
 from vgtm_qp.parts import find_part, part_names
 from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.dense import EQUALITY
@@ -115,6 +116,88 @@ def test_wrong_answers_of_a_module_are_mistakes(answer: Callable[[], Any], expec
     vq.register("module", "wrong", answer)
     with pytest.raises(vq.ProblemError, match=re.escape(expected)):
         vq.load_problem("five_bay_free").replace({"truss": {"module": "wrong"}})
+
+
+# Curve families.
+
+UNEVEN = ([0.0, 0.3, 1.0], [[[1, 0, 0], [0.6, 0.4, 0], [0, 1, 0]], [[0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]]])
+"""Two quadratic segments over three control vertices, without linear precision."""
+
+
+def with_family(answer: Any, **changes: Any) -> vq.Problem:
+    vq.register("curve", "mine", lambda: answer)
+    return vq.load_problem("five_bay_free").replace(
+        {"curve": {"family": "mine"}, "maneuver.steps": 5, **changes}
+    )
+
+
+def changed(segment: int, point: int, weights: list[float]) -> tuple[Any, Any]:
+    """Return the uneven family with other weights of one Bezier point."""
+    extraction = np.array(UNEVEN[1], dtype=float)
+    extraction[segment, point] = weights
+    return UNEVEN[0], extraction
+
+
+def test_the_package_s_own_curve_as_segments_moves_the_arm_the_same_way():
+    problem = vq.load_problem("five_bay_two_cubes").replace({"maneuver.steps": 10})
+    for family in (b_spline(6), beta_spline(6, 1.5, 2.0)):
+        options = {"bias": family.bias, "tension": family.tension} if family.name == "beta-spline" else {}
+        known = vq.solve(problem.replace({"curve": {"family": family.name, **options}}))
+        answer = family.breaks, family.extraction
+        vq.register("curve", "mine", lambda answer=answer: answer)
+        own = vq.solve(problem.replace({"curve": {"family": "mine"}}))
+        assert own.certificate.ok
+        assert own.manifest["problem"]["curve"]["family"] == "segments"
+        np.testing.assert_allclose(own.control_vertices, known.control_vertices, atol=1e-6)
+
+
+def test_a_family_without_linear_precision_is_verified_with_its_segments(tmp_path: Path):
+    goal = [{"time": 10.0, "position": [0.3, 0.0, 3.9]}]
+    problem = with_family(UNEVEN, **{"maneuver.waypoint": goal, "method.tracking_mode": "hard"})
+    maneuver = vq.solve(problem)
+    assert maneuver.certificate.ok, str(maneuver.certificate)
+    assert maneuver.certificate.tracking_gap.value < 1e-9
+    maneuver.save(tmp_path / "own.npz")
+    assert vq.verify_file(tmp_path / "own.npz", problem=problem).ok
+    assert vq.load_result(tmp_path / "own.npz").certificate.ok
+
+
+def test_a_family_of_ones_own_keeps_its_number_of_control_vertices_while_the_arm_runs():
+    resolver = vq.Resolver(with_family(UNEVEN))
+    for count in (4, 2):
+        with pytest.raises(vq.CurveError):
+            resolver.set_control_vertices(count)
+    assert resolver.step(position=[0.02, 0.0, 4.0]).status is vq.StepStatus.REACHED
+
+
+@pytest.mark.parametrize(
+    ("answer", "expected"),
+    [
+        (([0.0, 0.5], UNEVEN[1]), "1 segments, one between two breaks"),
+        ((UNEVEN[0], UNEVEN[1][0]), "two arrays from the curve"),
+        (None, "two arrays from the curve"),
+        (([0.0, 0.3, 0.9], UNEVEN[1]), "breaks that increase from 0 to 1"),
+        (changed(0, 1, [0.6, 0.5, 0]), "weights whose sum is 1"),
+        (changed(0, 2, [0.1, 0.9, 0]), "segments that begin where the one before ends"),
+        (changed(0, 0, [0.9, 0.1, 0]), "first control vertex"),
+        (changed(1, 2, [0, 0.1, 0.9]), "last control vertex"),
+        (changed(0, 1, [0.6, 0.3, 0.1]), "first leg of the control polygon"),
+        (changed(0, 1, [1.4, -0.4, 0]), "a weight above 0"),
+    ],
+)
+def test_wrong_answers_of_a_family_are_mistakes(answer: Any, expected: str):
+    with pytest.raises(vq.ProblemError, match=re.escape(expected)):
+        vq.Resolver(with_family(answer))
+
+
+def test_segments_in_a_file_fit_one_another():
+    table = {"family": "segments", "breaks": [0.0, 1.0], "control_vertices": 3}
+    for extraction, expected in (
+        ([[[1, 0, 0], [0, 1]]], "3 weights, one a control vertex"),
+        ([[[1, 0, 0]]], "2 points, one more than the degree"),
+    ):
+        with pytest.raises(vq.ProblemError, match=expected):
+            vq.load_problem("five_bay_free").replace({"curve": {**table, "extraction": extraction}})
 
 
 # Solvers.
@@ -224,6 +307,7 @@ def test_an_unknown_solver_is_answered_with_those_of_ones_own():
         ("module", "mine", {}, "expected a function"),
         ("module", "mine", lambda *lengths: {}, "parameters that have names"),
         ("module", "mine", lambda **keys: {}, "parameters that have names"),
+        ("curve", "mine", lambda family: {}, "the key is its own"),
     ],
 )
 def test_what_cannot_be_registered_is_refused(kind: Any, name: Any, part: Any, expected: str):

@@ -23,11 +23,13 @@ _TAKEN: dict[str, frozenset[str]] = {
     "module": frozenset(
         ("octahedral", "double-octahedral", "hexapod", "longeron", "tetrahedral", "graph", "plate")
     ),
-    "curve": frozenset(("bezier", "b-spline", "beta-spline")),
+    "curve": frozenset(("bezier", "b-spline", "beta-spline", "segments")),
     "solver": frozenset(("daqp", "osqp", "piqp")),
     "obstacle": frozenset(("box", "sphere", "cylinder", "mesh")),
 }
 """Names of the package's own parts, which no other part can have."""
+_CALLED_BY: dict[str, str] = {"module": "module", "curve": "family", "obstacle": "shape"}
+"""The key of a table that names its part."""
 
 REGISTERED: dict[str, dict[str, Part]] = {kind: {} for kind in _GROUPS}
 """The parts of this process by kind and name; those of installed packages once they have been asked for."""
@@ -54,7 +56,9 @@ def register(kind: Kind, name: str, part: Part) -> None:
     PartError
         There is no such kind, the name is that of a part of the package, or the part cannot be called so.
     """
-    REGISTERED[_known_kind(kind)][_free_name(kind, name)] = _fitting(kind, name, part)
+    there = REGISTERED[_known_kind(kind)]
+    name = _free_name(kind, name)
+    there[name] = _fitting(kind, name, part)
 
 
 def part_names(kind: Kind) -> list[str]:
@@ -125,6 +129,10 @@ def _fitting(kind: str, name: str, part: Part) -> Part:
     if kind == "solver":
         return part
     for key, found in inspect.signature(part).parameters.items():
+        if key == _CALLED_BY[kind]:
+            raise PartError(
+                f'the {kind} "{name}" has the parameter {key}; expected another name: the key is its own'
+            )
         if found.kind not in (found.POSITIONAL_OR_KEYWORD, found.KEYWORD_ONLY):
             raise PartError(
                 f'the {kind} "{name}" has the parameter {found}; expected parameters that have names, such as '

@@ -11,13 +11,13 @@ from pydantic import Field, PrivateAttr, WithJsonSchema
 
 from vgtm_qp.errors import Mistake, PartError, ProblemError, VgtmError
 from vgtm_qp.notebook import html_table
-from vgtm_qp.parts import find_part
+from vgtm_qp.parts import Kind, find_part
 from vgtm_qp.problem.arm import FROM_URDF, OF_URDF, ArmTable
 from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
 from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
-from vgtm_qp.problem.shape import BezierCurve, Curve
+from vgtm_qp.problem.shape import BezierCurve, Curve, SegmentCurve
 from vgtm_qp.problem.table import Place, Table, key_path, shown, unique, value_at
 from vgtm_qp.problem.truss import GraphTruss, Truss
 
@@ -132,10 +132,10 @@ class Problem(Table, called="a problem"):
         data = self.to_dict()
         if any(f"arm.{key}" in changes for key in OF_URDF):
             data["arm"] = {key: value for key, value in data["arm"].items() if key not in FROM_URDF}
-        made_from = self.truss.made_from if isinstance(self.truss, GraphTruss) else None
-        if made_from is not None and find_part("module", made_from["module"]) is not None:
-            # The keys are those of the user's own module, which makes the graph again.
-            data["truss"] = dict(made_from)
+        # The keys are those of the user's own parts, which make the tables again.
+        for kind, name, place, made_from in self._made_by_parts():
+            if find_part(kind, made_from[name]) is not None:
+                data[place] = dict(made_from)
         for key, value in changes.items():
             table = data
             *outer, last = key.split(".")
@@ -144,6 +144,13 @@ class Problem(Table, called="a problem"):
                 table[part] = table = dict(inner) if isinstance(inner, Mapping) else {}
             table[last] = value
         return self.from_dict(data, source=self._source)
+
+    def _made_by_parts(self) -> Iterator[tuple[Kind, str, str, dict[str, Any]]]:
+        """Yield the tables that parts of the user's own have made: kind, key of the part, table, and as written."""
+        if isinstance(self.truss, GraphTruss) and self.truss.made_from is not None:
+            yield "module", "module", "truss", self.truss.made_from
+        if isinstance(self.curve, SegmentCurve) and self.curve.made_from is not None:
+            yield "curve", "family", "curve", self.curve.made_from
 
     def mistake(self, place: Place, expected: str) -> Mistake:
         """Return a mistake that a later check found at a place such as ``("obstacle", 1, "center")``."""

@@ -148,7 +148,8 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         is_hard, mistakes = False, []
     if mistakes:
         raise problem.error(mistakes)
-    options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
+    keys = ("degree", "bias", "tension", "breaks", "extraction")
+    options = {key: getattr(spec, key) for key in keys if hasattr(spec, key)}
     family = make_family(spec.family, spec.control_vertices, **options)
     stride = stations.stride if is_hard else 1
     tracked = np.arange(len(stations) - 1, stride - 1, -stride)[::-1]

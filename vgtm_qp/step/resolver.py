@@ -166,7 +166,7 @@ class Resolver(ChangingScene):
         GoalError
             The arm has no curve, or the method keeps the number.
         CurveError
-            So few control vertices cannot keep both ends and the base tangent.
+            So few control vertices cannot keep both ends and the base tangent, or the family is one of the user's own.
         """
         self._refuse("change the number of control vertices")
 
