@@ -42,6 +42,11 @@ SAYS = {
         "tension 0.2: solved; on the curve: True; True",
     ),
     "own_parts/module": ("36 members; solved; verified: True",),
+    "own_parts/obstacle": (
+        "beam: side, beam: lower end, beam: upper end",
+        "solved; 0.080 m",
+        "beam: side; True",
+    ),
     "own_parts/solver": ("solved in 50 steps; verified: True",),
 }
 

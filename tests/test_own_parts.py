@@ -18,6 +18,7 @@ from vgtm_qp.parts import find_part, part_names
 from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.dense import EQUALITY
 from vgtm_qp.qp.numbers import UNBOUNDED
+from vgtm_qp.rotation import rotation_from_vector
 
 WAYPOINT = {"maneuver.waypoint": [{"time": 2.0, "position": [0.05, 0.0, 1.9]}], "maneuver.steps": 2}
 
@@ -198,6 +199,99 @@ def test_segments_in_a_file_fit_one_another():
     ):
         with pytest.raises(vq.ProblemError, match=expected):
             vq.load_problem("five_bay_free").replace({"curve": {**table, "extraction": extraction}})
+
+
+# Shapes of obstacles.
+
+
+def dumbbell(*, radius: float, length: float = 1.0) -> list[dict[str, Any]]:
+    """Return two balls and a bar between them, which lies along the shape's y-axis."""
+    if length < 2 * radius:
+        raise ValueError(f"the balls overlap at a length of {length:g} m")
+    bar = {"shape": "cylinder", "height": length, "radius": radius / 2, "rotation_vector": [np.pi / 2, 0, 0]}
+    ends = [
+        {"shape": "sphere", "radius": radius, "center": np.array([0.0, y, 0.0])}
+        for y in (-length / 2, length / 2)
+    ]
+    return [{**bar, "name": "bar"}, *ends]
+
+
+BALL = {"name": "ball", "shape": "sphere", "center": [5.0, 0.0, 1.0], "radius": 0.2}
+WEIGHT = {"name": "weight", "shape": "dumbbell", "center": [1.2, 0.3, 2.0], "radius": 0.2}
+
+
+def with_obstacles(*tables: dict[str, Any], **changes: Any) -> vq.Problem:
+    vq.register("obstacle", "dumbbell", dumbbell)
+    return vq.load_problem("five_bay_free").replace({"obstacle": list(tables), **changes})
+
+
+def test_a_shape_becomes_its_pieces_where_the_obstacle_is():
+    turned = {"rotation_vector": [0.0, 0.0, np.pi / 2], "velocity": [0.0, 0.0, 0.1]}
+    problem = with_obstacles(BALL, {**WEIGHT, **turned})
+    assert [one.name for one in problem.obstacle] == ["ball", "weight: bar", "weight: 2", "weight: 3"]
+    bar, first, second = problem.obstacle[1:]
+    np.testing.assert_allclose(first.center, [1.7, 0.3, 2.0], atol=1e-12)
+    np.testing.assert_allclose(second.center, [0.7, 0.3, 2.0], atol=1e-12)
+    axis = rotation_from_vector(bar.rotation_vector)[:, 2]
+    np.testing.assert_allclose(np.abs(axis), [1.0, 0.0, 0.0], atol=1e-12)
+    assert {one.velocity for one in problem.obstacle[1:]} == {(0.0, 0.0, 0.1)}
+
+
+def test_a_shape_of_one_piece_has_the_obstacle_s_name():
+    vq.register(
+        "obstacle", "coin", lambda *, radius: [{"shape": "cylinder", "radius": radius, "height": 0.01}]
+    )
+    problem = with_obstacles({**WEIGHT, "shape": "coin"})
+    assert [(one.name, one.shape) for one in problem.obstacle] == [("weight", "cylinder")]
+
+
+def test_a_shape_is_kept_clear_of_and_verified_by_its_pieces(tmp_path: Path):
+    problem = with_obstacles({**WEIGHT, "center": [1.1, 0.0, 2.2]}, **{"maneuver.steps": 25})
+    maneuver = vq.solve(problem)
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok, str(maneuver.certificate)
+    assert "weight" in maneuver.certificate.clearance.where
+    maneuver.save(tmp_path / "own.npz")
+    assert vq.verify_file(tmp_path / "own.npz", problem=problem).ok
+    bigger = with_obstacles({**WEIGHT, "center": [1.1, 0.0, 2.2], "radius": 0.3}, **{"maneuver.steps": 25})
+    assert not vq.verify_file(tmp_path / "own.npz", problem=bigger).ok
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "expected"),
+    [
+        ({"shape": "dumbbel"}, 'obstacle[1] ("weight").shape', 'did you mean "dumbbell"?'),
+        ({"radios": 1.0}, 'obstacle[1] ("weight").radios', 'did you mean "radius"?'),
+        ({"radius": "wide"}, 'obstacle[1] ("weight").radius', "valid number"),
+        ({"radius": 0.7}, 'obstacle[1] ("weight")', "the balls overlap at a length of 1 m"),
+        ({"radius": -1.0}, 'obstacle[1] ("weight").radius', "a length in metres"),
+        ({"center": [0.0]}, 'obstacle[1] ("weight").center', "three numbers"),
+        ({"velocity": 1.0}, 'obstacle[1] ("weight").velocity', "three numbers"),
+    ],
+)
+def test_mistakes_in_the_table_of_a_shape_are_named(table: dict[str, Any], key: str, expected: str):
+    """Also behind another obstacle of a shape of one's own, whose pieces are more than one."""
+    with pytest.raises(vq.ProblemError) as caught:
+        with_obstacles({**WEIGHT, "name": "other"}, {**WEIGHT, **table}, {**BALL, "radius": 0.0})
+    first, *_, last = caught.value.mistakes
+    assert (first.key, last.key) == (key, 'obstacle[2] ("ball").radius')
+    assert expected in first.expected
+
+
+@pytest.mark.parametrize(
+    ("answer", "expected"),
+    [
+        ([], "tables of obstacles from the shape"),
+        ({"shape": "box"}, "tables of obstacles from the shape"),
+        ([{"shape": "box"}], "size: found nothing"),
+        ([{"shape": "ball", "radius": 1.0}], '"box", "sphere"'),
+        ([{"shape": "box", "size": 1.0, "center": "here"}], "three numbers for each center"),
+    ],
+)
+def test_wrong_answers_of_a_shape_are_mistakes(answer: Any, expected: str):
+    vq.register("obstacle", "wrong", lambda: answer)
+    with pytest.raises(vq.ProblemError, match=re.escape(expected)):
+        with_obstacles({"name": "wrong one", "shape": "wrong", "center": [3.0, 0.0, 1.0]})
 
 
 # Solvers.

@@ -16,7 +16,7 @@ from vgtm_qp.problem.arm import FROM_URDF, OF_URDF, ArmTable
 from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
-from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
+from vgtm_qp.problem.obstacle import ClearanceTable, Obstacles
 from vgtm_qp.problem.shape import BezierCurve, Curve, SegmentCurve
 from vgtm_qp.problem.table import Place, Table, key_path, shown, unique, value_at
 from vgtm_qp.problem.truss import GraphTruss, Truss
@@ -57,7 +57,7 @@ class Problem(Table, called="a problem"):
         default_factory=EndEffector, description="which coordinates are steered"
     )
     maneuver: Maneuver = Field(description="where the end effector goes")
-    obstacle: tuple[Obstacle, ...] = Field(default=(), description="what the arm keeps away from")
+    obstacle: Obstacles = Field(default=(), description="what the arm keeps away from")
     clearance: ClearanceTable = Field(default_factory=ClearanceTable, description="how far it keeps away")
     method: Method = Field(default_factory=Method, description="how each step is solved")
 
