@@ -42,6 +42,10 @@ SAYS = {
         "tension 0.2: solved; on the curve: True; True",
     ),
     "own_parts/module": ("36 members; solved; verified: True",),
+    "own_parts/objective": (
+        "0 objectives: solved, True; out of level by at most 0.266 m",
+        "1 objectives: solved, True; out of level by at most 0.058 m",
+    ),
     "own_parts/obstacle": (
         "beam: side, beam: lower end, beam: upper end",
         "solved; 0.080 m",

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -386,6 +387,132 @@ def test_an_unknown_solver_is_answered_with_those_of_ones_own():
     problem = vq.load_problem("five_bay_free").replace({"method.solver": "simplex-of-min"})
     with pytest.raises(vq.ProblemError, match='did you mean "simplex-of-mine"'):
         vq.Resolver(problem)
+
+
+# Objectives.
+
+PLACE = np.array([0.15, 0.1, 1.6])
+
+
+def to_place(nodes: Any) -> Any:
+    return nodes["n2-1"] - PLACE
+
+
+SNAKE = {
+    "schema_version": 1,
+    "arm": {
+        "joint": [
+            {"name": f"j{k}", "axis": [[1, 0, 0], [0, 1, 0]][k % 2], "home": 0.1, "position": [0, 0, 0.4]}
+            for k in range(8)
+        ],
+        "tip": [0.0, 0.0, 0.4],
+    },
+    "maneuver": {"steps": 4, "waypoint": [{"time": 3.0, "position": [0.2, -0.9, 3.0]}]},
+    "curve": {"control_vertices": 4},
+}
+
+
+def test_the_hessian_and_the_gradient_are_those_of_the_linearised_residual():
+    """Against finite differences, at a state away from home, with a nonlinear residual."""
+
+    def residual(nodes: Any) -> list[Any]:
+        return [ca.norm_2(nodes["n3-1"] - nodes["n1-2"]) - 2.0, nodes["n4-2"][0] * nodes["n4-2"][2]]
+
+    problem = vq.load_problem("five_bay_free")
+    resolver = vq.Resolver(problem, objectives=[vq.Objective("both", residual, weight=3.0)])
+    plain = vq.Resolver(problem)
+    resolver.step(position=[0.1, 0.02, 3.9])
+    plain.state = resolver.state
+    qp, known = (one.build(position=[0.2, 0.0, 3.9]) for one in (resolver, plain))
+    arm = resolver.setup.arm
+    index = {name: k for k, name in enumerate(arm.node_names)}
+
+    def numbers(free: Any) -> Any:
+        X = resolver.state.nodes.copy()
+        X[arm.free] = free.reshape(-1, 3)
+        first, second, third = (X[index[name]] for name in ("n3-1", "n1-2", "n4-2"))
+        return np.array([np.linalg.norm(first - second) - 2.0, third[0] * third[2]])
+
+    at, step = resolver.state.nodes[arm.free].reshape(-1), 1e-6
+    jacobian = np.column_stack(
+        [(numbers(at + d) - numbers(at - d)) / (2 * step) for d in step * np.eye(len(at))]
+    )
+    added = (qp.P - known.P).toarray()
+    np.testing.assert_allclose(added[: len(at), : len(at)], 3.0 * jacobian.T @ jacobian, atol=1e-6)
+    np.testing.assert_allclose((qp.q - known.q)[: len(at)], 3.0 * jacobian.T @ numbers(at), atol=1e-6)
+    assert np.abs(added[len(at) :]).max() == 0.0
+    assert [label.name for label in qp.columns] == [label.name for label in known.columns]
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"method.tracking": "none"}, {"method.solver": "piqp"}, {"truss.bays": 20}]
+)
+def test_an_objective_draws_the_arm_as_far_as_its_rows_let_it(changes: dict[str, Any]):
+    bays = changes.get("truss.bays", 5)
+    near = {"maneuver.waypoint": [{"time": 10.0, "position": [0.1, 0.0, 0.79 * bays]}], "maneuver.steps": 8}
+    problem = vq.load_problem("five_bay_free").replace({**changes, **near})
+    apart = []
+    for objectives in ((), [vq.Objective("place", to_place, weight=10.0)]):
+        maneuver = vq.solve(problem, objectives=objectives)
+        assert maneuver.status == "solved"
+        assert maneuver.certificate.ok, str(maneuver.certificate)
+        node = list(vq.Resolver(problem).setup.arm.node_names).index("n2-1")
+        apart.append(np.linalg.norm(maneuver.nodes[-1, node] - PLACE))
+    assert apart[1] < 0.95 * apart[0]
+
+
+def test_an_objective_of_a_serial_arm():
+    problem, found = vq.Problem.from_dict(SNAKE), []
+    name = vq.Resolver(problem).setup.arm.node_names[4]
+    for objectives in ((), [vq.Objective("aside", lambda nodes: nodes[name][0] - 0.4, weight=10.0)]):
+        maneuver = vq.solve(problem, objectives=objectives)
+        assert maneuver.status == "solved"
+        assert maneuver.certificate.ok
+        found.append(maneuver.nodes[-1, 4, 0])
+    assert found[1] > found[0] + 0.01
+
+
+def test_objectives_without_weight_change_nothing_much():
+    problem = vq.load_problem("five_bay_two_cubes").replace({"maneuver.steps": 10})
+    known = vq.solve(problem)
+    same = vq.solve(problem, objectives=[vq.Objective("none", to_place, weight=0.0)])
+    np.testing.assert_allclose(same.nodes, known.nodes, atol=1e-6)
+
+
+def test_objectives_are_kept_in_retries():
+    resolver = vq.Resolver(vq.load_problem("five_bay_free"), objectives=[vq.Objective("place", to_place)])
+    other = resolver.again(vq.load_problem("five_bay_free"))
+    assert other is not None
+    assert other.setup.layout.own is not None
+    assert other.setup.layout.own.objectives == resolver.setup.layout.own.objectives
+
+
+@pytest.mark.parametrize(
+    ("objective", "expected"),
+    [
+        (to_place, "expected vgtm_qp.Objective"),
+        (vq.Objective("mine", to_place, weight=-1.0), "has the weight -1.0"),
+        (vq.Objective("mine", to_place, weight=float("nan")), "has the weight nan"),
+        (vq.Objective("mine", 3), "expected a function"),  # type: ignore[arg-type]
+        (vq.Objective("mine", lambda nodes: nodes["n2-9"]), 'did you mean "n2-'),
+        (vq.Objective("mine", lambda nodes: "level"), "expected an expression of CasADi"),
+        (vq.Objective("mine", lambda nodes: []), "returned nothing"),
+        (vq.Objective("mine", lambda nodes: 1 / nodes["n0-1"][2]), "no finite value"),
+    ],
+)
+def test_wrong_objectives_are_refused(objective: Any, expected: str):
+    with pytest.raises(vq.PartError, match=re.escape(expected)):
+        vq.Resolver(vq.load_problem("five_bay_free"), objectives=[objective])
+
+
+@pytest.mark.parametrize(
+    "method", [{"name": "pseudoinverse"}, {"tracking": "recursive"}, {"name": "curve-pseudoinverse"}]
+)
+def test_methods_without_a_qp_of_the_arm_refuse_objectives(method: dict[str, Any]):
+    problem = vq.load_problem("five_bay_free").replace({"method": method})
+    assert vq.Resolver(problem, objectives=[]).step(position=[0.02, 0.0, 4.0]).moved
+    with pytest.raises(vq.PartError, match="has no QP of the whole arm"):
+        vq.Resolver(problem, objectives=[vq.Objective("place", to_place)])
 
 
 # Registration.

@@ -32,7 +32,7 @@ class StepQP:
     Attributes
     ----------
     P : (n, n) sparse
-        Hessian, symmetric, constant over a maneuver.
+        Hessian, symmetric, constant over a maneuver without objectives of the user's own.
     q : (n,)
     A : (m, n) sparse
     row_lower, row_upper : (m,)
@@ -157,6 +157,13 @@ class FullBuilder:
         q[self.column["progress"]] = numbers.progress_gradient
         self._hessian.data[-1] = numbers.progress_curvature
 
+        hessian = self._hessian
+        if numbers.own is not None:
+            nodes = self.column["nodes"]
+            q[nodes] += numbers.own.gradient
+            rest = sparse.csc_matrix((self.size - nodes.stop,) * 2)
+            hessian = hessian + sparse.block_diag([numbers.own.hessian, rest], format="csc")
+
         column_lower, column_upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         column_lower[self.column["actuators"]], column_upper[self.column["actuators"]] = (
             numbers.lower,
@@ -169,7 +176,7 @@ class FullBuilder:
         below = np.concatenate([equal, np.full(len(clearance), np.inf)])
         below[self.leg_rows] = np.inf
         return StepQP(
-            self._hessian,
+            hessian,
             q,
             self._matrix,
             np.concatenate([equal, clearance.lower]),

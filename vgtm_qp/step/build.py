@@ -8,7 +8,7 @@ by those who call for steps, for the maneuver.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -35,6 +35,7 @@ from vgtm_qp.qp.layout import Layout, with_angles
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, dense_solver, make_solver
+from vgtm_qp.qp.terms import Objective, OwnTerms
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.step.chain_engine import ChainEngine
@@ -51,16 +52,25 @@ _CONDENSED_ALL_THE_SAME = (
 )
 
 
-def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, solves: bool = True) -> Setup:
+def build_arm(
+    problem: Problem,
+    *,
+    compiled: bool = True,
+    plain: bool = False,
+    solves: bool = True,
+    objectives: Sequence[Objective] = (),
+) -> Setup:
     """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
 
     A `plain` arm does not step in one call of C; its answers are the same. If the caller never `solves` a QP,
-    it gets the engine that is built fastest.
+    it gets the engine that is built fastest. `objectives` of the user's own are for the QP of a whole arm.
 
     Raises
     ------
     ProblemError
         There is no such arm, or it cannot do at all what the problem asks for; each mistake is named.
+    PartError
+        An objective is none of this arm.
     """
     check_is_problem(problem)
     check_solver(problem)
@@ -71,6 +81,8 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
         task = TipTask(problem.end_effector.track, arm)
     with problem.blaming(("curve",), "a curve that starts in this arm's home pose"):
         home = home_curve(problem, arm, task)
+    if objectives:
+        home = home._replace(layout=replace(home.layout, own=OwnTerms(arm, objectives)))
     clearance, spec = problem.clearance, problem.arm_table
     solver, tracking = problem.method.solver, problem.method.tracking
     options: dict[str, Any] = {
@@ -274,7 +286,7 @@ def make_engine(
     is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
     if layout.elastic_tip and not is_short:
         _LOG.warning(_CONDENSED_ALL_THE_SAME)
-    is_quick = not plain and not layout.elastic_tip
+    is_quick = not plain and not layout.elastic_tip and not layout.own
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
         fused = FusedSolver(layout, dense_solver(solver), compiled=compiled)
         return FusedEngine(layout, kinematics, task, fused)
@@ -282,6 +294,9 @@ def make_engine(
     along = chain_solver(layout, dense_solver(solver)) if is_staged else None
     if along is not None and ChainEngine.serves(along):
         return ChainEngine(along, kinematics, task)
+    if layout.own:
+        condensed = CondensedSolver(layout, dense_solver(solver))
+        return GeneralEngine(layout, kinematics, task, condensed, compiled=compiled)
     return GeneralEngine(layout, kinematics, task, along or make_solver(solver, layout), compiled=compiled)
 
 
