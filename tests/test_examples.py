@@ -51,6 +51,7 @@ SAYS = {
         "solved; 0.080 m",
         "beam: side; True",
     ),
+    "own_parts/row": ("1 rows: solved, True; third face up to x = 0.350 m", "held by row: light before n5"),
     "own_parts/solver": ("solved in 50 steps; verified: True",),
 }
 

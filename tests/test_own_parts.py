@@ -515,6 +515,113 @@ def test_methods_without_a_qp_of_the_arm_refuse_objectives(method: dict[str, Any
         vq.Resolver(problem, objectives=[vq.Objective("place", to_place)])
 
 
+# Rows.
+
+
+def outside(center: Any, radius: float, node: str) -> vq.Inequality:
+    """A nonlinear row: a node stays outside a ball."""
+    return vq.Inequality(f"{node} outside", lambda nodes: ca.norm_2(nodes[node] - np.array(center)) - radius)
+
+
+def least_outside(maneuver: vq.Maneuver, problem: vq.Problem, center: Any, radius: float, node: str) -> float:
+    k = list(vq.Resolver(problem).setup.arm.node_names).index(node)
+    return float(np.linalg.norm(maneuver.nodes[:, k] - np.array(center), axis=1).min()) - radius
+
+
+MOVING = [{"time": 10.0, "position": [0.05, 0.0, 0.1], "rotation_vector": [0.0, 0.05, 0.0]}]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"method.tracking": "none"},
+        {"method.tracking_mode": "elastic"},
+        {"end_effector.mode": "elastic"},
+        {"method.solver": "piqp"},
+        {"truss.base_motion": MOVING},
+        {"truss.joint_offset": 0.05},
+    ],
+)
+def test_a_row_is_kept_by_every_state(changes: dict[str, Any]):
+    """The ball is in the way that the node takes without the row."""
+    problem = vq.load_problem("five_bay_free").replace({"maneuver.steps": 20, **changes})
+    free, node, radius = vq.solve(problem), "n3-1", 0.1
+    k = list(vq.Resolver(problem).setup.arm.node_names).index(node)
+    center = free.nodes[10, k] + [0.0, 0.03, 0.0]
+    assert least_outside(free, problem, center, radius, node) < -0.05
+    row = outside(center, radius, node)
+    maneuver = vq.solve(problem, rows=[row])
+    assert maneuver.certificate.ok, str(maneuver.certificate)
+    assert maneuver.steps > 5
+    assert least_outside(maneuver, problem, center, radius, node) >= -1e-9
+    (told,) = maneuver.manifest["own"]["rows"]
+    assert told["name"] == f"row: {row.name}"
+    assert told["least"] == pytest.approx(least_outside(maneuver, problem, center, radius, node), abs=1e-12)
+
+
+def test_a_row_that_blocks_is_named_in_the_step_the_stop_and_the_result(tmp_path: Path):
+    problem = vq.load_problem("five_bay_free").replace({"maneuver.steps": 20, "method.retries": False})
+    row = vq.Inequality("wall", lambda nodes: [0.8 - nodes[f"n5-{k}"][0] for k in (1, 2, 3)])
+    maneuver = vq.solve(problem, rows=[row])
+    assert maneuver.status == "blocked"
+    assert maneuver.certificate.ok
+    assert any(name.startswith("row: wall") for name in maneuver.manifest["blocked_by"])
+    assert maneuver.manifest["stop"]["kind"] in ("row", "members")
+    assert np.all(maneuver.nodes[:, 15:, 0] <= 0.8 + 1e-9)
+    maneuver.save(tmp_path / "blocked.npz")
+    assert vq.load_result(tmp_path / "blocked.npz").manifest["own"]["rows"][0]["name"] == "row: wall 1"
+    assert vq.verify_file(tmp_path / "blocked.npz", problem=problem).ok
+    resolver = vq.Resolver(problem, rows=[row])
+    for x in (0.4, 0.8, 1.2):
+        step = resolver.step(position=[x, 0.0, 3.8], dt=5.0)
+    assert step.status is not vq.StepStatus.REACHED
+    assert any(name.startswith("row: wall") for name in step.blocked_by)
+
+
+def test_rows_are_in_the_qp_with_name_and_unit():
+    resolver = vq.Resolver(
+        vq.load_problem("five_bay_free"),
+        rows=[vq.Inequality("height", lambda nodes: nodes["n5-1"][2] - 1.0, unit="ft")],
+    )
+    qp = resolver.build(position=[0.1, 0.0, 3.9])
+    (k,) = [k for k, label in enumerate(qp.rows) if label.name == "row: height"]
+    assert (qp.rows[k].kind, qp.rows[k].unit) == ("user's row", "ft")
+    row = qp.A[k].toarray()[0]
+    (column,) = np.flatnonzero(row)
+    assert (qp.columns[column].name, row[column]) == ("node n5-1 z", 1.0)
+
+
+def test_a_row_of_a_serial_arm_and_an_objective_beside_it():
+    problem = vq.Problem.from_dict(SNAKE)
+    name = vq.Resolver(problem).setup.arm.node_names[4]
+    free = vq.solve(problem)
+    start, end = free.nodes[[0, -1], 4, 1]
+    way = np.sign(end - start)
+    row = vq.Inequality("side", lambda nodes: way * (0.5 * (start + end) - nodes[name][1]))
+    drawn = vq.Objective("side", lambda nodes: nodes[name][1] - end - way)
+    maneuver = vq.solve(problem, rows=[row], objectives=[drawn])
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok
+    short = way * (0.5 * (start + end) - maneuver.nodes[:, 4, 1])
+    assert short.min() >= -1e-9
+    assert short[-1] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("row", "expected"),
+    [
+        (to_place, "expected vgtm_qp.Inequality"),
+        (vq.Inequality("mine", 3), "expected a function"),  # type: ignore[arg-type]
+        (vq.Inequality("low", lambda nodes: 1.0 - nodes["n5-1"][2]), 'the row "low" is -3'),
+        (vq.Inequality("mine", lambda nodes: nodes["m"]), "no node is called 'm'"),
+    ],
+)
+def test_wrong_rows_are_refused(row: Any, expected: str):
+    with pytest.raises(vq.PartError, match=re.escape(expected)):
+        vq.Resolver(vq.load_problem("five_bay_free"), rows=[row])
+
+
 # Registration.
 
 

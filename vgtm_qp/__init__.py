@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from vgtm_qp.parts import register
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
     from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere
-    from vgtm_qp.qp.terms import Objective
+    from vgtm_qp.qp.terms import Inequality, Objective
     from vgtm_qp.result.certificate import Certificate, Measure
     from vgtm_qp.step.step import Step, StepStatus
     from vgtm_qp.verify import verify, verify_file
@@ -45,7 +45,7 @@ _HOMES = {
     "vgtm_qp.certify.certify": ("Certifier", "certify"),
     "vgtm_qp.certify.verdict": ("Finding", "Verdict"),
     "vgtm_qp.export": ("export_maneuver",),
-    "vgtm_qp.qp.terms": ("Objective",),
+    "vgtm_qp.qp.terms": ("Inequality", "Objective"),
     "vgtm_qp.result.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),
     "vgtm_qp.maneuver.recording": ("Recording",),
@@ -72,6 +72,7 @@ __all__ = [
     "ExportError",
     "Finding",
     "GoalError",
+    "Inequality",
     "Maneuver",
     "Measure",
     "Mesh",

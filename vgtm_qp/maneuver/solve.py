@@ -20,7 +20,7 @@ from vgtm_qp.maneuver.retries import DeadEnd, retries
 from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
-from vgtm_qp.qp.terms import Objective
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.result.manifest import problem_digests
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.remedies import Remedy
@@ -56,6 +56,7 @@ def solve(
     progress: Progress | None = None,
     verify: bool = True,
     objectives: Sequence[Objective] = (),
+    rows: Sequence[Inequality] = (),
 ) -> Maneuver:
     """Solve a problem by its method and return the maneuver, certified unless `verify` is False.
 
@@ -68,8 +69,9 @@ def solve(
         maneuver with the steps made so far.
     verify
         Check the result again from its nodes alone.
-    objectives
-        Objectives of the user's own, which choose among the motions that the problem leaves free.
+    objectives, rows
+        Objectives of the user's own, which choose among the motions that the problem leaves free; and rows, which each
+        step keeps. The certificate is not about them; ``manifest["own"]`` has the least value of each row.
 
     Raises
     ------
@@ -85,7 +87,7 @@ def solve(
     digests = problem_digests(
         problem.to_dict(), **files, urdf=None if problem.arm is None else problem.arm.urdf
     )
-    resolver = Resolver(problem, objectives=objectives)
+    resolver = Resolver(problem, objectives=objectives, rows=rows)
     mistakes = check_problem(problem, resolver.setup)
     if mistakes:
         raise problem.error(mistakes)

@@ -35,7 +35,7 @@ from vgtm_qp.methods.resolver import (
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Method
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.terms import Objective
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.path import Path
 
@@ -256,7 +256,13 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
         The arm cannot be built.
     """
 
-    def __init__(self, problem: Problem, *, objectives: Sequence[Objective] = ()) -> None:  # noqa: ARG002
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        objectives: Sequence[Objective] = (),  # noqa: ARG002
+        rows: Sequence[Inequality] = (),  # noqa: ARG002
+    ) -> None:
         method = problem.method
         super().__init__(arm_without_curve(problem))
         arm, layout = self.setup.arm, self.setup.layout

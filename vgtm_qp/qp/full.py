@@ -143,8 +143,10 @@ class FullBuilder:
                 (np.zeros(len(unique)), unique % total, indptr), shape=(total, self.size)
             )
             self._order, self._pattern = position, pattern
+        units = {} if layout.own is None else layout.own.units
         self._labels = self._row_labels + tuple(
-            Label(clearance.name(k), "clearance", "m") for k in range(len(clearance))
+            Label(name, "user's row" if name in units else "clearance", units.get(name, "m"))
+            for name in map(clearance.name, range(len(clearance)))
         )
         fixed = [entry.values(numbers).reshape(-1) for rows in self._fixed for entry in rows.entries]
         values = np.concatenate([*fixed, clearance.coefficients[present].reshape(-1)])

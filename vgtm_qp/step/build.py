@@ -35,7 +35,7 @@ from vgtm_qp.qp.layout import Layout, with_angles
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, dense_solver, make_solver
-from vgtm_qp.qp.terms import Objective, OwnTerms
+from vgtm_qp.qp.terms import Inequality, Objective, OwnTerms
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.step.chain_engine import ChainEngine
@@ -59,18 +59,20 @@ def build_arm(
     plain: bool = False,
     solves: bool = True,
     objectives: Sequence[Objective] = (),
+    rows: Sequence[Inequality] = (),
 ) -> Setup:
     """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
 
     A `plain` arm does not step in one call of C; its answers are the same. If the caller never `solves` a QP,
-    it gets the engine that is built fastest. `objectives` of the user's own are for the QP of a whole arm.
+    it gets the engine that is built fastest. `objectives` and `rows` of the user's own are for the QP of a
+    whole arm.
 
     Raises
     ------
     ProblemError
         There is no such arm, or it cannot do at all what the problem asks for; each mistake is named.
     PartError
-        An objective is none of this arm.
+        An objective or a row is none of this arm, or a row is broken at home.
     """
     check_is_problem(problem)
     check_solver(problem)
@@ -81,8 +83,8 @@ def build_arm(
         task = TipTask(problem.end_effector.track, arm)
     with problem.blaming(("curve",), "a curve that starts in this arm's home pose"):
         home = home_curve(problem, arm, task)
-    if objectives:
-        home = home._replace(layout=replace(home.layout, own=OwnTerms(arm, objectives)))
+    if objectives or rows:
+        home = home._replace(layout=replace(home.layout, own=OwnTerms(arm, objectives, rows)))
     clearance, spec = problem.clearance, problem.arm_table
     solver, tracking = problem.method.solver, problem.method.tracking
     options: dict[str, Any] = {

@@ -12,7 +12,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
-from vgtm_qp.qp.terms import Objective
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.advance import Advancer
 from vgtm_qp.step.attempt import Attempt
@@ -46,9 +46,15 @@ class QPResolver(Resolver, serves="qp"):
 
     draws_vertices = True
 
-    def __init__(self, problem: Problem | Setup, *, objectives: Sequence[Objective] = ()) -> None:
+    def __init__(
+        self,
+        problem: Problem | Setup,
+        *,
+        objectives: Sequence[Objective] = (),
+        rows: Sequence[Inequality] = (),
+    ) -> None:
         super().__init__()
-        setup = problem if isinstance(problem, Setup) else checked_arm(problem, objectives)
+        setup = problem if isinstance(problem, Setup) else checked_arm(problem, objectives, rows)
         self._separation = Separation(setup)
         self._actuation = Actuation(setup)
         self._shaping = Shaping(setup)
@@ -209,4 +215,6 @@ class QPResolver(Resolver, serves="qp"):
     def again(self, problem: Problem) -> QPResolver:
         """See :class:`Resolver`."""
         own = self.setup.layout.own
-        return QPResolver(build_arm(problem, objectives=() if own is None else own.objectives))
+        if own is None:
+            return QPResolver(build_arm(problem))
+        return QPResolver(build_arm(problem, objectives=own.objectives, rows=own.rows))

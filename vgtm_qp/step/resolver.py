@@ -13,7 +13,7 @@ from vgtm_qp.errors import GoalError, PartError
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.full import StepQP
-from vgtm_qp.qp.terms import Objective
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.path import Path
@@ -52,7 +52,7 @@ class Resolver(ChangingScene):
     ProblemError
         The arm cannot be built, or not moved by that method.
     PartError
-        An objective is none of this arm; or the method has no QP over the whole arm, to which they are added.
+        An objective or row is none of this arm; or the method has no QP of the whole arm, to which they are added.
     """
 
     rank: int | None = None
@@ -71,10 +71,16 @@ class Resolver(ChangingScene):
             cls._method = serves
             Resolver._served[serves] = cls
 
-    def __new__(cls, problem: Problem | Setup, *, objectives: Sequence[Objective] = ()) -> Self:
+    def __new__(
+        cls,
+        problem: Problem | Setup,
+        *,
+        objectives: Sequence[Objective] = (),
+        rows: Sequence[Inequality] = (),
+    ) -> Self:
         """Return an instance of the subclass for the problem's method; for a ``Setup`` of ``QPResolver``.
 
-        `objectives` of the user's own are added to those of the QP.
+        `objectives` of the user's own are added to those of the QP; each step keeps the `rows` of the user's own.
         """
         chosen: type = cls
         if cls is Resolver:
@@ -83,7 +89,7 @@ class Resolver(ChangingScene):
             else:
                 check_is_problem(problem)
                 chosen = Resolver._served[problem.method.name]
-                _check_has_qp(problem, objectives)
+                _check_has_qp(problem, [*objectives, *rows])
         return object.__new__(chosen)
 
     @property
@@ -326,5 +332,5 @@ def _check_has_qp(problem: Problem, own: Sequence[object]) -> None:
     if own and (method.name != "qp" or method.goes_by_bays):
         raise PartError(
             f'the method "{method.name}" with tracking "{method.tracking}" has no QP of the whole arm; expected "qp" '
-            'with tracking "coupled" or "none" for objectives of one\'s own'
+            'with tracking "coupled" or "none" for terms of one\'s own'
         )
