@@ -72,6 +72,25 @@ def test_a_module_moves_and_its_result_needs_it_no_more(tmp_path: Path):
     assert not other.ok
 
 
+def test_other_processes_need_no_part_that_has_become_tables():
+    """They know none that a script has registered; a retry there changes the tables that the part has made."""
+    vq.register("curve", "own", lambda: UNEVEN)
+    vq.register("obstacle", "dumbbell", dumbbell)
+    tables = {"curve": {"family": "own"}, "obstacle": [{**WEIGHT, "center": [2.0, 0.0, 1.0]}]}
+    (maneuver,) = vq.solve_many([with_truss().replace(tables)], workers=1)
+    assert maneuver.status == "solved"
+    assert maneuver.certificate.ok
+    parts.REGISTERED["module"].clear()
+    assert (
+        with_truss_of(maneuver).replace({"method.weights.node_rate": 2.0}).truss
+        == with_truss_of(maneuver).truss
+    )
+
+
+def with_truss_of(maneuver: vq.Maneuver) -> vq.Problem:
+    return vq.Problem.from_dict(maneuver.manifest["problem"])
+
+
 def test_keys_of_a_module_can_be_replaced():
     problem = with_truss()
     taller = problem.replace({"truss.bays": 3, "truss.rate": 0.2})
