@@ -257,6 +257,18 @@ def test_a_shape_becomes_its_pieces_where_the_obstacle_is():
     assert {one.velocity for one in problem.obstacle[1:]} == {(0.0, 0.0, 0.1)}
 
 
+def test_a_shape_joins_the_scene_of_a_running_arm_piece_by_piece():
+    vq.register("obstacle", "dumbbell", dumbbell)
+    pieces = vq.obstacles({**WEIGHT, "center": [1.2, 0.0, 2.2]}, BALL)
+    assert pieces == with_obstacles({**WEIGHT, "center": [1.2, 0.0, 2.2]}, BALL).obstacle
+    resolver = vq.Resolver(vq.load_problem("five_bay_free"))
+    for piece in pieces:
+        resolver.add_obstacle(piece)
+    assert resolver.step(position=[0.02, 0.0, 4.0]).moved
+    with pytest.raises(vq.ProblemError, match=r'obstacle\[0\] \("weight"\).radius: found nothing'):
+        vq.obstacles({key: value for key, value in WEIGHT.items() if key != "radius"})
+
+
 def test_a_shape_of_one_piece_has_the_obstacle_s_name():
     vq.register(
         "obstacle", "coin", lambda *, radius: [{"shape": "cylinder", "radius": radius, "height": 0.01}]

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from vgtm_qp.methods import Resolver
     from vgtm_qp.parts import register
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
-    from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere
+    from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere, obstacles
     from vgtm_qp.qp.terms import Inequality, Objective
     from vgtm_qp.result.certificate import Certificate, Measure
     from vgtm_qp.step.step import Step, StepStatus
@@ -52,7 +52,7 @@ _HOMES = {
     "vgtm_qp.maneuver.solve": ("solve", "solve_many"),
     "vgtm_qp.comparison.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
-    "vgtm_qp.problem.obstacle": ("Box", "Cylinder", "Mesh", "Sphere"),
+    "vgtm_qp.problem.obstacle": ("Box", "Cylinder", "Mesh", "Sphere", "obstacles"),
     "vgtm_qp.methods": ("Resolver",),
     "vgtm_qp.parts": ("register",),
     "vgtm_qp.step.step": ("Step", "StepStatus"),
@@ -102,6 +102,7 @@ __all__ = [
     "export_maneuver",
     "load_problem",
     "load_result",
+    "obstacles",
     "problem_schema",
     "register",
     "solve",

@@ -121,6 +121,18 @@ def _with_own_shapes(
 Obstacles = Annotated[tuple[Obstacle, ...], WrapValidator(_with_own_shapes)]
 
 
+class _Around(Table, called="a scene"):
+    obstacle: Obstacles
+
+
+def obstacles(*tables: Mapping[str, Any]) -> tuple[Box | Sphere | Cylinder | Mesh, ...]:
+    """Return the obstacles of ``[[obstacle]]`` tables; one of a shape of the user's own as the pieces it consists of.
+
+    ProblemError with one :class:`~vgtm_qp.errors.Mistake` per mistake.
+    """
+    return _Around.model_validate({"obstacle": list(tables)}).obstacle
+
+
 def _moved(found: ErrorDetails, place: tuple[int | str, ...]) -> InitErrorDetails:
     """Return the error of a table at another place."""
     kind = PydanticCustomError(found["type"], found["msg"], found.get("ctx"))
