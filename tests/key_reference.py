@@ -23,7 +23,7 @@ TABLES = {
     "[arm.joint.mimic]": ("Mimic",),
     "[[arm.body]]": ("ArmBody",),
     "[[arm.locked]]": ("JointLock",),
-    "[curve]": ("BezierCurve", "BSplineCurve", "BetaSplineCurve"),
+    "[curve]": ("BezierCurve", "BSplineCurve", "BetaSplineCurve", "SegmentCurve"),
     "[[curve.control_vertex_goals]]": ("VertexGoal",),
     "[end_effector]": ("EndEffector",),
     "[maneuver]": ("WaypointManeuver", "PathManeuver"),

@@ -36,6 +36,14 @@ BASE: dict[str, Any] = {
     "obstacle": [{"name": "ball", "shape": "sphere", "center": [1.0, 0.0, 2.2], "radius": 0.25}],
 }
 MOVED = [{"time": 1.0, "position": [0.05, 0.0, 0.0], "rotation_vector": [0.0, 0.05, 0.0]}]
+SEGMENTS = {
+    "curve": {
+        "family": "segments",
+        "control_vertices": 3,
+        "breaks": [0.0, 0.5, 1.0],
+        "extraction": [[[1, 0, 0], [0.5, 0.5, 0], [0, 1, 0]], [[0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]]],
+    }
+}
 GOALS = [{"index": 2, "position": [0.3, 0.0, 1.4]}]
 SNAKE = {
     "arm": {
@@ -168,6 +176,11 @@ CASES: dict[str, tuple[Changes, Changes]] = {
     "curve.degree": ({"curve.family": "b-spline", "curve.degree": 2}, {"curve.degree": 3}),
     "curve.bias": ({"curve.family": "beta-spline"}, {"curve.bias": 2.0}),
     "curve.tension": ({"curve.family": "beta-spline"}, {"curve.tension": 2.0}),
+    "curve.breaks": (SEGMENTS, {"curve.breaks": [0.0, 0.3, 1.0]}),
+    "curve.extraction": (
+        SEGMENTS,
+        {"curve.extraction": [[[1, 0, 0], [0.6, 0.4, 0], [0, 1, 0]], *SEGMENTS["curve"]["extraction"][1:]]},
+    ),
     "curve.control_vertices": ({}, {"curve.control_vertices": 5}),
     "curve.torsion_vertices": ({}, {"curve.torsion_vertices": 1}),
     "curve.nodes": ({}, {"curve.nodes": "arc-length"}),

@@ -11,9 +11,20 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from vgtm_qp import parts
+
 ROOT = Path(__file__).resolve().parents[1]
-EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+FOLDER = ROOT / "examples"
+OWN_PARTS = sorted((FOLDER / "own_parts").glob("*.py"))
+EXAMPLES = [*sorted(FOLDER.glob("*.py")), *OWN_PARTS]
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+MOST_LINES = 30
+"""Of an example of a part of one's own."""
+
+
+def called(example: Path) -> str:
+    return example.relative_to(FOLDER).with_suffix("").as_posix()
+
 
 SAYS = {
     "own_truss": ("6 free motions", "solved; verified: True"),
@@ -30,6 +41,22 @@ SAYS = {
     "snakes": ("snake of 15 universal joints", "lower cube", "qp "),
     "panda_among_shelves": ("Panda among shelves", "upper board", "| qp                      | yes"),
     "own_study": ("x = 1.2 m: solved", "x = 2.4 m: blocked"),
+    "own_parts/curve": (
+        "tension 0.0: solved; on the curve: True; True",
+        "tension 0.2: solved; on the curve: True; True",
+    ),
+    "own_parts/module": ("36 members; solved; verified: True",),
+    "own_parts/objective": (
+        "0 objectives: solved, True; out of level by at most 0.266 m",
+        "1 objectives: solved, True; out of level by at most 0.058 m",
+    ),
+    "own_parts/obstacle": (
+        "beam: side, beam: lower end, beam: upper end",
+        "solved; 0.080 m",
+        "beam: side; True",
+    ),
+    "own_parts/row": ("1 rows: solved, True; third face up to x = 0.350 m", "held by row: light before n5"),
+    "own_parts/solver": ("solved in 50 steps; verified: True",),
 }
 
 SHOWS = {
@@ -40,20 +67,27 @@ SHOWS = {
 
 
 def test_what_examples_write_is_ignored_by_git():
-    ignored = (EXAMPLES[0].parents[1] / ".gitignore").read_text(encoding="utf-8").splitlines()
+    ignored = (FOLDER.parent / ".gitignore").read_text(encoding="utf-8").splitlines()
     assert "out/" in ignored
 
 
 def test_each_example_is_tried():
-    assert {example.stem for example in EXAMPLES} == set(SAYS)
+    assert {called(example) for example in EXAMPLES} == set(SAYS)
     assert {notebook.stem for notebook in NOTEBOOKS} == set(SHOWS)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.stem)
+@pytest.mark.parametrize("example", OWN_PARTS, ids=called)
+def test_a_part_of_ones_own_takes_few_lines(example: Path):
+    assert len(example.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=called)
 def test_an_example_runs(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
+    # What an example registers is not there for later tests.
+    monkeypatch.setattr(parts, "REGISTERED", {kind: {} for kind in parts.REGISTERED})
     # A plain install has none of the extras.
     for extra in ("viser", "mcap", "mujoco", "distributed", "dask"):
         monkeypatch.setitem(sys.modules, extra, None)
@@ -65,7 +99,7 @@ def test_an_example_runs(
             raise
         pytest.skip(str(ended))
     printed = capsys.readouterr().out
-    for words in SAYS[example.stem]:
+    for words in SAYS[called(example)]:
         assert words in printed
     assert {place.name for place in tmp_path.iterdir()} <= {"out"}
     for picture in tmp_path.glob("out/*.png"):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.conventional import BandedSystem
 from vgtm_qp.methods.pseudoinverse import (
-    Objective,
+    Cost,
     moore_penrose,
     null_space_vector,
     projector,
@@ -84,7 +84,7 @@ def test_dependent_rows_are_refused_by_the_weighted_inverse() -> None:
 def test_the_null_space_vector_gives_the_constrained_minimiser(seed: int) -> None:
     random = np.random.default_rng(seed)
     J, x = random.normal(size=(3, 8)), random.normal(size=3)
-    objective = Objective(random_metric(random, 8), random.normal(size=8))
+    objective = Cost(random_metric(random, 8), random.normal(size=8))
     inverse = moore_penrose(J)
     N = projector(inverse, J)
     start = inverse.matrix @ x

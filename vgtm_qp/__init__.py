@@ -13,6 +13,7 @@ from vgtm_qp.errors import (
     GoalError,
     MissingExtraError,
     Mistake,
+    PartError,
     ProblemError,
     ResultError,
     SolverError,
@@ -32,8 +33,10 @@ if TYPE_CHECKING:
     from vgtm_qp.maneuver.recording import Recording
     from vgtm_qp.maneuver.solve import solve, solve_many
     from vgtm_qp.methods import Resolver
+    from vgtm_qp.parts import register
     from vgtm_qp.problem import Problem, bundled_problems, load_problem, problem_schema
-    from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere
+    from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere, obstacles
+    from vgtm_qp.qp.terms import Inequality, Objective
     from vgtm_qp.result.certificate import Certificate, Measure
     from vgtm_qp.step.step import Step, StepStatus
     from vgtm_qp.verify import verify, verify_file
@@ -42,14 +45,16 @@ _HOMES = {
     "vgtm_qp.certify.certify": ("Certifier", "certify"),
     "vgtm_qp.certify.verdict": ("Finding", "Verdict"),
     "vgtm_qp.export": ("export_maneuver",),
+    "vgtm_qp.qp.terms": ("Inequality", "Objective"),
     "vgtm_qp.result.certificate": ("Certificate", "Measure"),
     "vgtm_qp.maneuver.maneuver": ("Maneuver", "load_result"),
     "vgtm_qp.maneuver.recording": ("Recording",),
     "vgtm_qp.maneuver.solve": ("solve", "solve_many"),
     "vgtm_qp.comparison.compare": ("Report", "compare"),
     "vgtm_qp.problem": ("Problem", "bundled_problems", "load_problem", "problem_schema"),
-    "vgtm_qp.problem.obstacle": ("Box", "Cylinder", "Mesh", "Sphere"),
+    "vgtm_qp.problem.obstacle": ("Box", "Cylinder", "Mesh", "Sphere", "obstacles"),
     "vgtm_qp.methods": ("Resolver",),
+    "vgtm_qp.parts": ("register",),
     "vgtm_qp.step.step": ("Step", "StepStatus"),
     "vgtm_qp.arm.truss.build": ("build_truss",),
     "vgtm_qp.arm.truss.mobility": ("describe",),
@@ -67,11 +72,14 @@ __all__ = [
     "ExportError",
     "Finding",
     "GoalError",
+    "Inequality",
     "Maneuver",
     "Measure",
     "Mesh",
     "MissingExtraError",
     "Mistake",
+    "Objective",
+    "PartError",
     "Problem",
     "ProblemError",
     "Recording",
@@ -94,7 +102,9 @@ __all__ = [
     "export_maneuver",
     "load_problem",
     "load_result",
+    "obstacles",
     "problem_schema",
+    "register",
     "solve",
     "solve_many",
     "verify",

@@ -69,6 +69,10 @@ class AlteredResultError(ResultError):
     """A result file whose content was changed after it was written."""
 
 
+class PartError(VgtmError):
+    """A part of one's own, such as a module or a solver, cannot be registered, imported or used."""
+
+
 class ExportError(VgtmError):
     """A maneuver cannot be written in the wanted form, or replayed there."""
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import CurveError, nearest
 
-FAMILIES = ("bezier", "b-spline", "beta-spline")
+FAMILIES = ("bezier", "b-spline", "beta-spline", "segments")
 
 _QUADRATURE_CELLS = 128
 _GAUSS_POINTS = 8
@@ -196,13 +196,57 @@ def beta_spline(control_vertices: int, bias: float = 1.0, tension: float = 0.0) 
     )
 
 
-def make_family(
-    name: str, control_vertices: int, *, degree: int = 3, bias: float = 1.0, tension: float = 0.0
-) -> CurveFamily:
-    """Make a family by its name in a problem file; `degree` is the B-spline's, the rest the Beta-spline's.
+def segments(breaks: ArrayLike, extraction: ArrayLike) -> CurveFamily:
+    """Chain of Bezier segments between `breaks` (S + 1,), their points by weights (S, d + 1, V): `extraction`.
 
-    CurveError for an unknown name, or for parameters that the family cannot have.
+    CurveError unless the breaks increase from 0 to 1, the weights of each point have the sum 1, each segment begins
+    where the one before ends, and the curve goes from the first control vertex, towards the second, to the last.
     """
+    at, points = np.array(breaks, dtype=float), np.array(extraction, dtype=float)
+    degree, size = points.shape[1] - 1, points.shape[2]
+    _require_vertices("chain of segments", size, 2)
+    if at[0] != 0.0 or at[-1] != 1.0 or np.any(np.diff(at) <= 0.0):
+        raise CurveError("the breaks of the segments are others; expected breaks that increase from 0 to 1")
+    corner = np.eye(size)
+    wrong = {
+        "weights whose sum is 1 for each Bezier point": points.sum(axis=2) - 1.0,
+        "segments that begin where the one before ends": points[1:, 0] - points[:-1, -1],
+        "a first Bezier point that is the first control vertex": points[0, 0] - corner[0],
+        "a last Bezier point that is the last control vertex": points[-1, -1] - corner[-1],
+        "a second Bezier point on the first leg of the control polygon": points[0, 1, 2:],
+    }
+    for expected, error in wrong.items():
+        if np.abs(error).max(initial=0.0) > _OUTSIDE:
+            raise CurveError(f"the weights of the segments are others; expected {expected}")
+    if not points[0, 1, 1] > 0.0:
+        raise CurveError("the curve begins away from its second control vertex; expected a weight above 0")
+    # Control vertices at these fractions of a line give Bezier points that are evenly spaced in each segment.
+    even = within(at, np.arange(degree + 1) / degree)
+    abscissae = np.linalg.lstsq(points.reshape(-1, size), even.ravel(), rcond=None)[0]
+    if np.abs(points @ abscissae - even).max() > _OUTSIDE or np.any(np.diff(abscissae) <= 0.0):
+        abscissae = np.linspace(0.0, 1.0, size)
+    before, after = points[:-1, -1] - points[:-1, -2], points[1:, 1] - points[1:, 0]
+    lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    smooth = bool(np.all(np.abs(np.einsum("kv,kv->k", before, after) - lengths) <= _OUTSIDE))
+    return CurveFamily("segments", degree, at, points, abscissae, smooth, np.empty(0))
+
+
+def make_family(
+    name: str,
+    control_vertices: int,
+    *,
+    degree: int = 3,
+    bias: float = 1.0,
+    tension: float = 0.0,
+    breaks: ArrayLike = (),
+    extraction: ArrayLike = (),
+) -> CurveFamily:
+    """Make a family by its name in a problem file; `degree` is the B-spline's, bias and tension the Beta-spline's.
+
+    The rest is for :func:`segments`. CurveError for an unknown name, or for parameters that the family cannot have.
+    """
+    if name == "segments":
+        return segments(breaks, extraction)
     if name == "bezier":
         return bezier(control_vertices)
     if name == "b-spline":

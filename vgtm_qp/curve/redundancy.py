@@ -51,7 +51,7 @@ def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
 
     A Bezier curve is raised in degree; a B-spline gets knots, each in the middle of the longest span. Both
     move by rounding alone. A uniform Beta-spline cannot keep its shape exactly, and moves by `change`.
-    CurveError where `count` is negative.
+    CurveError where `count` is negative, or the family is a chain of segments without knots.
     """
     _require_count(count)
     family = curve.family
@@ -61,6 +61,7 @@ def add_control_vertices(curve: Curve, count: int = 1) -> Refit:
         return refit(curve, bezier(family.control_vertices + count))
     if family.name == "beta-spline":
         return refit(curve, beta_spline(family.control_vertices + count, family.bias, family.tension))
+    _require_knots(family)
     degree, knots = family.degree, family.knots
     for _ in range(count):
         longest = int(np.argmax(np.diff(knots)))
@@ -122,6 +123,13 @@ def _require_count(count: int) -> None:
         raise CurveError(f"the number of control vertices to add or remove must be 0 or more, not {count}")
 
 
+def _require_knots(family: CurveFamily) -> None:
+    if not len(family.knots):
+        raise CurveError(
+            f"a curve of {family.name} keeps its number of control vertices; expected a bezier, b-spline or beta-spline"
+        )
+
+
 def _quadrature(*families: CurveFamily) -> tuple[Array, Array]:
     """Gauss points of the common segments, exact for squares, and the square roots of their weights."""
     breaks = np.unique(np.concatenate([family.breaks for family in families]))
@@ -148,6 +156,7 @@ def _lower_families(family: CurveFamily) -> list[CurveFamily]:
         return [bezier(vertices)]
     if family.name == "beta-spline":
         return [beta_spline(vertices, family.bias, family.tension)]
+    _require_knots(family)
     degree = family.degree
     interior = family.knots[degree + 1 : -degree - 1]
     if not interior.size:

@@ -98,6 +98,7 @@ class Log:
         set-up.
         """
         resolver, setup, (first, *scenes) = self._resolver, self._resolver.setup, self._scenes
+        own = setup.layout.own
         manifest = {
             "schema_version": SCHEMA_VERSION,
             "problem": problem.to_dict(),
@@ -119,6 +120,7 @@ class Log:
             # Of the Jacobian of eq. (26) in the last step, where the method reveals it: eq. (6) holds at full row rank.
             "jacobian_rank": resolver.rank,
             "clearance_rows": self._clearance_rows,
+            **({"own": own.record(np.asarray(self._rows["configuration"]))} if own else {}),
             **told,
         }
         arrays: dict[str, Any] = {name: np.asarray(rows, dtype=float) for name, rows in self._rows.items()}

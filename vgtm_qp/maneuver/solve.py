@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import islice
@@ -20,6 +20,7 @@ from vgtm_qp.maneuver.retries import DeadEnd, retries
 from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.result.manifest import problem_digests
 from vgtm_qp.step.checks import check_problem
 from vgtm_qp.step.remedies import Remedy
@@ -49,7 +50,14 @@ _NOTHING = Remedy((), 1.0)
 Progress = Callable[[float, Step], None]
 
 
-def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = True) -> Maneuver:
+def solve(
+    problem: Problem,
+    *,
+    progress: Progress | None = None,
+    verify: bool = True,
+    objectives: Sequence[Objective] = (),
+    rows: Sequence[Inequality] = (),
+) -> Maneuver:
     """Solve a problem by its method and return the maneuver, certified unless `verify` is False.
 
     Parameters
@@ -61,11 +69,16 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
         maneuver with the steps made so far.
     verify
         Check the result again from its nodes alone.
+    objectives, rows
+        Objectives of the user's own, which choose among the motions that the problem leaves free; and rows, which each
+        step keeps. The certificate is not about them; ``manifest["own"]`` has the least value of each row.
 
     Raises
     ------
     ProblemError
         The problem cannot be set up, or is not a Problem; no step was made.
+    PartError
+        As of `Resolver`.
     """
     check_is_problem(problem)
     started = perf_counter()
@@ -74,7 +87,7 @@ def solve(problem: Problem, *, progress: Progress | None = None, verify: bool = 
     digests = problem_digests(
         problem.to_dict(), **files, urdf=None if problem.arm is None else problem.arm.urdf
     )
-    resolver = Resolver(problem)
+    resolver = Resolver(problem, objectives=objectives, rows=rows)
     mistakes = check_problem(problem, resolver.setup)
     if mistakes:
         raise problem.error(mistakes)

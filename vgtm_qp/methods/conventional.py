@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.objectives import DEFAULT_TERMS, NamedTerms, Terms
 from vgtm_qp.methods.pseudoinverse import (
     RANK_TOLERANCE,
-    Objective,
+    Cost,
     moore_penrose,
     null_space_vector,
     projector,
@@ -34,6 +35,7 @@ from vgtm_qp.methods.resolver import (
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Method
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.path import Path
 
@@ -62,7 +64,7 @@ class Resolved(NamedTuple):
     rank: int
 
 
-def resolved(J: Array, x: Array, objective: Objective, method: Method) -> Resolved:
+def resolved(J: Array, x: Array, objective: Cost, method: Method) -> Resolved:
     """Return J^+ x + (1 - J^+ J) v with the null-space vector v of `objective`, by the method's variant."""
     if method.variant in ("moore-penrose", "truncated"):
         truncation = method.truncation if method.variant == "truncated" else RANK_TOLERANCE
@@ -101,7 +103,7 @@ class DenseSolution:
         count = len(terms.blocks)
         by_node = hessian.reshape(count, 3, count, 3)
         by_node[np.arange(count), :, np.arange(count)] += terms.blocks
-        objective = Objective(hessian, actuated.T @ terms.actuator_gradient + terms.node_gradient)
+        objective = Cost(hessian, actuated.T @ terms.actuator_gradient + terms.node_gradient)
         found = resolved(J, np.concatenate([system.x_e, system.x_g]), objective, self._method)
         self.rank = found.rank
         return found.displacement
@@ -135,7 +137,7 @@ class JointSolution:
         by_node = K.reshape(-1, 3, K.shape[1])
         hessian = terms.node * K.T @ K + np.einsum("nai,nab,nbj->ij", by_node, terms.blocks, by_node)
         hessian[np.diag_indices_from(hessian)] += terms.actuator * self._levers[free] ** 2
-        objective = Objective(hessian, terms.actuator_gradient[free] + K.T @ terms.node_gradient)
+        objective = Cost(hessian, terms.actuator_gradient[free] + K.T @ terms.node_gradient)
         J = system.tip[:, self._present] @ K[self._tip]
         moved = np.zeros(len(free))
         moved[free], self.rank = resolved(J, system.x_e, objective, self._method)
@@ -254,7 +256,13 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
         The arm cannot be built.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        objectives: Sequence[Objective] = (),  # noqa: ARG002
+        rows: Sequence[Inequality] = (),  # noqa: ARG002
+    ) -> None:
         method = problem.method
         super().__init__(arm_without_curve(problem))
         arm, layout = self.setup.arm, self.setup.layout

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from vgtm_qp.methods.resolver import MethodResolver, Moved, displacement_to
 from vgtm_qp.methods.segments import make_segments
 from vgtm_qp.methods.tracking import Tracker
 from vgtm_qp.problem import Problem
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
 
@@ -26,7 +28,13 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
         The arm cannot be built, or cannot track a curve.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        objectives: Sequence[Objective] = (),  # noqa: ARG002
+        rows: Sequence[Inequality] = (),  # noqa: ARG002
+    ) -> None:
         method = problem.method
         coupled = problem.replace({"method": method.kept_by("qp", "coupled")})
         super().__init__(build_arm(coupled, solves=False))

@@ -12,7 +12,7 @@ from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.objectives import potential_curvature, potential_slope
-from vgtm_qp.methods.pseudoinverse import Objective, moore_penrose, null_space_vector, projector
+from vgtm_qp.methods.pseudoinverse import Cost, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.tip import TipGoal
@@ -113,7 +113,7 @@ class CurveMotion:
             curve = displaced(curve, moore_penrose(self._rows(curve, across)).matrix @ x)
         raise SolverError("Newton's method on the curve's tip does not converge")
 
-    def objective(self, curve: Curve, X: Array, time: float) -> Objective:
+    def objective(self, curve: Curve, X: Array, time: float) -> Cost:
         """Return the null-space terms as a quadratic cost of the displacements (D,) of the curve's coordinates."""
         p = curve.control_vertices
         vertices, size = p.size, curve.coordinates
@@ -138,7 +138,7 @@ class CurveMotion:
             stiffness = gain * potential_curvature(distance, self._setup.influence)
             hessian[:vertices, :vertices] += (rows.T * stiffness) @ rows
             gradient[:vertices] += gain * potential_slope(distance, self._setup.influence) @ rows
-        return Objective(hessian, gradient)
+        return Cost(hessian, gradient)
 
     def _missing(self, curve: Curve, goal: TipGoal) -> tuple[Array, Array, Array]:
         """Return the error x_e - x(1), eq. (34), and the goal's rates, (n_e,) each; and the turned axes (r, 3)."""

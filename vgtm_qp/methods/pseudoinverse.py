@@ -20,7 +20,7 @@ class Inverse(NamedTuple):
     rank: int
 
 
-class Objective(NamedTuple):
+class Cost(NamedTuple):
     """A quadratic cost 1/2 d' hessian d + gradient . d of displacements d (n,)."""
 
     hessian: Array
@@ -69,7 +69,7 @@ def projector(inverse: Inverse, J: Array) -> Array:
     return np.asarray(np.eye(J.shape[1]) - inverse.matrix @ J)
 
 
-def null_space_vector(N: Array, start: Array, objective: Objective) -> Array:
+def null_space_vector(N: Array, start: Array, objective: Cost) -> Array:
     """Return the null-space vector v whose image N v minimises `objective` at start + N v.
 
     ``v = (N'HN + c (1 - N))^-1 N' (-gradient - H start)``; the second term, with c the scale of H, makes the

@@ -21,6 +21,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from vgtm_qp.errors import ProblemError, nearest
+from vgtm_qp.parts import Kind
 
 # Beyond these, squares of lengths exceed the certificate's tolerances; no arm is that long or that fine.
 LEAST_LENGTH = 1e-6
@@ -74,7 +75,7 @@ class ByKey:
 
     The key is a ``Literal`` of strings in each table; it may be missing if a table has a default for it, unless it has
     to be `in_file`. If given, `pick` returns the table for a value, or None, instead. Values `later` are reserved:
-    messages say that this version does not serve them.
+    messages say that this version does not serve them. Messages name the user's own parts of a `kind` as well.
     """
 
     def __init__(
@@ -84,8 +85,9 @@ class ByKey:
         *,
         later: Iterable[str] = (),
         in_file: bool = False,
+        kind: Kind | None = None,
     ) -> None:
-        self._in_file = in_file
+        self._in_file, self._kind = in_file, kind
         self.key, self.pick, self.later = key, pick or self._by_key, ",".join(later)
         # Both are read from the tables of the union when its schema is built.
         self.tables: dict[str, type[BaseModel]] = {}
@@ -102,7 +104,12 @@ class ByKey:
             lambda value: _tag(self.pick(value)),
             custom_error_type="choice",
             custom_error_message="a table",
-            custom_error_context={"key": self.key, "choices": ",".join(self.tables), "later": self.later},
+            custom_error_context={
+                "key": self.key,
+                "choices": ",".join(self.tables),
+                "later": self.later,
+                "kind": self._kind or "",
+            },
         )
 
     def _by_key(self, value: Any) -> type[BaseModel] | None:

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import operator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+import numpy as np
+from pydantic import (
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from vgtm_qp.problem.fields import (
     ORIGIN,
@@ -19,8 +29,10 @@ from vgtm_qp.problem.fields import (
     Length,
     Name,
     Vector,
+    unexpected,
 )
-from vgtm_qp.problem.table import Place, Table
+from vgtm_qp.problem.own import own_answer, own_name
+from vgtm_qp.problem.table import Place, Table, shown
 
 
 def _names_shape(schema: dict[str, Any]) -> None:
@@ -68,7 +80,104 @@ class Mesh(_Obstacle, called="a mesh"):
     scale: Factor = Field(default=1.0, description="factor that brings the file's unit to metres")
 
 
-Obstacle = Annotated[Box | Sphere | Cylinder | Mesh, ByKey("shape", in_file=True)]
+Obstacle = Annotated[Box | Sphere | Cylinder | Mesh, ByKey("shape", in_file=True, kind="obstacle")]
+
+
+def _with_own_shapes(
+    value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+) -> tuple[Box | Sphere | Cylinder | Mesh, ...]:
+    """Return the obstacles of a problem; one of a shape of the user's own becomes the obstacles it consists of.
+
+    A mistake in one of these is one of the table that it was made from.
+    """
+    if not isinstance(value, list | tuple):
+        return handler(value)  # type: ignore[no-any-return]
+    tables: list[Any] = []
+    origin: list[int] = []
+    wrong: list[InitErrorDetails] = []
+    for k, table in enumerate(value):
+        try:
+            made = _pieces(table, info)
+        except ValidationError as error:
+            wrong += [_moved(found, (k, *found["loc"])) for found in error.errors(include_url=False)]
+        except PydanticCustomError as error:
+            wrong.append(InitErrorDetails(type=error, loc=(k,), input=table))
+        else:
+            tables += made
+            origin += [k] * len(made)
+    if not wrong and len(tables) == len(value) and all(map(operator.is_, tables, value)):
+        return handler(value)  # type: ignore[no-any-return]
+    try:
+        obstacles = handler(tables)
+    except ValidationError as error:
+        for found in error.errors(include_url=False):
+            index, *inner = found["loc"]
+            wrong.append(_moved(found, (origin[int(index)], *inner)))
+    if wrong:
+        raise ValidationError.from_exception_data("obstacle", wrong)
+    return obstacles  # type: ignore[no-any-return]
+
+
+Obstacles = Annotated[tuple[Obstacle, ...], WrapValidator(_with_own_shapes)]
+
+
+class _Around(Table, called="a scene"):
+    obstacle: Obstacles
+
+
+def obstacles(*tables: Mapping[str, Any]) -> tuple[Box | Sphere | Cylinder | Mesh, ...]:
+    """Return the obstacles of ``[[obstacle]]`` tables; one of a shape of the user's own as the pieces it consists of.
+
+    ProblemError with one :class:`~vgtm_qp.errors.Mistake` per mistake.
+    """
+    return _Around.model_validate({"obstacle": list(tables)}).obstacle
+
+
+def _moved(found: ErrorDetails, place: tuple[int | str, ...]) -> InitErrorDetails:
+    """Return the error of a table at another place."""
+    kind = PydanticCustomError(found["type"], found["msg"], found.get("ctx"))
+    return InitErrorDetails(type=kind, loc=place, input=found["input"])
+
+
+def _pieces(table: Any, info: ValidationInfo) -> list[Any]:
+    """Return the tables that an obstacle of a user's own shape consists of; a table of the package's shapes alone."""
+    name = own_name("obstacle", table, "shape")
+    if name is None:
+        return [table]
+    answer, given = own_answer("obstacle", name, table, "shape", _Obstacle.model_fields, info)
+    place = _Obstacle.model_validate(given, context=info.context)
+    if (
+        not isinstance(answer, list | tuple)
+        or not answer
+        or not all(isinstance(one, Mapping) for one in answer)
+    ):
+        raise unexpected(f'tables of obstacles from the shape "{name}"; it returned {shown(answer)}')
+    made = []
+    for number, piece in enumerate(answer, start=1):
+        of = str(piece.get("name", number))
+        called = place.name if len(answer) == 1 else f"{place.name}: {of}"
+        made.append({**piece, "name": called, "velocity": place.velocity, **_placed(place, piece, name)})
+    return made
+
+
+def _placed(place: _Obstacle, piece: Mapping[str, Any], shape: str) -> dict[str, Any]:
+    """Return center and rotation vector of a piece that stands in the frame of an obstacle."""
+    # Imported only if there is a shape of one's own: the import takes a tenth of a second.
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(place.rotation_vector)
+    try:
+        own, center = (
+            np.array(piece.get(key, ORIGIN), dtype=float).reshape(3) for key in ("rotation_vector", "center")
+        )
+    except (TypeError, ValueError):
+        raise unexpected(
+            f'three numbers for each center and rotation_vector from the shape "{shape}"'
+        ) from None
+    return {
+        "center": (np.array(place.center) + turn.apply(center)).tolist(),
+        "rotation_vector": (turn * Rotation.from_rotvec(own)).as_rotvec().tolist(),
+    }
 
 
 class ClearanceTable(Table, called="[clearance]"):

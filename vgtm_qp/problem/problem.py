@@ -9,16 +9,17 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, PrivateAttr, WithJsonSchema
 
-from vgtm_qp.errors import Mistake, ProblemError, VgtmError
+from vgtm_qp.errors import Mistake, PartError, ProblemError, VgtmError
 from vgtm_qp.notebook import html_table
+from vgtm_qp.parts import Kind, find_part
 from vgtm_qp.problem.arm import FROM_URDF, OF_URDF, ArmTable
 from vgtm_qp.problem.fields import Name, expect, quoted
 from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
-from vgtm_qp.problem.obstacle import ClearanceTable, Obstacle
-from vgtm_qp.problem.shape import BezierCurve, Curve
+from vgtm_qp.problem.obstacle import ClearanceTable, Obstacles
+from vgtm_qp.problem.shape import BezierCurve, Curve, SegmentCurve
 from vgtm_qp.problem.table import Place, Table, key_path, shown, unique, value_at
-from vgtm_qp.problem.truss import Truss
+from vgtm_qp.problem.truss import GraphTruss, Truss
 
 SCHEMA_VERSION = 1
 
@@ -56,7 +57,7 @@ class Problem(Table, called="a problem"):
         default_factory=EndEffector, description="which coordinates are steered"
     )
     maneuver: Maneuver = Field(description="where the end effector goes")
-    obstacle: tuple[Obstacle, ...] = Field(default=(), description="what the arm keeps away from")
+    obstacle: Obstacles = Field(default=(), description="what the arm keeps away from")
     clearance: ClearanceTable = Field(default_factory=ClearanceTable, description="how far it keeps away")
     method: Method = Field(default_factory=Method, description="how each step is solved")
 
@@ -131,6 +132,10 @@ class Problem(Table, called="a problem"):
         data = self.to_dict()
         if any(f"arm.{key}" in changes for key in OF_URDF):
             data["arm"] = {key: value for key, value in data["arm"].items() if key not in FROM_URDF}
+        # The keys are those of the user's own parts, which make the tables again.
+        for kind, name, place, made_from in self._made_by_parts():
+            if find_part(kind, made_from[name]) is not None:
+                data[place] = dict(made_from)
         for key, value in changes.items():
             table = data
             *outer, last = key.split(".")
@@ -139,6 +144,13 @@ class Problem(Table, called="a problem"):
                 table[part] = table = dict(inner) if isinstance(inner, Mapping) else {}
             table[last] = value
         return self.from_dict(data, source=self._source)
+
+    def _made_by_parts(self) -> Iterator[tuple[Kind, str, str, dict[str, Any]]]:
+        """Yield the tables that parts of the user's own have made: kind, key of the part, table, and as written."""
+        if isinstance(self.truss, GraphTruss) and self.truss.made_from is not None:
+            yield "module", "module", "truss", self.truss.made_from
+        if isinstance(self.curve, SegmentCurve) and self.curve.made_from is not None:
+            yield "curve", "family", "curve", self.curve.made_from
 
     def mistake(self, place: Place, expected: str) -> Mistake:
         """Return a mistake that a later check found at a place such as ``("obstacle", 1, "center")``."""
@@ -152,11 +164,11 @@ class Problem(Table, called="a problem"):
     def blaming(self, place: Place, expected: str) -> Iterator[None]:
         """Raise any other error of this package as a mistake at a place, with what is `expected` there.
 
-        An error that ends in "; expected ..." has its own expectation.
+        An error that ends in "; expected ..." has its own expectation. That of a part of the user's own stays one.
         """
         try:
             yield
-        except ProblemError:
+        except (ProblemError, PartError):
             raise
         except VgtmError as error:
             found, _, other = str(error).partition("; expected ")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, PrivateAttr, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator
 
-from vgtm_qp.problem.fields import ByKey, Factor, NonNegative, Vector, count
-from vgtm_qp.problem.table import Place, Table, unique
+from vgtm_qp.problem.fields import ByKey, Factor, NonNegative, Number, Vector, count, unexpected
+from vgtm_qp.problem.own import own_answer, own_name
+from vgtm_qp.problem.table import Place, Table, shown, unique
 
 
 class VertexGoal(Table, called="a control vertex goal"):
@@ -78,4 +80,65 @@ class BetaSplineCurve(_Curve, called="a Beta-spline curve"):
     tension: NonNegative = Field(default=0.0, description="pull towards the control vertices; 0 is none")
 
 
-Curve = Annotated[BezierCurve | BSplineCurve | BetaSplineCurve, ByKey("family")]
+class SegmentCurve(_Curve, called="a curve of Bezier segments"):
+    """A chain of Bezier segments of one degree, given by their points; a family of the user's own becomes one."""
+
+    _made_from: dict[str, Any] | None = PrivateAttr(None)
+
+    family: Literal["segments"]
+    breaks: tuple[NonNegative, ...] = Field(
+        min_length=2, description="parameters at which the segments begin and end, from 0 to 1"
+    )
+    extraction: tuple[tuple[tuple[Number, ...], ...], ...] = Field(
+        min_length=1,
+        description="of each segment its Bezier points, each by the weights of the control vertices, whose sum is 1",
+    )
+
+    @property
+    def made_from(self) -> dict[str, Any] | None:
+        """The table of the user's own family that the segments were made from; None if they were written as such."""
+        return self._made_from
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        yield from super()._contradictions()
+        if len(self.extraction) != len(self.breaks) - 1:
+            yield ("extraction",), f"{len(self.breaks) - 1} segments, one between two breaks"
+        points = len(self.extraction[0])
+        for k, segment in enumerate(self.extraction):
+            if len(segment) != points or points < 2:
+                yield ("extraction", k), f"{max(points, 2)} points, one more than the degree of all segments"
+            for j, weights in enumerate(segment):
+                if len(weights) != self.control_vertices:
+                    yield ("extraction", k, j), f"{self.control_vertices} weights, one a control vertex"
+
+
+def _from_own_family(
+    value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+) -> BezierCurve | BSplineCurve | BetaSplineCurve | SegmentCurve:
+    """Return the table of a curve; that of a family of the user's own becomes one of Bezier segments."""
+    name = own_name("curve", value, "family")
+    if name is None:
+        return handler(value)  # type: ignore[no-any-return]
+    answer, given = own_answer("curve", name, value, "family", _Curve.model_fields, info)
+    try:
+        breaks, extraction = (np.array(part, dtype=float) for part in answer)
+    except (TypeError, ValueError):
+        breaks = extraction = np.zeros(0)
+    if breaks.ndim != 1 or extraction.ndim != 3:
+        raise unexpected(
+            f'two arrays from the curve "{name}": breaks (S + 1,) and weights (S, degree + 1, control vertices) of '
+            f"Bezier points; it returned {shown(answer)}"
+        )
+    size = {"control_vertices": extraction.shape[2]}
+    segments = {"family": "segments", "breaks": breaks.tolist(), "extraction": extraction.tolist()}
+    curve = handler({**given, **size, **segments})
+    assert isinstance(curve, SegmentCurve)
+    curve._made_from = dict(value)
+    return curve
+
+
+Curve = Annotated[
+    BezierCurve | BSplineCurve | BetaSplineCurve | SegmentCurve,
+    ByKey("family", kind="curve"),
+    WrapValidator(_from_own_family),
+]

@@ -18,6 +18,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails, InitErrorDetails
 
 from vgtm_qp.errors import Mistake, ProblemError, closest, nearest
+from vgtm_qp.parts import part_names
 from vgtm_qp.problem.fields import entry, quoted, unexpected
 
 Place = tuple[str | int, ...]
@@ -143,7 +144,8 @@ class Table(BaseModel):
         elif kind == "choice" and isinstance(value, Mapping):
             key = context["key"]
             place, value = (*place, key), value.get(key, _MISSING)
-            phrase = _one_of(context["choices"].split(","), value)
+            own = part_names(context["kind"]) if context["kind"] else []
+            phrase = _one_of([*context["choices"].split(","), *own], value)
             if value in context["later"].split(","):
                 reserved, phrase = True, f"{phrase}; that one is reserved for a later version"
         elif kind == "literal_error":

@@ -6,7 +6,15 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, GetJsonSchemaHandler, model_validator
+from pydantic import (
+    Field,
+    GetJsonSchemaHandler,
+    PrivateAttr,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -26,7 +34,8 @@ from vgtm_qp.problem.fields import (
     exactly,
     unexpected,
 )
-from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
+from vgtm_qp.problem.own import own_answer, own_name
+from vgtm_qp.problem.table import Place, Table, increasing, known_names, shown, unique
 
 _SLACK = 1e-9
 
@@ -230,6 +239,8 @@ class Member(Table, called="a member"):
 class GraphTruss(_Truss, called="a truss given as a graph"):
     """Any truss, given by its nodes and members."""
 
+    _made_from: dict[str, Any] | None = PrivateAttr(None)
+
     module: Literal["graph"]
     node: tuple[Node, ...] = Field(min_length=2, description="the nodes")
     member: tuple[Member, ...] = Field(min_length=1, description="the members")
@@ -244,6 +255,11 @@ class GraphTruss(_Truss, called="a truss given as a graph"):
         default=None,
         description="least and greatest length of an actuated member without a stroke of its own, m",
     )
+
+    @property
+    def made_from(self) -> dict[str, Any] | None:
+        """The table of the user's own module that the graph was made from; None if it was written as a graph."""
+        return self._made_from
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
         yield from super()._contradictions()
@@ -308,7 +324,30 @@ class GraphTruss(_Truss, called="a truss given as a graph"):
                 yield ("member", i, "nodes"), f'two nodes that no other member joins; "{other}" joins these'
 
 
-Truss = Annotated[ModuleTruss | TetrahedralTruss | GraphTruss, ByKey("module", later=("plate",))]
+def _from_own_module(
+    value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+) -> ModuleTruss | TetrahedralTruss | GraphTruss:
+    """Return the table of a truss; that of a module of the user's own becomes a graph."""
+    name = own_name("module", value, "module")
+    if name is None:
+        return handler(value)  # type: ignore[no-any-return]
+    shared = (*_Truss.model_fields, "stroke")
+    answer, given = own_answer("module", name, value, "module", shared, info)
+    if not isinstance(answer, Mapping):
+        raise unexpected(
+            f'a mapping of node, member, tip and faces from the module "{name}"; it returned {shown(answer)}'
+        )
+    truss = handler({**given, **answer, "module": "graph"})
+    assert isinstance(truss, GraphTruss)
+    truss._made_from = dict(value)
+    return truss
+
+
+Truss = Annotated[
+    ModuleTruss | TetrahedralTruss | GraphTruss,
+    ByKey("module", later=("plate",), kind="module"),
+    WrapValidator(_from_own_module),
+]
 
 
 def holds_home(

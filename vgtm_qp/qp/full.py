@@ -32,7 +32,7 @@ class StepQP:
     Attributes
     ----------
     P : (n, n) sparse
-        Hessian, symmetric, constant over a maneuver.
+        Hessian, symmetric, constant over a maneuver without objectives of the user's own.
     q : (n,)
     A : (m, n) sparse
     row_lower, row_upper : (m,)
@@ -143,8 +143,10 @@ class FullBuilder:
                 (np.zeros(len(unique)), unique % total, indptr), shape=(total, self.size)
             )
             self._order, self._pattern = position, pattern
+        units = {} if layout.own is None else layout.own.units
         self._labels = self._row_labels + tuple(
-            Label(clearance.name(k), "clearance", "m") for k in range(len(clearance))
+            Label(name, "user's row" if name in units else "clearance", units.get(name, "m"))
+            for name in map(clearance.name, range(len(clearance)))
         )
         fixed = [entry.values(numbers).reshape(-1) for rows in self._fixed for entry in rows.entries]
         values = np.concatenate([*fixed, clearance.coefficients[present].reshape(-1)])
@@ -156,6 +158,13 @@ class FullBuilder:
         q[self.column["slack"]] = layout.weights.end_effector * layout.arm.unit * layout.slack_levers
         q[self.column["progress"]] = numbers.progress_gradient
         self._hessian.data[-1] = numbers.progress_curvature
+
+        hessian = self._hessian
+        if numbers.own is not None:
+            nodes = self.column["nodes"]
+            q[nodes] += numbers.own.gradient
+            rest = sparse.csc_matrix((self.size - nodes.stop,) * 2)
+            hessian = hessian + sparse.block_diag([numbers.own.hessian, rest], format="csc")
 
         column_lower, column_upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         column_lower[self.column["actuators"]], column_upper[self.column["actuators"]] = (
@@ -169,7 +178,7 @@ class FullBuilder:
         below = np.concatenate([equal, np.full(len(clearance), np.inf)])
         below[self.leg_rows] = np.inf
         return StepQP(
-            self._hessian,
+            hessian,
             q,
             self._matrix,
             np.concatenate([equal, clearance.lower]),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.errors import EvaluationError, SolverError
+from vgtm_qp.errors import EvaluationError
 from vgtm_qp.native import Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
 from vgtm_qp.qp.daqp import DAQP
@@ -245,7 +245,7 @@ class _FusedWorkspace:
         self._accuracy: Accuracy | None = None
         self._goals: object = None
         self._other_status = ""
-        self._failure: SolverError | None = None
+        self._failure: Exception | None = None
 
     @property
     def is_ready(self) -> bool:
@@ -299,7 +299,7 @@ class _FusedWorkspace:
             answer = self.solver.ask(
                 self.hessian, self.gradient, self.constraint[:rows], *bounds, self._sense[:count]
             )
-        except SolverError as error:
+        except Exception as error:  # a solver of the user's own raises anything, and C cannot hand it on
             self._failure = error
             return _FusedCode.FAILED
         self.x[:], self.multipliers[:count] = answer.x, answer.multipliers

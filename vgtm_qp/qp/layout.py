@@ -15,6 +15,7 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
+from vgtm_qp.qp.terms import OwnTerms
 from vgtm_qp.rows.tip import axes as tip_axes
 from vgtm_qp.rows.tip import levers
 
@@ -69,6 +70,8 @@ class Layout:
         How the curve's nodes are placed; None for a curve that constant tables describe.
     vertex_goals : tuple of int
         Control vertices that are drawn to goals.
+    own : OwnTerms or None
+        Objectives and rows of the user's own; an arm that has some is moved by the general engine.
     """
 
     arm: Arm
@@ -83,6 +86,7 @@ class Layout:
     reach: float = math.inf
     shape: CurveShape | None = None
     vertex_goals: tuple[int, ...] = ()
+    own: OwnTerms | None = None
 
     def giving_way(self) -> Layout:
         """Return the layout in which hard tracking becomes a penalty with a great weight.

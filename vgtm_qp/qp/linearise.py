@@ -149,6 +149,11 @@ class Linearisation:
             legs=Legs(legs.reshape(-1, 3), least),
             spacing_rhs=spacing if moves else 0.0 * spacing,
             curve=asked.curve,
+            own=(
+                layout.own.curvature(asked.q, asked.base, motion=moves)
+                if layout.own and layout.own.objectives
+                else None
+            ),
         )
 
 

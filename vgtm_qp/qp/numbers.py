@@ -13,6 +13,7 @@ from vgtm_qp.arm.arm import MotionRows
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.shape import CurveRows
+from vgtm_qp.qp.terms import Curvature
 
 
 @dataclass
@@ -148,6 +149,8 @@ class StepNumbers(RowNumbers):
     spacing_rhs : (S,)
     curve : CurveRows or None
         Replaces the curve's tables if ``Layout.general`` is given.
+    own : Curvature or None
+        Objectives of the user's own, over d_rho.
     """
 
     motion: MotionRows
@@ -161,6 +164,7 @@ class StepNumbers(RowNumbers):
     base_rhs: Array
     spacing_rhs: Array = field(default_factory=lambda: np.zeros(0))
     curve: CurveRows | None = None
+    own: Curvature | None = None
 
     def curve_rows(self, layout: Layout) -> tuple[Array, Array]:
         """Return the rows of points (3 K, D) and turns (R K, D) at the curve's nodes over d_c."""

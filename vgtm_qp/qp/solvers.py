@@ -15,6 +15,7 @@ from scipy import sparse
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError, nearest
+from vgtm_qp.parts import find_part, part_names
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.daqp import DAQP
@@ -22,6 +23,7 @@ from vgtm_qp.qp.dense import DenseAnswer, DenseSolver, check, check_question
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import chain_solver, prefers_staged
 from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers
+from vgtm_qp.qp.own import OwnSolver
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, NoAnswerError
 
 DEFAULT_SOLVER = "daqp"
@@ -52,7 +54,8 @@ def available_solvers() -> list[str]:
     """Return the names that `dense_solver` accepts, the default first."""
     import qpsolvers
 
-    return [DEFAULT_SOLVER, *sorted({"osqp", "piqp", *qpsolvers.available_solvers} - {DEFAULT_SOLVER})]
+    others = {"osqp", "piqp", *qpsolvers.available_solvers, *part_names("solver")}
+    return [DEFAULT_SOLVER, *sorted(others - {DEFAULT_SOLVER})]
 
 
 def dense_solver(name: str) -> DenseSolver:
@@ -62,9 +65,14 @@ def dense_solver(name: str) -> DenseSolver:
     ------
     SolverError
         There is no such solver, or it is not installed; the message lists those that are.
+    PartError
+        The name is that of a solver of the user's own, which cannot be imported.
     """
     if name == DEFAULT_SOLVER:
         return DAQP
+    own = find_part("solver", name)
+    if own is not None:
+        return OwnSolver(name, own)
     choices = available_solvers()
     if name not in choices:
         raise SolverError(

@@ -8,7 +8,7 @@ by those who call for steps, for the maneuver.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -21,9 +21,10 @@ from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
-from vgtm_qp.errors import Mistake, nearest
+from vgtm_qp.errors import Mistake, PartError, nearest
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
+from vgtm_qp.parts import find_part
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.problem import check_is_problem
@@ -34,6 +35,7 @@ from vgtm_qp.qp.layout import Layout, with_angles
 from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, dense_solver, make_solver
+from vgtm_qp.qp.terms import Inequality, Objective, OwnTerms
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.step.chain_engine import ChainEngine
@@ -50,16 +52,27 @@ _CONDENSED_ALL_THE_SAME = (
 )
 
 
-def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, solves: bool = True) -> Setup:
+def build_arm(
+    problem: Problem,
+    *,
+    compiled: bool = True,
+    plain: bool = False,
+    solves: bool = True,
+    objectives: Sequence[Objective] = (),
+    rows: Sequence[Inequality] = (),
+) -> Setup:
     """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
 
     A `plain` arm does not step in one call of C; its answers are the same. If the caller never `solves` a QP,
-    it gets the engine that is built fastest.
+    it gets the engine that is built fastest. `objectives` and `rows` of the user's own are for the QP of a
+    whole arm.
 
     Raises
     ------
     ProblemError
         There is no such arm, or it cannot do at all what the problem asks for; each mistake is named.
+    PartError
+        An objective or a row is none of this arm, or a row is broken at home.
     """
     check_is_problem(problem)
     check_solver(problem)
@@ -70,6 +83,8 @@ def build_arm(problem: Problem, *, compiled: bool = True, plain: bool = False, s
         task = TipTask(problem.end_effector.track, arm)
     with problem.blaming(("curve",), "a curve that starts in this arm's home pose"):
         home = home_curve(problem, arm, task)
+    if objectives or rows:
+        home = home._replace(layout=replace(home.layout, own=OwnTerms(arm, objectives, rows)))
     clearance, spec = problem.clearance, problem.arm_table
     solver, tracking = problem.method.solver, problem.method.tracking
     options: dict[str, Any] = {
@@ -147,7 +162,8 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         is_hard, mistakes = False, []
     if mistakes:
         raise problem.error(mistakes)
-    options = {key: getattr(spec, key) for key in ("degree", "bias", "tension") if hasattr(spec, key)}
+    keys = ("degree", "bias", "tension", "breaks", "extraction")
+    options = {key: getattr(spec, key) for key in keys if hasattr(spec, key)}
     family = make_family(spec.family, spec.control_vertices, **options)
     stride = stations.stride if is_hard else 1
     tracked = np.arange(len(stations) - 1, stride - 1, -stride)[::-1]
@@ -272,7 +288,7 @@ def make_engine(
     is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
     if layout.elastic_tip and not is_short:
         _LOG.warning(_CONDENSED_ALL_THE_SAME)
-    is_quick = not plain and not layout.elastic_tip
+    is_quick = not plain and not layout.elastic_tip and not layout.own
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
         fused = FusedSolver(layout, dense_solver(solver), compiled=compiled)
         return FusedEngine(layout, kinematics, task, fused)
@@ -280,6 +296,9 @@ def make_engine(
     along = chain_solver(layout, dense_solver(solver)) if is_staged else None
     if along is not None and ChainEngine.serves(along):
         return ChainEngine(along, kinematics, task)
+    if layout.own:
+        condensed = CondensedSolver(layout, dense_solver(solver))
+        return GeneralEngine(layout, kinematics, task, condensed, compiled=compiled)
     return GeneralEngine(layout, kinematics, task, along or make_solver(solver, layout), compiled=compiled)
 
 
@@ -297,7 +316,12 @@ def elastic_engine(
 def check_solver(problem: Problem) -> None:
     """Raise ProblemError if the problem's QP solver is unknown or not installed."""
     name = problem.method.solver
-    if name != DEFAULT_SOLVER and name not in (choices := available_solvers()):
+    try:
+        own = find_part("solver", name)
+    except PartError as error:
+        expected = f"a solver that can be used; {error}"
+        raise problem.error([problem.mistake(("method", "solver"), expected)]) from error
+    if own is None and name != DEFAULT_SOLVER and name not in (choices := available_solvers()):
         expected = f"one of the solvers installed here, {quoted(choices)}{nearest(name, choices)}"
         mistake = problem.mistake(("method", "solver"), expected)
         raise problem.error([mistake])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem import Problem, read_path
 from vgtm_qp.problem.goal import PathManeuver, WaypointManeuver
 from vgtm_qp.problem.table import Place, shown
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
@@ -27,15 +28,19 @@ _POINT = 1e-6
 """Length of the member that stands for a point, over the arm's unit: distances are printed less precisely."""
 
 
-def checked_arm(problem: Problem) -> Setup:
+def checked_arm(
+    problem: Problem, objectives: Sequence[Objective] = (), rows: Sequence[Inequality] = ()
+) -> Setup:
     """Return the arm of a problem, ready to move; warn of a curve with more freedom than the arm.
+
+    For `objectives` and `rows` see :func:`build_arm`.
 
     Raises
     ------
     ProblemError
         The end effector is asked for coordinates that no actuator can start to change.
     """
-    setup = build_arm(problem)
+    setup = build_arm(problem, objectives=objectives, rows=rows)
     mistakes = list(unreachable_tip(problem, setup))
     if mistakes:
         raise problem.error(mistakes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -13,6 +13,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.advance import Advancer
 from vgtm_qp.step.attempt import Attempt
@@ -46,9 +47,15 @@ class QPResolver(Resolver, serves="qp"):
 
     draws_vertices = True
 
-    def __init__(self, problem: Problem | Setup) -> None:
+    def __init__(
+        self,
+        problem: Problem | Setup,
+        *,
+        objectives: Sequence[Objective] = (),
+        rows: Sequence[Inequality] = (),
+    ) -> None:
         super().__init__()
-        setup = problem if isinstance(problem, Setup) else checked_arm(problem)
+        setup = problem if isinstance(problem, Setup) else checked_arm(problem, objectives, rows)
         self._separation = Separation(setup)
         self._actuation = Actuation(setup)
         self._shaping = Shaping(setup)
@@ -217,4 +224,7 @@ class QPResolver(Resolver, serves="qp"):
 
     def again(self, problem: Problem) -> QPResolver:
         """See :class:`Resolver`."""
-        return QPResolver(build_arm(problem))
+        own = self.setup.layout.own
+        if own is None:
+            return QPResolver(build_arm(problem))
+        return QPResolver(build_arm(problem, objectives=own.objectives, rows=own.rows))

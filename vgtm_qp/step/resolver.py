@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, NoReturn, Self
 
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import GoalError
+from vgtm_qp.errors import GoalError, PartError
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.full import StepQP
+from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.path import Path
@@ -50,6 +51,8 @@ class Resolver(ChangingScene):
     ------
     ProblemError
         The arm cannot be built, or not moved by that method.
+    PartError
+        An objective or row is none of this arm; or the method has no QP of the whole arm, to which they are added.
     """
 
     rank: int | None = None
@@ -68,8 +71,17 @@ class Resolver(ChangingScene):
             cls._method = serves
             Resolver._served[serves] = cls
 
-    def __new__(cls, problem: Problem | Setup) -> Self:
-        """Return an instance of the subclass for the problem's method; for a ``Setup`` of ``QPResolver``."""
+    def __new__(
+        cls,
+        problem: Problem | Setup,
+        *,
+        objectives: Sequence[Objective] = (),
+        rows: Sequence[Inequality] = (),
+    ) -> Self:
+        """Return an instance of the subclass for the problem's method; for a ``Setup`` of ``QPResolver``.
+
+        `objectives` of the user's own are added to those of the QP; each step keeps the `rows` of the user's own.
+        """
         chosen: type = cls
         if cls is Resolver:
             if isinstance(problem, Setup):
@@ -77,6 +89,7 @@ class Resolver(ChangingScene):
             else:
                 check_is_problem(problem)
                 chosen = Resolver._served[problem.method.name]
+                _check_has_qp(problem, [*objectives, *rows])
         return object.__new__(chosen)
 
     @property
@@ -166,7 +179,7 @@ class Resolver(ChangingScene):
         GoalError
             The arm has no curve, or the method keeps the number.
         CurveError
-            So few control vertices cannot keep both ends and the base tangent.
+            So few control vertices cannot keep both ends and the base tangent, or the family is one of the user's own.
         """
         self._refuse("change the number of control vertices")
 
@@ -311,3 +324,13 @@ class Resolver(ChangingScene):
 
     def _refuse(self, what: str, serving: str = '"qp"') -> NoReturn:
         raise GoalError(f'the method "{self._method}" cannot {what}; methods that can: {serving}')
+
+
+def _check_has_qp(problem: Problem, own: Sequence[object]) -> None:
+    """Raise PartError if there are terms of the user's own, and the method has no QP of the whole arm for them."""
+    method = problem.method
+    if own and (method.name != "qp" or method.goes_by_bays):
+        raise PartError(
+            f'the method "{method.name}" with tracking "{method.tracking}" has no QP of the whole arm; expected "qp" '
+            'with tracking "coupled" or "none" for terms of one\'s own'
+        )

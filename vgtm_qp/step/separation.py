@@ -1,4 +1,4 @@
-"""Clearance in a step: bodies and obstacles, bodies and bodies, and the angles between bodies that meet.
+"""Clearance in a step: bodies and obstacles, bodies and bodies, the angles between bodies that meet; the user's rows.
 
 A pair that is already below its clearance does not stop the arm: it must not come nearer, and is driven apart.
 """
@@ -13,6 +13,7 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.clearance import BetweenReport, Contacts, Pair
 from vgtm_qp.geometry.pairs import Wanted
 from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.qp.terms import OwnTerms
 from vgtm_qp.rows.angles import angle_gradients, angles, corners
 from vgtm_qp.rows.clearance import clearance_rows, slowed
 from vgtm_qp.step.setup import Setup
@@ -54,6 +55,8 @@ class Separation:
         self._setup, self._arm, self._monitor = setup, setup.arm, setup.monitor
         self._approach = _APPROACH if setup.slows_down else 1.0
         self._rounding, self._between = _ROUNDING * setup.arm.fineness, _BETWEEN * setup.arm.unit
+        own = setup.layout.own
+        self._own = own if own is not None and own.rows else None
         meeting = setup.monitor.bodies.joints
         self._corners = corners(meeting if setup.minimum_angle > 0.0 else meeting[:0])
 
@@ -82,12 +85,13 @@ class Separation:
     ) -> tuple[BetweenReport, Shortfall | None]:
         """Return the proof of :meth:`between` for the motion to `q`, and the pairs that are too near there.
 
-        The pairs are None if one of them was not too near `before`, or came nearer. The proof covers the end
+        The pairs are None if one of them was not too near `before`, or came nearer, or an angle or a row of the user's
+        own is not kept. The proof covers the end
         of the motion, unless points leave their chords: it then allows a little less clearance than a state
         must have.
         """
         report = self.between(state.q, q, state.time, time, before)
-        if not self._angles_hold(q):
+        if not self._angles_hold(q) or not (self._own is None or self._own.hold(q)):
             return report, None
         if report.certified and not before and not self._arm.leaves_chords:
             return report, {}
@@ -198,7 +202,13 @@ class Separation:
         rows = self._clearance_rows(q, contacts)
         if len(contacts):
             self._allow(rows, contacts, duration, short, gain)
-        return rows.joined(self._angle_rows(q, motion=motion)) if len(self._corners) else rows
+        if len(self._corners):
+            rows = rows.joined(self._angle_rows(q, motion=motion))
+        return rows if self._own is None else rows.joined(self._own_rows(self._own, q, motion=motion))
+
+    def _own_rows(self, own: OwnTerms, q: Array, *, motion: bool) -> ClearanceRows:
+        names = list(own.units)
+        return ClearanceRows(*own.linear_rows(q, motion=motion), names.__getitem__)
 
     def _wanted(self, expected: Array, duration: float) -> Wanted | None:
         """Return which pairs can become active in a displacement; None for all."""

@@ -51,6 +51,7 @@ class StopKind(StrEnum):
     OBSTACLE = "obstacle"
     MEMBERS = "members"
     ANGLE = "angle"
+    ROW = "row"
     STROKE = "stroke"
     RATE = "rate"
     ACCELERATION = "acceleration"
@@ -70,11 +71,11 @@ class Stop:
     Attributes
     ----------
     kind : StopKind
-        ``obstacle`` if one is in the set, then ``members`` or ``angle``, then limits by name; ``singular pose`` if the
-        tip cannot start in that direction even without limits, or the fixed quantities do not determine the nodes;
-        ``out of reach`` if the arm is stretched towards a goal further away. If no row forbids the step to first
-        order: ``acceleration`` if the arm could not brake after it, ``step limit`` if it is longer than the problem
-        allows, ``solver`` if the QP solver gave no accurate answer, else ``nonlinear``.
+        ``obstacle`` if one is in the set, then ``members``, ``angle`` or a ``row`` of the user's own, then limits by
+        name; ``singular pose`` if the tip cannot start in that direction even without limits, or the fixed quantities
+        do not determine the nodes; ``out of reach`` if the arm is stretched towards a goal further away. If no row
+        forbids the step to first order: ``acceleration`` if the arm could not brake after it, ``step limit`` if it is
+        longer than the problem allows, ``solver`` if the QP solver gave no accurate answer, else ``nonlinear``.
     multipliers : dict
         Rows of the set, the most decisive first, and the share of the path that each costs per metre (radian); 0 for
         an obstacle that strikes an arm at rest.
