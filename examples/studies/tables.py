@@ -41,6 +41,7 @@ OPTIONS = {
 COMMANDS = {
     **{name: f"vgtm study {name} {OPTIONS.get(name, '')}".strip() for name in STUDIES},
     "serial": "vgtm study robustness --arms serial --scenes 100 --seed 1991",
+    "changes": "vgtm study loops --scenes 100 --seed 20261203 --changes 0.4",
     "bench": "vgtm bench --seconds 0.7",
 }
 LONG = {"tracking"}
@@ -48,6 +49,7 @@ LONG = {"tracking"}
 SHORT = {
     **{name: f"vgtm study {name} --short" for name in STUDIES},
     "serial": "vgtm study robustness --arms serial --short",
+    "changes": "vgtm study loops --short --changes 0.4",
     "bench": "vgtm bench --scene cubes --bays 5 --tracking elastic --seconds 0.1 --steps 20 --baselines eq28",
 }
 
