@@ -10,7 +10,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError
-from vgtm_qp.live.stage import Stage
+from vgtm_qp.live.stage import PageStage
 from vgtm_qp.view.drawing import CURVE_COLOUR
 
 _TARGET_COLOUR = (214, 39, 40)
@@ -19,7 +19,7 @@ _TARGET_COLOUR = (214, 39, 40)
 class Handles:
     """The balls at tip and control vertices."""
 
-    def __init__(self, stage: Stage, pause: Callable[[], None]) -> None:
+    def __init__(self, stage: PageStage, pause: Callable[[], None]) -> None:
         self._stage, self._pause = stage, pause
         self.rebuild()
         stage.draws.append(self.draw)

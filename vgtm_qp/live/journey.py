@@ -8,7 +8,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.live.session import Session
-from vgtm_qp.live.stage import Stage
+from vgtm_qp.live.stage import PageStage
 
 _GOAL_COLOUR = (31, 119, 180)
 _LEAST_GAIN = 1e-3
@@ -61,7 +61,7 @@ class GoalTools:
         The last way to the goal.
     """
 
-    def __init__(self, stage: Stage, pause: Any) -> None:
+    def __init__(self, stage: PageStage, pause: Any) -> None:
         self._stage, self._pause = stage, pause
         gui, inbox = stage.server.gui, stage.inbox
         self.journey: Journey | None = None

@@ -11,7 +11,7 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError
 from vgtm_qp.live.session import Session
-from vgtm_qp.live.stage import Stage
+from vgtm_qp.live.stage import PageStage
 from vgtm_qp.problem.obstacle import Box, Cylinder, Sphere
 
 NONE = "(none)"
@@ -33,7 +33,7 @@ class ObstacleTools:
         Name of the chosen obstacle; empty if none is.
     """
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: PageStage) -> None:
         self._stage, self.chosen, self._is_dragged = stage, "", False
         gui, inbox = stage.server.gui, stage.inbox
         self._list = gui.add_dropdown("obstacle", (NONE,), initial_value=NONE)

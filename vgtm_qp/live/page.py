@@ -18,7 +18,7 @@ from vgtm_qp.live.player import Player
 from vgtm_qp.live.readout import read_out
 from vgtm_qp.live.session import Session
 from vgtm_qp.live.settings import ProblemChoice, Settings
-from vgtm_qp.live.stage import Stage
+from vgtm_qp.live.stage import PageStage
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.problem import Problem
 from vgtm_qp.result.manifest import stored_problem
@@ -79,7 +79,7 @@ class Page:
     """What the curves show of the last moment; a rest adds nothing to them."""
 
     def __init__(self, server: Any, session: Session, maneuver: Maneuver | None) -> None:
-        self._stage = Stage(server, session)
+        self._stage = PageStage(server, session)
         self._inbox = self._stage.inbox
         self._add_widgets(bool(maneuver))
         self._handles = Handles(self._stage, self._player.pause)

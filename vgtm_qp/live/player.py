@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vgtm_qp.live.stage import Stage
+from vgtm_qp.live.stage import PageStage
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.view.drawing import resampled
@@ -22,7 +22,7 @@ class Player:
     is_playing : bool
     """
 
-    def __init__(self, stage: Stage, tell: Callable[[], None]) -> None:
+    def __init__(self, stage: PageStage, tell: Callable[[], None]) -> None:
         self._stage, self._tell = stage, tell
         self._maneuver: Maneuver | None = None
         self.moment, self.is_playing = 0.0, False

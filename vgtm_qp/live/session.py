@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError
-from vgtm_qp.live.reading import OUTCOMES, Hold, Reading, TooNear
+from vgtm_qp.live.holding import hold_of, pairs_too_near
+from vgtm_qp.live.reading import OUTCOMES, Reading
 from vgtm_qp.methods import Resolver, method_name
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.problem import Problem
@@ -311,7 +312,7 @@ class Session:
         clearance, pair = monitor.least(points, state.time, among="obstacles")
         last = self._last
         outcome = "at rest" if last is None else "stopped" if self._halted else OUTCOMES[last.status]
-        too_near = self._too_near()
+        too_near = pairs_too_near(self._resolver)
         holding = [name for name in self._held_by if name.startswith("clearance: ")]
         is_held = outcome in ("slowed", "blocked", "stopped")
         wanted = holding if is_held else [f"clearance: {name}" for name, *_ in too_near]
@@ -324,45 +325,11 @@ class Session:
             self_clearance=monitor.least(points, state.time, among="members")[0],
             nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),
             too_near=too_near,
-            hold=self._hold(wanted) if wanted else None,
+            hold=hold_of(setup, state, wanted) if wanted else None,
             gap=setup.gap_of(state),
             gave_way=last is not None and last.gave_way,
             step_time=self._step_time,
         )
-
-    def _too_near(self) -> tuple[TooNear, ...]:
-        """Return the pairs below their clearance, the worst first."""
-        monitor = self._resolver.setup.monitor
-        short = self._resolver.too_near(self.state)
-        found = [
-            TooNear(
-                monitor.names.clearance(pair).removeprefix("clearance: "),
-                distance,
-                monitor.self_safe if pair.is_self else monitor.safe,
-            )
-            for pair, distance in short.items()
-        ]
-        return tuple(sorted(found, key=lambda one: one.distance - one.least))
-
-    def _hold(self, wanted: list[str]) -> Hold | None:
-        """Return the first of the `wanted` clearance rows that is near, with its nearest points; None if none is."""
-        setup, state = self._resolver.setup, self.state
-        points = setup.arm.points(state.q)
-        near = setup.monitor.near(points, state.time)
-        rows = {near.name(k): k for k in np.argsort(-near.distance).tolist()}
-        k = next((rows[name] for name in wanted if name in rows), None)
-        if k is None:
-            return None
-        body, other, is_self = near.pair(k)
-        bodies, names = setup.monitor.bodies, near.names
-        ours = near.weights[k, :2] @ points[near.points[k, :2]]
-        away = float(bodies.radius[body] + near.distance[k]) * near.normal[k]
-        obstacle = "" if is_self else names.obstacles[names.owner[other]]
-        shown: tuple[int, ...] = (body, other) if is_self else (body,)
-        if len(bodies.names) != len(self.drawing.arm.radius):
-            shown = ()
-        name, distance = near.name(k).removeprefix("clearance: "), float(near.distance[k])
-        return Hold(name, distance, shown, obstacle, np.stack([ours, ours - away]))
 
 
 def _with_curve(state: State, setup: Setup) -> State:

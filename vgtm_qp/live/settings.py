@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.live.stage import Stage
+from vgtm_qp.live.stage import PageStage
 from vgtm_qp.methods import method_name, methods_for
 from vgtm_qp.problem import Problem, bundled_problems, load_problem
 
@@ -27,7 +27,7 @@ _SLIDERS = (
 class ProblemChoice:
     """The drop-down of problems: the one that the page was opened with, and those of the package."""
 
-    def __init__(self, stage: Stage, load: Callable[[Problem], None]) -> None:
+    def __init__(self, stage: PageStage, load: Callable[[Problem], None]) -> None:
         self._given, self._load = stage.session.problem, load
         source, bundled = self._given.source, bundled_problems()
         name = source.stem if source is not None else self._given.name or "as given"
@@ -44,7 +44,7 @@ class ProblemChoice:
 class Settings:
     """Method, least clearance and weights of the session that is shown."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: PageStage) -> None:
         self._stage = stage
         self._changes: dict[str, Any] = {}
         gui, inbox, problem = stage.server.gui, stage.inbox, stage.session.problem

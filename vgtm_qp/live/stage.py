@@ -15,7 +15,7 @@ from vgtm_qp.view.drawing import camera_for
 from vgtm_qp.view.scene import ArmScene
 
 
-class Stage:
+class PageStage:
     """The session that is shown, and its picture.
 
     Attributes

@@ -160,7 +160,7 @@ class ArmScene:
         Its two points (2, 3), m, are those where a body and an obstacle are nearest, and have the label `said`; None
         for no line.
         """
-        self._marked = list(bodies)
+        self._marked = [body for body in bodies if body < len(self._drawing.arm.radius)]
         for drawn in self._obstacles.values():
             colour = MARK_COLOUR if drawn.mesh.name in obstacles else OBSTACLE_COLOUR
             if tuple(drawn.surface.color) != tuple(_rgb(colour)):
