@@ -106,11 +106,9 @@ class Clearance:
 
     def _watch(self) -> Watch | None:
         """Return what watches the scene, if it can be watched and once that is compiled."""
-        if not self.is_watched:
-            return None
-        if self._watching is None and is_ready(self.scene.shapes):
+        if self._watching is None and self.is_watched and is_ready(self.scene.shapes):
             self._watching = Watch(self.scene)
-        return self._watching
+        return self._watching if self.is_watched else None
 
     def near(
         self,
@@ -237,10 +235,7 @@ class Clearance:
         floor: float,
         self_floor: float | None = None,
     ) -> BetweenReport:
-        """Prove that no surface distance falls below its floor while the points move on straight lines.
-
-        See :meth:`along`, for `start` and `end` (P, 3), m.
-        """
+        """Prove what :meth:`along` proves, for one straight motion from `start` to `end` (P, 3), m."""
         return self.along(np.stack([start, end]), start_time, end_time, floor, self_floor)
 
     def along(
@@ -273,8 +268,7 @@ class Clearance:
         thorough : bool
             False if nothing is tried after the watch, where there is one.
         lowered : Lowered or None
-            Other floors of some pairs, minus infinity for those that do not count. The watch does not know them, and is
-            not asked then.
+            Other floors of some pairs, minus infinity for those that do not count; the watch is not asked then.
 
         Raises
         ------
@@ -289,7 +283,9 @@ class Clearance:
         pieces, lowest = len(places) - 1, np.inf
         for k in range(pieces):
             since, until = (start_time + j / pieces * (end_time - start_time) for j in (k, k + 1))
-            report = self._between(places[k], places[k + 1], since, until, floor, self_floor, lowered or {})
+            report = self._between(
+                places[k], places[k + 1], (since, until), (floor, self_floor), lowered or {}
+            )
             lowest = min(lowest, report.clearance)
             if not report.certified:
                 break
@@ -299,14 +295,12 @@ class Clearance:
         self,
         start: Array,
         end: Array,
-        start_time: float,
-        end_time: float,
-        floor: float,
-        self_floor: float,
+        times: tuple[float, float],
+        floors: tuple[float, float],
         lowered: Lowered,
     ) -> BetweenReport:
         """Return the proof for one piece, without the watch."""
-        floor, self_floor = max(floor, 0.0), max(self_floor, 0.0)
+        (start_time, end_time), (floor, self_floor) = times, (max(least, 0.0) for least in floors)
         motion = self._candidates.cover(start, start_time, floor, self_floor, end, end_time)
         lowest, fractions = min(self._candidates.beyond(motion)), [np.zeros(0)]
         parts: list[Found] = []
@@ -317,20 +311,15 @@ class Clearance:
             lowest = min(lowest, others, float(lower[~open_].min(initial=np.inf)))
             rows = np.flatnonzero(open_)
             if len(rows):
-                floors = group.floors(rows, least, lowered) if lowered else least
-                result = sweep_group(group, rows, start, end, start_time, end_time, floors)
+                kept = group.floors(rows, least, lowered) if lowered else least
+                result = sweep_group(group, rows, start, end, start_time, end_time, kept)
                 lowest = min(lowest, result.lowest)
                 if len(result.rows):
                     parts.append((group.numbers[result.rows], result.contacts))
                     fractions.append(result.fraction)
-        for numbers, found in self._solids.enclosed(start, start_time):
-            owner = self.pieces.obstacle[numbers[:, 5]].tolist()
-            counts = [
-                (b, o, False) not in lowered for b, o in zip(numbers[:, 4].tolist(), owner, strict=True)
-            ]
-            if any(counts):
-                parts.append((numbers[counts], found[counts]))
-                fractions.append(np.full(sum(counts), 1.0 / 32.0))
+        for part in self._solids.enclosed(start, start_time, besides=lowered):
+            parts.append(part)
+            fractions.append(np.full(len(part[0]), 1.0 / 32.0))
         failing = self.scene.contacts(parts)
         lowest = min(lowest, float(failing.distance.min(initial=np.inf)))
         return BetweenReport(not parts, lowest, np.concatenate(fractions), failing)

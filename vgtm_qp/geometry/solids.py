@@ -6,7 +6,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.exact import NORMAL
-from vgtm_qp.geometry.groups import Found, Group, Scene
+from vgtm_qp.geometry.groups import Found, Group, Lowered, Scene
 
 _ROWS = 200_000
 
@@ -23,8 +23,12 @@ class Solids:
         }
         self._meshes = [(k, t, t.min(axis=(0, 1)), t.max(axis=(0, 1))) for k, t in meshes.items()]
 
-    def enclosed(self, X: Array, time: float) -> list[Found]:
-        """Return contacts of the bodies with an end inside a closed mesh; their distances are negative."""
+    def enclosed(self, X: Array, time: float, *, besides: Lowered | None = None) -> list[Found]:
+        """Return contacts of the bodies with an end inside a closed mesh; their distances are negative.
+
+        Pairs `besides` are left out.
+        """
+        known = besides or {}
         bodies, pieces = self._scene.bodies, self._scene.pieces
         parts: list[Found] = []
         for obstacle, triangles, low, high in self._meshes:
@@ -33,6 +37,7 @@ class Solids:
             if inside.any():
                 inside[inside] = winding_number(points[inside], triangles) > 0.5
             body = np.flatnonzero(inside[bodies.points].any(axis=1))
+            body = np.array([b for b in body.tolist() if (b, obstacle, False) not in known], dtype=np.int64)
             if not len(body):
                 continue
             piece = np.flatnonzero(pieces.obstacle == obstacle)
