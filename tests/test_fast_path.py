@@ -43,7 +43,8 @@ def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, cha
     problem = problem.replace(changes)
     slow = build_arm(problem, compiled=False, plain=True)
     monitor = slow.monitor
-    options = {key: getattr(monitor, key) for key in ("safe", "influence", "self_collision")}
+    kept = ("safe", "self_safe", "influence", "self_collision")
+    options = {key: getattr(monitor, key) for key in kept}
     by_fcl = monitor.scene.fcl is not None
     listed = Clearance(monitor.bodies, monitor.obstacles, watch=False, by_fcl=by_fcl, **options)
     fast, plain = vq.Resolver(problem), vq.Resolver(replace(slow, monitor=listed))
