@@ -45,7 +45,7 @@ def random_problem(random):
 
 
 def test_what_is_named_lets_the_arm_go_on_and_nothing_else_does(rng):
-    """Of ten random stops at most two have no remedy (of 600 ten had none), and no arm goes on as it is."""
+    """Of random stops at most one in ten has no remedy, and no arm goes on as it is."""
     stops, helped = 0, 0
     while stops < 10:
         try:
@@ -64,10 +64,10 @@ def test_what_is_named_lets_the_arm_go_on_and_nothing_else_does(rng):
             assert 1 <= len(remedy.changes) <= 3
             again = ManeuverAttempt(problem, attempt.resolver.relaxed(remedy))
             again.plan, again.value = attempt.plan, attempt.value
-            again.run(None)
+            again.resumed(again.run(None), None)
             assert again.progress > attempt.progress, str(remedy)
         assert attempt.resolver.state is kept
-    assert helped >= stops - 2, (helped, stops)
+    assert helped >= stops - 1, (helped, stops)
 
 
 def test_an_arm_that_stalls_and_is_free_in_a_later_step_goes_on():
