@@ -14,10 +14,10 @@ import vgtm_qp as vq
 from vgtm_qp.cli import main
 from vgtm_qp.errors import ResultError
 from vgtm_qp.export.html import read_out
-from vgtm_qp.maneuver.solve import ManeuverAttempt, helpful_remedies
+from vgtm_qp.maneuver.solve import STALLED_STEPS, ManeuverAttempt, helpful_remedies
 from vgtm_qp.methods import Resolver, with_method
 from vgtm_qp.step.first_order import ANGLE, CLEARANCE, MEMBERS, Limit
-from vgtm_qp.step.remedies import Change, Remedy, relaxed, resorts
+from vgtm_qp.step.remedies import Change, Remedy, relaxed, remedies, resorts
 from vgtm_qp.step.stops import StopKind
 
 WALL = {"name": "wall", "shape": "box", "center": [1.2, 0.0, 2.0], "size": [0.3, 6.0, 6.0]}
@@ -88,6 +88,38 @@ def test_an_arm_that_stalls_and_is_free_in_a_later_step_goes_on():
     assert attempt.progress > stalled + 0.01
     assert not attempt.goes_on(Remedy((), 1.0))
     assert vq.solve(problem.replace({"method.retries": False})).reached == pytest.approx(attempt.progress)
+
+
+def test_an_arm_that_gains_nothing_gives_up_whatever_was_foretold(monkeypatch):
+    """What is tried and what is done may differ for ever, in their last digits."""
+    problem = three_bays(
+        obstacle=[WALL], **{"maneuver.waypoint": [{"time": 4.0, "position": [1.1, 0.0, 1.9]}]}
+    )
+    attempt = ManeuverAttempt(problem, Resolver(problem))
+    stop = attempt.run(None)
+    assert stop is not None
+    attempt.stalled = STALLED_STEPS
+    monkeypatch.setattr(attempt, "goes_on", lambda _: True)
+    assert attempt.resumed(stop, None) is not None
+
+
+def test_an_obstacle_may_be_out_of_the_way_but_not_the_arm_itself():
+    setup = Resolver(three_bays(obstacle=[WALL])).setup
+
+    class Free:
+        progress, names, limits = 1.0, (), ()
+
+        def without(self, limits):
+            return float(bool(limits)), np.ones(2)
+
+        def least_changes(self, limits, most):
+            return np.full(len(limits), 99.0) if all(map(math.isinf, most)) else None
+
+    for limit, text in ((Limit(CLEARANCE, "wall"), "out of the way"), (Limit(MEMBERS), "mm less clearance")):
+        program = Free()
+        program.limits = (limit, limit)
+        (remedy,) = remedies(setup, program)
+        assert text in str(remedy)
 
 
 def test_a_remedy_of_the_wall_is_its_clearance_and_it_frees_the_arm_from_home_too():

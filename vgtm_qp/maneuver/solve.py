@@ -177,8 +177,11 @@ class ManeuverAttempt:
         path = self.plan.path
         return (self.value - path.start) / (path.end - path.start)
 
-    def run(self, progress: Progress | None) -> Stop | None:
-        """Step along the plan; return why the arm stopped for good, or None if it reached the end."""
+    def run(self, progress: Progress | None, *, patience: int = STALLED_STEPS) -> Stop | None:
+        """Step along the plan; return why the arm stopped for good, or None if it reached the end.
+
+        It gives up after `patience` steps in a row without progress.
+        """
         resolver, plan, arm = self.resolver, self.plan, self.resolver.setup.arm
         last = float(plan.marks[-1])
         keeps_moving = bool(np.isfinite(arm.acceleration[arm.actuators]).any())
@@ -198,7 +201,7 @@ class ManeuverAttempt:
                 self._come_to_rest()
                 return stop
             self.stalled = self.stalled + 1 if step.progress < STALLED_PROGRESS else 0
-            if self.stalled >= STALLED_STEPS:
+            if self.stalled >= patience:
                 return self._explain(aim, dt, step)
             if progress is not None:
                 progress(self.progress, step)
@@ -207,11 +210,15 @@ class ManeuverAttempt:
     def resumed(self, stop: Stop | None, progress: Progress | None) -> Stop | None:
         """Go on from a stop at which the arm stalled, wherever a later step is free; return the stop that stays.
 
-        An arm may move by millimetres off its curve for several steps, without progress, and then be free.
+        An arm may move by millimetres off its curve for several steps, without progress, and then be free. It has the
+        steps that :meth:`goes_on` tries for it, and gives up where it gains next to nothing.
         """
+        patience = STALLED_STEPS + _TRIED_STEPS
         while stop is not None and self.stalled >= STALLED_STEPS and self.goes_on(_NOTHING):
-            self.stalled = 0
-            stop = self.run(progress)
+            before, self.stalled = self.progress, 0
+            stop = self.run(progress, patience=patience)
+            if self.progress <= before + _FURTHER:
+                break
         return stop
 
     def goes_on(self, remedy: Remedy) -> bool:

@@ -158,7 +158,8 @@ def _remedy(setup: Setup, program: FirstOrder, limits: tuple[Limit, ...]) -> Rem
         # Obstacles in the set have to go; the other limits then change as much as needed.
         amounts = program.least_changes(limits, [math.inf] * len(limits))
         assert amounts is not None, "without these limits the arm is free"
-        amounts = np.where(amounts > most, math.inf, amounts)
+        is_obstacle = np.array([limit.kind == CLEARANCE for limit in limits])
+        amounts = np.where(amounts > most, np.where(is_obstacle, math.inf, most), amounts)
     changes = []
     for limit, amount, greatest in zip(limits, amounts.tolist(), most, strict=True):
         size, unit = amount, "m"
