@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from queue import Queue
 from time import monotonic
 from typing import Any
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, FLAGS, PATIENCE
 
 import vgtm_qp as vq
 from vgtm_qp.live.journey import Journey
@@ -23,18 +23,7 @@ pytest.importorskip("viser")
 
 from vgtm_qp.view.server import viser_server
 
-CHROMIUM = Path("/usr/bin/chromium")
-FLAGS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--use-gl=angle",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--disable-background-networking",
-]
 PERIOD = 1.0 / 30.0
-PATIENCE = 300.0
-"""Seconds that a busy machine may take for what an idle one does at once; every wait ends with what is waited for."""
 OF_VISER = "Unable to preventDefault inside passive event listener invocation."
 """What the browser says whenever a hand takes hold of a ball: viser's page listens to pointers passively. Harmless."""
 

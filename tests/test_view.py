@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, FLAGS, PATIENCE
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -24,19 +25,8 @@ from vgtm_qp.live.readout import read_out
 from vgtm_qp.live.session import Session
 from vgtm_qp.methods import method_name, methods_for
 
-CHROMIUM = Path("/usr/bin/chromium")
-FLAGS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--use-gl=angle",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--disable-background-networking",
-]
 PERIOD = 1.0 / 30.0
 SCENE_WIDTH = 600
-PATIENCE = 300.0
-"""Seconds that a busy machine may take for what an idle one does at once; every wait ends with what is waited for."""
 
 
 @pytest.fixture(scope="module")

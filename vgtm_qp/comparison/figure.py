@@ -144,12 +144,17 @@ def _draw_curves(figure: Figure, problems: list[str], pairs: list[tuple[Row, Man
         near = np.where(np.isfinite(maneuver.clearance), 1000.0 * maneuver.clearance, np.nan)
         clearance.plot(maneuver.progress, near, **look)
         drift.semilogy(maneuver.progress, np.maximum(off, _FLOOR), **look)
-        safe.add(1000.0 * float(maneuver.manifest["problem"]["clearance"]["safe"]))
-    floor = min(0.0, clearance.get_ylim()[0])
-    clearance.axhspan(floor, min(safe, default=floor), **FORBIDDEN)
+        if np.isfinite(near).any():
+            safe.add(1000.0 * float(maneuver.manifest["problem"]["clearance"]["safe"]))
+    if safe:
+        floor = min(0.0, clearance.get_ylim()[0])
+        clearance.axhspan(floor, min(safe), **FORBIDDEN)
+        clearance.set_ylim(bottom=floor)
+    else:
+        clearance.set_yticks([])
+        clearance.text(0.5, 0.5, "no obstacles", ha="center", color=DARK, transform=clearance.transAxes)
     for one in safe:
         clearance.axhline(one, color=BOUND_COLOUR, linewidth=0.6)
-    clearance.set_ylim(bottom=floor)
     clearance.set(xlim=(0.0, 1.0), xlabel="part of the path", ylabel="clearance at the states (mm)")
     drift.set(xlim=(0.0, 1.0), xlabel="part of the path", ylabel="change of a fixed member (m)")
     handles = [Line2D([], [], label=method, **look) for method, look in styles.items()]

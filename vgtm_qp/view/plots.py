@@ -32,14 +32,15 @@ def _draw_clearance(axes: Axes, maneuver: Result) -> None:
     for (name, values), colour, dash in zip(shown, COLOURS, DASHES, strict=False):
         axes.plot(maneuver.time, 1000.0 * values, color=colour, linestyle=dash, label=name)
     floor = min(0.0, *(1100.0 * float(values.min()) for _, values in shown)) if shown else 0.0
-    kept = np.full(len(maneuver.time), safe)
-    for scene in maneuver.manifest.get("scenes") or ():
-        kept[scene["row"] :] = 1000.0 * scene["safe"]
-    if np.ptp(kept) > 0.0:
-        label = f"too near an obstacle: below {kept.min():g} to {kept.max():g} mm"
-        axes.fill_between(maneuver.time, floor, kept, step="post", label=label, **FORBIDDEN)
-    else:
-        axes.axhspan(floor, safe, label=f"too near an obstacle: below {safe:g} mm", **FORBIDDEN)
+    if any(name == "to obstacles" for name, _ in shown):
+        kept = np.full(len(maneuver.time), safe)
+        for scene in maneuver.manifest.get("scenes") or ():
+            kept[scene["row"] :] = 1000.0 * scene["safe"]
+        if np.ptp(kept) > 0.0:
+            label = f"too near an obstacle: below {kept.min():g} to {kept.max():g} mm"
+            axes.fill_between(maneuver.time, floor, kept, step="post", label=label, **FORBIDDEN)
+        else:
+            axes.axhspan(floor, safe, label=f"too near an obstacle: below {safe:g} mm", **FORBIDDEN)
     if rules.get("self_collision", True) and any(name == bodies for name, _ in shown):
         least = SELF_SHARE * safe if own is None else 1000.0 * float(own)
         axes.axhline(least, color=COLOURS[1], linestyle=":", label=f"least {bodies}: {least:g} mm")
