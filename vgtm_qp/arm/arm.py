@@ -339,6 +339,13 @@ class Arm(ABC):
         """Return a bound, m, of how much nearer two points come than their chords when q moves straight."""
 
     @abstractmethod
+    def tip_deviation(self, start: Array, end: Array, reach: float) -> float:
+        """Return a bound, m, of how far what is fixed to the end effector leaves its chord when q moves straight.
+
+        It holds for points within `reach`, m, of the end effector, which has a frame.
+        """
+
+    @abstractmethod
     def travel(self, motion: Array) -> float:
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
 

@@ -193,16 +193,18 @@ class JointSpaceArm(Arm):
         return float(turn @ self.reaches + slide.sum() + np.abs(motion[-6:-3]).max(initial=0.0))
 
     def deviation(self, start: Array, end: Array) -> float:
-        """See ``arm.Arm``: for each of two points, an eighth of a bound of a node's second derivative.
+        return 2.0 * self.tip_deviation(start, end, 0.0)
+
+    def tip_deviation(self, start: Array, end: Array, reach: float) -> float:
+        """See ``arm.Arm``: an eighth of a bound of a point's second derivative, which holds for all nodes, too.
 
         A point's velocity is sum w_j a_j x (X - o_j) + sum d_j a_j. The axes a_j turn with all joints before
         them; X - o_j changes only by joint j and those beyond it.
         """
-        turn, slide = self._motions(end - start)
+        (turn, slide), reaches = self._motions(end - start), self.reaches + reach
         before = np.concatenate([[0.0], np.cumsum(turn)[:-1]])
-        beyond = np.cumsum((turn * self.reaches + slide)[::-1])[::-1]
-        bend = turn @ (2.0 * before * self.reaches + beyond) + slide @ before
-        return 2.0 * float(bend) / 8.0
+        beyond = np.cumsum((turn * reaches + slide)[::-1])[::-1]
+        return float(turn @ (2.0 * before * reaches + beyond) + slide @ before) / 8.0
 
     def _motions(self, motion: Array) -> tuple[Array, Array]:
         """Return turns (J + 1,), rad, and slides (J + 1,), m; the base comes first, with twice its turn."""

@@ -1,4 +1,4 @@
-"""The bodies of an arm: capsules, each spanned by two points."""
+"""The bodies of an arm, and what it carries: capsules, each spanned by two points."""
 
 from __future__ import annotations
 
@@ -28,6 +28,8 @@ class Bodies:
         Word for such a body in names, as in ``"member L3-2"``.
     touching : (K, 2) int
         Further pairs that may touch.
+    carried : int
+        Number of the last ones that belong to what the arm carries.
     """
 
     points: Index
@@ -36,6 +38,7 @@ class Bodies:
     names: tuple[str, ...]
     kind: str
     touching: Index = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    carried: int = 0
 
     def __len__(self) -> int:
         return len(self.points)
@@ -51,8 +54,9 @@ class Bodies:
         return np.asarray(allowed)
 
     def called(self, body: int) -> str:
-        """Return kind and name of a body: ``"member L3-2"``."""
-        return f"{self.kind} {self.names[body]}"
+        """Return kind and name of a body: ``"member L3-2"``, ``"carried crate"``."""
+        kind = self.kind if body < len(self) - self.carried else "carried"
+        return f"{kind} {self.names[body]}"
 
 
 def capsules(

@@ -63,13 +63,22 @@ class Clearance:
         unit: float = 1.0,
     ) -> None:
         self.scene = Scene(bodies, obstacles, self_collision, by_fcl, unit)
-        self.bodies, self.self_collision = bodies, self_collision
+        self.self_collision = self_collision
         self.safe, self.self_safe, self.influence = safe, self_safe, influence
-        self._widest = float(bodies.radius.max(initial=0.0))
         self._may_watch = watch and compiler() is not None
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget all pairs, and see what the scene is."""
+        self._widest = float(self.bodies.radius.max(initial=0.0))
         self._watching: Watch | None = None
-        self._candidates = Candidates(self.scene, influence, self.self_influence)
+        self._candidates = Candidates(self.scene, self.influence, self.self_influence)
         self._look()
+
+    @property
+    def bodies(self) -> Bodies:
+        """The bodies of the arm, and what it carries."""
+        return self.scene.bodies
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
@@ -98,6 +107,12 @@ class Clearance:
         if self._watching is not None:
             self._watching.forget_pieces()
         self._look()
+
+    def span(self, bodies: Bodies) -> None:
+        """Keep clear with other `bodies` from now on."""
+        self.scene.bodies = bodies
+        self.scene.put(self.obstacles)
+        self._begin()
 
     def _look(self) -> None:
         """See whether the obstacles can be watched, and which of them enclose space."""

@@ -32,6 +32,12 @@ class PairNames:
         other = self.bodies.called(pair.other) if pair.is_self else self.obstacles[self.owner[pair.other]]
         return f"clearance: {self.bodies.called(pair.body)} / {other}"
 
+    def plain(self, pair: Pair) -> str:
+        """Return the name of a pair as records have it, without kinds: ``"L3-2 / right cube"``."""
+        names = self.bodies.names
+        other = names[pair.other] if pair.is_self else self.obstacles[self.owner[pair.other]]
+        return f"{names[pair.body]} / {other}"
+
 
 @dataclass(frozen=True, eq=False)
 class Contacts:

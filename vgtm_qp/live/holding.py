@@ -31,7 +31,7 @@ def hold_of(setup: Setup, state: State, wanted: Sequence[str]) -> Hold | None:
 
     None if none of them is near.
     """
-    points = setup.arm.points(state.q)
+    points = setup.carrier.points(state.q)
     near = setup.monitor.near(points, state.time)
     rows = {near.name(k): k for k in np.argsort(-near.distance).tolist()}
     k = next((rows[name] for name in wanted if name in rows), None)

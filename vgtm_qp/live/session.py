@@ -303,12 +303,12 @@ class Session:
     def clearance(self) -> float:
         """Least distance to an obstacle, m; infinite without one."""
         setup, state = self._resolver.setup, self.state
-        return setup.monitor.least(setup.arm.points(state.q), state.time, among="obstacles")[0]
+        return setup.monitor.least(setup.carrier.points(state.q), state.time, among="obstacles")[0]
 
     def reading(self) -> Reading:
         """Return the readings of the present state."""
         setup, state = self._resolver.setup, self.state
-        monitor, points = setup.monitor, setup.arm.points(state.q)
+        monitor, points = setup.monitor, setup.carrier.points(state.q)
         clearance, pair = monitor.least(points, state.time, among="obstacles")
         last = self._last
         outcome = "at rest" if last is None else "stopped" if self._halted else OUTCOMES[last.status]

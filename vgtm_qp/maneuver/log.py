@@ -98,6 +98,9 @@ class Log:
         set-up.
         """
         resolver, setup, (first, *scenes) = self._resolver, self._resolver.setup, self._scenes
+        if first.carried:
+            # The problem has nothing that is carried.
+            scenes = self._scenes
         own = setup.layout.own
         manifest = {
             "schema_version": SCHEMA_VERSION,
@@ -144,16 +147,18 @@ class _RecordedScene:
     ----------
     recovered : list of dict
         Pairs that are too near in that state and that the method drives apart, with distances, m.
+    carried : list of dict
+        Records of what the arm carries.
     """
 
     def __init__(self, resolver: Resolver, row: int, state: State) -> None:
         setup = resolver.setup
         self._row, self._obstacles = row, setup.monitor.obstacles
         self._safe, self._self_safe = setup.safe, setup.self_safe
-        names, kind = setup.monitor.names, setup.arm.bodies.kind
+        self.carried = [body.record() for body in setup.carrier.carried]
         found: dict[str, float] = {}
         for pair, distance in resolver.too_near(state).items():
-            name = names.clearance(pair).removeprefix(f"clearance: {kind} ").replace(f"/ {kind} ", "/ ")
+            name = setup.monitor.names.plain(pair)
             found[name] = min(found.get(name, np.inf), distance)
         self.recovered = [{"pair": pair, "distance": apart} for pair, apart in sorted(found.items())]
 
@@ -175,4 +180,5 @@ class _RecordedScene:
             "self_safe": self._self_safe,
             "meshes": self.meshes,
             "recovered": self.recovered,
+            **({"carried": self.carried} if self.carried else {}),
         }

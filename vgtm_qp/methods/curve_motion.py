@@ -159,8 +159,9 @@ class CurveMotion:
         A member is assumed to move with its nearest point of the curve.
         """
         setup = self._setup
-        pairs = setup.monitor.near(setup.arm.points(X), time, setup.influence)
-        with_obstacle = np.flatnonzero(~pairs.is_self)
+        pairs = setup.monitor.near(setup.carrier.points(X), time, setup.influence)
+        # What the arm carries has no place on the curve.
+        with_obstacle = np.flatnonzero(~pairs.is_self & (pairs.body < len(setup.arm.bodies)))
         members = truss_of(setup.arm).members[pairs.body[with_obstacle]]
         t, normal = pairs.weights[with_obstacle, 1], pairs.normal[with_obstacle]
         s = np.clip((1.0 - t) * self._node_s[members[:, 0]] + t * self._node_s[members[:, 1]], 0.0, 1.0)

@@ -93,8 +93,8 @@ def potential_field(setup: Setup, q: Array, time: float) -> tuple[Array, Array]:
     at most twice their sum.
     """
     influence, count = setup.influence, len(setup.arm.node_names)
-    pairs = setup.monitor.near(setup.arm.points(q), time, influence)
-    nodes, rows = setup.arm.over_nodes(q, pairs.points, pairs.weights[:, :, None] * pairs.normal[:, None])
+    pairs = setup.monitor.near(setup.carrier.points(q), time, influence)
+    nodes, rows = setup.carrier.over_nodes(q, pairs.points, pairs.weights[:, :, None] * pairs.normal[:, None])
     gradient, blocks = np.zeros((count, 3)), np.zeros((count, 3, 3))
     np.add.at(gradient, nodes, potential_slope(pairs.distance, influence)[:, None, None] * rows)
     curvature = potential_curvature(pairs.distance, influence) * np.where(pairs.is_self, 2.0, 1.0)

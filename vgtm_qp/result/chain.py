@@ -255,6 +255,22 @@ class RecordedChain:
         A slide changes its vector at a constant speed v along itself. So |p''| <= (sum w)^2 |p| + 2 v sum w.
         The base's rotation vector counts twice, as its axis turns too.
         """
+        origins, own, _ = self._bends(before, after)
+        points = np.concatenate([origins, own], axis=-1)
+        return np.asarray(points[..., self.links[link]].max(axis=-1))
+
+    @property
+    def tip_joints(self) -> Index:
+        """The place at which the links end that what is carried may touch."""
+        return np.array([len(self.quantity_names) + 1])
+
+    def tip_bend(self, before: Array, after: Array, reach: Array) -> Array:
+        """Return (P,) such bounds, m, of points fixed to the tip at distances `reach` (P,), m, from it."""
+        origins, _, turning = self._bends(before, after)
+        return np.asarray(origins[-1] + turning[-1] * reach)
+
+    def _bends(self, before: Array, after: Array) -> tuple[Array, Array, Array]:
+        """Return the bounds of origins (..., J + 2) and of bodies' points (..., P), and squared speeds (..., J + 1)."""
         count, revolute = len(self.quantity_names), self.revolute
         moved = np.abs(after - before)
         base = 2.0 * np.linalg.norm(moved[..., -3:], axis=-1)[..., None]
@@ -270,8 +286,7 @@ class RecordedChain:
         origins = np.concatenate([none, np.cumsum(turning * lengths + sliding, axis=-1)], axis=-1)
         own = (origins[..., :-1] + sliding)[..., self.carriers]
         own = own + turning[..., self.carriers] * np.linalg.norm(self.points, axis=1)
-        points = np.concatenate([origins, own], axis=-1)
-        return np.asarray(points[..., self.links[link]].max(axis=-1))
+        return origins, own, turning
 
 
 class _Driven(NamedTuple):

@@ -92,6 +92,17 @@ def _is_scene(value: Any) -> bool:
         and _is_list(value.get("obstacle"), lambda table: isinstance(table, dict))
         and all(_is_number(value.get(key)) for key in ("safe", "self_safe"))
         and all(_VALUES[key][0](value.get(key)) for key in ("meshes", "recovered"))
+        and _is_list(value.get("carried", []), _is_carried)
+    )
+
+
+def _is_carried(value: Any) -> bool:
+    """Whether a value has a body's table, and capsules; their numbers are checked when they are read."""
+    return (
+        isinstance(value, dict)
+        and isinstance(value.get("body"), dict)
+        and _is_text(value["body"].get("name"))
+        and all(isinstance(value.get(key), list) for key in ("ends", "radius"))
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Kinematics
 from vgtm_qp.arm.build import make_arm
+from vgtm_qp.arm.carrying import Carrier
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.curve import Curve, straight_curve
@@ -106,6 +107,7 @@ def build_arm(
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     return Setup(
         arm=arm,
+        carrier=Carrier(arm),
         kinematics=kinematics,
         layout=home.layout,
         task=task,

@@ -52,9 +52,10 @@ class Separation:
     """
 
     def __init__(self, setup: Setup) -> None:
-        self._setup, self._arm, self._monitor = setup, setup.arm, setup.monitor
+        self._setup, self._arm, self._monitor = setup, setup.carrier, setup.monitor
         self._approach = _APPROACH if setup.slows_down else 1.0
-        self._rounding, self._between = _ROUNDING * setup.arm.fineness, _BETWEEN * setup.arm.unit
+        self._unit, self._rounding = setup.arm.unit, _ROUNDING * setup.arm.fineness
+        self._between = _BETWEEN * self._unit
         own = setup.layout.own
         self._own = own if own is not None and own.rows else None
         meeting = setup.monitor.bodies.joints
@@ -121,7 +122,7 @@ class Separation:
         deviation = self.deviation(start, end)
         # In k pieces, the deviation from the chords is 1 / k^2 of the whole. Most motions need only one
         # piece.
-        is_far = deviation >= self._arm.unit
+        is_far = deviation >= self._unit
         needed = 1 if is_far else math.ceil(math.sqrt(max(deviation / self._between, 1.0)))
         tries = sorted({1, min(needed, _MOST_PIECES)})
         for pieces in tries:
@@ -155,7 +156,7 @@ class Separation:
 
     def deviation(self, start: Array, end: Array) -> float:
         """Return a bound of how much nearer two points come to each other than their chords, m."""
-        return self._arm.deviation(start, end) if self._arm.leaves_chords else 0.0
+        return self._arm.deviation(start, end)
 
     def rows(
         self,
@@ -243,7 +244,7 @@ class Separation:
             if self._monitor.pieces.moving:
                 rows.lower += contacts.normal_speed * duration
             # `lower` now has the remaining clearance after the obstacles' motion.
-            rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH * self._arm.unit)
+            rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH * self._unit)
 
     def with_rows_between(
         self, rows: ClearanceRows, state: State, q: Array, time: float, fractions: list[float]
@@ -294,7 +295,7 @@ class Separation:
         body, end = np.moveaxis(self._corners[chosen], 2, 0)
         far = bodies.joints[body, 1 - end]
         nodes = np.concatenate([bodies.joints[body[:, :1], end[:, :1]], far, far[:, 1:]], axis=1)
-        margin = kept.margin / self._arm.unit
+        margin = kept.margin / self._unit
         lower = kept.minimum_angle + margin - angle
         return ClearanceRows(
             nodes,

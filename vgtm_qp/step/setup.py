@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Kinematics, Pose
+from vgtm_qp.arm.carrying import Carried, Carrier
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import Obstacle
@@ -29,6 +30,8 @@ class Setup:
 
     Attributes
     ----------
+    carrier : Carrier
+        The arm with what it carries.
     kinematics : Kinematics
         The arm at one configuration; every call of ``evaluate`` overwrites it.
     layout, task, engine, monitor
@@ -60,6 +63,7 @@ class Setup:
     """
 
     arm: Arm
+    carrier: Carrier
     kinematics: Kinematics
     layout: Layout
     task: TipTask
@@ -99,9 +103,18 @@ class Setup:
 
     def put(self, obstacles: Sequence[Obstacle]) -> None:
         """Put `obstacles` in the place of those that were there."""
-        for monitor in (self.monitor, self.measure):
-            if monitor is not None:
-                monitor.put(obstacles)
+        for monitor in self._monitors:
+            monitor.put(obstacles)
+
+    def carry(self, carried: Sequence[Carried]) -> None:
+        """Let the arm carry these bodies from now on, and no others."""
+        self.carrier.carry(carried)
+        for monitor in self._monitors:
+            monitor.span(self.carrier.bodies)
+
+    @property
+    def _monitors(self) -> list[Clearance]:
+        return [monitor for monitor in (self.monitor, self.measure) if monitor is not None]
 
     @property
     def slows_down(self) -> bool:
@@ -110,7 +123,7 @@ class Setup:
 
     def least_clearance(self, q: Array, time: float, among: str = "all") -> float:
         """Return the exact least clearance at a configuration, m; see ``Clearance.least``."""
-        return (self.measure or self.monitor).least(self.arm.points(q), time, among=among)[0]
+        return (self.measure or self.monitor).least(self.carrier.points(q), time, among=among)[0]
 
     @cached_property
     def _gap(self) -> Gap:

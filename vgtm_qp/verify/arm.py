@@ -163,6 +163,48 @@ class RecordedArm:
         frames = [polygon_frame(polygon, angles)[0] for polygon in nodes[:, self.tip]]
         return np.asarray(frames @ home_frame.T @ self.tip_frame)
 
+    @property
+    def tip_joints(self) -> Index:
+        """Nodes at which the members end that what is carried may touch."""
+        return self.tip
+
+    def tip_bend(self, before: Array, after: Array, reach: Array) -> Array:
+        """Return (P,) upper bounds, m, of |d2 r / d share2| of points fixed to the tip between nodes (N, 3).
+
+        The points are at distances `reach` (P,), m, from the tip's position. See :func:`polygon_frame`: z is the unit
+        vector of the area, a polynomial of the share, and x that of u - z x w with the sums u and w of the spokes times
+        the cosines and the sines of their angles at home, which are linear; x less its part along z.
+        """
+        if self._tip_fit is None:
+            return np.full(len(reach), np.inf)
+        spokes = [nodes[self.tip] - nodes[self.tip].mean(axis=0) for nodes in (before, after)]
+        area = [np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0) for ring in spokes]
+        moved = spokes[1] - spokes[0]
+        curved = np.cross(moved, np.roll(moved, -1, axis=0)).sum(axis=0)
+        # The area's derivative is linear from its value at the start to that at the end.
+        slopes = [area[1] - area[0] - curved, area[1] - area[0] + curved]
+        rate, least = max(map(_norm, slopes)), np.array(_norm(area[0]) + _norm(area[1]))
+        z_rate, z_bend = _unit_bounds((least - rate) / 2.0, rate, 2.0 * _norm(curved))
+        _, angles = self._tip_fit
+        u, w = (
+            [np.asarray(turn @ ring) for ring in (*spokes, moved)]
+            for turn in (np.cos(angles), np.sin(angles))
+        )
+        size, long = _norm(u[0]), max(_norm(w[0]), _norm(w[1]))
+        size = max(size, _norm(u[1])) + long
+        x_rate = _norm(u[2]) + _norm(w[2]) + long * z_rate
+        x_bend = 2.0 * _norm(w[2]) * z_rate + long * z_bend
+        if len(self.tip) > 3:
+            flat_bend = x_bend + 4.0 * z_rate * x_rate + 2.0 * (z_bend + z_rate**2) * size
+            x_rate, x_bend = x_rate + 2.0 * z_rate * size, flat_bend
+        z = [_unit(way) for way in area]
+        x = [u[k] - np.cross(z[k], w[k]) for k in range(2)]
+        least = np.sum([_norm(x[k] - z[k] * (z[k] @ x[k])) for k in range(2)])
+        x_rate, x_bend = _unit_bounds((least - x_rate) / 2.0, x_rate, x_bend)
+        y_bend = z_bend + 2.0 * z_rate * x_rate + x_bend
+        bound = float(np.sqrt(x_bend**2 + y_bend**2 + z_bend**2))
+        return reach * (bound if np.isfinite(bound) else np.inf)
+
     def length_gradient(self, nodes: Array) -> tuple[Array, Index]:
         """Return (..., M, Q, 3) the gradients of the lengths with respect to (M, Q) nodes, m/m, at nodes (..., N, 3).
 

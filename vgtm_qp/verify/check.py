@@ -62,7 +62,7 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
     maneuver, foreign, differing = held_against(maneuver, problem)
     arm = arm_of(maneuver)
     motion = RecordedMotion(arm, maneuver.time, maneuver.configurations)
-    clearances, clearance, self_clearance, wrong, notes = clearances_of(maneuver, motion)
+    clearances, clearance, self_clearance, wrong, notes = clearances_of(maneuver, arm, motion)
     values = _singular_values(arm, motion.states)
     if len(motion.states) > _FEW_STATES and 3 * len(arm.free) > _MANY_UNKNOWNS:
         notes.append(f"singular values are those of {_FEW_STATES} states")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.carrying import CarryingArm
 from vgtm_qp.verify.distance import Separation, segment_segment
 from vgtm_qp.verify.obstacles import Body
 
@@ -41,19 +42,19 @@ class RecordedMotion:
     The ends (T, M, 2, 3), m, are those of its bodies at the states. In names the states count from `first` on.
     """
 
-    def __init__(self, arm: Arm, time: Array, states: Array, first: int = 0) -> None:
+    def __init__(self, arm: Arm | CarryingArm, time: Array, states: Array, first: int = 0) -> None:
         self.arm, self.time, self.states, self.first = arm, time, states, first
         self.ends = arm.states_ends(states)
         # No bound is nearer than the rounding of positions.
         rounding = 64.0 * float(np.finfo(float).eps) * float(np.abs(self.ends).max(initial=0.0))
         self.resolution = max(RESOLUTION * arm.size, rounding)
 
-    def part(self, first: int, last: int) -> RecordedMotion:
-        """Return the motion from the state `first` to the state `last`."""
-        if (first, last) == (0, len(self.time) - 1):
+    def part(self, first: int, last: int, arm: Arm | CarryingArm | None = None) -> RecordedMotion:
+        """Return the motion from the state `first` to the state `last`, of another `arm` if it then carries something."""
+        if arm is None and (first, last) == (0, len(self.time) - 1):
             return self
         rows = slice(first, last + 1)
-        return RecordedMotion(self.arm, self.time[rows], self.states[rows], self.first + first)
+        return RecordedMotion(arm or self.arm, self.time[rows], self.states[rows], self.first + first)
 
     def name(self, state: int) -> str:
         """Return the name of a state."""

@@ -14,6 +14,8 @@ from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Measure
 from vgtm_qp.result.manifest import stored_problem
 from vgtm_qp.result.result import Result
+from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.carrying import CarryingArm
 from vgtm_qp.verify.clearance import (
     BETWEEN_TOLERANCE,
     CLEARANCE_TOLERANCE,
@@ -47,17 +49,18 @@ class Clearances(NamedTuple):
 
 
 class _Scene(NamedTuple):
-    """States from `first` to `last`, and the tables of the manifest that hold in the steps between them."""
+    """States from `first` to `last`, and what holds in the steps between: tables of the manifest, what is carried."""
 
     first: int
     last: int
     problem: Mapping[str, Any]
     meshes: Mapping[str, Any]
     recovered: Sequence[Mapping[str, Any]]
+    arm: CarryingArm | None = None
 
 
-def clearances_of(maneuver: Result, motion: RecordedMotion) -> Clearances:
-    """Return the clearances of a maneuver that moved like `motion`.
+def clearances_of(maneuver: Result, arm: Arm, motion: RecordedMotion) -> Clearances:
+    """Return the clearances of a maneuver whose `arm` moved like `motion`.
 
     A state at which the scene changed has to keep clear in the scene before; in the one after, pairs that were too near
     at once have to recover.
@@ -67,9 +70,11 @@ def clearances_of(maneuver: Result, motion: RecordedMotion) -> Clearances:
     ResultError
         A scene in the manifest is malformed.
     """
-    scenes = list(_scenes_of(maneuver))
+    scenes = list(_scenes_of(maneuver, arm))
     directory = Path(maneuver.manifest.get("directory") or ".")
-    each = [_clearances(scene, motion.part(scene.first, scene.last), directory) for scene in scenes]
+    each = [
+        _clearances(scene, motion.part(scene.first, scene.last, scene.arm), directory) for scene in scenes
+    ]
     first, *others = each
     measures = {name: min((found.measures[name] for found in each), key=_spare) for name in first.measures}
     angle = float((maneuver.manifest["problem"].get("clearance") or {}).get("minimum_angle") or -np.inf)
@@ -92,7 +97,7 @@ def clearances_of(maneuver: Result, motion: RecordedMotion) -> Clearances:
     )
 
 
-def _scenes_of(maneuver: Result) -> Iterator[_Scene]:
+def _scenes_of(maneuver: Result, arm: Arm) -> Iterator[_Scene]:
     """Yield the scenes of a maneuver in the order in which it went through them."""
     manifest = maneuver.manifest
     changes = manifest.get("scenes") or []
@@ -107,7 +112,8 @@ def _scenes_of(maneuver: Result) -> Iterator[_Scene]:
         rules = {**(problem.get("clearance") or {}), "safe": scene["safe"], "self_safe": scene["self_safe"]}
         own = {**problem, "obstacle": scene["obstacle"], "clearance": rules}
         stored_problem(own)
-        yield _Scene(first, last, own, scene.get("meshes") or {}, scene.get("recovered") or [])
+        carrying = CarryingArm(arm, scene["carried"]) if scene.get("carried") else None
+        yield _Scene(first, last, own, scene.get("meshes") or {}, scene.get("recovered") or [], carrying)
 
 
 def _spare(measure: Measure) -> float:
@@ -127,7 +133,8 @@ def _clearances(scene: _Scene, motion: RecordedMotion, directory: Path) -> Clear
     against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]
     at, between, clearance = _least_clearances(motion, against)
     self_at, self_between, self_clearance = _least_clearances(motion, members)
-    wrong = [*wrong, *members[0].contradictions()]
+    if scene.arm is None:
+        wrong = [*wrong, *members[0].contradictions()]
     if scene.recovered:
         kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
         nearer, remarks = excuse_recovering(scene.recovered, kept)

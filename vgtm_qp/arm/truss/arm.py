@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Kinematics, Label, MotionPattern, Newton, Pose, Stations, Tip
+from vgtm_qp.arm.frames import frame_constants
 from vgtm_qp.arm.symbols import Constants
-from vgtm_qp.arm.truss.bounds import chord_deviation, hollow, longest_paths
+from vgtm_qp.arm.truss.bounds import chord_deviation, frame_deviation, hollow, longest_paths
 from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
 from vgtm_qp.arm.truss.lengths import LengthSolver
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
@@ -127,6 +128,16 @@ class TrussArm(Arm):
     def deviation(self, start: Array, end: Array) -> float:
         """See ``arm.Arm``: offset joints turn during the motion."""
         return 2.0 * chord_deviation(self.truss, start, end)
+
+    def tip_deviation(self, start: Array, end: Array, reach: float) -> float:
+        nodes = self.end_effector.nodes
+        return reach * frame_deviation(start[nodes], end[nodes], *self._tip_polygon)
+
+    @cached_property
+    def _tip_polygon(self) -> tuple[Array, Array]:
+        """Cosines and sines (K,) of the polar angles of the tip's nodes."""
+        tip = self.end_effector
+        return frame_constants(self.home[tip.nodes], tip.frame)[:2]
 
     def symbols(self, constants: Constants) -> TrussSymbols:
         return TrussSymbols(self.truss, constants)

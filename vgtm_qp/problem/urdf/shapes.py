@@ -9,19 +9,12 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError, ProblemError
+from vgtm_qp.problem.enclosing import Capsule, capsule_along, enclosing_capsule
 from vgtm_qp.problem.urdf.text import Element, Mistakes
 
-Array = NDArray[np.float64]
-Capsule = tuple[Array, float]
-"""Both ends of the axis (2, 3), or its one point (1, 3), and the radius, m."""
-
-_ROUNDING = 1e-12
-_RADII = np.linspace(1.0, 1.6, 61)
-"""Radii that are tried, over the least possible one: a thicker capsule may be shorter."""
-_STEPS = 100
 _GREATEST_POINTS = 2_000_000
 _HEAD = 1_000_000
 """Bytes at the beginning of a COLLADA file in which its unit is searched."""
@@ -56,7 +49,7 @@ class Shapes:
         if shape.tag == "cylinder":
             half = 0.5 * mistakes.length(shape, what, "length")
             rim = np.full(2, mistakes.length(shape, what, "radius"))
-            return _capsule(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([-half, half]), rim)
+            return capsule_along(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([-half, half]), rim)
         if shape.tag == "box":
             corners = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
             return enclosing_capsule(corners * mistakes.lengths(shape, what, "size", 3))
@@ -111,74 +104,6 @@ class Shapes:
         for folder in (beside, *beside.parents):
             places += [folder / rest] + ([folder / inner] if folder.name == package else [])
         return places
-
-
-def enclosing_capsule(points: Array) -> Capsule:
-    """Return a small capsule that holds points (K, 3): the smallest over axes along and near their principal ones."""
-    from scipy.optimize import minimize
-
-    centred = points - points.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=True)[2]
-
-    def along(tilt: Array, frame: Array) -> Capsule:
-        direction = frame[0] + tilt[0] * frame[1] + tilt[1] * frame[2]
-        direction = direction / np.linalg.norm(direction)
-        across = np.linalg.svd(direction[None])[2][1:]
-        middle = _centre(points @ across.T)
-        centre = middle @ across
-        gap = points - centre
-        return _capsule(centre, direction, gap @ direction, np.linalg.norm(gap @ across.T, axis=1))
-
-    frames = [np.roll(axes, -k, axis=0) for k in range(3)]
-    best = min(frames, key=lambda frame: _volume(along(np.zeros(2), frame)))
-    options = {"maxfev": 60, "initial_simplex": [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]}
-    tilt = minimize(
-        lambda tilt: _volume(along(tilt, best)), np.zeros(2), method="Nelder-Mead", options=options
-    ).x
-    return min((along(np.zeros(2), best), along(tilt, best)), key=_volume)
-
-
-def _capsule(centre: Array, direction: Array, along: Array, aside: Array) -> Capsule:
-    """Return the smallest capsule on a line that holds points at distances `along` and `aside` of it (K,), m."""
-    least = float(aside.max())
-    # With the radius of the whole extent the capsule is a ball.
-    extent = float(np.hypot(least, 0.5 * np.ptp(along)))
-    found = []
-    for radius in np.minimum(least * _RADII, extent) if least > 0.0 else [extent]:
-        # How far the caps reach beyond the axis's ends at each point.
-        cap = np.sqrt(np.maximum(radius**2 - aside**2, 0.0))
-        low, high = float((along + cap).min()), float((along - cap).max())
-        if low > high:
-            low = high = 0.5 * (low + high)
-        ends = centre + np.array([[low], [high]]) * direction
-        found.append((ends, float(radius)))
-    ends, _ = min(found, key=_volume)
-    points = centre + along[:, None] * direction
-    length = float(np.linalg.norm(ends[1] - ends[0]))
-    share = np.clip((points - ends[0]) @ direction, 0.0, length)
-    # The radius grows by what rounding left outside.
-    needed = np.hypot((points - ends[0]) @ direction - share, aside).max()
-    size = float(np.abs(ends).max()) + float(needed)
-    return ends, float(needed) + _ROUNDING * size
-
-
-def _volume(capsule: Capsule) -> float:
-    ends, radius = capsule
-    return float(np.pi * radius**2 * (np.linalg.norm(ends[-1] - ends[0]) + 4.0 / 3.0 * radius))
-
-
-def _centre(points: Array) -> Array:
-    """Return (2,) nearly the centre of the smallest circle round points (K, 2) (Badoiu and Clarkson 2003)."""
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    best, least = centre, np.inf
-    for k in range(1, _STEPS):
-        gaps = points - centre
-        squares = (gaps * gaps).sum(axis=1)
-        furthest = int(np.argmax(squares))
-        if squares[furthest] < least:
-            best, least = centre, squares[furthest]
-        centre = centre + gaps[furthest] / (k + 1)
-    return np.asarray(best)
 
 
 def _read_mesh(file: Path) -> Array:

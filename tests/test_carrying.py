@@ -1,0 +1,322 @@
+"""What an arm carries at its tip: rows, bounds of its motion, loops with it, and their verification."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from arms import TRUSSES, random_pose, three_bays
+from hypothesis import given
+from hypothesis import strategies as st
+
+import vgtm_qp as vq
+from vgtm_qp.arm.build import make_arm
+from vgtm_qp.arm.carrying import Carried, Carrier, carried
+from vgtm_qp.arm.frames import frame_constants, frame_function
+from vgtm_qp.arm.truss.arm import TrussArm
+from vgtm_qp.arm.truss.bounds import frame_deviation
+from vgtm_qp.errors import ResultError
+from vgtm_qp.problem.enclosing import box_capsules
+from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.step.build import make_obstacle
+from vgtm_qp.verify.arm import RecordedArm, polygon_frame
+
+CRATE = {"name": "crate", "size": [0.3, 0.2, 0.2]}
+
+
+def arms():
+    """Return every arm whose tip has a frame, by name."""
+    trusses = {name: TrussArm(make()) for name, make in TRUSSES.items()}
+    found = {name: arm for name, arm in trusses.items() if arm.end_effector.has_frame}
+    found["offset joints"] = TrussArm(TRUSSES["octahedral"](joint_offset=0.06))
+    found["serial"] = make_arm(vq.load_problem("station_arm_past_a_module"))
+    return found
+
+
+ARMS = arms()
+
+
+def loaded(arm, random, count=2):
+    """Return the arm with some capsules at its tip."""
+    carrier = Carrier(arm)
+    ends = 0.4 * arm.unit * random.normal(size=(count, 2, 3))
+    carrier.carry([Carried(vq.Sphere(name="load", center=[0, 0, 0], radius=1.0), ends, np.full(count, 0.05))])
+    return carrier
+
+
+def random_configuration(arm, random, size=0.05):
+    if isinstance(arm, TrussArm):
+        return random_pose(arm.truss, random, size)
+    q = arm.home_configuration.copy()
+    q[:-6] += 10.0 * size * random.normal(size=len(q) - 6)
+    return q
+
+
+def recorded(arm):
+    record = json.loads(json.dumps(arm.record()))
+    return RecordedArm(record, arm.truss.members) if isinstance(arm, TrussArm) else RecordedChain(record)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_points_of_what_is_carried_are_fixed_to_the_tip(name, rng):
+    arm = ARMS[name]
+    carrier, q = loaded(arm, rng), random_configuration(arm, rng)
+    kinematics = arm.kinematics(compiled=False)
+    kinematics.evaluate(q)
+    own = carrier.points(q)[len(arm.points(q)) :] - arm.end_effector.position(arm.nodes(q))
+    np.testing.assert_allclose(
+        own @ kinematics.tip_rotation, carrier.carried[0].ends.reshape(-1, 3), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_rows_of_what_is_carried_agree_with_finite_differences(name, rng):
+    arm = ARMS[name]
+    carrier, q = loaded(arm, rng), random_configuration(arm, rng)
+    count = len(carrier.points(q))
+    points = rng.integers(count, size=(12, 4))
+    points[:6, :2] = count - 1 - rng.integers(4, size=(6, 2))
+    coefficients = rng.normal(size=(12, 4, 3))
+    nodes, by_nodes = carrier.over_nodes(q, points, coefficients)
+    # A motion of the configuration, and that of its nodes.
+    motion = random_configuration(arm, rng, 1.0) - arm.home_configuration
+    h = 1e-6
+
+    def at(s):
+        moved = q + s * motion
+        return np.einsum("rsc,rsc->r", coefficients, carrier.points(moved)[points]), arm.nodes(moved)
+
+    (ahead, X), (behind, Y) = at(h), at(-h)
+    expected = (ahead - behind) / (2 * h)
+    found = np.einsum("rsc,rsc->r", by_nodes, ((X - Y) / (2 * h))[nodes])
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("size", [0.002, 0.02, 0.06])
+def test_bounds_hold_for_every_point_between_two_states(name, size, rng):
+    arm = ARMS[name]
+    carrier, told = loaded(arm, rng), recorded(arm)
+    for _ in range(5):
+        start = random_configuration(arm, rng)
+        end = start + size * (random_configuration(arm, rng, 1.0) - arm.home_configuration)
+        share = np.linspace(0.0, 1.0, 41)
+        way = np.stack([carrier.points((1 - s) * start + s * end) for s in share])
+        chord = way[0] + share[:, None, None] * (way[-1] - way[0])
+        off = np.linalg.norm(way - chord, axis=2).max(axis=0)
+        bound = carrier.deviation(start, end) / 2.0
+        assert off.max() <= bound + 1e-12
+        mine = slice(len(way[0]) - 4, None)
+        reach = np.full(1, np.linalg.norm(carrier.carried[0].ends, axis=2).max())
+        bend = told.tip_bend(start, end, reach)[0]
+        assert off[mine].max() <= bend / 8.0 + 1e-12
+        if size == 0.002 and name != "serial":
+            assert bound < 1e-3 * arm.unit
+            assert bend / 8.0 < 1e-3 * arm.unit
+
+
+@pytest.mark.parametrize("corners", [3, 4, 6])
+@pytest.mark.parametrize("size", [0.01, 0.1])
+def test_bounds_of_frames_of_any_polygon_hold(corners, size, rng):
+    """The tip of a truss of the user's own may have any number of nodes, not all in one plane."""
+    angle = 2.0 * np.pi * np.arange(corners) / corners
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(corners)], axis=1)
+    home = ring + 0.1 * rng.normal(size=ring.shape)
+    cosines, sines, alignment = frame_constants(home, np.eye(3))
+    frame = frame_function(corners)
+    own = SimpleNamespace(tip=np.arange(corners), _tip_fit=polygon_frame(home, None))
+    for _ in range(10):
+        start = home + 0.05 * rng.normal(size=home.shape)
+        turn = rotation_from_vector(size * rng.normal(size=3))
+        end = (start + 0.1 * size * rng.normal(size=home.shape)) @ turn.T + rng.normal(size=3)
+        frames = [
+            np.array(frame((start + s * (end - start)).T, cosines, sines, alignment)[0])
+            for s in np.linspace(0.0, 1.0, 21)
+        ]
+        direction = rng.normal(size=3)
+        way = np.stack(frames) @ (direction / np.linalg.norm(direction))
+        off = np.linalg.norm(
+            way - way[0] - np.linspace(0.0, 1.0, 21)[:, None] * (way[-1] - way[0]), axis=1
+        ).max()
+        assert off <= frame_deviation(start, end, cosines, sines) + 1e-12
+        assert off <= RecordedArm.tip_bend(own, start, end, np.ones(1))[0] / 8.0 + 1e-12
+    assert frame_deviation(start, start + 1.0, cosines, sines) <= 1e-12
+
+
+@given(st.lists(st.floats(0.01, 2.0), min_size=3, max_size=3), st.integers(0, 2**32 - 1))
+def test_capsules_hold_the_box_and_stick_out_little(edges, seed):
+    size, random = np.array(edges), np.random.default_rng(seed)
+    points = (random.random((400, 3)) - 0.5) * size
+    side = random.integers(3, size=400)
+    points[np.arange(400), side] = np.sign(points[np.arange(400), side]) * size[side] / 2
+    found, least = box_capsules(size), np.full(400, np.inf)
+    for ends, radius in found:
+        along = ends[1] - ends[0]
+        share = np.clip((points - ends[0]) @ along / max(along @ along, 1e-30), 0.0, 1.0)
+        least = np.minimum(least, np.linalg.norm(points - ends[0] - share[:, None] * along, axis=1) - radius)
+    assert least.max() <= 1e-12
+    assert len(found) <= 9
+    assert max(np.max(np.abs(ends) + radius - size / 2) for ends, radius in found) <= 0.37 * np.sort(size)[1]
+
+
+def test_capsules_hold_every_shape(rng, tmp_path):
+    file = tmp_path / "stone.stl"
+    trimesh.creation.icosahedron().export(file)
+    place = {"center": [0.3, -0.2, 0.1], "rotation_vector": [0.4, -0.5, 0.6]}
+    turn = rotation_from_vector(place["rotation_vector"])
+    shapes = {
+        vq.Box(name="b", size=[0.1, 0.2, 0.3], **place): trimesh.creation.box([0.1, 0.2, 0.3]),
+        vq.Sphere(name="s", radius=0.2, **place): trimesh.creation.icosphere(radius=0.2),
+        vq.Cylinder(name="c", radius=0.1, height=0.4, **place): trimesh.creation.cylinder(0.1, 0.4),
+        vq.Mesh(name="m", file=str(file), scale=0.3, **place): trimesh.creation.icosahedron().apply_scale(
+            0.3
+        ),
+    }
+    for table, surface in shapes.items():
+        points = trimesh.sample.sample_surface(surface, 500, seed=1)[0] @ turn.T + place["center"]
+        found = carried(make_obstacle(table))
+        start, along = found.ends[:, 0], found.ends[:, 1] - found.ends[:, 0]
+        assert (np.linalg.norm(along, axis=1) > 0.0).all()
+        gap = points[:, None] - start
+        share = np.clip(np.einsum("kcx,cx->kc", gap, along) / np.einsum("cx,cx->c", along, along), 0.0, 1.0)
+        away = np.linalg.norm(gap - share[..., None] * along, axis=2) - found.radius
+        assert away.min(axis=1).max() <= 1e-9
+
+
+def carry_round(problem, crate, shift, steps=30):
+    """Return resolver, recording and what was too near after a loop that takes up a crate, and lets it go."""
+    resolver = vq.Resolver(problem)
+    tip, recording = resolver.tip()[0], vq.Recording(resolver, problem)
+    told = []
+    for k in range(steps):
+        if k == 5:
+            told.append(resolver.attach(crate))
+        if k == steps - 5:
+            told.append(resolver.release(crate.name))
+        resolver.step(position=tip + shift * np.sin([0.15 * k, 0.1 * k, 0.05 * k]), dt=0.2)
+    return resolver, recording, told
+
+
+def crate_at(problem, beyond):
+    """Return a crate `beyond` the tip of the arm of a problem at home, m."""
+    resolver = vq.Resolver(problem)
+    position, rotation = resolver.tip()
+    return vq.Box(**CRATE, center=position + beyond * rotation[:, 2])
+
+
+def test_a_loop_that_carries_a_crate_past_obstacles_is_verified(tmp_path):
+    problem = three_bays(obstacle=[{"name": "cube", "shape": "box", "center": [0.95, 0.0, 3.2], "size": 0.5}])
+    resolver, recording, told = carry_round(problem, crate_at(problem, 0.35), 0.35)
+    assert told[0] == {}
+    # What was let go is beside the bodies that held it.
+    assert all("crate" in name for name in told[1])
+    assert [obstacle.name for obstacle in resolver.obstacles] == ["cube", "crate"]
+    maneuver = recording.maneuver()
+    certificate = vq.verify(maneuver)
+    assert certificate.ok, str(certificate)
+    scenes = maneuver.manifest["scenes"]
+    assert [len(scene.get("carried", ())) for scene in scenes] == [1, 0]
+    maneuver.save(tmp_path / "loop.npz")
+    assert vq.verify_file(tmp_path / "loop.npz").ok
+
+    def edited(**changes):
+        scenes = json.loads(json.dumps(maneuver.manifest["scenes"]))
+        scenes[0]["carried"][0].update(changes)
+        return replace(maneuver, manifest={**maneuver.manifest, "scenes": scenes})
+
+    large = vq.verify(edited(radius=[0.6] * len(scenes[0]["carried"][0]["radius"])))
+    assert not large.ok
+    assert "crate" in large.clearance.where + large.self_clearance.where
+    for wrong in ({"ends": [[1.0]]}, {"radius": ["a"]}, {"radius": None}, {"body": {}}):
+        with pytest.raises(ResultError, match=r"manifest\."):
+            vq.verify(edited(**wrong))
+
+
+def test_a_crate_keeps_the_arm_from_where_it_could_go_without():
+    wall = {"name": "wall", "shape": "box", "center": [0.0, 0.0, 3.15], "size": [3.0, 3.0, 0.2]}
+    problem = three_bays(obstacle=[wall])
+    crate = crate_at(problem, 0.35)
+    reached = {}
+    for carries in (False, True):
+        resolver = vq.Resolver(problem)
+        goal = resolver.tip()[0] + [0.0, 0.0, 0.6]
+        if carries:
+            resolver.attach(crate)
+        for _ in range(40):
+            step = resolver.step(position=goal)
+        reached[carries] = resolver.tip()[0][2]
+        if carries:
+            assert any("carried crate / wall" in name for name in step.blocked_by)
+            top = resolver.carried[0].center[2] + 0.1
+            assert top <= 3.05 - problem.clearance.safe
+    assert reached[True] < reached[False] - 0.1
+
+
+@pytest.mark.parametrize("problem", ["snake_past_a_cube", "offset_joints_past_a_cube", "moving_base"])
+def test_other_arms_carry_too(problem):
+    problem = vq.load_problem(problem)
+    _, recording, _ = carry_round(problem, crate_at(problem, 0.3), 0.05, steps=16)
+    certificate = vq.verify(recording.maneuver())
+    assert certificate.ok, str(certificate)
+
+
+def test_a_recording_that_begins_with_a_crate_is_verified():
+    problem = three_bays()
+    resolver = vq.Resolver(problem)
+    resolver.add_obstacle(crate_at(problem, 0.35))
+    before = resolver.obstacles[0]
+    resolver.attach("crate")
+    assert resolver.obstacles == ()
+    assert np.allclose(resolver.carried[0].center, before.center, atol=1e-12)
+    tip, recording = resolver.tip()[0], vq.Recording(resolver, problem)
+    for k in range(6):
+        resolver.step(position=tip + [0.02 * k, 0.0, 0.0])
+    maneuver = recording.maneuver()
+    assert [scene["row"] for scene in maneuver.manifest["scenes"]] == [0]
+    assert vq.verify(maneuver).ok
+
+
+def test_what_is_let_go_may_be_gone():
+    problem = three_bays()
+    resolver = vq.Resolver(problem)
+    bodies = len(resolver.setup.monitor.bodies)
+    resolver.attach(crate_at(problem, 0.35))
+    assert len(resolver.setup.monitor.bodies) > bodies
+    assert resolver.release("crate", keep=False) == {}
+    assert resolver.obstacles == resolver.carried == ()
+    assert len(resolver.setup.monitor.bodies) == bodies
+
+
+def test_wrong_things_to_carry_are_goal_errors_that_change_nothing(tmp_path):
+    (tmp_path / "words.stl").write_text("solid words")
+    cube = {"name": "cube", "shape": "box", "center": [1.3, 0.0, 2.0], "size": 0.5}
+    resolver = vq.Resolver(three_bays(obstacle=[cube]))
+    crate = vq.Box(**CRATE, center=[0.0, 0.0, 4.0])
+    resolver.attach(crate)
+    wrong = [
+        (lambda: resolver.attach(crate), '"crate" is carried already'),
+        (lambda: resolver.add_obstacle(crate), '"crate" is carried already'),
+        (lambda: resolver.attach("cub"), 'did you mean "cube"'),
+        (lambda: resolver.attach(vq.Box(**cube)), 'an obstacle "cube" already'),
+        (lambda: resolver.attach(CRATE), "expected Box, Sphere, Cylinder or Mesh"),
+        (
+            lambda: resolver.attach(vq.Mesh(name="m", file=str(tmp_path / "words.stl"))),
+            "no triangle|cannot read",
+        ),
+        (lambda: resolver.release("cube"), "'cube' is not carried"),
+    ]
+    before, changes = (resolver.obstacles, resolver.carried), resolver.scene_changes
+    for call, message in wrong:
+        with pytest.raises(vq.GoalError, match=message):
+            call()
+    assert (resolver.obstacles, resolver.carried) == before
+    assert resolver.scene_changes == changes
+    mast = vq.Resolver(vq.load_problem("tetrahedral_truss_circle"))
+    if not mast.setup.arm.end_effector.has_frame:
+        with pytest.raises(vq.GoalError, match="fewer than three nodes"):
+            mast.attach(crate)
