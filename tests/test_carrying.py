@@ -128,7 +128,7 @@ def test_bounds_of_frames_of_any_polygon_hold(corners, size, rng):
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(corners)], axis=1)
     home = ring + 0.1 * rng.normal(size=ring.shape)
     cosines, sines, alignment = frame_constants(home, np.eye(3))
-    frame = frame_function(corners)
+    frame, bound = frame_function(corners), frame_deviation(corners)
     own = SimpleNamespace(tip=np.arange(corners), _tip_fit=polygon_frame(home, None))
     for _ in range(10):
         start = home + 0.05 * rng.normal(size=home.shape)
@@ -143,9 +143,9 @@ def test_bounds_of_frames_of_any_polygon_hold(corners, size, rng):
         off = np.linalg.norm(
             way - way[0] - np.linspace(0.0, 1.0, 21)[:, None] * (way[-1] - way[0]), axis=1
         ).max()
-        assert off <= frame_deviation(start, end, cosines, sines) + 1e-12
+        assert off <= float(bound(start.T, end.T, cosines, sines)) + 1e-12
         assert off <= RecordedArm.tip_bend(own, start, end, np.ones(1))[0] / 8.0 + 1e-12
-    assert frame_deviation(start, start + 1.0, cosines, sines) <= 1e-12
+    assert float(bound(start.T, start.T + 1.0, cosines, sines)) <= 1e-12
 
 
 @given(st.lists(st.floats(0.01, 2.0), min_size=3, max_size=3), st.integers(0, 2**32 - 1))
@@ -275,7 +275,7 @@ def test_a_recording_that_begins_with_a_crate_is_verified():
     assert np.allclose(resolver.carried[0].center, before.center, atol=1e-12)
     tip, recording = resolver.tip()[0], vq.Recording(resolver, problem)
     for k in range(6):
-        resolver.step(position=tip + [0.02 * k, 0.0, 0.0])
+        resolver.step(position=tip + np.array([0.02 * k, 0.0, 0.0]))
     maneuver = recording.maneuver()
     assert [scene["row"] for scene in maneuver.manifest["scenes"]] == [0]
     assert vq.verify(maneuver).ok

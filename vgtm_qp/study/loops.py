@@ -180,11 +180,18 @@ def text(rows: Sequence[Row]) -> str:
         markdown_table(("", *map(str, StepStatus), "loops"), lines),
     ]
     if rows[0].get("changes") is not None:
-        disturbed = [row for row in rows if row["changes"]]
-        middle = float(np.median([row["change_cost"] for row in disturbed])) if disturbed else 0.0
         parts.append(
-            f"{sum(row['changes'] for row in disturbed)} changes of the scene, in the middle of a loop at {middle:.2g} "
-            f"of its median step's CPU time; {sum(row['dear_changes'] for row in disturbed)} at more than two of them."
+            f"{sum(row['changes'] for row in rows)} changes of the scene, in the middle of a loop at "
+            f"{_middle(rows, 'changes', 'change_cost'):.2g} of its median step's CPU time; "
+            f"{sum(row['dear_changes'] for row in rows)} at more than two of them. "
+            f"{sum(row.get('carried', 0) for row in rows)} bodies taken up at the tip or let go, at "
+            f"{_middle(rows, 'carried', 'carry_cost'):.2g}."
         )
     parts += [f"Loop {row['number']}: {'; '.join(row['failures'][:3])}" for row in broken]
     return "\n\n".join(parts)
+
+
+def _middle(rows: Sequence[Row], count: str, cost: str) -> float:
+    """Return the median cost of those loops in which something was changed."""
+    costs = [row[cost] for row in rows if row.get(count)]
+    return float(np.median(costs)) if costs else 0.0

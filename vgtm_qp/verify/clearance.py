@@ -50,7 +50,7 @@ class RecordedMotion:
         self.resolution = max(RESOLUTION * arm.size, rounding)
 
     def part(self, first: int, last: int, arm: Arm | CarryingArm | None = None) -> RecordedMotion:
-        """Return the motion from the state `first` to the state `last`, of another `arm` if it then carries something."""
+        """Return the motion from the state `first` to the state `last`, of an `arm` that carries something if given."""
         if arm is None and (first, last) == (0, len(self.time) - 1):
             return self
         rows = slice(first, last + 1)

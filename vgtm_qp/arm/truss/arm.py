@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +18,7 @@ from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.symbols import TrussSymbols
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import TrussError
 from vgtm_qp.geometry.bodies import capsules
 
@@ -130,14 +132,19 @@ class TrussArm(Arm):
         return 2.0 * chord_deviation(self.truss, start, end)
 
     def tip_deviation(self, start: Array, end: Array, reach: float) -> float:
-        nodes = self.end_effector.nodes
-        return reach * frame_deviation(start[nodes], end[nodes], *self._tip_polygon)
+        """See ``arm.Arm``: infinite where the tip turns too far for a bound."""
+        kernel, nodes = self._tip_turning, self.end_effector.nodes
+        kernel.inputs[0][:], kernel.inputs[1][:] = start[nodes].reshape(-1), end[nodes].reshape(-1)
+        kernel()
+        bound = reach * float(kernel.outputs[0][0])
+        return bound if math.isfinite(bound) else math.inf
 
     @cached_property
-    def _tip_polygon(self) -> tuple[Array, Array]:
-        """Cosines and sines (K,) of the polar angles of the tip's nodes."""
+    def _tip_turning(self) -> Kernel:
         tip = self.end_effector
-        return frame_constants(self.home[tip.nodes], tip.frame)[:2]
+        kernel = Kernel(frame_deviation(len(tip.nodes)), compiled=False)
+        kernel.inputs[2][:], kernel.inputs[3][:], _ = frame_constants(self.home[tip.nodes], tip.frame)
+        return kernel
 
     def symbols(self, constants: Constants) -> TrussSymbols:
         return TrussSymbols(self.truss, constants)

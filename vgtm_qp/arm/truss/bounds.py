@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
@@ -89,51 +90,52 @@ def chord_deviation(truss: Truss, start: Array, end: Array) -> float:
     return float(np.nan_to_num(bend, nan=np.inf).max(initial=0.0)) / 8.0
 
 
-def frame_deviation(start: Array, end: Array, cosines: Array, sines: Array) -> float:
-    """Return a bound of how far a point fixed to a fitted frame leaves its chord where the nodes (K, 3) move straight.
+def frame_deviation(count: int) -> ca.Function:
+    """Return a bound of how far a point fixed to a fitted frame leaves its chord where `count` nodes move straight.
 
-    It is over the point's distance from the origin of the frame, that of ``frames.fitted_frame``; inf without one.
+    Arguments: the nodes (3, K) at both ends of the motion, cosines and sines (K) of their angles, see
+    ``frames.fitted_frame``. The result is over the point's distance from the origin of the frame; inf without a bound.
     z is the direction of a polynomial A of the share of the motion. The sums c = sum cos s and d = sum sin s of the
     nodes from their middle are polynomials, too, and x is the direction of v = c + d x z less its part along z, which a
     triangle has not.
     """
-    before, after = (nodes - nodes.mean(axis=0) for nodes in (start, end))
+    ends = [ca.SX.sym("start", 3, count), ca.SX.sym("end", 3, count)]
+    cosines, sines = ca.SX.sym("cosines", count), ca.SX.sym("sines", count)
+    before, after = (nodes - ca.repmat(ca.sum2(nodes) / count, 1, count) for nodes in ends)
     change = after - before
 
-    def area(first: Array, second: Array) -> Array:
-        return np.asarray(np.cross(first, np.roll(second, -1, axis=0)).sum(axis=0))
+    def area(ring: ca.SX) -> ca.SX:
+        return sum((ca.cross(ring[:, j], ring[:, (j + 1) % count]) for j in range(count)), ca.SX.zeros(3))
 
-    # A = A(0) + share * slope + share^2 * area(change, change)
-    slope, square = area(before, change) + area(change, before), area(change, change)
-    ends = area(before, before), area(after, after)
-    z = _unit(
-        ends[0][None], ends[1][None], max(_size(slope), _size(slope + 2.0 * square)), 2.0 * _size(square)
-    )
-    z1, z2 = float(z.first[0]), float(z.second[0])
-    if not z2 < math.inf:
-        return math.inf
-    c, d = ([weights @ nodes for nodes in (before, after, change)] for weights in (cosines, sines))
-    c0, d0 = (max(_size(way[0]), _size(way[1])) for way in (c, d))
-    c1, d1 = _size(c[2]), _size(d[2])
+    # A = A(0) + share * slope + share^2 * square
+    areas, square = [area(before), area(after)], area(change)
+    slope = areas[1] - areas[0] - square
+    rate = ca.fmax(ca.norm_2(slope), ca.norm_2(slope + 2.0 * square))
+    z1, z2 = _unit_bounds(areas[0], areas[1], rate, 2.0 * ca.norm_2(square))
+    c, d = ([nodes @ weights for nodes in (before, after, change)] for weights in (cosines, sines))
+    c0, d0 = (ca.fmax(ca.norm_2(way[0]), ca.norm_2(way[1])) for way in (c, d))
+    c1, d1 = ca.norm_2(c[2]), ca.norm_2(d[2])
     v0, v1, v2 = c0 + d0, c1 + d1 + d0 * z1, 2.0 * d1 * z1 + d0 * z2
-    if len(start) > 3:
+    if count > 3:
         v1, v2 = v1 + 2.0 * z1 * v0, v2 + 4.0 * z1 * v1 + 2.0 * (z2 + z1**2) * v0
     across = []
-    for k, w in enumerate(ends):
-        normal = w / _size(w)
-        v = c[k] + np.cross(d[k], normal)
-        across.append((v - normal * (normal @ v))[None])
-    x = _unit(across[0], across[1], v1, v2)
-    x1, x2 = float(x.first[0]), float(x.second[0])
-    y2 = z2 + 2.0 * z1 * x1 + x2
-    return math.sqrt(x2**2 + y2**2 + z2**2) / 8.0 if x2 < math.inf else math.inf
+    for k, w in enumerate(areas):
+        normal = w / ca.norm_2(w)
+        v = c[k] + ca.cross(d[k], normal)
+        across.append(v - normal * ca.dot(normal, v))
+    x1, x2 = _unit_bounds(across[0], across[1], v1, v2)
+    bound = ca.norm_2(ca.vertcat(x2, z2 + 2.0 * z1 * x1 + x2, z2)) / 8.0
+    return ca.Function("frame_deviation", [*ends, cosines, sines], [bound])
 
 
-def _size(vector: Array) -> float:
-    return float(np.linalg.norm(vector))
+def _unit_bounds(before: ca.SX, after: ca.SX, first: ca.SX, second: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return bounds of the first two derivatives of w/|w| from w (3) at both ends and bounds of its own; or inf."""
+    least = (ca.norm_2(before) + ca.norm_2(after) - first) / 2.0
+    relative = ca.if_else(least > 0.0, first / least, np.inf)
+    return relative, ca.if_else(least > 0.0, second / least + 3.0 * relative**2, np.inf)
 
 
-def _unit(before: Array, after: Array, first: Array | float, second: Array | float) -> _Bounds:
+def _unit(before: Array, after: Array, first: Array, second: Array) -> _Bounds:
     """Return the bounds for w/|w| from w (N, 3) at both ends and bounds of its derivatives (N,)."""
     least = (_norm(before) + _norm(after) - first) / 2.0
     with np.errstate(divide="ignore", invalid="ignore"):
