@@ -1,4 +1,4 @@
-"""The obstacles on the page: choose one, drag it, add others clear of the arm, take them away."""
+"""The obstacles on the page: choose one, drag it, let the arm carry it, add others clear of the arm, delete them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,13 @@ class ObstacleTools:
         self._delete = gui.add_button("Delete", color="red", disabled=True)
         inbox.on(self._list.on_update, lambda _: self.choose(self._list.value))
         inbox.on(self._place.on_update, lambda _: self._type(), newest="center")
+        self._carry = gui.add_button(
+            "Carry", disabled=True, hint="fix the chosen obstacle to the tip, where it is now"
+        )
+        self._drop = gui.add_button("Let go", disabled=True, hint="of what the arm carries")
         inbox.on(self._delete.on_click, lambda _: self.delete())
+        inbox.on(self._carry.on_click, lambda _: self.carry())
+        inbox.on(self._drop.on_click, lambda _: self.let_go())
         stage.draws.append(self.draw)
         self.rebuild()
 
@@ -68,7 +74,8 @@ class ObstacleTools:
         if tuple(self._list.options) != options:
             self._list.options = options
         self._list.value = self.chosen or NONE
-        self._delete.disabled = self._place.disabled = not self.chosen
+        self._delete.disabled = self._place.disabled = self._carry.disabled = not self.chosen
+        self._drop.disabled = not self._stage.session.carried
         self._gizmo.visible, self._is_dragged = bool(self.chosen), False
         if self.chosen:
             table = self._stage.session.obstacle(self.chosen)
@@ -115,7 +122,7 @@ class ObstacleTools:
     def _add(self, shape: str, make: Callable[[str, float], Any], _event: Any) -> None:
         """Add an obstacle of a shape beside the arm, and choose it."""
         session = self._stage.session
-        names = {table.name for table in session.obstacles}
+        names = {*(table.name for table in session.obstacles), *session.carried}
         name = next(name for k in range(1, len(names) + 2) if (name := f"{shape} {k}") not in names)
         session.add_obstacle(make(name, max(_SIZE * self._stage.scene.unit, 4.0 * self._stage.scene.ball)))
         self.choose(name)
@@ -140,6 +147,19 @@ class ObstacleTools:
         self._stage.session.remove_obstacle(self.chosen)
         self.choose("")
 
+    def carry(self) -> None:
+        """Fix the chosen obstacle to the tip; GoalError if none is chosen or the tip has no attitude."""
+        self._stage.session.attach(self.chosen)
+        self.choose("")
+
+    def let_go(self) -> None:
+        """Let go of what was taken up last, and choose it; GoalError if nothing is carried."""
+        held = self._stage.session.carried
+        if not held:
+            raise GoalError("the arm carries nothing; choose an obstacle and press Carry")
+        self._stage.session.release(held[-1])
+        self.choose(held[-1])
+
 
 def free_place(session: Session, radius: float, room: float) -> Array:
     """Return the center (3,), m, of a ball of a `radius`, m, that is clear of the arm and of all obstacles.
@@ -151,8 +171,9 @@ def free_place(session: Session, radius: float, room: float) -> Array:
     middle = (nodes.min(axis=0) + nodes.max(axis=0)) / 2
     time = session.state.time
     others = [
-        np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) + mesh.position(time)
+        np.stack([corners.min(axis=0), corners.max(axis=0)]) + mesh.position(time)
         for mesh in session.drawing.obstacles
+        for corners in [mesh.vertices @ mesh.rotation(time).T]
     ]
     least = radius + session.safe + room
     away = least

@@ -25,7 +25,7 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.verify.arm import recorded_arm
-from vgtm_qp.view.drawing import make_drawing, obstacle_meshes
+from vgtm_qp.view.drawing import carried_mesh, make_drawing, obstacle_meshes
 
 _REACHED = 1e-4
 _STRIDE = 0.06
@@ -176,6 +176,7 @@ class Session:
     def _use(self, problem: Problem) -> None:
         """Go on with another problem from the same state."""
         resolver, short = Resolver(problem), bool(self.state.shortfall)
+        resolver.setup.carry(self._resolver.setup.carrier.carried)
         resolver.state = replace(_with_curve(self.state, resolver.setup), shortfall=None)
         self._problem, self._resolver, self._scene_changed = problem, resolver, False
         if short:
@@ -225,6 +226,21 @@ class Session:
         self._resolver.remove_obstacle(name)
         self._redraw(name)
 
+    @property
+    def carried(self) -> tuple[str, ...]:
+        """Names of the bodies that the arm carries."""
+        return tuple(table.name for table in self._resolver.carried)
+
+    def attach(self, name: str) -> None:
+        """Carry an obstacle at the tip; GoalError, and no change, if there is none of that name."""
+        self._resolver.attach(name)
+        self._redraw(name)
+
+    def release(self, name: str) -> None:
+        """Let go of a body that is carried; GoalError if there is none of that name."""
+        self._resolver.release(name)
+        self._redraw(name)
+
     def _redraw(self, name: str) -> None:
         """Let problem and drawing follow a change of the obstacle called `name`."""
         self._scene_changed = True
@@ -233,8 +249,11 @@ class Session:
         known = {mesh.name: mesh for mesh in self.drawing.obstacles}
         fresh = [there[name].model_dump(mode="json", exclude_none=True)] if name in there else []
         known |= {mesh.name: mesh for mesh in obstacle_meshes(fresh, self._directory)}
-        shown = tuple(mesh for key, mesh in known.items() if key in there)
-        self.drawing = replace(self.drawing, obstacles=shown)
+        shown = [mesh for key, mesh in known.items() if key in there]
+        for body in self._resolver.setup.carrier.carried:
+            mesh = carried_mesh(body.record()["body"], self._directory, lambda _: self.pose())
+            shown += [mesh] if mesh is not None else []
+        self.drawing = replace(self.drawing, obstacles=tuple(shown))
 
     def advance(self, dt: float) -> bool:
         """Make one step of duration `dt`, s, towards the goals; return whether the arm moved.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,9 +53,45 @@ class ObstacleMesh:
         """Return whether the obstacle is in the scene at `time`, s."""
         return self.since <= time < self.until
 
+    @property
+    def moves(self) -> bool:
+        """Whether it is elsewhere at another time."""
+        return bool(self.velocity.any())
+
     def position(self, time: float) -> Array:
         """Return (3,) the position of the obstacle's origin at `time`, s, in m."""
         return np.asarray(self.center + time * self.velocity)
+
+    def rotation(self, time: float) -> Array:  # noqa: ARG002
+        """Return (3, 3) its rotation at `time`, s."""
+        return np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedMesh(ObstacleMesh):
+    """The surface of a body that the arm carries: in the frame of the tip, whose `pose` at a time, s, is known."""
+
+    pose: Callable[[float], tuple[Array, Array]] = field(kw_only=True)
+
+    @property
+    def moves(self) -> bool:
+        """See :class:`ObstacleMesh`, as for the others."""
+        return True
+
+    def position(self, time: float) -> Array:
+        """Return (3,) where its origin is."""
+        position, rotation = self.pose(time)
+        return np.asarray(position + rotation @ self.center)
+
+    def rotation(self, time: float) -> Array:
+        """Return (3, 3) that of the tip."""
+        return self.pose(time)[1]
+
+    def at(self, time: float) -> ObstacleMesh:
+        """Return the surface where it is at `time`, s, at rest."""
+        turned = self.vertices @ self.rotation(time).T
+        none = np.zeros(3)
+        return ObstacleMesh(self.name, turned, self.faces, self.position(time), none, self.since, self.until)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +107,12 @@ class Drawing:
     obstacles: tuple[ObstacleMesh, ...]
 
     def surfaces(self) -> list[Array]:
-        """Return (K, 3) the vertices of each obstacle at time 0, m."""
-        return [mesh.vertices + mesh.center for mesh in self.obstacles]
+        """Return (K, 3) the vertices of each obstacle at time 0, or where it is later taken up, m."""
+        times = [max(mesh.since, 0.0) for mesh in self.obstacles]
+        return [
+            mesh.vertices @ mesh.rotation(time).T + mesh.position(time) - time * mesh.velocity
+            for mesh, time in zip(self.obstacles, times, strict=True)
+        ]
 
     def curve(self, control_vertices: Array) -> Array:
         """Return (K, 3) points along the curve with `control_vertices` (V, 3), m; K = 0 without a curve."""
@@ -113,22 +153,43 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
     drawing = make_drawing(manifest["problem"], arm, vertices, directory)
     if not manifest.get("scenes"):
         return drawing
+    scenes, at_first = manifest["scenes"], manifest["problem"].get("obstacle") or ()
     there = [
         replace(mesh, since=since, until=until)
-        for entry, since, until in _lifetimes(maneuver)
+        for entry, since, until in _lifetimes(maneuver, at_first, [scene["obstacle"] for scene in scenes])
         for mesh in obstacle_meshes([entry], directory)
     ]
-    return replace(drawing, obstacles=tuple(there))
-
-
-def _lifetimes(maneuver: Result) -> list[tuple[Mapping[str, Any], float, float]]:
-    """Return each obstacle that was ever in the scene of a maneuver, and from when to when, s."""
-    found: list[tuple[Mapping[str, Any], float, float]] = []
-    there: list[tuple[Mapping[str, Any], float]] = [
-        (entry, -np.inf) for entry in maneuver.manifest["problem"].get("obstacle") or ()
+    at_tip = [[held["body"] for held in scene.get("carried", ())] for scene in scenes]
+    pose = _pose_of_tip(maneuver)
+    carried = [
+        carried_mesh(entry, directory, pose, since, until)
+        for entry, since, until in _lifetimes(maneuver, (), at_tip)
     ]
-    for scene in maneuver.manifest["scenes"]:
-        time, entries = float(maneuver.time[scene["row"]]), list(scene["obstacle"])
+    return replace(drawing, obstacles=(*there, *(mesh for mesh in carried if mesh is not None)))
+
+
+def _pose_of_tip(maneuver: Result) -> Callable[[float], tuple[Array, Array]]:
+    """Return the tip's pose in a maneuver as a function of the time, s."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    turns = Slerp(maneuver.time, Rotation.from_matrix(maneuver.tip_rotation))
+    first, last = float(maneuver.time[0]), float(maneuver.time[-1])
+
+    def pose(time: float) -> tuple[Array, Array]:
+        position = resampled(maneuver.time, maneuver.tip_position, np.array([time]))[0]
+        return np.asarray(position), np.asarray(turns(min(max(time, first), last)).as_matrix())
+
+    return pose
+
+
+def _lifetimes(
+    maneuver: Result, at_first: Sequence[Mapping[str, Any]], later: Sequence[Sequence[Mapping[str, Any]]]
+) -> list[tuple[Mapping[str, Any], float, float]]:
+    """Return each table that was ever in the scenes of a maneuver, `at_first` or `later`, and from when to when, s."""
+    found: list[tuple[Mapping[str, Any], float, float]] = []
+    there: list[tuple[Mapping[str, Any], float]] = [(entry, -np.inf) for entry in at_first]
+    for scene, entries in zip(maneuver.manifest["scenes"], later, strict=True):
+        time = float(maneuver.time[scene["row"]])
         found += [(entry, since, time) for entry, since in there if entry not in entries]
         there = [(entry, since) for entry, since in there if entry in entries]
         known = [entry for entry, _ in there]
@@ -166,6 +227,20 @@ def obstacle_meshes(entries: Sequence[Mapping[str, Any]], directory: Path) -> tu
             )
         )
     return tuple(found)
+
+
+def carried_mesh(
+    entry: Mapping[str, Any],
+    directory: Path,
+    pose: Callable[[float], tuple[Array, Array]],
+    since: float = -np.inf,
+    until: float = np.inf,
+) -> CarriedMesh | None:
+    """Return the surface of a body whose table is in the frame of the tip; None if its file is gone or damaged."""
+    for mesh in obstacle_meshes([entry], directory):
+        own = mesh.vertices, mesh.faces, mesh.center, np.zeros(3)
+        return CarriedMesh(mesh.name, *own, since, until, pose=pose)
+    return None
 
 
 def _surface(entry: Mapping[str, Any], directory: Path) -> Any:

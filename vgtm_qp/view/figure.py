@@ -221,15 +221,15 @@ class View:
         inside = projection.flat(np.concatenate([arm, corners, maneuver.tip_target_position]))
         times = maneuver.time[seen]
         around = [
-            place
-            for surface in self.surfaces
-            for time in times
-            if surface.mesh.is_there(time)
-            for place in surface.polygons(time)
+            place for time in times for surface in self._there(time) for place in surface.polygons(time)
         ]
         least, most = with_surroundings(inside, around, 0.3 * np.ptp(inside, axis=0).max())
         pad = 0.03 * float((most - least).max())
         self.low, self.high = least - pad, most + pad
+
+    def _there(self, time: float) -> list[ProjectedMesh]:
+        """Return the surfaces that are there at `time`, s, as they are then."""
+        return [surface.at(time) for surface in self.surfaces if surface.mesh.is_there(time)]
 
     def of(self, maneuver: Result) -> View:
         """Return the same view of another maneuver among the same obstacles."""
@@ -327,8 +327,7 @@ class View:
     def _draw_state(self, axes: Axes, shown: _Shown, scale: float) -> None:
         """Draw arm and obstacles, farthest first."""
         drawing, projection, time, nodes = self.drawing, self.projection, shown.time, shown.nodes
-        there = [surface for surface in self.surfaces if surface.mesh.is_there(time)]
-        surfaces = sorted(there, key=lambda surface: surface.depth(time))
+        surfaces = sorted(self._there(time), key=lambda surface: surface.depth(time))
         for k, surface in enumerate(surfaces, start=1):
             _draw_surface(axes, surface, time, 2.0 * k)
         ends = drawing.arm.ends(nodes)

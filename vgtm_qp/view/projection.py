@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
-from vgtm_qp.view.drawing import ObstacleMesh, direction
+from vgtm_qp.view.drawing import CarriedMesh, ObstacleMesh, direction
 
 _MANY_FACES = 4000
 _SHARP = np.radians(20.0)
@@ -47,6 +47,11 @@ class ProjectedMesh:
         sharp = np.asarray(solid.face_adjacency_angles) > _SHARP
         self._sharp_edges = np.asarray(solid.face_adjacency_edges)[sharp]
         self._beside = np.asarray(solid.face_adjacency)[sharp]
+
+    def at(self, time: float) -> ProjectedMesh:
+        """Return the surface as it is turned at `time`, s."""
+        mesh = self.mesh
+        return ProjectedMesh(mesh.at(time), self.projection) if isinstance(mesh, CarriedMesh) else self
 
     @cached_property
     def is_convex(self) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
@@ -37,6 +38,12 @@ class _DrawnObstacle:
     mesh: ObstacleMesh
     frame: Any
     surface: Any
+
+    def place(self, time: float) -> None:
+        """Put it where it is at `time`, s."""
+        self.frame.position = self.mesh.position(time)
+        x, y, z, w = Rotation.from_matrix(self.mesh.rotation(time)).as_quat()
+        self.frame.wxyz = np.array([w, x, y, z])
 
 
 def import_viser() -> Any:
@@ -132,10 +139,10 @@ class ArmScene:
                 self._vertices.points = numbers(control_vertices)
             is_changing = any(np.isfinite((mesh.since, mesh.until)).any() for mesh in self._drawing.obstacles)
             for drawn in self._obstacles.values():
-                if drawn.mesh.velocity.any():
-                    drawn.frame.position = drawn.mesh.position(time)
                 if is_changing:
                     drawn.frame.visible = drawn.mesh.is_there(time)
+                if drawn.mesh.moves and drawn.mesh.is_there(time):
+                    drawn.place(time)
 
     def put(self, obstacles: Sequence[ObstacleMesh], time: float) -> None:
         """Show `obstacles` in the place of those that were there, where they are at `time`, s."""
@@ -152,7 +159,7 @@ class ArmScene:
                     drawn.surface.vertices = mesh.vertices.astype(np.float32)
                     drawn.surface.faces = mesh.faces.astype(np.uint32)
                 drawn.mesh = mesh
-                drawn.frame.position = mesh.position(time)
+                drawn.place(time)
 
     def mark(self, bodies: Sequence[int], obstacles: Collection[str], line: Array | None, said: str) -> None:
         """Show bodies, by index, with the next `move`, and obstacles, by name, as what holds the arm; so the `line`.
@@ -203,7 +210,7 @@ class ArmScene:
 
     def _add_obstacle(self, mesh: ObstacleMesh) -> _DrawnObstacle:
         path = _path(mesh)
-        frame = self._scene.add_frame(path, show_axes=False, position=mesh.center)
+        frame = self._scene.add_frame(path, show_axes=False)
         surface = self._scene.add_mesh_simple(
             f"{path}/surface",
             mesh.vertices.astype(np.float32),
@@ -215,7 +222,9 @@ class ArmScene:
             cast_shadow=False,
         )
         self._scene.add_label(f"{path}/name", mesh.name, anchor="center-center")
-        return _DrawnObstacle(mesh, frame, surface)
+        drawn = _DrawnObstacle(mesh, frame, surface)
+        drawn.place(max(mesh.since, 0.0))
+        return drawn
 
     def _add_ground(self, nodes: Array) -> None:
         base = nodes[self._drawing.arm.base]
