@@ -177,6 +177,23 @@ def test_nodes_and_quantities_move_with_the_actuators(arm):
     check_motion(arm)
 
 
+def test_forces_do_as_much_work_as_the_load_at_the_tip(arm, rng):
+    """In every motion, also one that stretches members or bends joints that cannot: virtual work."""
+    q, load = bent(arm, rng), rng.normal(size=3)
+    forces = arm.forces(q, load)
+    for _ in range(4):
+        way = np.zeros_like(q)
+        if q.ndim == 2:
+            way[arm.free] = rng.normal(size=(len(arm.free), 3))
+        else:
+            way[:-6] = arm.following(rng.normal(size=len(q) - 6))
+        ends = [q + s * H * way for s in (1.0, -1.0)]
+        tips = [arm.end_effector.position(arm.nodes(at)) for at in ends]
+        quantities = [arm.measured(at) for at in ends]
+        work = load @ (tips[0] - tips[1]) / (2.0 * H)
+        assert forces @ (quantities[0] - quantities[1]) / (2.0 * H) == pytest.approx(work, abs=1e-6)
+
+
 TRACKS = [("position",), ("position", "orientation"), ("x", "z", "pointing")]
 
 

@@ -317,6 +317,8 @@ def live() -> Iterator[Live]:
 
 def test_every_control_is_driven_without_an_error(live: Live):
     drive_obstacles(live)
+    drive_carrying(live)
+    drive_forces(live)
     drive_clearance_and_method(live)
     drive_moves(live)
     drive_maneuver(live)
@@ -400,6 +402,43 @@ def drive_clearance_and_method(live: Live) -> None:
     live.wait(
         lambda session: abs(session.problem.method.weights.actuator_rate - 0.1) < 1e-9, "another weight"
     )
+
+
+def drive_carrying(live: Live) -> None:
+    """Carry an obstacle, move with it, and let it go."""
+    live.press("Add sphere")
+    live.wait(lambda session: session.obstacles[-1].name == "sphere 1", "no sphere")
+    place = live.ask(lambda session: np.add(session.tip, [0.0, 0.0, 0.5]))
+    live.page.post(
+        lambda: live.page.session.move_obstacle("sphere 1", center=place, rotation_vector=[0.0, 0.0, 0.0])
+    )
+    live.press("Carry")
+    live.wait(lambda session: session.carried == ("sphere 1",), "not carried")
+    live.page.post(lambda: live.page.session.want_tip(live.page.session.tip + [0.2, 0.0, 0.0]))
+
+    def is_with_the_tip(session: Session) -> bool:
+        (mesh,) = (mesh for mesh in session.drawing.obstacles if mesh.name == "sphere 1")
+        gap = mesh.position(session.state.time) - session.tip
+        return bool(session.state.time > 0.0) and abs(float(np.linalg.norm(gap)) - 0.5) < 1e-9
+
+    live.wait(is_with_the_tip, "the sphere is not where the tip is")
+    live.press("Let go")
+    live.wait(lambda session: session.carried == () and len(session.obstacles) == 3, "not let go")
+    live.press("Delete")
+    live.wait(lambda session: len(session.obstacles) == 2, "not deleted")
+
+
+def drive_forces(live: Live) -> None:
+    """Show what the members bear."""
+    live.open("Forces")
+    live.tab.get_by_text("Show forces").click()
+    live.driven += 1
+    live.seen("greatest push")
+    live.enter("100", "force at the tip [N]", 2)
+    live.seen("greatest pull")
+    live.tab.get_by_text("Show forces").click()
+    live.driven += 1
+    live.open("Obstacles")
 
 
 def drive_moves(live: Live) -> None:

@@ -316,6 +316,18 @@ class Arm(ABC):
         """
 
     @abstractmethod
+    def forces(self, q: Array, load: Array) -> Array:
+        """Return (M,) what the quantities bear at rest where a force `load` (3,), N, pulls at the end effector.
+
+        By virtual work: forces of lengths, N, tension positive, and torques about joints, N m. The arm weighs nothing.
+
+        Raises
+        ------
+        SolverError
+            The arm is in a singular pose.
+        """
+
+    @abstractmethod
     def nodes(self, q: Array) -> Array:
         """Return (N, 3) the nodes at a configuration, m."""
 

@@ -212,6 +212,12 @@ class JointSpaceArm(Arm):
         turn, slide = np.where(self.revolute, joints, 0.0), np.where(self.revolute, 0.0, joints)
         return np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
 
+    def forces(self, q: Array, load: Array) -> Array:
+        tip, constants = self.end_effector, [value.T for value in self.constants.values()]
+        _, jacobian = self.functions[1](q, *constants)
+        moved = self.by_quantities(np.array(jacobian)).reshape(len(self.home), 3, -1)
+        return np.asarray(np.einsum("k,kcj,c->j", tip.weights, moved[tip.nodes], load))
+
     def reach(self) -> Array:
         """See ``arm.Arm``: only the distance from the base's origin, its first node, is bounded."""
         return np.array([self.reaches[0], *[np.inf] * (int(self.base.sum()) - 1)])

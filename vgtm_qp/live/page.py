@@ -11,6 +11,7 @@ from typing import Any
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.live.curves import Curves
+from vgtm_qp.live.forces import ForceTools
 from vgtm_qp.live.handles import Handles
 from vgtm_qp.live.journey import GoalTools
 from vgtm_qp.live.obstacles import ObstacleTools
@@ -72,6 +73,7 @@ class Page:
     _player: Player
     _goal: GoalTools
     _obstacles: ObstacleTools
+    _forces: ForceTools
     _settings: Settings
     _curves: Curves
     _read_out: Any
@@ -194,7 +196,7 @@ class Page:
         self._read_out = gui.add_html(read_out(session, ""))
         self._curves = Curves(gui)
         tabs = gui.add_tab_group()
-        names = ("Move", "Obstacles", "Maneuver", "Method")
+        names = ("Move", "Obstacles", "Forces", "Maneuver", "Method")
         # A result is there to be played first of all.
         order = sorted(names, key=lambda name: name != "Maneuver") if has_maneuver else names
         tab = {name: tabs.add_tab(name) for name in order}
@@ -206,6 +208,8 @@ class Page:
             self._goal = GoalTools(self._stage, self._player.pause)
         with tab["Obstacles"]:
             self._obstacles = ObstacleTools(self._stage)
+        with tab["Forces"]:
+            self._forces = ForceTools(self._stage)
         with tab["Method"]:
             self._problems = ProblemChoice(self._stage, self.load)
             self._settings = Settings(self._stage)

@@ -226,6 +226,13 @@ class Session:
         self._resolver.remove_obstacle(name)
         self._redraw(name)
 
+    def forces(self, load: ArrayLike) -> Array:
+        """Return (M,) what members or joints bear where a force (3,), N, pulls at the tip; see ``Arm.forces``.
+
+        SolverError in a singular pose.
+        """
+        return self._resolver.setup.arm.forces(self.state.q, np.asarray(load, dtype=float))
+
     @property
     def carried(self) -> tuple[str, ...]:
         """Names of the bodies that the arm carries."""

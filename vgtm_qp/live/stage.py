@@ -27,6 +27,8 @@ class PageStage:
     scene : ArmScene
     path : (K, 3)
         The path of the tip in the problem's maneuver, m.
+    prepares : list of callable
+        Called before the arm is drawn, by the parts that say how.
     draws : list of callable
         Called after the arm is drawn, by the parts that have something of their own in the scene.
     """
@@ -34,6 +36,7 @@ class PageStage:
     def __init__(self, server: Any, session: Session) -> None:
         self.server, self.inbox, self.session = server, Inbox(), session
         self.draws: list[Callable[[], None]] = []
+        self.prepares: list[Callable[[], None]] = []
         self.scene, self.path = self._picture()
 
     def open(self, session: Session) -> None:
@@ -73,6 +76,8 @@ class PageStage:
         if session.drawing.obstacles is not self._shown:
             self._shown = session.drawing.obstacles
             self.scene.put(self._shown, session.state.time)
+        for prepare in self.prepares:
+            prepare()
         self.scene.move(session.nodes, session.control_vertices, session.state.time)
         for draw in self.draws:
             draw()

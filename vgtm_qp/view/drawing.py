@@ -145,6 +145,13 @@ def stroke_colours(share: Array) -> Array:
     return np.stack([np.interp(share, knots, channel) for channel in _STROKE_COLOURS.T], axis=-1)
 
 
+def force_colours(forces: Array) -> Array:
+    """Return (M, 3) colours of forces (M,): from grey without force to red for the greatest push, blue for pulls."""
+    share = forces / max(float(np.abs(forces).max(initial=0.0)), np.finfo(float).tiny)
+    extreme = np.where(share[:, None] < 0.0, _STROKE_COLOURS[2], _STROKE_COLOURS[0])
+    return np.asarray(FIXED_COLOUR + np.abs(share)[:, None] * (extreme - FIXED_COLOUR))
+
+
 def drawing_of_maneuver(maneuver: Result) -> Drawing:
     """Return the drawing of a result, from its manifest; ResultError if its record of the arm is wrong."""
     manifest = maneuver.manifest

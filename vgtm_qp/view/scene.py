@@ -64,7 +64,11 @@ class ArmScene:
         The size of the arm's parts, m.
     ball : float
         Radius of a ball that stands out at the arm, m.
+    painted : (M, 3) or None
+        Colours of the bodies from the next `move` on, 0 to 1; by default those of ``Drawing.colours``.
     """
+
+    painted: Array | None = None
 
     def __init__(self, server: Any, drawing: Drawing, nodes: Array, control_vertices: Array) -> None:
         import trimesh
@@ -119,7 +123,7 @@ class ArmScene:
 
         arm = self._drawing.arm
         position, wxyz, span = map(numbers, _placement(arm.ends(nodes)))
-        shown = self._drawing.colours(arm.lengths(nodes))
+        shown = self._drawing.colours(arm.lengths(nodes)) if self.painted is None else self.painted.copy()
         shown[self._marked] = MARK_COLOUR
         colours = _instance_rgb(shown)
         with self._server.atomic():

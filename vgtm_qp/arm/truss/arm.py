@@ -12,7 +12,7 @@ from vgtm_qp.arm.arm import Arm, Kinematics, Label, MotionPattern, Newton, Pose,
 from vgtm_qp.arm.frames import frame_constants
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.bounds import chord_deviation, frame_deviation, hollow, longest_paths
-from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows
+from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows, length_gradients, solved
 from vgtm_qp.arm.truss.lengths import LengthSolver
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.symbols import TrussSymbols
@@ -113,6 +113,12 @@ class TrussArm(Arm):
     def _ends(self) -> EndKinematics | None:
         truss = self.truss
         return None if truss.joints is None else EndKinematics(truss.members, truss.joints)
+
+    def forces(self, q: Array, load: Array) -> Array:
+        at_nodes, tip = np.zeros_like(self.home), self.end_effector
+        at_nodes[tip.nodes] = tip.weights[:, None] * load
+        jacobian = self.truss.scatter.sparse(length_gradients(self.truss, q))
+        return solved(jacobian.T.tocsc(), at_nodes[self.free].reshape(-1))
 
     def travel(self, motion: Array) -> float:
         return float(np.abs(motion).max())

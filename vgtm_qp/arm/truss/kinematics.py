@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.sparse.linalg import splu
 
@@ -80,13 +82,20 @@ class LengthRows:
         known = np.zeros((members, count + 1))
         known[truss.actuators, np.arange(count)] = 1.0
         known[:, -1] = self.rhs
-        try:
-            if members <= _DENSE:
-                answer = np.asarray(np.linalg.solve(self.jacobian(), known), dtype=float)
-            else:
-                answer = splu(truss.scatter.sparse(self.gradient)).solve(known)
-        except (np.linalg.LinAlgError, RuntimeError) as reason:
-            raise SolverError(_SINGULAR) from reason
-        if not np.isfinite(answer).all():
-            raise SolverError(_SINGULAR)
+        small = members <= _DENSE
+        answer = solved(self.jacobian() if small else truss.scatter.sparse(self.gradient), known)
         return answer[:, :-1], answer[:, -1]
+
+
+def solved(jacobian: Any, known: Array) -> Array:
+    """Return the solution for the length Jacobian or its transpose, dense or sparse; SolverError in a singular pose."""
+    try:
+        if isinstance(jacobian, np.ndarray):
+            answer = np.asarray(np.linalg.solve(jacobian, known), dtype=float)
+        else:
+            answer = np.asarray(splu(jacobian).solve(known), dtype=float)
+    except (np.linalg.LinAlgError, RuntimeError) as reason:
+        raise SolverError(_SINGULAR) from reason
+    if not np.isfinite(answer).all():
+        raise SolverError(_SINGULAR)
+    return answer
