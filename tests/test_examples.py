@@ -29,6 +29,7 @@ def called(example: Path) -> str:
 SAYS = {
     "own_truss": ("6 free motions", "solved; verified: True"),
     "control_loop": ("400 cycles at 200 Hz", "certified: True"),
+    "pick_and_place": ("taken up, too near: nothing", "56 steps, certified: True", "least clearance 0.080"),
     "compare_methods": ("curve-pseudoinverse", "pseudoinverse", "qp"),
     "jammed_actuator": ("it moved by 0.000000000 m", "verified: True"),
     "certify_plans": (

@@ -11,7 +11,7 @@ Its keys are:
 - `method`; `solver`; `setup_time`, s; `versions`; `jacobian_rank`, of the last step if the method reveals it;
 - `directory`, in which relative paths of the problem start; `meshes`, from ``mesh_record`` for each mesh;
 - `scenes`, where the scene changed while the arm ran: from each `row` on, to the next one's, the tables of `obstacle`,
-  `safe` and `self_safe` of ``[clearance]``, `meshes` and `recovered` as above;
+  `safe` and `self_safe` of ``[clearance]``, `meshes` and `recovered` as above, and what is `carried` at the tip;
 - `certificate`, null before verification;
 - `clearance_rows`, numbers of rows by `fcl` and of `exact` ones in the QPs that moved the arm.
 """
