@@ -1,4 +1,4 @@
-"""Pick and place: the arm takes up a crate, carries it over to the other side, and lets it go; all of it is certified."""
+"""Pick and place: the arm takes up a crate, carries it to the other side and lets it go; all of it is certified."""
 
 from pathlib import Path
 
@@ -13,12 +13,12 @@ problem = vq.load_problem("five_bay_two_cubes")
 resolver = vq.Resolver(problem)
 recording = vq.Recording(resolver, problem)
 home = resolver.tip()[0]
-resolver.add_obstacle(vq.Box(name="crate", center=home + [-0.75, 0.0, 0.25], size=[0.3, 0.3, 0.25]))
+resolver.add_obstacle(vq.Box(name="crate", center=np.add(home, [-0.75, 0.0, 0.25]), size=[0.3, 0.3, 0.25]))
 
 
-def go(goal: np.ndarray, steps: int = 12) -> None:
-    """Step along the straight way to a goal, as far as the arm can."""
-    start = resolver.tip()[0]
+def go(shift: list[float], steps: int = 12) -> None:
+    """Step along the straight way to a place beside home, as far as the arm can."""
+    goal, start = np.add(home, shift), resolver.tip()[0]
     for share in np.linspace(0.0, 1.0, steps + 1)[1:]:
         step = resolver.step(position=start + share * (goal - start), dt=0.2)
     if step.status is not vq.StepStatus.REACHED:
@@ -27,13 +27,13 @@ def go(goal: np.ndarray, steps: int = 12) -> None:
 
 
 # Beside the crate a gripper takes it: from now on it belongs to the arm, and keeps clear of the cubes like a member.
-go(home + [-0.25, 0.0, -0.05])
+go([-0.25, 0.0, -0.05])
 print(f"taken up, too near: {resolver.attach('crate') or 'nothing'}")
-go(home + [0.2, 0.0, 0.1])
-go(home + [1.4, 0.0, -0.7], steps=20)
+go([0.2, 0.0, 0.1])
+go([1.4, 0.0, -0.7], steps=20)
 place = np.array(resolver.carried[0].center)
 print(f"let go at {place.round(2).tolist()}, too near: {resolver.release('crate') or 'nothing'}")
-go(home + [0.6, 0.0, -0.1])
+go([0.6, 0.0, -0.1])
 
 maneuver = recording.maneuver()
 certificate = vq.verify(maneuver)

@@ -110,7 +110,7 @@ def test_between_never_certifies_what_sampling_refutes(seed, size, floor):
     rng = np.random.default_rng(seed)
     X, clearance = random_scene(rng)
     end = X + size * rng.normal(size=X.shape)
-    report = clearance.between(X, end, 1.0, 1.5, floor)
+    report = clearance.along(np.stack([X, end]), 1.0, 1.5, floor)
     s = np.linspace(0.0, 1.0, 60)
     sampled = min(clearance.least(X + f * (end - X), 1.0 + 0.5 * f)[0] for f in s)
     if report.certified:
@@ -134,8 +134,8 @@ def test_between_certifies_what_is_clear_and_shows_where_it_is_not():
         capsules([(0, 1)], 0.03), [box("cube", (1.0, 0.0, 1.0), 0.4)], safe=0.08, influence=0.5
     )
     aside, past = X + np.array([0.65, 0.0, 0.0]), X + np.array([2.0, 0.0, 0.0])
-    assert clearance.between(X, aside, 0.0, 1.0, 0.0799).certified
-    report = clearance.between(X, past, 0.0, 1.0, 0.08)
+    assert clearance.along(np.stack([X, aside]), 0.0, 1.0, 0.0799).certified
+    report = clearance.along(np.stack([X, past]), 0.0, 1.0, 0.08)
     assert not report.certified
     assert report.failing.name(0) == "clearance: member 0 / cube"
     assert report.fraction[0] == pytest.approx(0.5, abs=0.1)
@@ -146,14 +146,14 @@ def test_between_certifies_what_is_clear_and_shows_where_it_is_not():
         safe=0.08,
         influence=0.5,
     )
-    assert fleeing.between(X, past, 0.0, 1.0, 0.08).certified
+    assert fleeing.along(np.stack([X, past]), 0.0, 1.0, 0.08).certified
     chasing = Clearance(
         capsules([(0, 1)], 0.03),
         [box("cube", (1.0, 0.0, 1.0), 0.4, velocity=(-3.0, 0.0, 0.0))],
         safe=0.08,
         influence=0.5,
     )
-    assert not chasing.between(X, X, 0.0, 1.0, 0.08).certified
+    assert not chasing.along(np.stack([X, X]), 0.0, 1.0, 0.08).certified
 
 
 @pytest.mark.smoke
@@ -166,8 +166,8 @@ def test_a_path_round_an_edge_is_certified_down_to_its_dip():
     angle = np.array([0.6, 0.9])
     start, end = (axis + np.array([0.5 + reach * np.cos(a), 0.5 + reach * np.sin(a), 0.0]) for a in angle)
     dip = reach * np.cos(0.15) - 0.03
-    assert clearance.between(start, end, 0.0, 0.0, dip - 1e-6).certified
-    assert not clearance.between(start, end, 0.0, 0.0, dip + 1e-6).certified
+    assert clearance.along(np.stack([start, end]), 0.0, 0.0, dip - 1e-6).certified
+    assert not clearance.along(np.stack([start, end]), 0.0, 0.0, dip + 1e-6).certified
 
 
 def test_what_is_not_a_number_is_refused():
@@ -179,7 +179,11 @@ def test_what_is_not_a_number_is_refused():
     for value in (np.nan, np.inf, 1e160):
         bad = X.copy()
         bad[4, 1] = value
-        for ask in (clearance.near, clearance.least, lambda Y: clearance.between(X, Y, 0.0, 0.0, 0.05)):
+        for ask in (
+            clearance.near,
+            clearance.least,
+            lambda Y: clearance.along(np.stack([X, Y]), 0.0, 0.0, 0.05),
+        ):
             with pytest.raises(GeometryError, match="finite"):
                 ask(bad)
 
@@ -260,7 +264,7 @@ def test_far_and_absent_obstacles():
     empty = Clearance(capsules(members, 0.03), safe=0.08, influence=0.5, self_collision=False)
     assert empty.least(X) == (np.inf, None)
     assert len(empty.near(X)) == 0
-    report = empty.between(X, X + 1.0, 0.0, 1.0, 0.08)
+    report = empty.along(np.stack([X, X + 1.0]), 0.0, 1.0, 0.08)
     assert report.certified
     assert report.clearance == np.inf
 
@@ -316,7 +320,7 @@ def test_closed_mesh_equals_the_box_it_bounds_and_is_solid(rng):
     assert len(near) == 1
     assert near.distance[0] == pytest.approx(-0.2 - 0.02)
     np.testing.assert_allclose(near.normal[0], [1.0, 0.0, 0.0], atol=1e-12)
-    assert not solid.between(inside, inside + 0.01, 0.0, 0.0, 0.0).certified
+    assert not solid.along(np.stack([inside, inside + 0.01]), 0.0, 0.0, 0.0).certified
 
 
 def test_mesh_from_a_file(tmp_path):

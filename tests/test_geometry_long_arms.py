@@ -161,7 +161,7 @@ def test_what_is_proven_of_an_arm_that_bends_holds_on_the_way(seed, size):
     start = X
     for _ in range(4):
         end = turned(start, rng.integers(1, BAYS), Rotation.from_rotvec(rng.normal(size=3) * size))
-        report = monitor.between(start, end, 0.0, 0.0, 0.02, 0.01)
+        report = monitor.along(np.stack([start, end]), 0.0, 0.0, 0.02, 0.01)
         for s in np.linspace(0.0, 1.0, 6) if report.certified else ():
             exact = every_distance(monitor, start + s * (end - start))
             assert exact[False].min() >= 0.02 - 1e-9

@@ -414,7 +414,7 @@ def drive_carrying(live: Live) -> None:
     )
     live.press("Carry")
     live.wait(lambda session: session.carried == ("sphere 1",), "not carried")
-    live.page.post(lambda: live.page.session.want_tip(live.page.session.tip + [0.2, 0.0, 0.0]))
+    live.page.post(lambda: live.page.session.want_tip(np.add(live.page.session.tip, [0.2, 0.0, 0.0])))
 
     def is_with_the_tip(session: Session) -> bool:
         (mesh,) = (mesh for mesh in session.drawing.obstacles if mesh.name == "sphere 1")

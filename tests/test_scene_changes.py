@@ -99,7 +99,8 @@ def test_answers_after_changes_are_those_of_a_scene_made_anew(rng, mesh_file):
             assert named[0] == named[1]
         further = points + 0.02 * rng.normal(size=points.shape)
         proofs = [
-            monitor.between(points, further, time, time + 0.1, 0.03, 0.005) for monitor in (changed, anew)
+            monitor.along(np.stack([points, further]), time, time + 0.1, 0.03, 0.005)
+            for monitor in (changed, anew)
         ]
         assert proofs[0].certified == proofs[1].certified
         resolver.step(position=tip + 0.1 * np.sin([0.3 * k, 0.2 * k, 0.1 * k]), dt=0.1)

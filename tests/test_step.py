@@ -477,7 +477,9 @@ def test_accepted_steps_keep_every_limit_by_recomputation(crate_problem, dt):
         statuses.add(step.status)
         assert fresh.least(step.state.nodes, among="obstacles")[0] >= 0.05 - 1e-9
         assert fresh.least(step.state.nodes, among="members")[0] >= 0.01 - 1e-9
-        assert fresh.between(before.nodes, step.state.nodes, 0.0, 0.0, 0.05 - 1e-4, 0.01 - 1e-4).certified
+        assert fresh.along(
+            np.stack([before.nodes, step.state.nodes]), 0.0, 0.0, 0.05 - 1e-4, 0.01 - 1e-4
+        ).certified
     assert StepStatus.SLOWED in statuses
 
 

@@ -203,9 +203,9 @@ def test_a_motion_is_proven_from_where_it_starts_though_its_array_was_overwritte
     wall = box("wall", [1.0, 0.0, 0.0], [0.1, 4.0, 4.0])
     monitor = Clearance(capsules([(0, 1), (2, 3)], 0.03), [wall], safe=0.08, influence=0.5)
     X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, 1.0]])
-    assert monitor.between(X, X + 0.1 * FORWARD, 0.0, 0.0, 0.08).certified
+    assert monitor.along(np.stack([X, X + 0.1 * FORWARD]), 0.0, 0.0, 0.08).certified
     X += 2.0 * FORWARD
-    assert not monitor.between(X, X - 2.0 * FORWARD, 0.0, 0.0, 0.08).certified
+    assert not monitor.along(np.stack([X, X - 2.0 * FORWARD]), 0.0, 0.0, 0.08).certified
     for number in (np.nan, np.inf, 1e160):
         with pytest.raises(GeometryError, match="finite"):
             monitor.near(np.full(X.shape, number), tracked=True)
@@ -304,5 +304,5 @@ def test_a_way_in_pieces_is_proven_where_each_piece_is(rng):
         )
         for _ in range(20):
             way = start + np.cumsum(rng.normal(scale=0.4, size=(6, 1, 3)), axis=0)
-            pieces = [monitor.between(*piece, 0.0, 0.0, 0.08).certified for piece in pairwise(way)]
+            pieces = [monitor.along(np.stack(piece), 0.0, 0.0, 0.08).certified for piece in pairwise(way)]
             assert monitor.along(way, 0.0, 1.0, 0.08).certified == all(pieces)

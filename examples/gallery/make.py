@@ -37,7 +37,9 @@ def make(picture: str, command: str) -> None:
         shutil.copytree(EXAMPLES, Path(folder, "examples"), ignore=shutil.ignore_patterns("*.png", "*.gif"))
         places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
         subprocess.run(command, shell=True, cwd=folder, check=True, env={**os.environ, "PATH": places})
-        made = next(path for path in (Path(folder, file.name), Path(folder, "out", file.name)) if path.exists())
+        made = next(
+            path for path in (Path(folder, file.name), Path(folder, "out", file.name)) if path.exists()
+        )
         store(made, file)
     print(f"{picture}: {file.stat().st_size / 1000:.0f} kB")
 

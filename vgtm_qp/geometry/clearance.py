@@ -70,15 +70,11 @@ class Clearance:
 
     def _begin(self) -> None:
         """Forget all pairs, and see what the scene is."""
+        self.bodies = self.scene.bodies
         self._widest = float(self.bodies.radius.max(initial=0.0))
         self._watching: Watch | None = None
         self._candidates = Candidates(self.scene, self.influence, self.self_influence)
         self._look()
-
-    @property
-    def bodies(self) -> Bodies:
-        """The bodies of the arm, and what it carries."""
-        return self.scene.bodies
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
@@ -100,19 +96,19 @@ class Clearance:
         """Surface distance below which a pair of bodies is near, m."""
         return min(self.influence, 2.0 * (self.safe + self._widest))
 
-    def put(self, obstacles: Sequence[Obstacle]) -> None:
-        """Put `obstacles` in the place of those that were there; what is known of pairs of bodies is kept."""
-        self.scene.put(obstacles)
+    def put(self, obstacles: Sequence[Obstacle], bodies: Bodies | None = None) -> None:
+        """Put `obstacles` in the place of those that were there, and other `bodies` in that of the arm's, if given.
+
+        What is known of pairs of bodies is kept if these stay.
+        """
+        self.scene.put(obstacles, bodies)
+        if bodies is not None:
+            self._begin()
+            return
         self._candidates.forget_pieces()
         if self._watching is not None:
             self._watching.forget_pieces()
         self._look()
-
-    def span(self, bodies: Bodies) -> None:
-        """Keep clear with other `bodies` from now on."""
-        self.scene.bodies = bodies
-        self.scene.put(self.obstacles)
-        self._begin()
 
     def _look(self) -> None:
         """See whether the obstacles can be watched, and which of them enclose space."""
@@ -240,18 +236,6 @@ class Clearance:
             if len(rows) and not (group.distances(X, time, rows) >= least).all():
                 return False
         return not self._solids.enclosed(X, time)
-
-    def between(
-        self,
-        start: Array,
-        end: Array,
-        start_time: float,
-        end_time: float,
-        floor: float,
-        self_floor: float | None = None,
-    ) -> BetweenReport:
-        """Prove what :meth:`along` proves, for one straight motion from `start` to `end` (P, 3), m."""
-        return self.along(np.stack([start, end]), start_time, end_time, floor, self_floor)
 
     def along(
         self,

@@ -63,11 +63,13 @@ class Scene:
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
         self.put(obstacles)
 
-    def put(self, obstacles: Sequence[Obstacle]) -> None:
+    def put(self, obstacles: Sequence[Obstacle], bodies: Bodies | None = None) -> None:
         """Put `obstacles` in the place of those that were there, and make the functions that steps use for them.
 
-        Groups of pairs with obstacles that were made before are of no use afterwards; those of bodies are.
+        Groups of pairs with obstacles that were made before are of no use afterwards; those of bodies are, unless there
+        are other `bodies` now.
         """
+        self.bodies = self.bodies if bodies is None else bodies
         self.obstacles = tuple(obstacles)
         self.pieces = ObstaclePieces(self.obstacles)
         names = tuple(obstacle.name for obstacle in self.obstacles)

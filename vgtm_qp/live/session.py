@@ -12,20 +12,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.errors import GoalError
 from vgtm_qp.live.holding import hold_of, pairs_too_near
 from vgtm_qp.live.reading import OUTCOMES, Reading
+from vgtm_qp.live.surroundings import Surroundings
 from vgtm_qp.methods import Resolver, method_name
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.problem import Problem
-from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere
 from vgtm_qp.rows.curve import fitted
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 from vgtm_qp.verify.arm import recorded_arm
-from vgtm_qp.view.drawing import carried_mesh, make_drawing, obstacle_meshes
+from vgtm_qp.view.drawing import make_drawing
 
 _REACHED = 1e-4
 _STRIDE = 0.06
@@ -34,7 +33,7 @@ _CRAWL = 1e-3
 """Share of a step below which an arm counts as held, so that the page says what would let it go on."""
 
 
-class Session:
+class Session(Surroundings):
     """One arm, its resolver, and its goals. Threads must not share a session.
 
     Attributes
@@ -176,7 +175,8 @@ class Session:
     def _use(self, problem: Problem) -> None:
         """Go on with another problem from the same state."""
         resolver, short = Resolver(problem), bool(self.state.shortfall)
-        resolver.setup.carry(self._resolver.setup.carrier.carried)
+        if held := self._resolver.setup.carrier.carried:
+            resolver.setup.put(resolver.setup.monitor.obstacles, held)
         resolver.state = replace(_with_curve(self.state, resolver.setup), shortfall=None)
         self._problem, self._resolver, self._scene_changed = problem, resolver, False
         if short:
@@ -192,75 +192,12 @@ class Session:
         given = self._given.to_dict()["method"]
         self._use(with_method(self.problem.replace({"method": given}), name))
 
-    @property
-    def obstacles(self) -> tuple[Box | Sphere | Cylinder | Mesh, ...]:
-        """The obstacles of the scene; their centers are those at time 0."""
-        return self._resolver.obstacles
-
-    def obstacle(self, name: str) -> Box | Sphere | Cylinder | Mesh:
-        """Return the obstacle called `name`, its center where it is now.
-
-        GoalError if there is none.
-        """
-        for table in self.obstacles:
-            if table.name == name:
-                now = np.add(table.center, np.multiply(self.state.time, table.velocity))
-                return table.model_copy(update={"center": tuple(now.tolist())})
-        raise GoalError(f"there is no obstacle {name!r}; {len(self.obstacles)} others are there")
-
-    def add_obstacle(self, obstacle: Box | Sphere | Cylinder | Mesh) -> None:
-        """Put an obstacle into the scene, its center where it is now; GoalError if its name is taken."""
-        self._resolver.add_obstacle(obstacle)
-        self._redraw(obstacle.name)
-
-    def move_obstacle(self, name: str, *, center: ArrayLike, rotation_vector: ArrayLike) -> None:
-        """Put an obstacle at `center` (3,), m, in an attitude `rotation_vector` (3,), rad.
-
-        GoalError, and no change, if there is none of that name.
-        """
-        self._resolver.move_obstacle(name, center=center, rotation_vector=rotation_vector)
-        self._redraw(name)
-
-    def remove_obstacle(self, name: str) -> None:
-        """Take an obstacle out of the scene; GoalError if there is none of that name."""
-        self._resolver.remove_obstacle(name)
-        self._redraw(name)
-
     def forces(self, load: ArrayLike) -> Array:
         """Return (M,) what members or joints bear where a force (3,), N, pulls at the tip; see ``Arm.forces``.
 
         SolverError in a singular pose.
         """
         return self._resolver.setup.arm.forces(self.state.q, np.asarray(load, dtype=float))
-
-    @property
-    def carried(self) -> tuple[str, ...]:
-        """Names of the bodies that the arm carries."""
-        return tuple(table.name for table in self._resolver.carried)
-
-    def attach(self, name: str) -> None:
-        """Carry an obstacle at the tip; GoalError, and no change, if there is none of that name."""
-        self._resolver.attach(name)
-        self._redraw(name)
-
-    def release(self, name: str) -> None:
-        """Let go of a body that is carried; GoalError if there is none of that name."""
-        self._resolver.release(name)
-        self._redraw(name)
-
-    def _redraw(self, name: str) -> None:
-        """Let problem and drawing follow a change of the obstacle called `name`."""
-        self._scene_changed = True
-        self._wake()
-        there = {table.name: table for table in self.obstacles}
-        known = {mesh.name: mesh for mesh in self.drawing.obstacles}
-        fresh = [there[name].model_dump(mode="json", exclude_none=True)] if name in there else []
-        known |= {mesh.name: mesh for mesh in obstacle_meshes(fresh, self._directory)}
-        shown = [mesh for key, mesh in known.items() if key in there]
-        for body in self._resolver.setup.carrier.carried:
-            mesh = carried_mesh(body.record()["body"], self._directory, lambda _: self.pose())
-            shown += [mesh] if mesh is not None else []
-        self.drawing = replace(self.drawing, obstacles=tuple(shown))
 
     def advance(self, dt: float) -> bool:
         """Make one step of duration `dt`, s, towards the goals; return whether the arm moved.

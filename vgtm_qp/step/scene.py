@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.arm.carrying import carried
+from vgtm_qp.arm.carrying import Carried, carried
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, ProblemError, nearest
 from vgtm_qp.geometry.shapes import GeometryError, Obstacle
@@ -179,8 +179,7 @@ class ChangingScene(ABC):
             position, rotation = self.tip()
             turn = rotation.T @ rotation_from_vector(table.rotation_vector)
             own = _placed(table, rotation.T @ (centre - position), turn)
-            self.setup.carry([*self.setup.carrier.carried, carried(_made(own))])
-            return self._put(there)
+            return self._put(there, [*self.setup.carrier.carried, carried(_made(own))])
 
     def release(self, name: str, *, keep: bool = True) -> Near:
         """Let go of a body that is carried; return the pairs that are too near now.
@@ -201,8 +200,7 @@ class ChangingScene(ABC):
             k, there = names.index(name), list(self.setup.monitor.obstacles)
             if keep:
                 there.append(_made(self.carried[k]))
-            self.setup.carry([*held[:k], *held[k + 1 :]])
-            return self._put(there)
+            return self._put(there, [*held[:k], *held[k + 1 :]])
 
     def set_clearance(self, *, safe: float | None = None, self_safe: float | None = None) -> Near:
         """Change the least clearances that are kept; return the pairs that are too near now.
@@ -254,8 +252,8 @@ class ChangingScene(ABC):
         except ProblemError as error:
             raise GoalError("; ".join(map(str, error.mistakes))) from None
 
-    def _put(self, obstacles: Sequence[Obstacle]) -> Near:
-        self.setup.put(obstacles)
+    def _put(self, obstacles: Sequence[Obstacle], carried: Sequence[Carried] | None = None) -> Near:
+        self.setup.put(obstacles, carried)
         self._changes += 1
         return self._after_change()
 

@@ -101,20 +101,13 @@ class Setup:
         """Least clearance between bodies, m."""
         return self.monitor.self_safe
 
-    def put(self, obstacles: Sequence[Obstacle]) -> None:
-        """Put `obstacles` in the place of those that were there."""
-        for monitor in self._monitors:
-            monitor.put(obstacles)
-
-    def carry(self, carried: Sequence[Carried]) -> None:
-        """Let the arm carry these bodies from now on, and no others."""
-        self.carrier.carry(carried)
-        for monitor in self._monitors:
-            monitor.span(self.carrier.bodies)
-
-    @property
-    def _monitors(self) -> list[Clearance]:
-        return [monitor for monitor in (self.monitor, self.measure) if monitor is not None]
+    def put(self, obstacles: Sequence[Obstacle], carried: Sequence[Carried] | None = None) -> None:
+        """Put `obstacles` in the place of those that were there, and `carried` in that of what is carried, if given."""
+        if carried is not None:
+            self.carrier.carry(carried)
+        for monitor in (self.monitor, self.measure):
+            if monitor is not None:
+                monitor.put(obstacles, None if carried is None else self.carrier.bodies)
 
     @property
     def slows_down(self) -> bool:
