@@ -29,8 +29,12 @@ class PairNames:
 
     def clearance(self, pair: Pair) -> str:
         """Return the name of a clearance row: ``"clearance: member L3-2 / right cube"``."""
+        return f"clearance: {self.called(pair)}"
+
+    def called(self, pair: Pair) -> str:
+        """Return the name of a pair: ``"member L3-2 / right cube"``."""
         other = self.bodies.called(pair.other) if pair.is_self else self.obstacles[self.owner[pair.other]]
-        return f"clearance: {self.bodies.called(pair.body)} / {other}"
+        return f"{self.bodies.called(pair.body)} / {other}"
 
     def plain(self, pair: Pair) -> str:
         """Return the name of a pair as records have it, without kinds: ``"L3-2 / right cube"``."""

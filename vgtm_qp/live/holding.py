@@ -17,7 +17,7 @@ def pairs_too_near(resolver: Resolver) -> tuple[TooNear, ...]:
     monitor = resolver.setup.monitor
     found = [
         TooNear(
-            monitor.names.clearance(pair).removeprefix("clearance: "),
+            monitor.names.called(pair),
             distance,
             monitor.self_safe if pair.is_self else monitor.safe,
         )
@@ -41,7 +41,7 @@ def hold_of(setup: Setup, state: State, wanted: Sequence[str]) -> Hold | None:
     ours = near.weights[k, :2] @ points[near.points[k, :2]]
     away = float(setup.monitor.bodies.radius[body] + near.distance[k]) * near.normal[k]
     return Hold(
-        name=near.name(k).removeprefix("clearance: "),
+        name=near.names.called(near.pair(k)),
         distance=float(near.distance[k]),
         bodies=(body, other) if is_self else (body,),
         obstacle="" if is_self else near.names.obstacles[near.names.owner[other]],

@@ -286,7 +286,7 @@ class Session(Surroundings):
             active=() if last is None else last.active,
             clearance=clearance,
             self_clearance=monitor.least(points, state.time, among="members")[0],
-            nearest="" if pair is None else monitor.names.clearance(pair).removeprefix("clearance: "),
+            nearest="" if pair is None else monitor.names.called(pair),
             too_near=too_near,
             hold=hold_of(setup, state, wanted) if wanted else None,
             gap=setup.gap_of(state),

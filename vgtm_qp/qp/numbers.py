@@ -194,6 +194,11 @@ UNBOUNDED = 1e30
 """Infinity in DAQP's bounds."""
 
 
+def infinite(bounds: Array) -> Array:
+    """Return DAQP's bounds with infinities where there are none."""
+    return np.where(np.abs(bounds) < UNBOUNDED, bounds, np.copysign(np.inf, bounds))
+
+
 def norm(vector: Array) -> float:
     """Return the Euclidean norm; NaN where an entry is."""
     return math.sqrt(vector @ vector)

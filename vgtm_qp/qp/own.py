@@ -9,7 +9,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.errors import PartError
 from vgtm_qp.parts import Part
 from vgtm_qp.qp.dense import DenseAnswer, check, check_question
-from vgtm_qp.qp.numbers import UNBOUNDED
+from vgtm_qp.qp.numbers import infinite
 from vgtm_qp.qp.residual import AnswerError, NoAnswerError
 
 
@@ -45,10 +45,8 @@ class OwnSolver:
         check_question(self._name, hessian, gradient, constraint, lower, upper)
         size, bounded = len(gradient), len(lower) - len(constraint)
         rows = np.concatenate([np.eye(size)[:bounded], constraint])
-        low = np.where(lower > -UNBOUNDED, lower, -np.inf)
-        high = np.where(upper < UNBOUNDED, upper, np.inf)
         try:
-            answer = self._solve(hessian.copy(), gradient.copy(), rows, low, high)
+            answer = self._solve(hessian.copy(), gradient.copy(), rows, infinite(lower), infinite(upper))
         except (ValueError, ArithmeticError) as error:
             raise AnswerError(f"{self._name}: {error}") from error
         if answer is None:

@@ -22,7 +22,7 @@ from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.dense import DenseAnswer, DenseSolver, check, check_question
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import chain_solver, prefers_staged
-from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers
+from vgtm_qp.qp.numbers import StepNumbers, infinite
 from vgtm_qp.qp.own import OwnSolver
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, NoAnswerError
 
@@ -134,11 +134,10 @@ class _QpSolvers:
         check_question(self._name, hessian, gradient, constraint, lower, upper)
         bounded = len(lower) - len(constraint)
         box = [np.full(len(gradient), bound) for bound in (-np.inf, np.inf)]
-        box[0][:bounded] = np.where(lower[:bounded] > -UNBOUNDED, lower[:bounded], -np.inf)
-        box[1][:bounded] = np.where(upper[:bounded] < UNBOUNDED, upper[:bounded], np.inf)
-        low, high = lower[bounded:], upper[bounded:]
+        box[0][:bounded], low = np.split(infinite(lower), [bounded])
+        box[1][:bounded], high = np.split(infinite(upper), [bounded])
         equal = low == high
-        below, above = ~equal & (high < UNBOUNDED), ~equal & (low > -UNBOUNDED)
+        below, above = ~equal & (high < np.inf), ~equal & (low > -np.inf)
         sides = np.concatenate([constraint[below], -constraint[above]])
         problem = qpsolvers.Problem(
             self._matrix(hessian),

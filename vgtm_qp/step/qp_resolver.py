@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -199,15 +198,13 @@ class QPResolver(Resolver, serves="qp"):
         """
         braking, state = self._known_braking(), self._state
         short = self._separation.shortfall(state.q, state.time, tracked=True)
-        self._state, near = replace(state, shortfall=short), self._named(short)
+        self._state, near = replace(state, shortfall=short), self._named(short.items())
         if braking is not None:
             self._braking = braking.changed(self._state, lambda then: replace(then, shortfall=None))
             for then, _ in self._braking.steps:
                 failing = self._separation.between(state.q, then.q, state.time, then.time, short).failing
-                for k in range(len(failing)):
-                    name = failing.name(k).removeprefix("clearance: ")
-                    near[name] = min(near.get(name, math.inf), float(failing.distance[k]))
-                state = then
+                found = ((failing.pair(k), float(failing.distance[k])) for k in range(len(failing)))
+                near, state = self._named(found, near), then
         return near
 
     def too_near(self, state: State) -> Shortfall:

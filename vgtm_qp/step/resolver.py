@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import ClassVar, NoReturn, Self
 
 from numpy.typing import ArrayLike
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, PartError
+from vgtm_qp.geometry.clearance import Pair
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.full import StepQP
@@ -295,14 +297,15 @@ class Resolver(ChangingScene):
 
     def _after_change(self) -> Near:
         """See :class:`ChangingScene`."""
-        return self._named(self.too_near(self.state))
+        return self._named(self.too_near(self.state).items())
 
-    def _named(self, short: Shortfall) -> Near:
-        """Return pairs below their clearance by name."""
-        names = self.setup.monitor.names
-        return {
-            names.clearance(pair).removeprefix("clearance: "): distance for pair, distance in short.items()
-        }
+    def _named(self, found: Iterable[tuple[Pair, float]], known: Near | None = None) -> Near:
+        """Return the least distance of each name: of pairs that are `found`, and of those that are `known`."""
+        names, near = self.setup.monitor.names, dict(known or {})
+        for pair, distance in found:
+            name = names.called(pair)
+            near[name] = min(near.get(name, math.inf), distance)
+        return near
 
     def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
