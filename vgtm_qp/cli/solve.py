@@ -132,6 +132,7 @@ def _report(summary: dict[str, Any], *, serial: bool) -> str:
             "(method.retries = false switches this off)"
         )
     lines += [f"  not within tolerance: {line}" for line in summary["failures"]]
+    lines += [f"  {line}" for line in summary["notes"] if line.startswith("recovered")]
     step = summary["step_time"]
     rows = [
         ("path covered", f"{100 * summary['reached']:.4g} % in {summary['steps']} steps"),

@@ -41,8 +41,8 @@ def excess_freedom(curve_dof: int, arm_dof: int) -> str | None:
     if excess <= 0:
         return None
     return (
-        f"the reference curve has {curve_dof} degrees of freedom and the arm {arm_dof}: {excess} of them "
-        f"mean nothing to the arm; {-(-excess // 3)} control vertices fewer would do"
+        f"the reference curve has {curve_dof} degrees of freedom and the arm {arm_dof}: {excess} without effect on the "
+        "arm, which only cost time"
     )
 
 

@@ -280,6 +280,7 @@ class Result:
             "way_out": str(manifest.get("way_out", "")),
             "verified": None if certificate is None else certificate.ok,
             "failures": [] if certificate is None else list(certificate.failures()),
+            "notes": [] if certificate is None else list(certificate.notes),
             "result": None if result is None else str(result),
         }
 

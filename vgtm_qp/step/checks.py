@@ -110,7 +110,7 @@ def excess_of_freedom(problem: Problem, setup: Setup) -> Iterator[Mistake]:
 def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
     """Yield least distance, m, and mistake of each obstacle too near at home, and of the members."""
     arm, bodies, rules = setup.arm, setup.arm.bodies, problem.clearance
-    safe, self_safe = rules.safe, rules.safe if rules.self_safe is None else rules.self_safe
+    safe, self_safe = rules.safe, rules.between_members
     pairs = setup.monitor.near(arm.points(arm.home_configuration), 0.0, reach=safe, self_reach=self_safe)
     owner = np.where(pairs.is_self, -1, 0)
     owner[~pairs.is_self] = setup.monitor.pieces.obstacle[pairs.other[~pairs.is_self]]
@@ -120,9 +120,9 @@ def _at_home(problem: Problem, setup: Setup) -> Iterator[tuple[float, Mistake]]:
         distance, body = float(pairs.distance[k]), bodies.called(int(pairs.body[k]))
         place: Place
         if index < 0:
-            place = problem.arm_table.thickness
+            place = problem.arm_table.thickness if distance <= 0.0 else ("clearance", "self_safe")
             first, second = bodies.names[int(pairs.body[k])], bodies.names[int(pairs.other[k])]
-            needed, what = self_safe, f"{bodies.kind}s {first} and {second}, which share no node,"
+            needed, what = self_safe, f"{bodies.kind}s {first} and {second}, which do not join,"
         else:
             place, needed, what = ("obstacle", int(index), "center"), safe, f"it and {body}"
         found = (
@@ -178,5 +178,7 @@ def _inside_obstacles(problem: Problem, setup: Setup, hollow: float) -> Iterator
         if k >= 0 and (distance := float(contacts.distance[k])) + hollow + point_size < needed:
             obstacle = obstacles[point.pieces.obstacle[contacts.other[k]]].name
             found = f"{-distance:.3g} m inside it" if distance <= 0.0 else f"{distance:.3g} m from it"
-            expected = f'a position {needed:g} m from obstacle "{obstacle}" (clearance and member radius)'
+            expected = (
+                f'a position {needed:g} m from obstacle "{obstacle}" (clearance and {arm.bodies.kind} radius)'
+            )
             yield Mistake(key, value, f"{expected}; this one is {found}")

@@ -31,8 +31,9 @@ class ChangingScene(ABC):
 
     Each change takes effect with the next step, and costs about as much as one. A shape that the scene has not had yet
     costs more the first time, up to 0.2 s: a loop that cannot wait adds one of each before it starts. A body that is
-    taken up or let go costs about as much as four steps of five bays. Other threads may call these methods: a change waits for the step that runs. An
-    arm that is nearer than it should be afterwards does not come nearer, and the next steps drive it away.
+    taken up or let go costs about as much as four steps of five bays. Other threads may call these methods: a change
+    waits for the step that runs. An arm that is nearer than it should be afterwards does not come nearer, and the next
+    steps drive it away.
     """
 
     def __init__(self) -> None:

@@ -34,6 +34,8 @@ _FREER = 2.0
 """A row holds the arm if the share grows by at least this factor without the row."""
 _SINGULAR = 0.1
 """Share below which the tip moves far less than the actuators do."""
+_OUTWARD, _A_LITTLE = 0.5, 0.2
+"""Cosine of a path's direction to that away from the base above which it leads outward, and a little outward."""
 _FURTHER = (2.0, 4.0, 8.0, 16.0)
 """Factors of the piece of path that are tried one after another if the arm is free on the piece itself."""
 _NAMED = 3
@@ -167,7 +169,7 @@ def explain(
         ways = _remedies(setup, program, make)
         names = [*pressing, *([ACCELERATION] if _is_braking(reason) else [])]
         others = tuple(resorts(setup, state.quantities, names, ways))
-        kind = _first(kinds, other)
+        kind = StopKind.OUT_OF_REACH if _is_straight(setup, state, goal, kinds) else _first(kinds, other)
         return Stop(kind, pressing, _obstacles(setup, pressing), reason, remedies=ways, resorts=others)
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: costs[k]):
         kept[k] = False
@@ -182,8 +184,9 @@ def explain(
         kinds.add(kind := _kind(setup, name))
         if kind is StopKind.OBSTACLE:
             away += cost * program.normal(k)
-    is_stretched = kinds == {StopKind.STROKE} and np.count_nonzero(kept) >= setup.arm.segments and is_outward
-    kind = StopKind.OUT_OF_REACH if is_stretched else _first(kinds, StopKind.NONLINEAR)
+    is_long = kinds == {StopKind.STROKE} and np.count_nonzero(kept) >= setup.arm.segments
+    is_beyond = (is_outward and is_long) or _is_straight(setup, state, goal, kinds)
+    kind = StopKind.OUT_OF_REACH if is_beyond else _first(kinds, StopKind.NONLINEAR)
     ways = _remedies(setup, program, make)
     others = tuple(resorts(setup, state.quantities, multipliers, ways))
     return Stop(kind, multipliers, _obstacles(setup, multipliers), reason, tuple(away.tolist()), ways, others)
@@ -242,8 +245,17 @@ def _kind(setup: Setup, name: str) -> StopKind:
     return StopKind(first)
 
 
-def _is_outward(arm: Arm, state: State, goal: TipGoal) -> bool:
-    """Return whether the path to the goal leads away from the base, within about 60 degrees."""
+def _is_straight(setup: Setup, state: State, goal: TipGoal, kinds: set[StopKind]) -> bool:
+    """Return whether the arm is stretched out, by the kinds of rows that hold it.
+
+    Rates alone hold a tip that may slow down where joints would have to turn without end.
+    """
+    slowed = kinds == {StopKind.RATE} and setup.tip_mode == "scaled"
+    return slowed and _is_outward(setup.arm, state, goal, _A_LITTLE)
+
+
+def _is_outward(arm: Arm, state: State, goal: TipGoal, least: float = _OUTWARD) -> bool:
+    """Return whether the path to the goal leads away from the base: its cosine is above the `least`."""
     way = goal.position - state.nodes[arm.base].mean(axis=0)
     speed = float(np.linalg.norm(goal.velocity))
-    return speed > 0.0 and float(way @ goal.velocity) > 0.5 * speed * float(np.linalg.norm(way))
+    return speed > 0.0 and float(way @ goal.velocity) > least * speed * float(np.linalg.norm(way))

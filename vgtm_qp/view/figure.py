@@ -51,6 +51,8 @@ _PIECES, _MANY_MEMBERS, _SLICES = 8, 1500, 12
 _THINNEST = 0.5
 _NUMBERS, _NAME, _ASLANT, _STEEP = 2.5, 11.5, 0.3, 0.4
 """Points from an axis to its numbers and to its name; shares of a direction above which texts stand at its side."""
+_CHARACTER = 4.0
+"""Points that a character of a number is wide."""
 _ABOVE = 100.0
 _MANY_GOALS = 20
 """Greatest number of waypoints that are marked: a record of a loop has one a step."""
@@ -85,6 +87,23 @@ class _Shown(NamedTuple):
             np.concatenate([tip[maneuver.time <= time], now(tip)[None]]),
             np.concatenate([now(target)[None], target[maneuver.time > time]]),
         )
+
+
+class _Balls(NamedTuple):
+    """Balls: centres (K, 3), m, diameters (K,), points, colours (K, 3), and how far above the bodies each is drawn."""
+
+    centre: Array
+    diameter: Array
+    colour: Array
+    above: Array
+
+    def draw(self, axes: Axes, projection: Projection, chosen: Any, order: float) -> None:
+        """Draw the `chosen` ones beside bodies of the `order`."""
+        for above in np.unique(self.above[chosen]):
+            some = chosen[self.above[chosen] == above]
+            x, y = projection.flat(self.centre[some]).T
+            sizes: Any = {"s": self.diameter[some] ** 2, "c": self.colour[some], "linewidths": 0.0}
+            axes.scatter(x, y, marker="o", zorder=order + above / _SLICES, **sizes)
 
 
 def _style(label: str, colour: Any, order: int, **more: Any) -> dict[str, Any]:
@@ -209,7 +228,10 @@ class View:
             azimuth = heading(maneuver.tip_position) - np.radians(70.0)
         self.projection = projection = Projection(azimuth, elevation)
         self.surfaces = [ProjectedMesh(mesh, projection) for mesh in self.drawing.obstacles]
-        arm = np.concatenate([maneuver.nodes[seen].reshape(-1, 3), others])
+        # Surfaces count, not axes alone.
+        thick, ends = self.drawing.arm.radius[:, None, None], self.drawing.arm.ends(maneuver.nodes[seen])
+        skins = [(ends + side * thick).reshape(-1, 3) for side in (-1.0, 1.0)]
+        arm = np.concatenate([maneuver.nodes[seen].reshape(-1, 3), *skins, others])
         size = float(np.ptp(arm, axis=0).max())
         self.step = _round_step(size / 6.0)
         self.ground = float(maneuver.nodes[0, self.drawing.arm.base, 2].min())
@@ -334,21 +356,18 @@ class View:
         cuts = _PIECES if len(ends) <= _MANY_MEMBERS else 1
         cut, bare = pieces(ends, cuts), pieces(ends, cuts, overlap=0.0)
         width = np.repeat(np.maximum(2.0 * drawing.arm.radius * scale, _THINNEST), cuts)
-        # The nodes of a truss are a little wider than its members, the joints of a serial arm are marks on its links.
-        wider = 1.15 if drawing.arm.stretches.any() else 0.5
-        ball: Any = {"color": DARK, "marker": "o", "linestyle": "none", "markeredgewidth": 0.0}
-        ball["markersize"] = wider * float(np.median(width)) + CASING
+        balls = self._balls(nodes, scale)
         colour = np.repeat(drawing.colours(shown.lengths), cuts, axis=0)
         middles = cut.mean(axis=1)
         depth, layer = projection.depth(middles), layers(middles, surfaces, time)
-        node_depth, node_layer = projection.depth(nodes), layers(nodes, surfaces, time)
+        ball_depth, ball_layer = projection.depth(balls.centre), layers(balls.centre, surfaces, time)
         for k in range(len(surfaces) + 1):
             order = np.flatnonzero(layer == k)
             order = order[np.argsort(depth[order], kind="stable")]
-            balls = np.flatnonzero(node_layer == k)
+            here = np.flatnonzero(ball_layer == k)
             slices = [part for part in np.array_split(order, _SLICES) if len(part)]
             borders = np.array([depth[part[-1]] for part in slices[:-1]])
-            slot = np.searchsorted(borders, node_depth[balls])
+            slot = np.searchsorted(borders, ball_depth[here])
             for j, part in enumerate(slices):
                 # A dark line below each member, a little wider, separates it from things behind it. It ends where its
                 # piece does, so that the next piece hides its end.
@@ -360,14 +379,31 @@ class View:
                 colours[::2] = DARK
                 style: Any = {"capstyle": "butt", "zorder": 2.0 * k + 1.0 + j / (2.0 * _SLICES)}
                 axes.add_collection(LineCollection(list(lines), colors=colours, linewidths=widths, **style))
-                x, y = projection.flat(nodes[balls[slot == j]]).T
-                above = style["zorder"] + 0.1 / _SLICES
-                axes.plot(x, y, zorder=above, **ball)
+                balls.draw(axes, projection, here[slot == j], style["zorder"])
         if drawing.curve_weights.size:
             vertices = shown.vertices
             effects = [Stroke(linewidth=2.6, foreground="white"), Normal()]
             axes.plot(*projection.flat(vertices).T, **_POLYGON)
             axes.plot(*projection.flat(drawing.curve(vertices)).T, path_effects=effects, **_CURVE)
+
+    def _balls(self, nodes: Array, scale: float) -> _Balls:
+        """Return the nodes of a truss; of a serial arm the round ends of its links, and small marks at its joints."""
+        arm = self.drawing.arm
+        width = np.maximum(2.0 * arm.radius * scale, _THINNEST)
+        if arm.stretches.any():
+            same = np.full(len(nodes), 1.15 * float(np.median(width)) + CASING)
+            return _Balls(nodes, same, np.tile(DARK, (len(nodes), 1)), np.full(len(nodes), 0.1))
+        joints = nodes[1 : len(arm.quantity_names) + 1]
+        mark = np.full(len(joints), 0.35 * float(np.median(width)) + CASING)
+        ends, twice = arm.ends(nodes).reshape(-1, 3), np.repeat(width, 2)
+        colour = np.tile(FIXED_COLOUR, (len(ends), 1))
+        # The dark casing of each end, the end itself, below the links; the marks above them.
+        return _Balls(
+            np.concatenate([ends, ends, joints]),
+            np.concatenate([twice + CASING, twice, mark]),
+            np.concatenate([np.tile(DARK, (len(ends), 1)), colour, np.tile(DARK, (len(joints), 1))]),
+            np.repeat([-0.2, -0.1, 0.1], [len(ends), len(ends), len(joints)]),
+        )
 
     @cached_property
     def _goals(self) -> Array:
@@ -463,7 +499,10 @@ def _label(axes: Axes, name: str, values: Array, places: Array, aside: Array, sc
     for value, place in list(zip(values, places, strict=True))[::every]:
         axes.annotate(f"{value:g}", place, tuple(_NUMBERS * aside), fontsize=6.5, **text)
     text |= {"fontsize": 7.0, "rotation": 90.0 * (name == "z")}
-    axes.annotate(f"{name} (m)", places.mean(axis=0), tuple(_NAME * aside), **text)
+    # Beside numbers of more than two characters a name stands further out.
+    longest = max(len(f"{value:g}") for value in values[::every])
+    away = _NAME + (_CHARACTER * max(longest - 2, 0) if name == "z" else 0.0)
+    axes.annotate(f"{name} (m)", places.mean(axis=0), tuple(away * aside), **text)
 
 
 def _draw_surface(axes: Axes, surface: ProjectedMesh, time: float, zorder: float) -> None:
