@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -45,7 +46,15 @@ def loaded(arm, random, count=2):
     """Return the arm with some capsules at its tip."""
     carrier = Carrier(arm)
     ends = 0.4 * arm.unit * random.normal(size=(count, 2, 3))
-    carrier.carry([Carried(vq.Sphere(name="load", center=[0, 0, 0], radius=1.0), ends, np.full(count, 0.05))])
+    carrier.carry(
+        [
+            Carried(
+                make_obstacle(vq.Sphere(name="load", center=[0, 0, 0], radius=1.0)),
+                ends,
+                np.full(count, 0.05),
+            )
+        ]
+    )
     return carrier
 
 
@@ -164,6 +173,15 @@ def test_capsules_hold_the_box_and_stick_out_little(edges, seed):
     assert max(np.max(np.abs(ends) + radius - size / 2) for ends, radius in found) <= 0.37 * np.sort(size)[1]
 
 
+def held_by(body, points):
+    """Return how far points (K, 3) are outside the capsules of a body, m."""
+    start, along = body.ends[:, 0], body.ends[:, 1] - body.ends[:, 0]
+    assert (np.linalg.norm(along, axis=1) > 0.0).all()
+    gap = points[:, None] - start
+    share = np.clip(np.einsum("kcx,cx->kc", gap, along) / np.einsum("cx,cx->c", along, along), 0.0, 1.0)
+    return (np.linalg.norm(gap - share[..., None] * along, axis=2) - body.radius).min(axis=1)
+
+
 def test_capsules_hold_every_shape(rng, tmp_path):
     file = tmp_path / "stone.stl"
     trimesh.creation.icosahedron().export(file)
@@ -179,13 +197,7 @@ def test_capsules_hold_every_shape(rng, tmp_path):
     }
     for table, surface in shapes.items():
         points = trimesh.sample.sample_surface(surface, 500, seed=1)[0] @ turn.T + place["center"]
-        found = carried(make_obstacle(table))
-        start, along = found.ends[:, 0], found.ends[:, 1] - found.ends[:, 0]
-        assert (np.linalg.norm(along, axis=1) > 0.0).all()
-        gap = points[:, None] - start
-        share = np.clip(np.einsum("kcx,cx->kc", gap, along) / np.einsum("cx,cx->c", along, along), 0.0, 1.0)
-        away = np.linalg.norm(gap - share[..., None] * along, axis=2) - found.radius
-        assert away.min(axis=1).max() <= 1e-9
+        assert held_by(carried(make_obstacle(table)), points).max() <= 1e-9
 
 
 def carry_round(problem, crate, shift, steps=30):
@@ -232,9 +244,23 @@ def test_a_loop_that_carries_a_crate_past_obstacles_is_verified(tmp_path):
     large = vq.verify(edited(radius=[0.6] * len(scenes[0]["carried"][0]["radius"])))
     assert not large.ok
     assert "crate" in large.clearance.where + large.self_clearance.where
-    for wrong in ({"ends": [[1.0]]}, {"radius": ["a"]}, {"radius": None}, {"body": {}}):
+    count, body = len(scenes[0]["carried"][0]["radius"]), scenes[0]["carried"][0]["body"]
+    for wrong in (
+        {"ends": [[1.0]]},
+        {"radius": ["a"]},
+        {"radius": None},
+        {"radius": [-0.5] * count},
+        {"ends": [], "radius": []},
+        {"body": {}},
+        {"body": {"name": "crate"}},
+        {"body": {**body, "center": [0.0, 0.0]}},
+        {"body": {**body, "name": "cube"}},
+        {"body": {**body, "name": "B1-1"}},
+    ):
         with pytest.raises(ResultError, match=r"manifest\."):
             vq.verify(edited(**wrong))
+    for small in ({"radius": [1e-9] * count}, {"body": {**body, "size": [30.0, 20.0, 20.0]}}):
+        assert any("sticks out of its capsules" in line for line in vq.verify(edited(**small)).contradictions)
 
 
 def test_a_crate_keeps_the_arm_from_where_it_could_go_without():
@@ -281,6 +307,119 @@ def test_a_recording_that_begins_with_a_crate_is_verified():
     assert vq.verify(maneuver).ok
 
 
+@pytest.mark.parametrize("first", ["attach", "release", "add"])
+def test_a_recording_may_change_before_its_first_step(first):
+    wall = {"name": "wall", "shape": "box", "center": [0.0, 0.0, 3.15], "size": [3.0, 3.0, 0.2]}
+    problem = three_bays(obstacle=[wall])
+    resolver, crate = vq.Resolver(problem), crate_at(problem, 0.35)
+    if first == "release":
+        resolver.attach(crate)
+    tip, recording = resolver.tip()[0], vq.Recording(resolver, problem)
+    if first == "attach":
+        resolver.attach(crate)
+    elif first == "release":
+        resolver.release("crate", keep=False)
+    else:
+        resolver.add_obstacle(vq.Sphere(name="ball", center=[0.8, 0.0, 2.0], radius=0.1))
+    for k in range(5):
+        resolver.step(position=tip + np.array([0.02 * k, 0.0, 0.0]))
+    certificate = vq.verify(recording.maneuver())
+    assert certificate.ok, str(certificate)
+
+
+def test_a_body_that_is_too_near_when_recording_begins_recovers():
+    wall = {"name": "wall", "shape": "box", "center": [0.0, 0.0, 3.04], "size": [3.0, 3.0, 0.2]}
+    problem = three_bays(obstacle=[wall])
+    resolver = vq.Resolver(problem)
+    assert resolver.attach(crate_at(problem, 0.35))
+    tip, recording = resolver.tip()[0], vq.Recording(resolver, problem)
+    for _ in range(8):
+        resolver.step(position=tip - np.array([0.0, 0.0, 0.1]))
+    certificate = vq.verify(recording.maneuver())
+    assert certificate.ok, str(certificate)
+    assert any("recovered" in note for note in certificate.notes)
+
+
+def test_a_body_round_members_of_the_tip_can_be_let_go():
+    """Their axes are inside it: the deepest that verification knows is the radius."""
+    problem = three_bays()
+    resolver, crate = vq.Resolver(problem), crate_at(problem, 0.0)
+    tip, recording = resolver.tip()[0], vq.Recording(resolver, problem)
+    resolver.step(position=tip)
+    resolver.attach(vq.Box(name="crate", center=crate.center, size=[1.0, 1.0, 0.2]))
+    resolver.step(position=tip + np.array([0.02, 0.0, 0.0]))
+    assert min(resolver.release("crate").values()) < 0.0
+    for _ in range(3):
+        resolver.step(position=tip + np.array([0.02, 0.0, 0.0]))
+    certificate = vq.verify(recording.maneuver())
+    assert not any("recovered" in line for line in certificate.contradictions), str(certificate)
+
+
+def test_a_mesh_stays_what_it_was_when_its_file_goes(tmp_path):
+    file = tmp_path / "stone.stl"
+    trimesh.creation.icosahedron().export(file)
+    problem = three_bays()
+    resolver = vq.Resolver(problem)
+    tip, rotation = resolver.tip()
+    resolver.add_obstacle(vq.Mesh(name="stone", file=str(file), scale=0.1, center=tip + 0.4 * rotation[:, 2]))
+    before = resolver.setup.monitor.obstacles[0]
+    file.unlink()
+    resolver.attach("stone")
+    assert np.allclose(resolver.carried[0].center, before.table.center)
+    resolver.step(position=tip)
+    resolver.release("stone")
+    np.testing.assert_allclose(resolver.setup.monitor.obstacles[0].pieces, before.pieces, atol=1e-9)
+
+
+def test_a_state_of_another_scene_can_be_taken_up_again():
+    problem = three_bays(
+        obstacle=[{"name": "wall", "shape": "box", "center": [0, 0, 3.04], "size": [3, 3, 0.2]}]
+    )
+    resolver = vq.Resolver(problem)
+    assert resolver.attach(crate_at(problem, 0.35))
+    state = resolver.state
+    resolver.release("crate", keep=False)
+    resolver.remove_obstacle("wall")
+    resolver.state = state
+    assert not resolver.state.shortfall
+    assert resolver.step(position=resolver.tip()[0]).status is vq.StepStatus.REACHED
+
+
+def test_other_threads_may_read_what_is_carried():
+    problem = vq.load_problem("hexapod_past_a_cube")
+    states = []
+    for reads in (False, True):
+        resolver, done = vq.Resolver(problem), threading.Event()
+        tip, rotation = resolver.tip()
+        resolver.attach(vq.Sphere(name="ball", center=tip + 0.4 * rotation[:, 2], radius=0.1))
+
+        def read(resolver=resolver, done=done):
+            while not done.is_set():
+                assert resolver.carried[0].name == "ball"
+
+        reader = threading.Thread(target=read)
+        if reads:
+            reader.start()
+        for k in range(25):
+            resolver.step(position=tip + np.array([0.01 * k, 0.0, 0.0]))
+        done.set()
+        if reads:
+            reader.join()
+        states.append(resolver.state.nodes)
+    np.testing.assert_array_equal(*states)
+
+
+def test_nearly_round_meshes_are_held_too(tmp_path):
+    for stretch in (1.0, 1.0005, 1.002):
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
+        ball.apply_transform(np.diag([stretch, 1.0, 1.0, 1.0]))
+        ball.export(tmp_path / "ball.stl")
+        table = vq.Mesh(name="ball", file=str(tmp_path / "ball.stl"), center=[0.1, 0.2, 0.3])
+        found = carried(make_obstacle(table))
+        corners = found.obstacle.pieces[:, :9].reshape(-1, 3)
+        assert held_by(found, corners).max() <= 1e-9
+
+
 def test_what_is_let_go_may_be_gone():
     problem = three_bays()
     resolver = vq.Resolver(problem)
@@ -309,6 +448,11 @@ def test_wrong_things_to_carry_are_goal_errors_that_change_nothing(tmp_path):
             "no triangle|cannot read",
         ),
         (lambda: resolver.release("cube"), "'cube' is not carried"),
+        (lambda: resolver.release(np.zeros(3)), "is not carried"),
+        (
+            lambda: resolver.attach(vq.Box(**{**CRATE, "name": "B1-1", "center": [0, 0, 4]})),
+            "a member of the arm",
+        ),
     ]
     before, changes = (resolver.obstacles, resolver.carried), resolver.scene_changes
     for call, message in wrong:

@@ -1,8 +1,10 @@
 """Make the tables of figures in README.md of this folder again, each by its own command.
 
-    python examples/studies/tables.py              all of them but tracking, in under an hour on two cores
+    python examples/studies/tables.py              all of them but the three below, in half an hour on two cores
     python examples/studies/tables.py figure8      only this one
     python examples/studies/tables.py tracking     a thousand scenes in six forms: another hour and more
+    python examples/studies/tables.py robustness   a thousand scenes with and without a compiler: two hours
+    python examples/studies/tables.py loops        100,000 steps: half an hour
     python examples/studies/tables.py --short      every command in its quick form; the document stays as it is
 
 Each table stands between two marks, with the commit and the machine that it was made on. What has moved by more than
@@ -33,9 +35,9 @@ UNITS = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 NUMBER = re.compile(r"(?<![\w.])([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?: (us|ms|s)\b)?")
 
 OPTIONS = {
-    "robustness": "--scenes 1000 --seed 20261129",
+    "robustness": "--scenes 1000 --seed 20261206 --without-compiler 1",
     "tracking": "--scenes 1000 --seed 1991",
-    "loops": "--scenes 40 --seed 1991",
+    "loops": "--scenes 400 --seed 20261206",
 }
 """Of the studies that take any."""
 COMMANDS = {
@@ -44,7 +46,7 @@ COMMANDS = {
     "changes": "vgtm study loops --scenes 100 --seed 20261203 --changes 0.4",
     "bench": "vgtm bench --seconds 0.7",
 }
-LONG = {"tracking"}
+LONG = {"tracking", "robustness", "loops"}
 """Made only where they are asked for by name, or with --short."""
 SHORT = {
     **{name: f"vgtm study {name} --short" for name in STUDIES},

@@ -26,24 +26,24 @@ class Carried:
 
     Attributes
     ----------
-    table
-        The body as an obstacle's table, its pose in the frame of the end effector.
+    obstacle : Obstacle
+        The body as an obstacle, its pose in the frame of the end effector.
     ends, radius : (C, 2, 3), (C,)
         Axes of the capsules in that frame, and radii, m.
     """
 
-    table: Any
+    obstacle: Obstacle
     ends: Array
     radius: Array
 
     @property
     def name(self) -> str:
         """Its name in messages and results."""
-        return str(self.table.name)
+        return self.obstacle.name
 
     def record(self) -> dict[str, Any]:
         """Return the body as JSON data for verification and pictures."""
-        table = self.table.model_dump(mode="json", exclude_none=True)
+        table = self.obstacle.table.model_dump(mode="json", exclude_none=True)
         return {"body": table, "ends": self.ends.tolist(), "radius": self.radius.tolist()}
 
 
@@ -65,10 +65,12 @@ def carried(obstacle: Obstacle) -> Carried:
         found = [(ends @ turn + table.center, radius) for ends, radius in own]
     radius = np.array([radius for _, radius in found])
     ends = np.stack([ends[[0, -1]] for ends, _ in found])
-    # The axis of a ball has a direction, too.
-    short = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) < _LEAST_AXIS * radius
-    ends[short] += np.array([[-0.5], [0.5]]) * [0.0, 0.0, _LEAST_AXIS] * radius[short, None, None]
-    return Carried(table, ends, radius)
+    # The axis of a ball has a direction, too; short ones grow along their own.
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    unit = np.where(length > 0.0, along / np.maximum(length, np.finfo(float).tiny), [0.0, 0.0, 1.0])
+    more = np.maximum(_LEAST_AXIS * radius[:, None] - length, 0.0) / 2.0
+    return Carried(obstacle, ends + np.array([[-1.0], [1.0]]) * (more * unit)[:, None], radius)
 
 
 class Carrier:

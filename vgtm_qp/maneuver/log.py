@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vgtm_qp.arm.arm import Pose
+from vgtm_qp.errors import GoalError
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.methods import Resolver
 from vgtm_qp.problem import Problem
@@ -35,6 +36,8 @@ class Log:
         self._resolver = resolver
         self._rows: dict[str, list[Any]] = {}
         self._scenes = [_RecordedScene(resolver, 0, resolver.state)]
+        # The problem has nothing that is carried.
+        self._begins_otherwise = bool(self._scenes[0].carried)
         self._changes, self._state = resolver.scene_changes, resolver.state
         self._clearance_rows = {"fcl": 0, "exact": 0}
         self._seconds, self._phases = 0.0, [0.0] * len(resolver.phases)
@@ -59,16 +62,33 @@ class Log:
     def add(self, step: Step, target: Pose, progress: float) -> None:
         """Add the state after a step whose goal was the pose `target` of the tip."""
         if self._resolver.scene_changes != self._changes:
-            self._changes = self._resolver.scene_changes
-            self._scenes.append(_RecordedScene(self._resolver, len(self._rows["time"]) - 1, self._state))
+            self._change(len(self._rows["time"]) - 1)
         self._state = step.state
         self._clearance_rows["fcl"] += step.fcl_rows
         self._clearance_rows["exact"] += step.exact_rows
         self.progress = progress
         self._add_row(target)
 
+    def _change(self, row: int) -> None:
+        """Take the scene of now for that from a row on; before the first step, for that of the beginning."""
+        self._changes, scene = self._resolver.scene_changes, _RecordedScene(self._resolver, row, self._state)
+        if row:
+            self._scenes.append(scene)
+            return
+        self._scenes, self._begins_otherwise = [scene], True
+        for name, value in self._clearances(self._state).items():
+            self._rows[name] = [value]
+
+    def _clearances(self, state: State) -> dict[str, float]:
+        """Return the least clearances of a state in the scene of now, m."""
+        measured = self._resolver.setup.least_clearance
+        return {
+            "clearance": measured(state.q, state.time, "obstacles"),
+            "self_clearance": measured(state.q, state.time, "members"),
+        }
+
     def _add_row(self, target: Pose) -> None:
-        resolver, state, setup = self._resolver, self._resolver.state, self._resolver.setup
+        resolver, state = self._resolver, self._resolver.state
         position, rotation = resolver.tip()
         row = {
             "time": state.time,
@@ -79,8 +99,7 @@ class Log:
             "tip_rotation": rotation,
             "tip_target_position": target.position,
             "tip_target_rotation": target.rotation,
-            "clearance": setup.least_clearance(state.q, state.time, "obstacles"),
-            "self_clearance": setup.least_clearance(state.q, state.time, "members"),
+            **self._clearances(state),
             "progress": self.progress,
             "step_time": self._seconds,
             "phase_time": self._phases,
@@ -97,10 +116,12 @@ class Log:
         ``result.manifest``: digests of the problem's files, the retry that led out of a dead end, and the time of the
         set-up.
         """
-        resolver, setup, (first, *scenes) = self._resolver, self._resolver.setup, self._scenes
-        if first.carried:
-            # The problem has nothing that is carried.
-            scenes = self._scenes
+        resolver, setup, first = self._resolver, self._resolver.setup, self._scenes[0]
+        scenes = self._scenes if self._begins_otherwise else self._scenes[1:]
+        if len({np.shape(vertices) for vertices in self._rows["control_vertices"]}) > 1:
+            raise GoalError(
+                "the number of control vertices changed while it was recorded; record again from there"
+            )
         own = setup.layout.own
         manifest = {
             "schema_version": SCHEMA_VERSION,
@@ -112,7 +133,7 @@ class Log:
             "reached": float(self._rows["progress"][-1]) / whole,
             "blocked_by": [] if stop is None else list(stop.names),
             "stop": None if stop is None else stop.to_dict(),
-            "recovered": first.recovered,
+            "recovered": [] if self._begins_otherwise else first.recovered,
             "method": problem.method.name,
             "solver": resolver.solver,
             "directory": str((problem.source.parent if problem.source else Path.cwd()).resolve()),
@@ -156,6 +177,7 @@ class _RecordedScene:
         self._row, self._obstacles = row, setup.monitor.obstacles
         self._safe, self._self_safe = setup.safe, setup.self_safe
         self.carried = [body.record() for body in setup.carrier.carried]
+        self._held = [body.obstacle for body in setup.carrier.carried]
         found: dict[str, float] = {}
         for pair, distance in resolver.too_near(state).items():
             name = setup.monitor.names.plain(pair)
@@ -164,11 +186,11 @@ class _RecordedScene:
 
     @property
     def meshes(self) -> dict[str, Any]:
-        """Records of the files of meshes, by obstacle."""
+        """Records of the files of meshes, by name; a file that is gone has none."""
         return {
             obstacle.name: mesh_record(obstacle.table.file, len(obstacle.pieces))
-            for obstacle in self._obstacles
-            if obstacle.table.shape == "mesh"
+            for obstacle in (*self._obstacles, *self._held)
+            if obstacle.table.shape == "mesh" and Path(obstacle.table.file).is_file()
         }
 
     def record(self) -> dict[str, Any]:

@@ -24,7 +24,8 @@ def enclosing_capsule(points: Array) -> Capsule:
     from scipy.optimize import minimize
 
     centred = points - points.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=True)[2]
+    # The full matrices of many points would fill the memory; those of fewer than three have all axes.
+    axes = np.linalg.svd(centred, full_matrices=len(points) < 3)[2]
 
     def along(tilt: Array, frame: Array) -> Capsule:
         direction = frame[0] + tilt[0] * frame[1] + tilt[1] * frame[2]

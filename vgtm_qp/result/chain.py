@@ -208,13 +208,19 @@ class RecordedChain:
         values[:, self.followers[:, 0]] += self.multipliers * values[:, self.followers[:, 1]]
         return values
 
+    def tip_poses(self, q: Array) -> tuple[Array, Array]:
+        """Return positions (T, 3), m, and attitudes (T, 3, 3) of the end effector at configurations (T, J + 6)."""
+        points, _, frames = self.placed(q)
+        position = points[:, len(self.quantity_names) + 1]
+        return np.asarray(position), np.asarray(frames @ self._home_tip.T @ self.tip_frame)
+
     def tip_position(self, q: Array) -> Array:
         """Return (T, 3) the end effector's position, m."""
-        return np.asarray(self.placed(q)[0][:, len(self.quantity_names) + 1])
+        return self.tip_poses(q)[0]
 
     def tip_rotations(self, q: Array) -> Array:
         """Return (T, 3, 3) the end effector's attitude at configurations (T, J + 6)."""
-        return np.asarray(self.placed(q)[2] @ self._home_tip.T @ self.tip_frame)
+        return self.tip_poses(q)[1]
 
     def singular_values(self, q: Array) -> tuple[float, float, float] | None:
         """Return 1, in place of the length Jacobian's, and least and greatest value of the tip's Jacobian."""

@@ -207,6 +207,18 @@ def stored_problem(data: Any) -> Problem:
         raise ResultError(mistakes) from None
 
 
+def scene_problem(problem: Mapping[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the problem of a manifest with the obstacles and clearances of one of its scenes.
+
+    What is carried is checked like an obstacle, and no two of all have the same name; ResultError names the wrong keys.
+    """
+    rules = {**(problem.get("clearance") or {}), "safe": scene["safe"], "self_safe": scene["self_safe"]}
+    own = {**problem, "obstacle": scene["obstacle"], "clearance": rules}
+    carried = [held["body"] for held in scene.get("carried") or ()]
+    stored_problem({**own, "obstacle": [*scene["obstacle"], *carried]})
+    return own
+
+
 def _with_present_keys(data: Any) -> Any:
     """Return a manifest's problem with ``tracking_mode`` instead of ``hard_tracking``, its former key."""
     method = data.get("method") if isinstance(data, Mapping) else None

@@ -285,4 +285,14 @@ def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
         "unit": setup.arm.unit,
     }
     monitor = Clearance(before.bodies, obstacles, self_collision=before.self_collision, **options)
-    return replace(setup, arm=arm, monitor=monitor, measure=None, minimum_angle=angle, step_limit=step_limit)
+    # What the one takes up the other does not.
+    carrier = copy.copy(setup.carrier)
+    return replace(
+        setup,
+        arm=arm,
+        carrier=carrier,
+        monitor=monitor,
+        measure=None,
+        minimum_angle=angle,
+        step_limit=step_limit,
+    )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar, NoReturn, Self
 
 from numpy.typing import ArrayLike
@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, PartError
-from vgtm_qp.geometry.clearance import Pair
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.problem import check_is_problem
 from vgtm_qp.qp.full import StepQP
@@ -122,6 +121,9 @@ class Resolver(ChangingScene):
                 f"this state has {len(state.nodes)} nodes and {len(state.control_vertices)} control vertices; the arm "
                 f"has {nodes} and its curve {vertices}"
             )
+        if state.shortfall:
+            # What was too near then may be gone, and something else be there.
+            state = replace(state, shortfall=self.too_near(state) or None)
         self._state = state
 
     @property
@@ -232,9 +234,10 @@ class Resolver(ChangingScene):
 
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
-        kinematics = self.setup.kinematics
-        kinematics.evaluate(self.state.q)
-        return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
+        with self._lock:
+            kinematics = self.setup.kinematics
+            kinematics.evaluate(self.state.q)
+            return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's.
@@ -298,14 +301,6 @@ class Resolver(ChangingScene):
     def _after_change(self) -> Near:
         """See :class:`ChangingScene`."""
         return self._named(self.too_near(self.state).items())
-
-    def _named(self, found: Iterable[tuple[Pair, float]], known: Near | None = None) -> Near:
-        """Return the least distance of each name: of pairs that are `found`, and of those that are `known`."""
-        names, near = self.setup.monitor.names, dict(known or {})
-        for pair, distance in found:
-            name = names.called(pair)
-            near[name] = min(near.get(name, math.inf), distance)
-        return near
 
     def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""

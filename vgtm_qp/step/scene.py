@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from threading import RLock
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike
 from vgtm_qp.arm.carrying import Carried, carried
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, ProblemError, nearest
+from vgtm_qp.geometry.clearance import Pair
 from vgtm_qp.geometry.shapes import GeometryError, Obstacle
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.obstacle import Box, Cylinder, Mesh, Sphere
@@ -66,17 +68,15 @@ class ChangingScene(ABC):
     @property
     def carried(self) -> tuple[Box | Sphere | Cylinder | Mesh, ...]:
         """The bodies that the arm carries, where they are now."""
-        if not (held := self.setup.carrier.carried):
-            return ()
+        with self._lock:
+            return tuple(self._at_rest(body).table for body in self.setup.carrier.carried)
+
+    def _at_rest(self, body: Carried) -> Obstacle:
+        """Return a body that is carried as an obstacle where it is now."""
         position, rotation = self.tip()
-        return tuple(
-            _placed(
-                body.table,
-                position + rotation @ body.table.center,
-                rotation @ rotation_from_vector(body.table.rotation_vector),
-            )
-            for body in held
-        )
+        table = body.obstacle.table
+        turn = rotation @ rotation_from_vector(table.rotation_vector)
+        return _placed(body.obstacle, position + rotation @ table.center, turn)
 
     @property
     def scene_changes(self) -> int:
@@ -172,15 +172,20 @@ class ChangingScene(ABC):
                 )
             there = list(self.setup.monitor.obstacles)
             if isinstance(body, str):
-                table = there.pop(self._number(body)).table
-                centre = np.add(table.center, np.multiply(self.state.time, table.velocity))
+                made = there.pop(self._number(body))
+                center = np.add(made.table.center, np.multiply(self.state.time, made.velocity))
             else:
                 self._check_is_new(body)
-                table, centre = body, np.array(body.center)
+                made, center = (
+                    _made(self._at_time_0(body, {"velocity": (0.0, 0.0, 0.0)})),
+                    np.array(body.center),
+                )
+            if made.name in self.setup.arm.bodies.names:
+                raise GoalError(f'a {self.setup.arm.bodies.kind} of the arm is called "{made.name}", too')
             position, rotation = self.tip()
-            turn = rotation.T @ rotation_from_vector(table.rotation_vector)
-            own = _placed(table, rotation.T @ (centre - position), turn)
-            return self._put(there, [*self.setup.carrier.carried, carried(_made(own))])
+            turn = rotation.T @ rotation_from_vector(made.table.rotation_vector)
+            held = carried(_placed(made, rotation.T @ (center - position), turn))
+            return self._put(there, [*self.setup.carrier.carried, held])
 
     def release(self, name: str, *, keep: bool = True) -> Near:
         """Let go of a body that is carried; return the pairs that are too near now.
@@ -196,11 +201,11 @@ class ChangingScene(ABC):
         with self._lock:
             held = self.setup.carrier.carried
             names = [body.name for body in held]
-            if name not in names:
+            if (name := str(name)) not in names:
                 raise GoalError(f"{name!r} is not carried; {_known(name, names)}")
             k, there = names.index(name), list(self.setup.monitor.obstacles)
             if keep:
-                there.append(_made(self.carried[k]))
+                there.append(self._at_rest(held[k]))
             return self._put(there, [*held[:k], *held[k + 1 :]])
 
     def set_clearance(self, *, safe: float | None = None, self_safe: float | None = None) -> Near:
@@ -230,9 +235,17 @@ class ChangingScene(ABC):
 
     def _number(self, name: str) -> int:
         names = [obstacle.name for obstacle in self.setup.monitor.obstacles]
-        if name not in names:
+        if (name := str(name)) not in names:
             raise GoalError(f"there is no obstacle {name!r}; {_known(name, names)}")
         return names.index(name)
+
+    def _named(self, found: Iterable[tuple[Pair, float]], known: Near | None = None) -> Near:
+        """Return the least distance of each name: of pairs that are `found`, and of those that are `known`."""
+        names, near = self.setup.monitor.names, dict(known or {})
+        for pair, distance in found:
+            name = names.called(pair)
+            near[name] = min(near.get(name, math.inf), distance)
+        return near
 
     def _check_is_new(self, body: Any) -> None:
         if not isinstance(body, Box | Sphere | Cylinder | Mesh):
@@ -267,10 +280,17 @@ def _made(table: Any) -> Obstacle:
         raise GoalError(str(error)) from None
 
 
-def _placed(table: Any, center: Array, rotation: Array) -> Any:
-    """Return an obstacle's table at rest elsewhere."""
-    place = {"center": center, "rotation_vector": vector_from_rotation(rotation), "velocity": (0.0, 0.0, 0.0)}
-    return type(table)(**{**table.model_dump(), **place})
+def _placed(obstacle: Obstacle, center: Array, rotation: Array) -> Obstacle:
+    """Return an obstacle at rest elsewhere; nothing is read again of a mesh."""
+    table = obstacle.table
+    place = {
+        "center": tuple(center.tolist()),
+        "rotation_vector": tuple(vector_from_rotation(rotation).tolist()),
+        "velocity": (0.0, 0.0, 0.0),
+    }
+    moved = table.model_copy(update=place)
+    before = np.asarray(table.center), rotation_from_vector(table.rotation_vector)
+    return replace(obstacle.placed(before, center, rotation, np.zeros(3)), table=moved)
 
 
 def _known(name: object, names: Sequence[str]) -> str:

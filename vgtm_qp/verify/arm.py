@@ -163,6 +163,10 @@ class RecordedArm:
         frames = [polygon_frame(polygon, angles)[0] for polygon in nodes[:, self.tip]]
         return np.asarray(frames @ home_frame.T @ self.tip_frame)
 
+    def tip_poses(self, nodes: Array) -> tuple[Array, Array]:
+        """Return positions (T, 3), m, and attitudes (T, 3, 3) of the end effector at nodes (T, N, 3)."""
+        return self.tip_position(nodes), self.tip_rotations(nodes)
+
     @property
     def tip_joints(self) -> Index:
         """Nodes at which the members end that what is carried may touch."""

@@ -127,6 +127,11 @@ class Encounters(ABC):
     def name(self, pair: tuple[int, int]) -> str:
         """Return the name of the pair."""
 
+    def deepest(self, pair: Pairs) -> Array:
+        """Return (P,) the distances of pairs whose axes touch, m: none is less."""
+        count = len(pair[0])
+        return self.apart(np.zeros((count, 4, 3)), np.zeros((count, 3)), pair)
+
     def distances(self, state: int, pair: Pairs) -> Array:
         """Return the exact distances (P,) of pairs at a state, m."""
         ends, time = self.motion.ends[state], np.full(len(pair[0]), self.motion.time[state])

@@ -38,7 +38,9 @@ def excuse_recovering(
             distance = np.array([group.distances(k, index).min() for k in range(len(group.motion.time))])
             kept = np.flatnonzero(distance >= floor - CLEARANCE_TOLERANCE)
             since = int(kept[0]) if len(kept) else len(distance)
-            if since == 0 or abs(distance[0] - wanted[name]) > CLEARANCE_TOLERANCE:
+            # However deep an axis is inside, its distance here is minus the radius.
+            off = distance[0] - max(wanted[name], float(group.deepest(index).min()))
+            if since == 0 or abs(off) > CLEARANCE_TOLERANCE:
                 wrong.append(
                     f"recovered: {name} is {distance[0]:.9g} m apart {_at_first(group)}, not {wanted[name]:.9g} m"
                 )

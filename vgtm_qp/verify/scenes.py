@@ -12,7 +12,7 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Measure
-from vgtm_qp.result.manifest import stored_problem
+from vgtm_qp.result.manifest import scene_problem
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.carrying import CarryingArm
@@ -107,12 +107,12 @@ def _scenes_of(maneuver: Result, arm: Arm) -> Iterator[_Scene]:
             f"manifest.scenes begin at rows {rows[1:-1]}; expected ascending rows before the last one"
         )
     problem = manifest["problem"]
-    yield _Scene(0, rows[1], problem, manifest.get("meshes") or {}, manifest.get("recovered") or [])
+    # A scene from the first row on takes the place of the problem's.
+    if not changes or changes[0]["row"]:
+        yield _Scene(0, rows[1], problem, manifest.get("meshes") or {}, manifest.get("recovered") or [])
     for scene, first, last in zip(changes, rows[1:-1], rows[2:], strict=True):
-        rules = {**(problem.get("clearance") or {}), "safe": scene["safe"], "self_safe": scene["self_safe"]}
-        own = {**problem, "obstacle": scene["obstacle"], "clearance": rules}
-        stored_problem(own)
-        carrying = CarryingArm(arm, scene["carried"]) if scene.get("carried") else None
+        own, carried = scene_problem(problem, scene), scene.get("carried") or []
+        carrying = CarryingArm(arm, carried) if carried else None
         yield _Scene(first, last, own, scene.get("meshes") or {}, scene.get("recovered") or [], carrying)
 
 
@@ -135,6 +135,9 @@ def _clearances(scene: _Scene, motion: RecordedMotion, directory: Path) -> Clear
     self_at, self_between, self_clearance = _least_clearances(motion, members)
     if scene.arm is None:
         wrong = [*wrong, *members[0].contradictions()]
+    else:
+        uncovered, remarks = scene.arm.contradictions(scene.meshes, directory)
+        wrong, notes = [*wrong, *uncovered], [*notes, *remarks]
     if scene.recovered:
         kept = [*((pairs, safe) for pairs in against), *((pairs, self_safe) for pairs in members)]
         nearer, remarks = excuse_recovering(scene.recovered, kept)

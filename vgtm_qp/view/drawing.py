@@ -11,6 +11,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.curve.families import make_family
+from vgtm_qp.result.manifest import scene_problem
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.verify.arm import Arm, arm_of
@@ -160,6 +161,8 @@ def drawing_of_maneuver(maneuver: Result) -> Drawing:
     drawing = make_drawing(manifest["problem"], arm, vertices, directory)
     if not manifest.get("scenes"):
         return drawing
+    for scene in manifest["scenes"]:
+        scene_problem(manifest["problem"], scene)
     scenes, at_first = manifest["scenes"], manifest["problem"].get("obstacle") or ()
     there = [
         replace(mesh, since=since, until=until)
@@ -320,7 +323,9 @@ def _hidden(obstacles: Sequence[ObstacleMesh], eye: Array, points: Array) -> int
     rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     behind = np.zeros(len(points), dtype=bool)
     for mesh in obstacles:
-        walls = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) + mesh.center - eye
+        time = max(mesh.since, 0.0)
+        corners = mesh.vertices @ mesh.rotation(time).T
+        walls = np.stack([corners.min(axis=0), corners.max(axis=0)]) + mesh.position(time) - eye
         crossings = np.sort(walls[:, None] / rays, axis=0)
         enters, leaves = crossings[0].max(axis=1), crossings[1].min(axis=1)
         behind |= (enters < leaves) & (enters < 1.0) & (leaves > 0.0)

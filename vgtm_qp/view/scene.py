@@ -248,7 +248,7 @@ class ArmScene:
 
 def _path(mesh: ObstacleMesh) -> str:
     """Return where an obstacle is in the scene; one that was moved is drawn once for each place."""
-    return f"/obstacles/{mesh.name}" + (f" from {mesh.since:g} s" if np.isfinite(mesh.since) else "")
+    return f"/obstacles/{mesh.name}" + (f" from {mesh.since!r} s" if np.isfinite(mesh.since) else "")
 
 
 def _placement(ends: Array) -> tuple[Array, Array, Array]:
