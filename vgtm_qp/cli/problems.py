@@ -27,15 +27,28 @@ def check(problem: ProblemName, /, *, json: Json = False) -> None:
         warnings = find_warnings(loaded, setup)
     for warning in warnings:
         note(f"{source}: warning: {warning}")
-    arm = setup.arm.describe()
+    arm, tip, bodies = setup.arm.describe(), setup.arm.end_effector, setup.arm.bodies
+    position = (tip.position(setup.arm.home).round(12) + 0.0).tolist()
+    touching = [[bodies.names[a], bodies.names[b]] for a, b in bodies.touching.tolist()]
     found = {
         "file": source,
         "name": loaded.name,
         "valid": True,
         "warnings": [asdict(warning) for warning in warnings],
         "arm" if loaded.truss is None else "truss": asdict(arm),
+        "tip_at_home": position,
+        "touching_at_home": touching,
     }
-    answer(found, f"{source}: no mistakes\n{arm}", as_json=json)
+    lines = [
+        f"{source}: no mistakes",
+        str(arm),
+        f"tip at home: [{', '.join(f'{x:.6g}' for x in position)}] m",
+    ]
+    if touching:
+        lines.append(
+            f"touch at home and are not kept apart: {', '.join(' / '.join(pair) for pair in touching)}"
+        )
+    answer(found, "\n".join(lines), as_json=json)
 
 
 def list_problems(*, json: Json = False) -> None:
