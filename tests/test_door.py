@@ -177,6 +177,19 @@ def test_nodes_and_quantities_move_with_the_actuators(arm):
     check_motion(arm)
 
 
+def test_no_pose_is_out_of_reach(arm, rng):
+    """The bound is met by the arm stretched out, and by no pose surpassed."""
+    base, bound = np.flatnonzero(arm.base), arm.reach()
+    for size in (0.0, 0.05, 0.2):
+        q = bent(arm, rng, size) if size < 0.2 or arm.bays is not None else arm.home_configuration + 0.0
+        if q.ndim == 1:
+            q[:-6] += arm.following(size * 5.0 * rng.normal(size=len(q) - 6)) * arm.revolute
+        nodes = arm.nodes(q)
+        tip = arm.end_effector.position(nodes)
+        assert (np.linalg.norm(tip - nodes[base], axis=1) <= bound + 1e-9).all()
+    assert np.isfinite(bound).any()
+
+
 def test_forces_do_as_much_work_as_the_load_at_the_tip(arm, rng):
     """In every motion, also one that stretches members or bends joints that cannot: virtual work."""
     q, load = bent(arm, rng), rng.normal(size=3)

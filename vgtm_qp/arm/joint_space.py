@@ -218,10 +218,6 @@ class JointSpaceArm(Arm):
         moved = self.by_quantities(np.array(jacobian)).reshape(len(self.home), 3, -1)
         return np.asarray(np.einsum("k,kcj,c->j", tip.weights, moved[tip.nodes], load))
 
-    def reach(self) -> Array:
-        """See ``arm.Arm``: only the distance from the base's origin, its first node, is bounded."""
-        return np.array([self.reaches[0], *[np.inf] * (int(self.base.sum()) - 1)])
-
     def describe(self) -> JointSpaceDescription:
         stations, hard = len(self.stations) - 1, "position" in self.stations.trackable
         counts = self.segments, len(self.actuators), len(self.bodies), stations

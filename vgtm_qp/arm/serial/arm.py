@@ -132,6 +132,12 @@ class SerialArm(JointSpaceArm):
         reaches[1:] -= to_places[:-1]
         return reaches
 
+    def reach(self) -> Array:
+        """See ``arm.Arm``: from the base's origin and from that of the first joint, which are its first nodes."""
+        to_places, bounds = self._ways[0], np.full(int(self.base.sum()), np.inf)
+        bounds[:2] = to_places[-1], to_places[-1] - to_places[0]
+        return bounds
+
     def approach(self, motion: Array) -> Approach:
         """See ``arm.Arm``.
 
