@@ -296,7 +296,9 @@ def test_methods_without_rows_take_changes_and_their_records_say_what_they_struc
     resolver = vq.Resolver(problem)
     tip, recording = resolver.tip()[0], vq.Recording(resolver, problem)
     resolver.step(position=np.add(tip, [0.05, 0.0, 0.0]))
-    resolver.add_obstacle(vq.Sphere(name="ball", center=np.add(tip, [0.2, 0.0, 0.0]), radius=0.1))
+    near = resolver.add_obstacle(vq.Sphere(name="ball", center=np.add(tip, [0.2, 0.0, 0.0]), radius=0.1))
+    assert all(name.endswith(" / ball") and distance < 0.08 for name, distance in near.items())
+    assert near
     resolver.step(position=np.add(tip, [0.15, 0.0, 0.0]))
     certificate = vq.verify(recording.maneuver())
     assert not certificate.ok

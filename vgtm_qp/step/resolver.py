@@ -299,8 +299,12 @@ class Resolver(ChangingScene):
         return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
 
     def _after_change(self) -> Near:
-        """See :class:`ChangingScene`."""
-        return self._named(self.too_near(self.state).items())
+        """See :class:`ChangingScene`; a method without rows drives no pair apart, but tells."""
+        setup, state = self.setup, self.state
+        near = setup.monitor.near(
+            setup.carrier.points(state.q), state.time, setup.safe, self_reach=setup.self_safe
+        )
+        return self._named((near.pair(k), float(near.distance[k])) for k in range(len(near)))
 
     def too_near(self, state: State) -> Shortfall:  # noqa: ARG002
         """Return the pairs below their clearance in a state, which steps drive apart, with their distances, m."""
