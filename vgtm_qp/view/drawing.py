@@ -19,6 +19,7 @@ from vgtm_qp.verify.curve import TRACKING_TOLERANCE, greatest_gaps
 
 FIXED_COLOUR = (0.70, 0.72, 0.74)
 OBSTACLE_COLOUR = (0.90, 0.62, 0.0)
+CARRIED_COLOUR = (0.34, 0.71, 0.91)
 CURVE_COLOUR = (0.0, 0.45, 0.34)
 POLYGON_COLOUR = (0.35, 0.62, 0.53)
 PATH_COLOUR = (0.10, 0.10, 0.12)
@@ -49,6 +50,7 @@ class ObstacleMesh:
     velocity: Array
     since: float = -np.inf
     until: float = np.inf
+    colour: tuple[float, float, float] = OBSTACLE_COLOUR
 
     def is_there(self, time: float) -> bool:
         """Return whether the obstacle is in the scene at `time`, s."""
@@ -91,8 +93,8 @@ class CarriedMesh(ObstacleMesh):
     def at(self, time: float) -> ObstacleMesh:
         """Return the surface where it is at `time`, s, at rest."""
         turned = self.vertices @ self.rotation(time).T
-        none = np.zeros(3)
-        return ObstacleMesh(self.name, turned, self.faces, self.position(time), none, self.since, self.until)
+        place = self.position(time), np.zeros(3)
+        return ObstacleMesh(self.name, turned, self.faces, *place, self.since, self.until, self.colour)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +251,7 @@ def carried_mesh(
     """Return the surface of a body whose table is in the frame of the tip; None if its file is gone or damaged."""
     for mesh in obstacle_meshes([entry], directory):
         own = mesh.vertices, mesh.faces, mesh.center, np.zeros(3)
-        return CarriedMesh(mesh.name, *own, since, until, pose=pose)
+        return CarriedMesh(mesh.name, *own, since, until, CARRIED_COLOUR, pose=pose)
     return None
 
 

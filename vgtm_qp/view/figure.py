@@ -24,6 +24,7 @@ from vgtm_qp.errors import VgtmError
 from vgtm_qp.result.file import replacing
 from vgtm_qp.result.result import Result
 from vgtm_qp.view.drawing import (
+    CARRIED_COLOUR,
     CURVE_COLOUR,
     FIXED_COLOUR,
     OBSTACLE_COLOUR,
@@ -46,7 +47,6 @@ MARGIN, FOOT = 0.42, 0.95
 _GAP, _TITLE, _NOTE = 0.16, 0.24, 0.16
 _POINTS_PER_INCH = 72.0
 _GRID = (0.80, 0.80, 0.82)
-_EDGE: Any = tuple(0.6 * channel for channel in OBSTACLE_COLOUR)
 _PIECES, _MANY_MEMBERS, _SLICES = 8, 1500, 12
 _THINNEST = 0.5
 _NUMBERS, _NAME, _ASLANT, _STEEP = 2.5, 11.5, 0.3, 0.4
@@ -431,9 +431,11 @@ class View:
         styles += [_BEHIND, _AHEAD]
         styles += [_GOAL] if len(self._goals) else []
         handles: list[Any] = [Line2D([], [], **style) for style in styles]
-        if self.surfaces:
-            face = (*OBSTACLE_COLOUR, 0.30)
-            handles.append(Patch(facecolor=face, edgecolor=_EDGE, linewidth=0.8, label="obstacle"))
+        there = {surface.mesh.colour for surface in self.surfaces}
+        for colour, label in ((OBSTACLE_COLOUR, "obstacle"), (CARRIED_COLOUR, "carried")):
+            if colour in there:
+                edge = _edge(colour)
+                handles.append(Patch(facecolor=(*colour, 0.30), edgecolor=edge, linewidth=0.8, label=label))
         figure.legend(
             handles=handles,
             loc="lower right",
@@ -505,13 +507,20 @@ def _label(axes: Axes, name: str, values: Array, places: Array, aside: Array, sc
     axes.annotate(f"{name} (m)", places.mean(axis=0), tuple(away * aside), **text)
 
 
+def _edge(colour: tuple[float, float, float]) -> Any:
+    """Return the darker colour of the edges of a surface."""
+    return tuple(0.6 * channel for channel in colour)
+
+
 def _draw_surface(axes: Axes, surface: ProjectedMesh, time: float, zorder: float) -> None:
     polygons = surface.polygons(time)
-    styles: list[Any] = [{"facecolors": [OBSTACLE_COLOUR], "alpha": 0.30, "linewidths": 0.0}]
+    colour = surface.mesh.colour
+    styles: list[Any] = [{"facecolors": [colour], "alpha": 0.30, "linewidths": 0.0}]
     if surface.is_convex:
-        styles.append({"facecolors": "none", "edgecolors": [_EDGE], "linewidths": 0.8})
+        styles.append({"facecolors": "none", "edgecolors": [_edge(colour)], "linewidths": 0.8})
     for style in styles:
         axes.add_collection(PolyCollection(polygons, zorder=zorder, **style))
     for seen, width, dashes in ((False, 0.5, (0, (1.5, 2.0))), (True, 0.8, "solid")):
-        line: Any = {"colors": [_EDGE], "linewidths": width, "linestyles": [dashes], "zorder": zorder + 0.1}
+        line: Any = {"colors": [_edge(colour)], "linewidths": width, "linestyles": [dashes]}
+        line["zorder"] = zorder + 0.1
         axes.add_collection(LineCollection(list(surface.edges(time, seen=seen)), **line))

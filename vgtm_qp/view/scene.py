@@ -15,7 +15,6 @@ from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.view.drawing import (
     CURVE_COLOUR,
     FIXED_COLOUR,
-    OBSTACLE_COLOUR,
     PATH_COLOUR,
     POLYGON_COLOUR,
     Camera,
@@ -162,7 +161,7 @@ class ArmScene:
                     # Faces and vertices go together: another shape may have taken the name.
                     drawn.surface.vertices = mesh.vertices.astype(np.float32)
                     drawn.surface.faces = mesh.faces.astype(np.uint32)
-                drawn.mesh = mesh
+                drawn.mesh, drawn.surface.color = mesh, tuple(_rgb(mesh.colour).tolist())
                 drawn.place(time)
 
     def mark(self, bodies: Sequence[int], obstacles: Collection[str], line: Array | None, said: str) -> None:
@@ -173,7 +172,7 @@ class ArmScene:
         """
         self._marked = [body for body in bodies if body < len(self._drawing.arm.radius)]
         for drawn in self._obstacles.values():
-            colour = MARK_COLOUR if drawn.mesh.name in obstacles else OBSTACLE_COLOUR
+            colour = MARK_COLOUR if drawn.mesh.name in obstacles else drawn.mesh.colour
             if tuple(drawn.surface.color) != tuple(_rgb(colour)):
                 drawn.surface.color = tuple(_rgb(colour).tolist())
         if self._line is None and line is not None:
@@ -219,7 +218,7 @@ class ArmScene:
             f"{path}/surface",
             mesh.vertices.astype(np.float32),
             mesh.faces.astype(np.uint32),
-            color=_rgb(OBSTACLE_COLOUR),
+            color=_rgb(mesh.colour),
             opacity=0.45,
             flat_shading=True,
             side="double",
