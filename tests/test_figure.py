@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import vgtm_qp as vq
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.view.drawing import ObstacleMesh, drawing_of_maneuver
-from vgtm_qp.view.figure import plot_frames, save_figure
+from vgtm_qp.view.figure import View, plot_frames, save_figure
 from vgtm_qp.view.projection import ProjectedMesh, Projection, layers, pieces
 
 angles = st.floats(-3.0, 3.0)
@@ -153,3 +153,16 @@ def test_what_cannot_be_drawn_is_named(maneuver: vq.Maneuver, tmp_path: Path):
         plot_frames(maneuver, frames=[last + 1])
     with pytest.raises(VgtmError, match="1 or more"):
         plot_frames(maneuver, frames=0)
+
+
+def test_a_serial_arm_is_drawn_as_its_capsules_and_whole():
+    problem = vq.load_problem("station_arm_past_a_module").replace({"maneuver.steps": 6})
+    result = vq.solve(problem, verify=False)
+    view, arm = View(result, [0, len(result.time) - 1]), drawing_of_maneuver(result).arm
+    for row in (0, -1):
+        ends = view.projection.flat(arm.ends(result.nodes[row]))
+        assert (ends.min(axis=1) - arm.radius[:, None] >= view.low - 1e-9).all()
+        assert (ends.max(axis=1) + arm.radius[:, None] <= view.high + 1e-9).all()
+    clipped, overlapping = clipped_and_overlapping(plot_frames(result, frames=2))
+    assert not clipped
+    assert not overlapping
