@@ -146,7 +146,7 @@ def test_excess_freedom_is_named_with_its_number():
     warning = excess_freedom(19, 15)
     assert "19 degrees of freedom" in warning
     assert "the arm 15" in warning
-    assert "2 control vertices fewer" in warning
+    assert "4 without effect" in warning
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 import vgtm_qp as vq
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import EQUALITY, check, residuals
+from vgtm_qp.qp.dense import EQUALITY, DenseAnswer, check, residuals
 from vgtm_qp.qp.numbers import UNBOUNDED
 from vgtm_qp.qp.osqp import AGAIN, FIRST, Osqp
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError
@@ -164,3 +164,14 @@ def test_osqp_is_set_up_a_few_times_in_a_maneuver_with_many_blocked_qps(monkeypa
     assert vq.solve(problem).status == "solved"
     assert counts["solve"] > 100
     assert counts["setup"] < 0.05 * counts["solve"]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("part", ["x", "multipliers"])
+def test_an_answer_beyond_all_numbers_is_refused(part):
+    """Its square would overflow, and its dual residual over that be zero."""
+    answer = DenseAnswer(np.zeros(2), np.zeros(2), 0, "a solver")
+    answer = answer._replace(**{part: np.array([1e194, 0.0])})
+    qp = np.eye(2), np.ones(2), np.zeros((0, 2)), np.full(2, -1e30), np.full(2, 1e30)
+    with pytest.raises(AnswerError):
+        check(answer, *qp)

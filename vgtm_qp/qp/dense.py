@@ -20,6 +20,9 @@ from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError, loose, refuse_
 EQUALITY = 5
 """DAQP's mark for a row that is always active."""
 
+_GREATEST = 1e100
+"""Greatest number of an answer: the squares of much greater ones overflow, and residuals over infinity would be zero."""
+
 
 class DenseAnswer(NamedTuple):
     """A solver's answer to a dense QP.
@@ -91,7 +94,8 @@ def residuals(
     The dual residual is the greater of two norms: of H x + g + multipliers, and of what is :func:`loose`.
     """
     x, y = answer.x, answer.multipliers
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+    # A comparison with NaN is false, too.
+    if not (np.abs(x).max(initial=0.0) < _GREATEST and np.abs(y).max(initial=0.0) < _GREATEST):
         return np.nan, np.nan
     bounded = len(y) - len(constraint)
     values = np.concatenate((x[:bounded], constraint @ x))
