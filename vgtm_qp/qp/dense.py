@@ -21,7 +21,7 @@ EQUALITY = 5
 """DAQP's mark for a row that is always active."""
 
 _GREATEST = 1e100
-"""Greatest number of an answer: the squares of much greater ones overflow, and residuals over infinity would be zero."""
+"""Greatest number of an answer: squares of much greater ones overflow, and residuals over infinity would be zero."""
 
 
 class DenseAnswer(NamedTuple):
