@@ -304,7 +304,22 @@ def test_a_recording_that_begins_with_a_crate_is_verified():
         resolver.step(position=tip + np.array([0.02 * k, 0.0, 0.0]))
     maneuver = recording.maneuver()
     assert [scene["row"] for scene in maneuver.manifest["scenes"]] == [0]
+    certificate = vq.verify(maneuver)
+    assert certificate.ok
+    assert any("the scene changed at states 0;" in note for note in certificate.notes)
+
+
+def test_pairs_that_an_arm_says_touch_are_looked_at_while_it_carries_something_too():
+    problem = vq.load_problem("snake_past_a_cube")
+    resolver = vq.Resolver(problem)
+    resolver.attach(crate_at(problem, 0.3))
+    recording = vq.Recording(resolver, problem)
+    resolver.step(position=resolver.tip()[0])
+    maneuver = recording.maneuver()
     assert vq.verify(maneuver).ok
+    forged = {**maneuver.manifest["arm"], "touching": [[0, 6]]}
+    certificate = vq.verify(replace(maneuver, manifest={**maneuver.manifest, "arm": forged}))
+    assert any("do not touch at home" in line for line in certificate.contradictions)
 
 
 @pytest.mark.parametrize("first", ["attach", "release", "add"])

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from vgtm_qp.arm.arm import Approach, Arm, between
-from vgtm_qp.arm.frames import frame_constants, frame_function
+from vgtm_qp.arm.symbols import Constants, Frames
 from vgtm_qp.arrays import Array, Index
-from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.shapes import Obstacle
 from vgtm_qp.problem.enclosing import box_capsules, capsule_along, enclosing_capsule
 from vgtm_qp.rotation import rotation_from_vector
@@ -95,8 +95,7 @@ class Carrier:
             self.bodies, self._local = own, np.zeros((0, 3))
             return
         self._local = np.concatenate([body.ends for body in carried]).reshape(-1, 3)
-        count, first = len(self._local) // 2, int(own.points.max(initial=-1)) + 1
-        self._first = max(first, len(self.arm.points(self.arm.home_configuration)))
+        count, self._first = len(self._local) // 2, len(self.arm.points(self.arm.home_configuration))
         pairs = np.arange(2 * count).reshape(-1, 2)
         at_tip = np.flatnonzero(np.isin(own.joints, self.arm.end_effector.nodes).any(axis=1))
         new = len(own) + np.arange(count)
@@ -180,14 +179,14 @@ class _TipFrame:
 
     def __init__(self, arm: Arm) -> None:
         self._tip = tip = arm.end_effector
-        self._kernel = Kernel(frame_function(len(tip.nodes)), compiled=False)
-        for k, value in enumerate(frame_constants(arm.home[tip.nodes], tip.frame)):
-            self._kernel.inputs[k + 1][:] = value.T.reshape(-1)
+        constants, nodes = Constants(), ca.MX.sym("nodes", 3, len(tip.nodes))
+        own = np.arange(len(tip.nodes))[None]
+        frame = Frames(arm.home[tip.nodes][None], tip.frame[None], own, constants, "tip")
+        self._kernel = constants.bound("tip_frame", [nodes], list(frame.at(nodes))).kernel(compiled=False)
 
     def at(self, X: Array) -> tuple[Array, Array, Array]:
-        """Return position, rotation and spin for nodes at `X` (N, 3), m."""
-        kernel = self._kernel
-        kernel.inputs[0][:] = X[self._tip.nodes].reshape(-1)
-        kernel()
-        rotation, spin = kernel.outputs
+        """Return position (3,), m, rotation (3, 3) and spin (3, 3K) for nodes at `X` (N, 3), m."""
+        self._kernel.inputs[0][:] = X[self._tip.nodes].reshape(-1)
+        self._kernel()
+        rotation, spin = self._kernel.outputs
         return self._tip.position(X), rotation.reshape(3, 3).T.copy(), spin.reshape(-1, 3).T.copy()

@@ -126,7 +126,7 @@ class ChangingScene(ABC):
             before = there[k].table
             wanted = {"center": center, "rotation_vector": rotation_vector, "velocity": velocity}
             changes = {key: value for key, value in wanted.items() if value is not None}
-            changes.setdefault("center", np.add(before.center, np.multiply(self.state.time, before.velocity)))
+            changes.setdefault("center", self._center(before))
             table = self._at_time_0(before, changes)
             place = before.center, rotation_from_vector(before.rotation_vector)
             rotation = rotation_from_vector(table.rotation_vector)
@@ -173,18 +173,14 @@ class ChangingScene(ABC):
             there = list(self.setup.monitor.obstacles)
             if isinstance(body, str):
                 made = there.pop(self._number(body))
-                center = np.add(made.table.center, np.multiply(self.state.time, made.velocity))
             else:
                 self._check_is_new(body)
-                made, center = (
-                    _made(self._at_time_0(body, {"velocity": (0.0, 0.0, 0.0)})),
-                    np.array(body.center),
-                )
+                made = _made(self._at_time_0(body, {"velocity": (0.0, 0.0, 0.0)}))
             if made.name in self.setup.arm.bodies.names:
                 raise GoalError(f'a {self.setup.arm.bodies.kind} of the arm is called "{made.name}", too')
             position, rotation = self.tip()
             turn = rotation.T @ rotation_from_vector(made.table.rotation_vector)
-            held = carried(_placed(made, rotation.T @ (center - position), turn))
+            held = carried(_placed(made, rotation.T @ (self._center(made.table) - position), turn))
             return self._put(there, [*self.setup.carrier.carried, held])
 
     def release(self, name: str, *, keep: bool = True) -> Near:
@@ -254,6 +250,10 @@ class ChangingScene(ABC):
             raise GoalError(f'there is an obstacle "{body.name}" already; move_obstacle moves it')
         if any(other.name == body.name for other in self.setup.carrier.carried):
             raise GoalError(f'"{body.name}" is carried already; release lets go of it')
+
+    def _center(self, table: Any) -> Array:
+        """Return (3,) where the center of an obstacle is now, m."""
+        return np.asarray(np.add(table.center, np.multiply(self.state.time, table.velocity)))
 
     def _at_time_0(self, table: Any, changes: dict[str, Any]) -> Any:
         """Return an obstacle's table with `changes`, its center, given for now, that of time 0."""

@@ -13,6 +13,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.record import Record
 from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.distance import segment_ball
 from vgtm_qp.verify.obstacles import Body, read_obstacles
 
 _HELD = 1e-6
@@ -104,15 +105,6 @@ class CarryingArm:
         found[~own] = self._arm.tip_bend(before, after, reach)
         return found
 
-    def ends(self, points: Array) -> Array:
-        """Return the ends of the arm's own bodies for its points."""
-        return self._arm.ends(points)
-
-    @property
-    def home(self) -> Array:
-        """The arm's points at home, m."""
-        return self._arm.home
-
     def _placed(self, states: Array) -> Array:
         """Return (T, C, 2, 3) the ends of the capsules, m, at states (T, ...)."""
         position, rotation = self._arm.tip_poses(states)
@@ -131,19 +123,19 @@ def _surface(table: Mapping[str, Any], body: Body) -> Array:
     angle, height = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 8 * _GRID), share)
     round_it = float(table["radius"]) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     if shape == "cylinder":
-        return np.concatenate([round_it, height[..., None] * float(table["height"]) / 2.0], axis=-1).reshape(
-            -1, 3
+        along = height[..., None] * float(table["height"]) / 2.0
+    else:
+        round_it, along = (
+            np.sqrt(1.0 - height**2)[..., None] * round_it,
+            height[..., None] * float(table["radius"]),
         )
-    level = np.sqrt(1.0 - height**2)[..., None] * round_it
-    return np.concatenate([level, height[..., None] * float(table["radius"])], axis=-1).reshape(-1, 3)
+    return np.concatenate([round_it, along], axis=-1).reshape(-1, 3)
 
 
 def _outside(points: Array, ends: Array, radius: Array) -> Array:
     """Return how far points (K, 3) are outside the union of capsules (C, 2, 3), m; negative inside."""
-    least = np.full(len(points), np.inf)
-    for (start, end), thick in zip(ends, radius, strict=True):
-        along, gap = end - start, points - start
-        square = float(along @ along)
-        share = np.clip(gap @ along / square, 0.0, 1.0) if square > 0.0 else np.zeros(len(points))
-        least = np.minimum(least, np.linalg.norm(gap - share[:, None] * along, axis=1) - thick)
-    return least
+    each = [
+        segment_ball(start - points, end - points, 0.0)[0] - thick
+        for (start, end), thick in zip(ends, radius, strict=True)
+    ]
+    return np.asarray(np.min(each, axis=0))

@@ -298,14 +298,6 @@ class AgainstMembers(Encounters):
         ]
         return [pair for a, b in kept for pair in ((a, b), (b, a))]
 
-    def contradictions(self) -> list[str]:
-        """Return the pairs that are recorded as touching at home but do not touch there."""
-        pairs = np.array(sorted(self._touching), dtype=np.int64).reshape(-1, 2)
-        ends = self.motion.arm.ends(self.motion.arm.home)
-        points = np.concatenate([ends[pairs[:, 0]], ends[pairs[:, 1]]], axis=1)
-        apart = self.separation(points, (pairs[:, 0], pairs[:, 1]))[0] > self.motion.resolution
-        return [f"{self.name((a, b))} do not touch at home" for a, b in pairs[apart].tolist() if a < b]
-
     @cached_property
     def _touching(self) -> frozenset[tuple[int, int]]:
         """The pairs that are not kept apart, in either order."""
@@ -360,6 +352,16 @@ class AgainstMembers(Encounters):
     def radii(self, pair: Pairs) -> Array:
         """Return (P,) the sums of both radii, m."""
         return np.asarray(self.motion.arm.radius[pair[0]] + self.motion.arm.radius[pair[1]])
+
+
+def apart_at_home(arm: Arm, resolution: float) -> list[str]:
+    """Return the pairs of bodies recorded as touching at home that are further apart there than the `resolution`, m."""
+    first, second = arm.touching.T
+    ends = arm.ends(arm.home)
+    gap, _ = segment_segment(ends[first, 0], ends[first, 1], ends[second, 0], ends[second, 1])
+    apart = gap - arm.radius[first] - arm.radius[second] > resolution
+    names = arm.member_names
+    return [f"{names[a]} / {names[b]} do not touch at home" for a, b in arm.touching[apart].tolist()]
 
 
 def box_gap(low: Array, high: Array, other_low: Array, other_high: Array) -> Array:

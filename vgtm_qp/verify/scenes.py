@@ -24,6 +24,7 @@ from vgtm_qp.verify.clearance import (
     Encounters,
     Least,
     RecordedMotion,
+    apart_at_home,
 )
 from vgtm_qp.verify.obstacles import read_obstacles
 from vgtm_qp.verify.path import DIRECTION_TOLERANCE, angles
@@ -83,11 +84,11 @@ def clearances_of(maneuver: Result, arm: Arm, motion: RecordedMotion) -> Clearan
     clearance = [first.clearance, *(found.clearance[1:] for found in others)]
     self_clearance = [first.self_clearance, *(found.self_clearance[1:] for found in others)]
     notes = [line for found in each for line in found.notes]
-    if others:
-        some = ", ".join(str(scene.first) for scene in scenes[1 : _NAMED + 1])
-        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+    if changes := maneuver.manifest.get("scenes"):
+        some = ", ".join(str(scene["row"]) for scene in changes[:_NAMED])
+        more = f" and {len(changes) - _NAMED} more" if len(changes) > _NAMED else ""
         notes.append(f"the scene changed at states {some}{more}; each step was checked against its own")
-    wrong = [line for found in each for line in found.wrong]
+    wrong = [*apart_at_home(arm, motion.resolution), *(line for found in each for line in found.wrong)]
     return Clearances(
         measures,
         np.concatenate(clearance),
@@ -133,9 +134,7 @@ def _clearances(scene: _Scene, motion: RecordedMotion, directory: Path) -> Clear
     against, members = [AgainstBody(motion, body) for body in bodies], [AgainstMembers(motion)]
     at, between, clearance = _least_clearances(motion, against)
     self_at, self_between, self_clearance = _least_clearances(motion, members)
-    if scene.arm is None:
-        wrong = [*wrong, *members[0].contradictions()]
-    else:
+    if scene.arm is not None:
         uncovered, remarks = scene.arm.contradictions(scene.meshes, directory)
         wrong, notes = [*wrong, *uncovered], [*notes, *remarks]
     if scene.recovered:
